@@ -26,11 +26,11 @@ import numpy as np
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import single_pictures
+from topoloc.recordings.recording import as_monocular
 from topoloc.tracking.tracker import Tracker
 from topoloc_worlds.hospital.plan import BAY, walls_of
 
@@ -76,7 +76,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     localizer = Localizer(build_map(open_sequence(args.mapped)))
-    sequence = single_pictures(open_sequence(args.asked))
+    sequence = as_monocular(open_sequence(args.asked))
     frames = [
         frame
         for frame in (sequence[i] for i in range(len(sequence)))

@@ -25,16 +25,16 @@ import numpy as np
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
-from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.map_cache import MapCache
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import Picture
+from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.memory import set_node_memory
+from topoloc.mapping.node_cache import set_node_cache_size
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import single_pictures
+from topoloc.recordings.recording import as_monocular
 from topoloc.tracking.warm_up import warm_up
 
 RIGHT_METRES = 0.5
@@ -50,7 +50,7 @@ def asked(
     middle = time.process_time()
     by_atlas = localizer.localize(frame.image, frame.camera)
     end = time.process_time()
-    ranking = [name for name, _ in localizer.rank(Picture(frame.image, frame.camera))]
+    ranking = [name for name, _ in localizer.rank(QueryImage(frame.image, frame.camera))]
     answer = by_atlas.provenance.tile if isinstance(by_atlas, Localization) else None
     outcome = (
         "right"
@@ -150,7 +150,7 @@ def ask_elsewhere(localizer: AtlasLocalizer, paths: list[str]) -> dict[str, list
         }
         alone = {tile_id: Localizer(topomap) for tile_id, topomap in maps.items()}
         for path in paths:
-            sequence = single_pictures(open_sequence(path))
+            sequence = as_monocular(open_sequence(path))
             rows[path] = [
                 asked_elsewhere(localizer, alone, sequence[k]) for k in range(len(sequence))
             ]
@@ -172,13 +172,13 @@ def main() -> None:
     args = parser.parse_args()
     warm_up()
     atlas = Atlas.open(args.atlas)
-    set_node_memory(args.memory_mb * 500_000)
-    localizer = AtlasLocalizer(atlas, Maps([args.atlas], Localizer, args.memory_mb * 500_000))
+    set_node_cache_size(args.memory_mb * 500_000)
+    localizer = AtlasLocalizer(atlas, MapCache([args.atlas], Localizer, args.memory_mb * 500_000))
     rows: dict[str, list[dict[str, Any]]] = {}
     for pair in args.recordings:
         tile_id, path = pair.split("=", 1)
         with TopoMetricMap.load(atlas.map_path(atlas.tile(tile_id))) as topomap:
-            sequence, alone = single_pictures(open_sequence(path)), Localizer(topomap)
+            sequence, alone = as_monocular(open_sequence(path)), Localizer(topomap)
             of_one = [
                 asked(localizer, alone, tile_id, sequence[k], set(args.alike.split(",")))
                 for k in range(len(sequence))

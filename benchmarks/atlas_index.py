@@ -26,12 +26,12 @@ import numpy as np
 from jaxtyping import Float16, Float32
 
 from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.descriptor_shard import DescriptorShard
+from topoloc.atlas.global_descriptors import GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index import AtlasIndex
 from topoloc.atlas.index_files import open_index
 from topoloc.atlas.manifest import StoredFile, Tile
-from topoloc.atlas.place_shard import PlaceShard
-from topoloc.atlas.place_vectors import PlaceVectors, read_vectors
-from topoloc.retrieval.place_kernels import multiply_rows
+from topoloc.retrieval.descriptor_kernels import multiply_rows
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 NUM_NEIGHBOURS, PLACES_A_TILE, CHUNK = 20, 250, 100_000
@@ -114,7 +114,7 @@ def nearest(places: Float16[np.ndarray, "n d"], asked: Float32[np.ndarray, "q d"
 
 def tiles_of(
     folder: Path, kind: str, dimension: int
-) -> tuple[list[Tile], Callable[[Tile], PlaceVectors]]:
+) -> tuple[list[Tile], Callable[[Tile], GlobalDescriptors]]:
     """Tiles of places that follow each other in the file, and what reads them."""
     row, vocabulary = 2 * dimension, shared_vocabulary(kind)
     assert vocabulary is not None
@@ -142,7 +142,7 @@ def tiles_of(
             )
         )
 
-    def read(tile: Tile) -> PlaceVectors:
+    def read(tile: Tile) -> GlobalDescriptors:
         least, most = bounds[int(tile.tile_id)], bounds[int(tile.tile_id) + 1]
         rows = np.fromfile(
             folder / "places", np.float16, (most - least) * dimension, offset=int(least) * row
@@ -243,7 +243,7 @@ def recall_of_places(folder: Path, queries: dict[str, np.ndarray], likeness: str
     """The part of the true neighbours that is among as many that the shards name; all where there
     are none."""
     shards = sorted(
-        (PlaceShard.open(path) for path in (folder / "index").glob("*.index")),
+        (DescriptorShard.open(path) for path in (folder / "index").glob("*.index")),
         key=lambda shard: shard.tiles[0].tile_id,
     )
     if not shards:
@@ -350,7 +350,9 @@ def main() -> None:
     args = parser.parse_args()
     atlas = Atlas.open(args.atlas)
     of_tiles = [
-        read_vectors(atlas.store.local(tile.places.name, tile.places.sha256), tile.vocabularies)
+        load_global_descriptors(
+            atlas.store.local_path(tile.places.name, tile.places.sha256), tile.vocabularies
+        )
         for tile in atlas.manifest.tiles
     ]
     true, rows = (

@@ -9,8 +9,8 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from topoloc.geometry.calibration_check import SeenCamera
-from topoloc.geometry.calibration_verdict import verdict_of_pictures
+from topoloc.geometry.calibration_check import IntrinsicsDeviation
+from topoloc.geometry.calibration_consistency import check_calibration_consistency
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.topomap import TopoMetricMap
@@ -39,7 +39,7 @@ def changed(camera: Camera, scale: float, across: float, down: float) -> Camera:
 
 def seen_with(
     localizer: Localizer, sequence: StereoSequence, every: int, case: tuple[float, float, float]
-) -> tuple[list[SeenCamera], Camera]:
+) -> tuple[list[IntrinsicsDeviation], Camera]:
     """What each picture says, and the calibration that it was asked with."""
     first = sequence[0].camera
     assert first is not None, "a recording with a calibration is needed"
@@ -65,15 +65,15 @@ def main() -> None:
         seen, camera = seen_with(localizer, sequence, args.every, case)
         for num in NUM_PICTURES:
             verdicts = [
-                verdict_of_pictures(seen[first : first + num], camera)
+                check_calibration_consistency(seen[first : first + num], camera)
                 for first in range(len(seen) - num + 1)
             ]
             said = [
-                one.is_of_focal_length if case[0] != 1.0 else one.is_of_centre
+                one.has_focal_mismatch if case[0] != 1.0 else one.has_principal_point_mismatch
                 for one in verdicts
                 if one is not None
             ]
-            accused = [one.contradicts for one in verdicts if one is not None]
+            accused = [one.is_contradicted for one in verdicts if one is not None]
             counts[num, case == RIGHT][0] += sum(accused if case == RIGHT else said)
             counts[num, case == RIGHT][1] += len(said)
     for num in NUM_PICTURES:

@@ -25,19 +25,19 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.evaluation.experiments import neighbours_of
+from topoloc.evaluation.query_localization import find_neighbour_ids
 from topoloc.features.extraction import extract_features
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.image_io import to_grey
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import grey_image
-from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse
-from topoloc.retrieval.network_config import PictureConfig
+from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse_localizer
+from topoloc.retrieval.network_config import NetworkInputConfig
 from topoloc_training.classifier_config import CnnFcConfig
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
-COMPACT_PICTURE = PictureConfig(112, 84)
+COMPACT_PICTURE = NetworkInputConfig(112, 84)
 METHODS = ("surf-vlad", "cnn-nn", "vlad-nn", "cnn-fc compact", "cnn-fc squeezenet1_1")
 
 
@@ -77,12 +77,12 @@ def main() -> None:
 
 def trained(topomap: TopoMetricMap, method: str, weights: str | None) -> CoarseLocalizer:
     if method == "surf-vlad":
-        return open_coarse(topomap.coarse_models[method])
+        return open_coarse_localizer(topomap.coarse_models[method])
     name, _, backbone = method.partition(" ")
     if backbone == "compact":
         config = CoarseTrainingConfig(cnn_fc=CnnFcConfig(picture=COMPACT_PICTURE))
-        return open_coarse(train_coarse(topomap, name, "compact", "scratch", config))
-    return open_coarse(train_coarse(topomap, name, "squeezenet1_1", weights))
+        return open_coarse_localizer(train_coarse(topomap, name, "compact", "scratch", config))
+    return open_coarse_localizer(train_coarse(topomap, name, "squeezenet1_1", weights))
 
 
 def judge(
@@ -97,10 +97,10 @@ def judge(
     for i, world_from_cam in enumerate(sequence.poses):
         assert world_from_cam is not None, "queries need their truth"
         image = sequence[i].image
-        first, *_ = localizer.rank(image, extract_features(grey_image(image), features_config), 1)
+        first, *_ = localizer.rank(image, extract_features(to_grey(image), features_config), 1)
         distances = node_distances(world_from_cam, nodes, lambda_rot)
         hits.append(first.node_id == int(np.argmin(distances)))
-        near.append(hits[-1] or first.node_id in neighbours_of(topomap, distances))
+        near.append(hits[-1] or first.node_id in find_neighbour_ids(topomap, distances))
         away.append(distances[first.node_id] / d_thresh)
     return {
         "top_1": float(np.mean(hits)),

@@ -24,8 +24,8 @@ from topoloc.retrieval.cnn_nn import DEPTHS as CNN_DEPTHS
 from topoloc.retrieval.cnn_nn import PooledFeatures
 from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel
 from topoloc.retrieval.inference import has_bfloat16
-from topoloc.retrieval.network_config import BackboneName, PictureConfig
-from topoloc.retrieval.vector_search import VectorSearch
+from topoloc.retrieval.network_config import BackboneName, NetworkInputConfig
+from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
 from topoloc.retrieval.vlad_nn import DEPTHS as VLAD_DEPTHS
 from topoloc.retrieval.vlad_nn import VladNetwork
 from topoloc_training.classifier_config import CnnNnConfig, VladNnConfig
@@ -64,7 +64,7 @@ def main() -> None:
     )
     for name in arguments.networks:
         method, _, backbone = name.partition("/")
-        localizer = made(method, backbone, PictureConfig(width, height))
+        localizer = made(method, backbone, NetworkInputConfig(width, height))
         localizer.rank(image, no_features, 4)
         walls, cores = [], []
         for _ in range(arguments.runs):
@@ -79,7 +79,7 @@ def main() -> None:
         )
 
 
-def made(method: str, backbone: BackboneName, picture: PictureConfig) -> CoarseLocalizer:
+def made(method: str, backbone: BackboneName, picture: NetworkInputConfig) -> CoarseLocalizer:
     """A localizer of this kind with random weights and vectors."""
     rng = np.random.default_rng(0)
     settings = {"backbone": backbone, "picture_shape": [213, 160]}
@@ -111,7 +111,7 @@ def made(method: str, backbone: BackboneName, picture: PictureConfig) -> CoarseL
         "mean": np.zeros(num_raw, np.float32),
     }
     arrays["projection"] = rng.standard_normal((DIMENSION, num_raw)).astype(np.float16)
-    return VectorSearch(
+    return NetworkDescriptorLocalizer(
         CoarseModel(method, settings, to_arrays(network) | arrays), network, picture
     )
 

@@ -33,13 +33,13 @@ import tyro
 from jaxtyping import Float32
 
 from topoloc import Localizer, TopoMetricMap, open_sequence
-from topoloc.features.kinds import find_kind
+from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.lifelong.prune import PruneConfig, _with_fewer
+from topoloc.lifelong.prune import PruneConfig, _drop_landmarks
 from topoloc.localization.result import Localization
-from topoloc.mapping.points import array_packed, unit_descriptors
+from topoloc.mapping.map_writing import write_map
+from topoloc.mapping.point_encoding import compress_array, dequantize_descriptors
 from topoloc.mapping.topomap import TopoNode
-from topoloc.mapping.writing import write_map
 
 _WRONG_M, _WRONG_DEG, _WORDS, _LEARNED_FROM = 0.5, 5.0, 256, 40_000
 
@@ -69,7 +69,7 @@ class Args:
 def coarse(times: int, scale: float) -> Form:
     def form(descriptors: Descriptors) -> tuple[Descriptors, float]:
         stored = np.clip(np.rint(descriptors * scale / times), -127, 127).astype(np.int8)
-        return unit_descriptors(stored), len(array_packed(stored))
+        return dequantize_descriptors(stored), len(compress_array(stored))
 
     return form
 
@@ -114,7 +114,7 @@ def _unit(descriptors: np.ndarray) -> Descriptors:
 
 def form_of(name: str, kind: str, topomap: TopoMetricMap) -> tuple[Form, int]:
     """How a kind's descriptors are quantised, and the bytes that this takes once a map."""
-    scale = find_kind(kind).descriptor_scale
+    scale = find_feature_type(kind).descriptor_scale
     if name == "bytes" or name.startswith("coarse"):
         return coarse(int(name.removeprefix("coarse") or 1) if name != "bytes" else 1, scale), 0
     learned_from = np.concatenate([node.features.descriptors for node in topomap.nodes_of(kind)])
@@ -189,7 +189,7 @@ def main(args: Args) -> None:
             for kind in whole.kinds
         }
         for most in args.landmarks:
-            fewer = _with_fewer(whole, nothing, most, PruneConfig()).topomap
+            fewer = _drop_landmarks(whole, nothing, most, PruneConfig()).topomap
             size, of_descriptors = written(fewer)
             for name in args.forms:
                 quantised, num_bytes = with_descriptors(fewer, name, whole)

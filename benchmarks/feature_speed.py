@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
+from topoloc.features.extraction import FeatureConfig, extract_from_normalized, normalize_image
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
+from topoloc.recordings.image_io import to_grey
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import grey_image
 
 RECORDINGS = {
     "kitchen": "seven_scenes/kitchen/seq-01",
@@ -65,7 +65,7 @@ def time_extraction(image: np.ndarray, repeats: int) -> None:
             name = f"{config.kind} on {config.normalization}, {num_threads} threads"
             report(
                 name,
-                lambda c=config, i=normalized, n=num_threads: extract_normalized(i, c, n),
+                lambda c=config, i=normalized, n=num_threads: extract_from_normalized(i, c, n),
                 repeats,
             )
 
@@ -101,7 +101,7 @@ def time_matching(
 
 def main(args: Args) -> None:
     for name, path in RECORDINGS.items():
-        image = grey_image(open_sequence(args.shared / "data" / path)[10].image)
+        image = to_grey(open_sequence(args.shared / "data" / path)[10].image)
         print(f"{name}, {image.shape[1]} x {image.shape[0]}: minimum and median, ms")
         time_extraction(image, args.repeats)
     print("matching 850 with 4000 descriptors of 64 numbers")

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.recordings.pictures import read_image
+from topoloc.recordings.image_io import read_image
 
 TESTS = Path(__file__).parents[1] / "tests" / "map"
 sys.path.insert(0, str(TESTS))

@@ -286,7 +286,7 @@ def _numbers(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _read_picture(path: Path) -> str:
-    from topoloc.recordings.pictures import exif_focal_length, image_size, read_depth, read_image
+    from topoloc.recordings.image_io import exif_focal_length, image_size, read_depth, read_image
 
     width, height = image_size(path)
     exif_focal_length(path, width, height)

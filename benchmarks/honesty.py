@@ -22,14 +22,14 @@ import cv2
 import numpy as np
 
 from real_recordings import PLACES, Place
-from topoloc.apps.cli.features_option import localizer_of
+from topoloc.apps.cli.features_option import create_localizer
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.evidence import EvidenceConfig, tolerated_translation
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.evidence import EvidenceConfig, compute_translation_tolerance
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.nodes import NodeConfig
@@ -71,7 +71,7 @@ class Asked:
         xi = (truth @ result.world_from_cam.inverse()).log()
         self.metres.append(metres)
         self.is_right.append(
-            metres < tolerated_translation(depth, EvidenceConfig()) and degrees < 2.0
+            metres < compute_translation_tolerance(depth, EvidenceConfig()) and degrees < 2.0
         )
         self.is_far_off.append(metres > 0.5 or degrees > 10.0)
         if not self.is_far_off[-1]:
@@ -125,7 +125,7 @@ def main() -> None:
                 ),
                 place.mapping,
             )
-        localizer = localizer_of(topomap, LocalizerConfig(), arguments.features)
+        localizer = create_localizer(topomap, LocalizerConfig(), arguments.features)
         ask_place(place, places, localizer, data, arguments.step, groups)
         for name, asked in groups.items():
             if name.startswith(place.name):
@@ -164,7 +164,7 @@ def ask_place(
         turned = Rigid3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
         asked("rolled 90").add(answer(localizer, *rolled(image, camera)), truth @ turned.inverse())
         asked("focal unknown").add(
-            answer(localizer, image, RoughCamera.unknown(camera.width, camera.height)), truth
+            answer(localizer, image, UncalibratedCamera.unknown(camera.width, camera.height)), truth
         )
     for other in places:
         if family_of(other.name) != family_of(place.name):
@@ -179,10 +179,10 @@ def ask_place(
 
 
 def answer(
-    localizer: Localizer, image: np.ndarray, camera: Camera | RoughCamera
+    localizer: Localizer, image: np.ndarray, camera: Camera | UncalibratedCamera
 ) -> tuple[Localization | NotLocalized, float]:
     """The result, and the median distance (metres) of the points that it stands on."""
-    result, named = localizer.localize_near(image, camera, None)
+    result, named = localizer.localize_with_inliers(image, camera, None)
     if not isinstance(result, Localization):
         return result, 0.0
     ((_, seen),) = named

@@ -31,15 +31,15 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.mapping.checking import damages
-from topoloc.mapping.edit import editing, undo_edit, undoable_edits
+from topoloc.mapping.edit import count_undoable_edits, edit_map, undo_edit
+from topoloc.mapping.integrity_check import find_map_damage
 
 
 def edit_without_end(path: Path) -> None:
     """What the child does."""
     print("ready", flush=True)
     for k in range(100_000):
-        with editing(path) as edit:
+        with edit_map(path) as edit:
             edit.commit(edit.topomap, f"edit {k}", {"k": k})
         if k % 3 == 2:
             undo_edit(path)
@@ -56,11 +56,11 @@ def kill_transactions(path: Path, kills: int, within_s: float) -> Counter[str]:
             child.stdout.readline()
             time.sleep(rng.uniform(0.0, within_s))
             child.send_signal(signal.SIGKILL)
-        counts["broken"] += bool(damages(path))
-        while undoable_edits(path):
+        counts["broken"] += bool(find_map_damage(path))
+        while count_undoable_edits(path):
             undo_edit(path)
             counts["undone"] += 1
-        counts["broken"] += bool(damages(path))
+        counts["broken"] += bool(find_map_damage(path))
         _one_more_edit(path)
         counts["left"] += sorted(one.name for one in path.parent.iterdir()) not in (
             [path.name],
@@ -148,7 +148,9 @@ def _kill_once(command: KilledCommand, folder: Path, seconds: float, counts: Cou
     is_after = all(data == command.after[name] for name, data in found.items())
     counts["before"] += is_before
     counts["after"] += is_after and not is_before
-    counts["broken"] += (not is_before and not is_after) or bool(damages(folder / command.target))
+    counts["broken"] += (not is_before and not is_after) or bool(
+        find_map_damage(folder / command.target)
+    )
     _one_more_edit(folder / command.target)
     kept = {*command.files, command.target, f"{command.target}.undo", "map.topo.undo", "temporary"}
     left = [path.name for path in folder.rglob("*") if path.name not in kept]
@@ -158,7 +160,7 @@ def _kill_once(command: KilledCommand, folder: Path, seconds: float, counts: Cou
 
 
 def _one_more_edit(path: Path) -> None:
-    with editing(path) as edit:
+    with edit_map(path) as edit:
         edit.commit(edit.topomap, "after")
     undo_edit(path)
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import faiss
 import numpy as np
 
-from topoloc.retrieval.neighbours import PlaceIndex
+from topoloc.retrieval.descriptor_index import DescriptorIndex
 
 NUM_QUERIES = 200
 
@@ -54,7 +54,7 @@ def measure(size: int, dimension: int) -> dict[str, float]:
         [np.argmax(queries[i : i + 8] @ vectors.T, axis=1) for i in range(0, NUM_QUERIES, 8)]
     )
     before, start = peak_mb(), time.perf_counter()
-    index = PlaceIndex(vectors, np.arange(size))
+    index = DescriptorIndex(vectors, np.arange(size))
     build_s = time.perf_counter() - start
     times, hits = [], 0
     for query, row in zip(queries, exact, strict=True):

@@ -26,8 +26,8 @@ from topoloc.features.features import Features
 from topoloc.features.learned import LearnedConfig, extract_learned
 from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.image_io import read_image, to_grey
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import grey_image, read_image
 
 _TURN = np.cos(np.deg2rad(25))
 _SOLVED = (0.10, 1.0)  # metres, degrees
@@ -83,7 +83,7 @@ def disparity_map(frame: StereoFrame) -> np.ndarray:
         speckleWindowSize=80,
         speckleRange=2,
     )
-    return matcher.compute(grey_image(frame.image), grey_image(frame.right)).astype(np.float64) / 16
+    return matcher.compute(to_grey(frame.image), to_grey(frame.right)).astype(np.float64) / 16
 
 
 def day_points(frame: StereoFrame, disparity: np.ndarray, points_img: np.ndarray) -> np.ndarray:
@@ -114,7 +114,7 @@ def rendered(names: str, args: Args) -> None:
         disparity = disparity_map(day)
         other_from_day = np.linalg.inv(pose) @ day_poses[nearest]
         for kind in args.kinds:
-            sets = [extract(grey_image(each.image), kind, args.features) for each in (day, frame)]
+            sets = [extract(to_grey(each.image), kind, args.features) for each in (day, frame)]
             outcomes[kind].append(ask(day, disparity, frame, other_from_day, sets))
     if not outcomes[args.kinds[0]]:
         print(f"{names}: no two pictures within {args.reach:g} m")
@@ -175,7 +175,7 @@ def walked(folder: Path, args: Args) -> None:
         sets = {
             walk: [
                 extract(
-                    grey_image(read_image(folder / walk / f"Image{i:03}.jpg")), kind, args.features
+                    to_grey(read_image(folder / walk / f"Image{i:03}.jpg")), kind, args.features
                 )
                 for i in frames
             ]

@@ -25,12 +25,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from topoloc.features.kinds import learned_kind
+from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.slam import run_slam
@@ -212,7 +212,7 @@ def measured(walk: Walk, features: str, with_slam: bool) -> dict[str, Any]:
         )
     else:
         topomap = build_map(
-            walk, BuildConfig(other_kinds=(learned_kind(),) if features == "both" else ())
+            walk, BuildConfig(other_kinds=(default_learned_type(),) if features == "both" else ())
         )
         with TemporaryDirectory() as folder:
             topomap.save(path := Path(folder) / "walk.topo")

@@ -17,13 +17,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 
-from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
+from topoloc.evaluation.query_localization import localize_queries
 from topoloc.features.extraction import FeatureConfig
 from topoloc.localization.evidence import EvidenceConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.open import open_sequence
 
@@ -83,7 +83,7 @@ def main() -> None:
             build_map(mapping, BuildConfig(features=method.features)), method.localizer
         )
         for light, sequence in queries.items():
-            e = summarize(answer_queries(localizer, sequence))
+            e = summarize(localize_queries(localizer, sequence))
             shares = " | ".join(f"{100 * e['recall'][bound]:.0f} %" for bound in BOUNDS)
             median = (
                 f"{100 * e['median_translation_m']:.1f} cm, {e['median_rotation_deg']:.2f} deg"

@@ -31,7 +31,7 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.metric_points import MetricPointsConfig, locate_points
-from topoloc.recordings.frame_view import FrameView, frame_view
+from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.recordings.open import open_sequence
 
 KITCHEN, ZED = "seven_scenes/kitchen/seq-01", "zed_lab/session{}"
@@ -79,7 +79,7 @@ class Args:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    mapped: FrameView
+    mapped: PreparedFrame
     queries: dict[str, np.ndarray]
     query_from_map: Rigid3
 
@@ -179,8 +179,8 @@ VARIANTS: dict[str, Extract] = {
 
 def make_pair(args: Args, number: int) -> Pair:
     map_path, map_idx, query_path, query_idx = PAIRS[number]
-    mapped = frame_view(open_sequence(args.shared / "data" / map_path)[map_idx])
-    query = frame_view(
+    mapped = prepare_frame(open_sequence(args.shared / "data" / map_path)[map_idx])
+    query = prepare_frame(
         open_sequence(args.shared / "data" / query_path)[query_idx], with_depth=False
     )
     config = FeatureConfig(kind="sift", normalization="none", max_features=3000)
@@ -199,7 +199,7 @@ def make_pair(args: Args, number: int) -> Pair:
 
 
 def matched(
-    features_map: Features, features_query: Features, mapped: FrameView
+    features_map: Features, features_query: Features, mapped: PreparedFrame
 ) -> tuple[np.ndarray, np.ndarray]:
     """Map points (metres, the map picture's camera frame) and the query's pixels that they are
     matched with."""

@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.frame_preparation import prepare_frame
+from topoloc.recordings.image_io import encode_jpeg
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import jpeg_of
 
 COLMAP_UNIT = 2.5  # metres
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -38,7 +38,7 @@ def write_nerfstudio(sequence: StereoSequence, folder: Path) -> Path:
         if frame.world_from_cam is None or frame.camera is None:
             continue
         name, depth_name = f"images/frame_{index:05d}.jpg", f"depth/frame_{index:05d}.png"
-        _write(folder / name, jpeg_of(frame.image, 95))
+        _write(folder / name, encode_jpeg(frame.image, 95))
         _write(folder / depth_name, cv2.imencode(".png", _depth_mm(frame))[1].tobytes())
         matrix = (frame.world_from_cam.matrix() @ GL_FROM_CV).tolist()
         frames.append(
@@ -69,7 +69,7 @@ def write_nerfstudio(sequence: StereoSequence, folder: Path) -> Path:
 def _depth_mm(frame: StereoFrame) -> np.ndarray:
     """Depth of the left picture by semi-global matching (Hirschmueller 2008, as OpenCV has it), 0
     where unknown."""
-    view = frame_view(frame)
+    view = prepare_frame(frame)
     assert view.rig is not None
     assert view.right_grey is not None
     matcher = cv2.StereoSGBM.create(
@@ -93,7 +93,7 @@ def write_colmap(sequence: StereoSequence, folder: Path) -> Path:
     for index in range(len(sequence)):
         if poses[index] is not None:
             index_of[f"{index:05d}.jpg"] = index
-            _write(folder / "images" / f"{index:05d}.jpg", jpeg_of(sequence[index].image, 95))
+            _write(folder / "images" / f"{index:05d}.jpg", encode_jpeg(sequence[index].image, 95))
     camera = sequence[0].camera
     assert camera is not None
     model, _, _, params = camera.to_colmap()

@@ -22,12 +22,12 @@ from pathlib import Path
 import numpy as np
 
 from topoloc.errors import MapError
-from topoloc.features.side_views import SideViewConfig, side_views
+from topoloc.features.virtual_views import VirtualViewConfig, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.config import WallsConfig
+from topoloc.localization.config import VirtualViewSearchConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
@@ -59,7 +59,7 @@ def main() -> None:
         f" {len(seen_twice)} see something twice"
     )
     figures = {"with side nodes": asked(Localizer(topomap), frames)}
-    without = LocalizerConfig(walls=WallsConfig(num_places=0))
+    without = LocalizerConfig(walls=VirtualViewSearchConfig(num_places=0))
     figures["without"] = asked(Localizer(topomap, without), frames)
     for name, f in figures.items():
         print(
@@ -92,8 +92,8 @@ def num_in_view(
     camera: Camera, world_from_cam: Rigid3, world_from_node: Rigid3, points: np.ndarray
 ) -> int:
     best = 0
-    for view in side_views(camera, SideViewConfig()):
-        world_from_side = world_from_cam @ view.cam_from_side
+    for view in make_virtual_views(camera, VirtualViewConfig()):
+        world_from_side = world_from_cam @ view.cam_from_virtual
         is_near = (
             np.linalg.norm(world_from_node.translation - world_from_side.translation) < MAX_METRES
         )

@@ -25,12 +25,12 @@ import numpy as np
 import tyro
 
 from topoloc.features.extraction import extract_features
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.kinds import FeatureConfig
 from topoloc.mapping.config import MapConfig
+from topoloc.recordings.image_io import read_image, to_grey
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import grey_image, read_image
-from topoloc.retrieval.vlad import SurfVlad, learn_words, placed, vlad
+from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words, vlad
 
 _TURN_DEG = 20.0
 _NUM_FRAMES = 100
@@ -63,8 +63,11 @@ def described(images: Iterator[np.ndarray], kind: str) -> Described:
 def learnt(mapped: Described, kind: str) -> SurfVlad:
     """As `topoloc build` does, but for the words, which it learns from features with a 3-D position
     alone."""
-    config = MapConfig().vlad_of(kind)
-    found = [placed(features, image.shape[1], image.shape[0], config) for features, image in mapped]
+    config = MapConfig().vlad_config_for(kind)
+    found = [
+        append_positions(features, image.shape[1], image.shape[0], config)
+        for features, image in mapped
+    ]
     words = learn_words(np.concatenate(found), config)
     vlads = np.stack([vlad(descriptors, words) for descriptors in found])
     return SurfVlad.fit(
@@ -112,7 +115,7 @@ def recorded(names: str, args: Args) -> None:
     print(f"{names}: {len(rows)} asked")
     for kind in args.kinds:
         sets = [
-            described((grey_image(sequence[int(k)].image) for k in which), kind)
+            described((to_grey(sequence[int(k)].image) for k in which), kind)
             for sequence, which in ((mapped, range(len(mapped))), (asked, rows))
         ]
         judge(sets[0], sets[1], kind, [(f"{args.reach:g} m", right[rows])])
@@ -130,7 +133,7 @@ def walked(names: str, args: Args) -> None:
 
 
 def reduced(folder: Path, k: int) -> np.ndarray:
-    grey = grey_image(read_image(folder / f"Image{k:03}.jpg"))
+    grey = to_grey(read_image(folder / f"Image{k:03}.jpg"))
     return cv2.resize(
         grey,
         (_WIDTH_PX, round(grey.shape[0] * _WIDTH_PX / grey.shape[1])),

@@ -23,7 +23,7 @@ from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
 from topoloc.points.metric_points import MetricPointsConfig, locate_points
-from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.open import open_sequence
 
 Rule = Callable[[np.ndarray, "Pool", float], tuple[np.ndarray, np.ndarray]]
@@ -95,7 +95,7 @@ def main(args: Args) -> None:
     config = FeatureConfig()
     nodes = []
     for node_id in range(0, len(sequence), 10):
-        view = frame_view(sequence[node_id])
+        view = prepare_frame(sequence[node_id])
         features = extract_features(view.grey, config)
         located = locate_points(features, view, MetricPointsConfig())
         rows = np.flatnonzero(located.valid)
@@ -106,7 +106,7 @@ def main(args: Args) -> None:
         )
     tallies: dict[tuple[str, float], list[tuple[int, int, int]]] = {}
     for query_idx in range(5, len(sequence), 20):
-        view = frame_view(sequence[query_idx], with_depth=False)
+        view = prepare_frame(sequence[query_idx], with_depth=False)
         nearest = sorted(range(len(nodes)), key=lambda k, at=query_idx: abs(10 * k - at))[2:7]
         pool = Pool.concatenate([nodes[k] for k in nearest])
         features = extract_features(view.grey, config)

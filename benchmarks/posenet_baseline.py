@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
+from topoloc.evaluation.query_localization import localize_queries
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
-from topoloc.retrieval.network_config import PictureConfig
+from topoloc.retrieval.network_config import NetworkInputConfig
 from topoloc_paper.posenet import PoseNet, PoseNetConfig, train_posenet
 from topoloc_training.classifier_config import TrainingConfig
 from topoloc_training.weights import find_weights
@@ -64,7 +64,7 @@ def main() -> None:
         theirs.append(
             float(np.rad2deg(np.median([rotation_error(a, b) for a, b in pairs if b is not None])))
         )
-        ours = summarize(answer_queries(localizer, sequence))
+        ours = summarize(localize_queries(localizer, sequence))
         row = {
             "queries": path,
             "posenet_m": theirs[0],
@@ -100,7 +100,7 @@ def tuned(topomap: TopoMetricMap, arguments: argparse.Namespace) -> PoseNet:
             topomap,
             "squeezenet1_1",
             found,
-            PoseNetConfig(loss, picture=PictureConfig(112, 84), training=training),
+            PoseNetConfig(loss, picture=NetworkInputConfig(112, 84), training=training),
         )
         print(
             f"PoseNet, {loss} loss, learning rate {rate:g}: D_total {posenet.held_out_m:.3f} m on"

@@ -24,9 +24,9 @@ from pathlib import Path
 
 from ray.cluster_utils import Cluster
 
-from topoloc.apps.cli.recording_maps import MapMaking, PosesAsked
-from topoloc.apps.cluster.building import AtlasBuild, build_on_ray
-from topoloc.apps.cluster.tiles import Outcome, TileJob, tile_ids
+from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
+from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
+from topoloc.apps.cluster.tiles import Outcome, TileJob, derive_tile_ids
 from topoloc.atlas.atlas import Atlas
 from topoloc.mapping.build import BuildConfig
 from topoloc.slam.slam import SlamConfig
@@ -111,7 +111,7 @@ def on_cluster(
             recording,
             name,
             name,
-            MapMaking((recording,), PosesAsked(), BuildConfig(), SlamConfig()),
+            MapJob((recording,), PoseOptions(), BuildConfig(), SlamConfig()),
         )
         for recording, name in zip(recordings, names, strict=True)
     ]
@@ -136,7 +136,7 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+")
     parser.add_argument("--nodes", type=int, default=2)
     args = parser.parse_args()
-    names = tile_ids(args.recordings)
+    names = derive_tile_ids(args.recordings)
     with tempfile.TemporaryDirectory() as folder:
         alone_s, work_s = one_by_one(args.recordings, names, Path(folder))
         where = str(Path(folder) / "atlas")

@@ -10,8 +10,8 @@ import sys
 import time
 from collections.abc import Callable
 
+from topoloc.recordings.image_io import image_size
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import image_size
 
 
 def least_ms(action: Callable[[], object], repetitions: int) -> float:

@@ -36,7 +36,7 @@ import numpy as np
 
 from topoloc import Localizer, TopoMetricMap, open_sequence, set_num_threads
 from topoloc.geometry.camera import Camera
-from topoloc.recordings.pictures import PictureBytes, jpeg_of, read_image
+from topoloc.recordings.image_io import EncodedImage, encode_jpeg, read_image
 
 
 @dataclass
@@ -127,7 +127,7 @@ def in_process(
     """Pictures a second, decoded and localized by threads of this process."""
 
     def ask(jpeg: bytes) -> None:
-        localizer.localize(read_image(PictureBytes("q", jpeg)), camera)
+        localizer.localize(read_image(EncodedImage("q", jpeg)), camera)
 
     start = time.perf_counter()
     with ThreadPoolExecutor(num_threads) as pool:
@@ -161,7 +161,7 @@ def main() -> None:
     frames = open_sequence(args.queries)
     camera = frames[0].camera
     assert camera is not None
-    clear = [jpeg_of(frames[i].image, 90) for i in range(min(len(frames), 24))]
+    clear = [encode_jpeg(frames[i].image, 90) for i in range(min(len(frames), 24))]
     set_num_threads(1)
     with TopoMetricMap.load(args.map) as topomap:
         speed(args, Localizer(topomap), camera, clear)
@@ -188,7 +188,7 @@ def speed(
             f"at 80 %: median {median:.0f} ms, p99 {p99:.0f} ms = {p99 / median:.1f} x;"
             f" {dict(statuses)}"
         )
-        elsewhere = jpeg_of(
+        elsewhere = encode_jpeg(
             cv2.GaussianBlur(
                 np.random.default_rng(0).integers(0, 255, (camera.height, camera.width), np.uint8),
                 (0, 0),
@@ -225,7 +225,7 @@ def many_maps(
     args: argparse.Namespace, localizer: Localizer, camera: Camera, clear: list[bytes]
 ) -> None:
     own = [
-        localizer.localize(read_image(PictureBytes("q", jpeg)), camera).to_json("q")
+        localizer.localize(read_image(EncodedImage("q", jpeg)), camera).to_json("q")
         for jpeg in clear[:6]
     ]
     with tempfile.TemporaryDirectory() as folder:

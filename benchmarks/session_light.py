@@ -24,15 +24,23 @@ import numpy as np
 import tyro
 
 from topoloc.features.extraction import extract_features
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.kinds import FeatureConfig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.session_light import light_distance, light_groups
-from topoloc.mapping.sessions import Light, Session, light_of, mean_light
+from topoloc.mapping.session_illumination import (
+    compute_illumination_distance,
+    group_by_illumination,
+)
+from topoloc.mapping.sessions import (
+    Illumination,
+    Session,
+    average_illumination,
+    measure_illumination,
+)
+from topoloc.recordings.image_io import read_image, to_grey
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import grey_image, read_image
-from topoloc.retrieval.vlad import SurfVlad, learn_words, placed, vlad
+from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words, vlad
 
 SHARED = Path(os.environ.get("TOPOLOC_SHARED", Path(__file__).parents[2] / "shared"))
 LAB = Path(__file__).parents[1] / "src/topoloc/demo/lab"
@@ -47,7 +55,7 @@ class View:
 
     features: Features
     size: tuple[int, int]
-    light: Light
+    light: Illumination
     place: int | Rigid3
 
 
@@ -76,8 +84,10 @@ def _view(picture: np.ndarray, place: int | Rigid3, kind: str) -> View:
     scale = _WIDTH_PX / picture.shape[1]
     if scale < 1.0:
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    features = extract_features(grey_image(picture), FeatureConfig(kind=kind))
-    return View(features, (picture.shape[1], picture.shape[0]), light_of(picture), place)
+    features = extract_features(to_grey(picture), FeatureConfig(kind=kind))
+    return View(
+        features, (picture.shape[1], picture.shape[0]), measure_illumination(picture), place
+    )
 
 
 def is_hit(a: View, b: View) -> bool:
@@ -94,8 +104,8 @@ def is_hit(a: View, b: View) -> bool:
 
 
 def judge(title: str, sessions: Sequence[Sequence[View]], asked: Sequence[View], kind: str) -> None:
-    config, first = MapConfig().vlad_of(kind), sessions[0]
-    found = [placed(view.features, *view.size, config) for view in first]
+    config, first = MapConfig().vlad_config_for(kind), sessions[0]
+    found = [append_positions(view.features, *view.size, config) for view in first]
     words = learn_words(np.concatenate(found), config)
     vlads = np.stack([vlad(descriptors, words) for descriptors in found])
     model = SurfVlad.fit(
@@ -103,23 +113,23 @@ def judge(title: str, sessions: Sequence[Sequence[View]], asked: Sequence[View],
     )
     views = [view for session in sessions for view in session]
     added = views[len(first) :]
-    model = model.with_images(
+    model = model.extend_with_features(
         [(view.features, *view.size) for view in added], np.arange(len(first), len(views))
     )
-    lights = [mean_light([view.light for view in session]) for session in sessions]
-    of = light_groups(
+    lights = [average_illumination([view.light for view in session]) for session in sessions]
+    of = group_by_illumination(
         [Session(k, str(k), light=light) for k, light in enumerate(lights)],
         {k: len(s) for k, s in enumerate(sessions)},
     )
     groups = np.concatenate([np.full(len(session), of[k]) for k, session in enumerate(sessions)])
     apart = max(
-        light_distance(lights[0], light)
+        compute_illumination_distance(lights[0], light)
         for light in lights[1:]
         if lights[0] is not None and light is not None
     )
     right = np.array([[is_hit(view, other) for other in views] for view in asked])
     rows = np.flatnonzero(right.any(axis=1))
-    changed = model.with_less_between(groups) if groups.any() else model
+    changed = model.suppress_group_differences(groups) if groups.any() else model
     said = " | ".join(_recall(way, asked, right, rows) for way in (model, changed))
     print(f"{kind:12} {title:36} {apart:.2f} apart, {len(rows):3d} asked: {said}", flush=True)
 

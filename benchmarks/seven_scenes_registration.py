@@ -16,8 +16,8 @@ import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.image_io import to_grey
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import grey_image
 from topoloc.recordings.seven_scenes import COLOUR_CAMERA, COLOUR_FROM_DEPTH, DEPTH_CAMERA
 
 EVERY = 7
@@ -27,7 +27,7 @@ BORDER_PX = 4
 def edges(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
     """Gradient strength of the colour picture, and the points (depth camera, metres) on the near
     side of depth jumps."""
-    grey = cv2.GaussianBlur(grey_image(frame.image), (0, 0), 1.0)
+    grey = cv2.GaussianBlur(to_grey(frame.image), (0, 0), 1.0)
     strength = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     depth = frame.depth.depth
     near = np.zeros(depth.shape, bool)

@@ -42,11 +42,11 @@ import numpy as np
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import single_pictures
+from topoloc.recordings.recording import as_monocular
 from topoloc.slam.slam import run_slam
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker, TrackerConfig
@@ -115,7 +115,7 @@ def known_pairs(shared: Path) -> list[Pair]:
 
 def judge(pair: Pair) -> None:
     localizer = Localizer(build_map([open_sequence(path) for path in pair.mapped]))
-    sequence = single_pictures(open_sequence(pair.streamed))
+    sequence = as_monocular(open_sequence(pair.streamed))
     frames = [
         frame
         for frame in (sequence[index] for index in range(len(sequence)))

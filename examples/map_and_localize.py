@@ -15,7 +15,7 @@ import numpy as np
 import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
+from topoloc.geometry.rigid import inverse_covariance, position_covariance
 
 
 def main(map_from: str, ask: str, out: Path) -> None:
@@ -36,7 +36,7 @@ def main(map_from: str, ask: str, out: Path) -> None:
             continue
         # The covariance is that of a perturbation of the whole pose; the position's own follows
         # from it.
-        covariance = covariance_of_inverse(result.world_from_cam, result.covariance)
+        covariance = inverse_covariance(result.world_from_cam, result.covariance)
         position = position_covariance(result.world_from_cam.inverse(), covariance)
         x, y, z = result.world_from_cam.translation
         sigma_cm = 100.0 * np.sqrt(np.trace(position))

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import topoloc
 from topoloc.demo.recordings import SHIPPED
-from topoloc.evaluation.experiments import answer_queries
 from topoloc.evaluation.metrics import summarize
+from topoloc.evaluation.query_localization import localize_queries
 from topoloc.mapping.nodes import NodeConfig
-from topoloc.retrieval.network_config import PictureConfig
+from topoloc.retrieval.network_config import NetworkInputConfig
 from topoloc_training.classifier_config import CnnFcConfig, TrainingConfig
 from topoloc_training.coarse_storing import store_coarse
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
@@ -33,7 +33,9 @@ def main(map_file: Path | None, weights: str | None, epochs: int, out: Path) -> 
     print(f"{len(topomap.nodes)} nodes, {len(topomap.place_images)} pictures to learn from")
 
     name, backbone = ("cnn-nn", "squeezenet1_1") if weights else ("cnn-fc", "compact")
-    of_fc = CnnFcConfig(picture=PictureConfig(112, 84), training=TrainingConfig(max_epochs=epochs))
+    of_fc = CnnFcConfig(
+        picture=NetworkInputConfig(112, 84), training=TrainingConfig(max_epochs=epochs)
+    )
     model = train_coarse(
         topomap, name, backbone, weights or "scratch", CoarseTrainingConfig(cnn_fc=of_fc)
     )
@@ -44,7 +46,9 @@ def main(map_file: Path | None, weights: str | None, epochs: int, out: Path) -> 
     trained, day = topoloc.TopoMetricMap.load(out), topoloc.open_sequence(SHIPPED / "day@0::4")
     for coarse in ("surf-vlad", name):
         judged = summarize(
-            answer_queries(topoloc.Localizer(trained, topoloc.LocalizerConfig(coarse=coarse)), day)
+            localize_queries(
+                topoloc.Localizer(trained, topoloc.LocalizerConfig(coarse=coarse)), day
+            )
         )
         accuracy, near = (
             100.0 * judged["topological_accuracy"],

@@ -15,11 +15,11 @@ import numpy as np
 
 from made_once import once_a_run
 from tiny_world import BASELINE, LEVEL_FROM_CAM, Panel, render, right_pose, smooth_texture
-from topoloc.features.kinds import learned_kind
+from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoFrame
@@ -127,7 +127,7 @@ def built_corridor() -> TopoMetricMap:
 def corridor_of_two_kinds() -> TopoMetricMap:
     """The same, of SURF and the learned features at hand, which describe the side nodes. Raises
     MissingExtraError without ONNX Runtime."""
-    return build_map(WalkAhead(0), BuildConfig(other_kinds=(learned_kind(),)))
+    return build_map(WalkAhead(0), BuildConfig(other_kinds=(default_learned_type(),)))
 
 
 @cache

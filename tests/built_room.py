@@ -13,7 +13,7 @@ import numpy as np
 from made_once import once_a_run
 from tiny_world import CAMERA, path_pose, render, room, tum_line, write_stereo_recording
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.features.feature_types import FeatureConfig, FeatureType, GuidedThresholds
 from topoloc.features.features import Features
-from topoloc.features.kinds import FeatureConfig, FeatureKind, GuidedThresholds
 
 _PATCH_PX, _CELLS = 24, 8
 
@@ -42,7 +42,7 @@ def extract_corner_patches(
     return Features(np.ascontiguousarray(table[:, :2]), same, zero, table[:, 2].copy(), patches)
 
 
-CORNER_PATCHES = FeatureKind(
+CORNER_PATCHES = FeatureType(
     "corner-patches",
     extract_corner_patches,
     descriptor_size=_CELLS**2,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from topoloc.evaluation.metrics import Answer
+from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -37,7 +37,7 @@ def answer(
     error_deg: float,
     node_id: int = 0,
     first_candidate: int = 0,
-) -> Answer:
+) -> EvaluatedQuery:
     """A query at `x` that was localized, off by this much; its nearest node is 0."""
     off = Rigid3(
         exp_so3(np.array([np.deg2rad(error_deg), 0.0, 0.0])), np.array([0.0, 0.0, error_m])
@@ -46,21 +46,21 @@ def answer(
     found = Rigid3(off.rotation @ truth.rotation, truth.translation + off.translation)
     candidates = [NodeScore(first_candidate, 0.9), NodeScore(1 - first_candidate, 0.4)]
     result = Localization(found, 1e-4 * np.eye(6), 0.9, node_id, candidates, 50, 40, TIMES_MS)
-    return Answer(query, result, truth, 0, "walk", picture)
+    return EvaluatedQuery(query, result, truth, 0, "walk", picture)
 
 
-def lost(query: str, x: float, reason: str = "too_few_inliers") -> Answer:
+def lost(query: str, x: float, reason: str = "too_few_inliers") -> EvaluatedQuery:
     """A query at `x` without a pose."""
     result = NotLocalized(reason, [NodeScore(1, 0.2)], 9, 3, TIMES_MS)  # pyright: ignore[reportArgumentType]
-    return Answer(query, result, pose(x), 0, "walk", picture)
+    return EvaluatedQuery(query, result, pose(x), 0, "walk", picture)
 
 
-def elsewhere(query: str, accepted: bool) -> Answer:
+def elsewhere(query: str, accepted: bool) -> EvaluatedQuery:
     """An image from elsewhere."""
     if accepted:
         result = Localization(pose(0.0), np.eye(6), 0.9, 1, [NodeScore(1, 0.3)], 12, 12, TIMES_MS)
-        return Answer(query, result, None, None, "moon", picture)
-    return Answer(
+        return EvaluatedQuery(query, result, None, None, "moon", picture)
+    return EvaluatedQuery(
         query,
         NotLocalized("not_in_map", [], 5, 0, {"features": 30.0, "total": 41.0}),
         None,

@@ -16,16 +16,16 @@ from hypothesis import strategies as st
 
 import topoloc
 from built_room import built_room
-from topoloc.apps.cli.settings_file import all_tables, config_class, meanings_of
+from topoloc.apps.cli.settings_file import all_tables, config_class, read_field_docs
 from topoloc.bounds import (
     Above,
     AtLeast,
     Between,
-    annotations_of,
-    bounds_of,
     check_bounds,
-    complaint,
-    settings_from,
+    field_annotations,
+    field_bounds,
+    find_violation,
+    parse_settings,
 )
 from topoloc.errors import ConfigError
 from topoloc.mapping.nodes import NodeConfig
@@ -96,9 +96,9 @@ def test_what_is_not_is_said_with_its_key(change: dict[str, Any], said: str):
 @given(st.sampled_from([Above(0), AtLeast(-2), Between(0, 1)]), st.floats() | st.integers())
 def test_no_number_that_is_not_one_passes(bound: Any, number: float):
     kind = Annotated[float, bound]
-    if complaint(number, kind) is None:
+    if find_violation(number, kind) is None:
         assert math.isfinite(number)
-        assert bound.holds(number)
+        assert bound.is_satisfied(number)
 
 
 def _settings_of(kind: type, key: str) -> list[tuple[str, type, str, Any, Any]]:
@@ -106,7 +106,7 @@ def _settings_of(kind: type, key: str) -> list[tuple[str, type, str, Any, Any]]:
     too."""
     config = kind()
     found: list[tuple[str, type, str, Any, Any]] = []
-    for name, declared in annotations_of(kind).items():
+    for name, declared in field_annotations(kind).items():
         default = getattr(config, name)
         found += _settings_of(type(default), f"{key}.{name}") if is_dataclass(default) else []
         found.append((f"{key}.{name}", kind, name, declared, default))
@@ -129,9 +129,11 @@ def test_every_setting_has_a_meaning_and_every_number_bounds(table: str):
                 f"{key}: what a dataclass without a docstring is given"
             )
         else:
-            assert meanings_of(kind).get(name), f"{key} has no docstring that says what it means"
+            assert read_field_docs(kind).get(name), (
+                f"{key} has no docstring that says what it means"
+            )
         if _is_of_numbers(declared):
-            assert bounds_of(declared), f"{key} has no bounds"
+            assert field_bounds(declared), f"{key} has no bounds"
 
 
 @pytest.mark.parametrize("table", all_tables())
@@ -166,9 +168,9 @@ class Stored:
 
 def test_plain_data_becomes_the_dataclass_again():
     data = json.loads(json.dumps(asdict(Stored("a", 10**18, Inner(1, ((0.0, 3.0),))))))
-    assert settings_from(Stored, data, "a") == Stored("a", 10**18, Inner(1.0, ((0.0, 3.0),)))
-    assert settings_from(Stored, {"name": "a", "inner": None}, "a") == Stored("a")
-    assert settings_from(
+    assert parse_settings(Stored, data, "a") == Stored("a", 10**18, Inner(1.0, ((0.0, 3.0),)))
+    assert parse_settings(Stored, {"name": "a", "inner": None}, "a") == Stored("a")
+    assert parse_settings(
         Stored, {"name": "a", "later": {}, "inner": {"later": 1}}, "a", is_strict=False
     ) == Stored("a", inner=Inner())
 
@@ -190,5 +192,5 @@ def test_plain_data_becomes_the_dataclass_again():
 )
 def test_plain_data_that_is_none_of_it_is_named_by_its_key(data: Any, said: str):
     with pytest.raises(ConfigError) as raised:
-        settings_from(Stored, data, "a")
+        parse_settings(Stored, data, "a")
     assert str(raised.value) == said

@@ -15,7 +15,7 @@ import pytest
 
 import topoloc
 from topoloc.apps.cli import all_commands, main
-from topoloc.evaluation.metrics import Answer, summarize
+from topoloc.evaluation.metrics import EvaluatedQuery, summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping import schema
@@ -91,7 +91,10 @@ def test_every_reason_is_documented(reason: str):
 def test_result_and_evaluation_keys_are_documented():
     for key in {**LOCALIZED.to_json("a.png"), **UNREADABLE.to_json("b.png")}:
         assert f'"{key}"' in _section("localize")
-    answers = [Answer("a.png", LOCALIZED, Rigid3.identity(), 0), Answer("b.png", UNREADABLE, None)]
+    answers = [
+        EvaluatedQuery("a.png", LOCALIZED, Rigid3.identity(), 0),
+        EvaluatedQuery("b.png", UNREADABLE, None),
+    ]
     evaluation = summarize(answers)
     for key in (*evaluation, *evaluation["recall"]):
         assert f'"{key}"' in _section("evaluate")
@@ -100,7 +103,7 @@ def test_result_and_evaluation_keys_are_documented():
 def test_every_table_and_column_of_the_map_is_documented():
     with closing(sqlite3.connect(":memory:")) as database:
         for table in schema.TABLES:
-            database.execute(schema.creation_of(table))
+            database.execute(schema.create_table_statement(table))
         tables = [
             name
             for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import topoloc
-from topoloc.apps.cli import BROUGHT, COMMANDS, all_commands, main
+from topoloc.apps.cli import COMMANDS, PLUGIN_PACKAGES, all_commands, main
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("cv2", "faiss", "matplotlib", "numba", "numpy", "poselib", "torch", "tyro")
@@ -159,7 +159,7 @@ def test_wrong_usage_exits_with_2(args: tuple[str, ...], complaint: str):
     assert "Traceback" not in answer.stderr
 
 
-@pytest.mark.parametrize(("command", "distribution"), BROUGHT.items())
+@pytest.mark.parametrize(("command", "distribution"), PLUGIN_PACKAGES.items())
 def test_commands_of_other_distributions_are_named_where_they_are_missing(
     installed: Path, command: str, distribution: str
 ):
@@ -214,7 +214,7 @@ def test_every_module_loads_without_extras_but_learned_classifiers_and_figures()
     assert not {
         "topoloc.apps.service.client",
         "topoloc.apps.service.config",
-        "topoloc.atlas.open_maps",
+        "topoloc.atlas.map_cache",
     } & set(learning), "commands and clients need these"
     assert "torchvision" not in asked
 

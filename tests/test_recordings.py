@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
 from topoloc.evaluation.metrics import summarize
+from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.build import BuildConfig, build_map
@@ -34,7 +34,7 @@ def test_another_session_in_the_lab(lab: Localizer, shared: Path):
         "session1_from_session2"
     ]
     queries = open_sequence(shared / "data/zed_lab/session2@0:99:4")
-    summary = summarize(answer_queries(lab, queries, Rigid3.from_matrix(np.array(matrix))))
+    summary = summarize(localize_queries(lab, queries, Rigid3.from_matrix(np.array(matrix))))
     assert summary["num_localized"] == summary["num_queries"] == 25
     assert summary["median_translation_m"] < 0.009
     assert summary["median_rotation_deg"] < 0.3
@@ -42,14 +42,14 @@ def test_another_session_in_the_lab(lab: Localizer, shared: Path):
 
 
 def test_a_street_is_not_the_lab(lab: Localizer, shared: Path):
-    answers = answer_elsewhere(lab, open_sequence(shared / "data/kitti/sequences/street1@0::5"))
+    answers = localize_out_of_map(lab, open_sequence(shared / "data/kitti/sequences/street1@0::5"))
     assert summarize(answers)["false_accepts"] == 0
 
 
 def test_the_odd_frames_of_a_street_in_the_map_of_the_even_ones(shared: Path):
     localizer = Localizer(build_map(open_sequence(shared / "data/kitti/sequences/street1@0:30:2")))
     summary = summarize(
-        answer_queries(localizer, open_sequence(shared / "data/kitti/sequences/street1@1:29:2"))
+        localize_queries(localizer, open_sequence(shared / "data/kitti/sequences/street1@1:29:2"))
     )
     assert summary["num_localized"] == summary["num_queries"] == 14
     assert summary["median_translation_m"] < 0.03
@@ -61,7 +61,7 @@ def test_a_kitchen_by_depth_camera(shared: Path):
     mapping = sequence_subset(kitchen, [i for i in range(120) if i % 20 < 12])
     localizer = Localizer(build_map(mapping, BuildConfig(nodes=NodeConfig(d_thresh=0.5))))
     summary = summarize(
-        answer_queries(localizer, sequence_subset(kitchen, list(range(16, 120, 20))))
+        localize_queries(localizer, sequence_subset(kitchen, list(range(16, 120, 20))))
     )
     assert summary["num_localized"] == summary["num_queries"]
     assert summary["median_translation_m"] < 0.016

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from topoloc.geometry.rig import StereoRig
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.localizer import Localizer, LocalizerConfig
-    from topoloc.localization.map_facts.building import build_map
+    from topoloc.localization.map_facts.map_building import build_map
     from topoloc.localization.provenance import Provenance
     from topoloc.localization.result import Alternative, Localization, NotLocalized
     from topoloc.localization.search import Trace
@@ -87,7 +87,7 @@ _MODULES = {
     "Trace": "topoloc.localization.search",
     "Tracker": "topoloc.tracking.tracker",
     "TrackerConfig": "topoloc.tracking.tracker",
-    "build_map": "topoloc.localization.map_facts.building",
+    "build_map": "topoloc.localization.map_facts.map_building",
     "open_sequence": "topoloc.recordings.open",
     "set_num_threads": "topoloc.compiled",
     "warm_up": "topoloc.tracking.warm_up",

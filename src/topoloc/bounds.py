@@ -1,6 +1,6 @@
 """Settings and their bounds, which are declared beside the field: `Annotated[float, Above(0)]`.
 
-`check_bounds` holds what was made in Python, `settings_from` what was read from a TOML file, a map
+`check_bounds` holds what was made in Python, `parse_settings` what was read from a TOML file, a map
 or a stored model. Whatever its bounds, no number may be NaN or infinite, and no whole number that
 has bounds so large that it does not fit into 32 bits.
 """
@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 from topoloc.errors import ConfigError, TopolocError
 
 T = TypeVar("T")
-_LARGEST_WHOLE = 2**31 - 1
+_MAX_INT32 = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Above:
 
     limit: float | int
 
-    def holds(self, number: float | int) -> bool:
+    def is_satisfied(self, number: float | int) -> bool:
         return number > self.limit
 
     def __str__(self) -> str:
@@ -43,7 +43,7 @@ class AtLeast:
 
     limit: float | int
 
-    def holds(self, number: float | int) -> bool:
+    def is_satisfied(self, number: float | int) -> bool:
         return number >= self.limit
 
     def __str__(self) -> str:
@@ -57,7 +57,7 @@ class Between:
     least: float | int
     most: float | int
 
-    def holds(self, number: float | int) -> bool:
+    def is_satisfied(self, number: float | int) -> bool:
         return self.least <= number <= self.most
 
     def __str__(self) -> str:
@@ -78,15 +78,15 @@ def check_bounds(config: Any, name: str | None = None) -> None:
         ConfigError: one is not; the text begins with its key, `BuildConfig.nodes.d_thresh`.
     """
     name = type(config).__name__ if name is None else name
-    for key, kind in annotations_of(type(config)).items():
+    for key, kind in field_annotations(type(config)).items():
         value = getattr(config, key)
-        if wrong := complaint(value, kind):
+        if wrong := find_violation(value, kind):
             raise ConfigError(f"{name}.{key}: {wrong}")
         if is_dataclass(value):
             check_bounds(value, f"{name}.{key}")
 
 
-def settings_from(
+def parse_settings(
     of: type[T],
     data: Any,
     key: str,
@@ -110,16 +110,16 @@ def settings_from(
     """
     if not isinstance(data, dict):
         raise ConfigError(f"{key}: a table is expected, [{key}]")
-    kinds, known = annotations_of(of), known or list(keys_of(of, key))
+    kinds, known = field_annotations(of), known or list(iter_keys(of, key))
     values = {name: getattr(default, name) for name in kinds} if default is not None else {}
     for name, value in data.items():
-        its_key = f"{key}.{quoted(name)}"
+        its_key = f"{key}.{quote_key(name)}"
         if name in kinds:
-            values[name] = value_from(
+            values[name] = parse_value(
                 kinds[name], value, its_key, values.get(name), known, is_strict
             )
         elif is_strict:
-            raise ConfigError(f"{its_key}: no such setting{did_you_mean(its_key, known)}")
+            raise ConfigError(f"{its_key}: no such setting{suggest_name(its_key, known)}")
     required = (
         field.name
         for field in fields(of)  # pyright: ignore[reportArgumentType]
@@ -133,7 +133,7 @@ def settings_from(
         raise ConfigError(f"{key}: {error}") from None
 
 
-def value_from(
+def parse_value(
     kind: Any,
     value: Any,
     key: str,
@@ -141,31 +141,31 @@ def value_from(
     known: Collection[str] | None = None,
     is_strict: bool = True,
 ) -> Any:
-    """One value as its annotation says; arguments and errors as of `settings_from`."""
-    plain, may_be_none = bare(kind)
+    """One value as its annotation says; arguments and errors as of `parse_settings`."""
+    plain, may_be_none = strip_annotation(kind)
     if is_dataclass(plain) and not (value is None and may_be_none):
-        return settings_from(plain, value, key, default, known, is_strict)  # pyright: ignore[reportArgumentType]
-    value = _as_declared(value, plain)
-    if wrong := complaint(value, kind):
+        return parse_settings(plain, value, key, default, known, is_strict)  # pyright: ignore[reportArgumentType]
+    value = _convert_to_declared(value, plain)
+    if wrong := find_violation(value, kind):
         raise ConfigError(f"{key}: {wrong}")
     return value
 
 
-def keys_of(kind: Any, key: str) -> Iterator[str]:
+def iter_keys(kind: Any, key: str) -> Iterator[str]:
     """The keys of a dataclass that is called `key`, and of those in it."""
-    for name, declared in annotations_of(kind).items():
+    for name, declared in field_annotations(kind).items():
         yield f"{key}.{name}"
-        if is_dataclass(plain := bare(declared)[0]):
-            yield from keys_of(plain, f"{key}.{name}")
+        if is_dataclass(plain := strip_annotation(declared)[0]):
+            yield from iter_keys(plain, f"{key}.{name}")
 
 
-def did_you_mean(name: str, names: Collection[str]) -> str:
+def suggest_name(name: str, names: Collection[str]) -> str:
     """The end of an error about a name that there is not."""
     near = get_close_matches(name[:100], names, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def quoted(name: Any) -> str:
+def quote_key(name: Any) -> str:
     """A key as it can stand in a line."""
     return (
         name
@@ -175,13 +175,13 @@ def quoted(name: Any) -> str:
 
 
 @cache
-def annotations_of(kind: type) -> dict[str, Any]:
+def field_annotations(kind: type) -> dict[str, Any]:
     """The fields of a dataclass, in their order, with what they are declared as, bounds and all."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in fields(kind)}
 
 
-def bounds_of(kind: Any) -> list[Bound]:
+def field_bounds(kind: Any) -> list[Bound]:
     """What an annotation says beside the type."""
     return (
         [extra for extra in get_args(kind)[1:] if isinstance(extra, Bound)]
@@ -190,7 +190,7 @@ def bounds_of(kind: Any) -> list[Bound]:
     )
 
 
-def bare(kind: Any) -> tuple[Any, bool]:
+def strip_annotation(kind: Any) -> tuple[Any, bool]:
     """The type that an annotation names, without bounds and None, and whether None is allowed."""
     if get_origin(kind) is Annotated:
         kind = get_args(kind)[0]
@@ -200,35 +200,35 @@ def bare(kind: Any) -> tuple[Any, bool]:
     return kind, False
 
 
-def complaint(value: Any, kind: Any) -> str | None:
+def find_violation(value: Any, kind: Any) -> str | None:
     """Why `value` cannot be that of a field declared as `kind`; None where it can. What is in a
     nested dataclass is not looked at."""
-    plain, may_be_none = bare(kind)
+    plain, may_be_none = strip_annotation(kind)
     if value is None and may_be_none:
         return None
-    if not _is_a(value, plain):
-        return f"{in_words(plain)} is expected, not {_shown(value)}"
-    for number in _numbers(value):
+    if not _is_instance(value, plain):
+        return f"{describe_type(plain)} is expected, not {_shorten(value)}"
+    for number in _iter_numbers(value):
         if not _is_finite(number):
-            return f"must be a finite number, not {_shown(number)}"
-        for bound in bounds_of(kind):
-            if not bound.holds(number):
-                return f"must be {bound}, not {_shown(number)}"
-        if plain is int and bounds_of(kind) and number > _LARGEST_WHOLE:
-            return f"must be at most {_LARGEST_WHOLE}, not {_shown(number)}"
+            return f"must be a finite number, not {_shorten(number)}"
+        for bound in field_bounds(kind):
+            if not bound.is_satisfied(number):
+                return f"must be {bound}, not {_shorten(number)}"
+        if plain is int and field_bounds(kind) and number > _MAX_INT32:
+            return f"must be at most {_MAX_INT32}, not {_shorten(number)}"
     return None
 
 
-def _as_declared(value: Any, plain: Any) -> Any:
+def _convert_to_declared(value: Any, plain: Any) -> Any:
     """What files know no type for: lists that are tuples, whole numbers where any will do."""
     if get_origin(plain) is tuple and isinstance(value, list):
         items = get_args(plain)
         kinds = [items[0]] * len(value) if items[-1] is ... else [*items, *[None] * len(value)]
-        return tuple(map(_as_declared, value, kinds))
+        return tuple(map(_convert_to_declared, value, kinds))
     return float(value) if plain is float and type(value) is int and abs(value) < 2**53 else value
 
 
-def in_words(plain: Any) -> str:
+def describe_type(plain: Any) -> str:
     """A bare type, for people."""
     if get_origin(plain) is Literal:
         return "one of " + ", ".join(get_args(plain))
@@ -237,24 +237,24 @@ def in_words(plain: Any) -> str:
         number = "" if items[-1] is ... else f"{len(items)} "
         return f"a list of {number}values"
     return {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}.get(
-        plain, f"a {_name(plain)}"
+        plain, f"a {_type_name(plain)}"
     )
 
 
-def _name(plain: Any) -> str:
+def _type_name(plain: Any) -> str:
     return getattr(plain, "__name__", str(plain))
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _is_a(value: Any, plain: Any) -> bool:
+def _is_instance(value: Any, plain: Any) -> bool:
     if get_origin(plain) is Literal:
         return isinstance(value, str) and value in get_args(plain)
     if get_origin(plain) is tuple:
-        return isinstance(value, tuple) and _are(value, get_args(plain))
+        return isinstance(value, tuple) and _are_instances(value, get_args(plain))
     if plain is float:
         return isinstance(value, Real) and not isinstance(value, bool)
     if plain is int:
@@ -262,10 +262,10 @@ def _is_a(value: Any, plain: Any) -> bool:
     return isinstance(value, plain)
 
 
-def _are(values: tuple[Any, ...], items: tuple[Any, ...]) -> bool:
+def _are_instances(values: tuple[Any, ...], items: tuple[Any, ...]) -> bool:
     if items[-1] is ...:
-        return all(_is_a(value, items[0]) for value in values)
-    return len(values) == len(items) and all(map(_is_a, values, items))
+        return all(_is_instance(value, items[0]) for value in values)
+    return len(values) == len(items) and all(map(_is_instance, values, items))
 
 
 def _is_finite(number: float | int) -> bool:
@@ -275,10 +275,10 @@ def _is_finite(number: float | int) -> bool:
         return False
 
 
-def _numbers(value: Any) -> Iterator[Any]:
+def _iter_numbers(value: Any) -> Iterator[Any]:
     """The numbers in a value; those of numpy as Python's."""
     if isinstance(value, tuple):
         for item in value:
-            yield from _numbers(item)
+            yield from _iter_numbers(item)
     elif isinstance(value, Real) and not isinstance(value, bool):
         yield int(value) if isinstance(value, Integral) else float(value)

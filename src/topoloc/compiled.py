@@ -22,13 +22,13 @@ import numba
 from numba.core import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 
-_USUAL_THREADS = 2
+_DEFAULT_NUM_THREADS = 2
 
 KERNELS: list[Any] = []
 """All that were declared by now."""
-_chosen: list[int] = []
-_own = threading.local()
-_told: list[str] = []
+_configured: list[int] = []
+_thread_local = threading.local()
+_warned_folders: list[str] = []
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -43,17 +43,17 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(nogil=True, **options)(function)
-        dispatcher._cache = _KeptCode(function)  # pyright: ignore[reportAttributeAccessIssue]
+        dispatcher._cache = _KernelCache(function)  # pyright: ignore[reportAttributeAccessIssue]
         KERNELS.append(dispatcher)
         return dispatcher
 
     return compiled
 
 
-def is_kept(compiled: Any) -> bool:
+def is_cached(compiled: Any) -> bool:
     """Whether machine code of this kernel lies somewhere, so that its first call takes no time to
     speak of."""
-    return compiled._cache.is_kept
+    return compiled._cache.is_cached
 
 
 def set_num_threads(number: int) -> None:
@@ -74,33 +74,39 @@ def set_num_threads(number: int) -> None:
     import cv2
     import faiss
 
-    _chosen[:] = [number]
+    _configured[:] = [number]
     cv2.setNumThreads(number)
     faiss.omp_set_num_threads(number)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(number)
 
 
-def num_threads(usual: int = _USUAL_THREADS) -> int:
-    """As `set_num_threads` said, `usual` where it was not called; 1 in a thread that is one of
+def num_threads(default: int = _DEFAULT_NUM_THREADS) -> int:
+    """As `set_num_threads` said, `default` where it was not called; 1 in a thread that is one of
     several already."""
-    return 1 if hasattr(_own, "is_one_of_several") else _chosen[0] if _chosen else usual
+    return (
+        1
+        if hasattr(_thread_local, "is_one_of_several")
+        else _configured[0]
+        if _configured
+        else default
+    )
 
 
-def be_one_of_several() -> None:
+def mark_worker_thread() -> None:
     """From now on this thread of Python starts no others: they are all at work on items of their
     own (`features/bands.py`)."""
-    _own.is_one_of_several = True
+    _thread_local.is_one_of_several = True
 
 
-class _KeptCode(NullCache):
+class _KernelCache(NullCache):
     """The machine code of one function, as Numba asks for it: read from the first folder that has
     it, kept in the first that takes it."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._caches = [
             _FolderCache(function, folder)
-            for folder in _folders(str(Path(function.__code__.co_filename).parent))
+            for folder in _cache_folders(str(Path(function.__code__.co_filename).parent))
         ]
 
     @property
@@ -108,8 +114,8 @@ class _KeptCode(NullCache):
         return self._caches[0].cache_path
 
     @property
-    def is_kept(self) -> bool:
-        return any(folder.is_kept for folder in self._caches)
+    def is_cached(self) -> bool:
+        return any(folder.is_cached for folder in self._caches)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         for folder in self._caches:
@@ -129,7 +135,7 @@ class _KeptCode(NullCache):
         for folder in self._caches:
             with contextlib.suppress(OSError):
                 return folder.save_overload(sig, cres)
-        _tell(" or ".join(folder.cache_path for folder in self._caches))
+        _warn_not_cached(" or ".join(folder.cache_path for folder in self._caches))
         return None
 
     def flush(self) -> None:
@@ -142,12 +148,14 @@ class _FolderCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any], folder: str) -> None:
         self._impl_class = type(
-            "_Impl", (CompileResultCacheImpl,), {"_locator_classes": [_Place(function, folder)]}
+            "_Impl",
+            (CompileResultCacheImpl,),
+            {"_locator_classes": [_CacheLocator(function, folder)]},
         )
         super().__init__(function)
 
     @property
-    def is_kept(self) -> bool:
+    def is_cached(self) -> bool:
         """Whether there is code of the function as it is now."""
         try:
             return bool(self._cache_file._load_index())
@@ -155,13 +163,13 @@ class _FolderCache(FunctionCache):
             return False
 
 
-class _Place:
+class _CacheLocator:
     """What Numba calls a locator: the folder of a function's code, and what the code is of."""
 
     def __init__(self, function: Callable[..., Any], folder: str) -> None:
         self._function, self._folder = function, folder
 
-    def from_function(self, function: Callable[..., Any], file: str) -> _Place:
+    def from_function(self, function: Callable[..., Any], file: str) -> _CacheLocator:
         del function, file
         return self
 
@@ -172,14 +180,14 @@ class _Place:
         return self._folder
 
     def get_source_stamp(self) -> str:
-        return _digest_of(self._function.__code__.co_filename)
+        return _source_digest(self._function.__code__.co_filename)
 
     def get_disambiguator(self) -> str:
         return str(self._function.__code__.co_firstlineno)
 
 
 @cache
-def _folders(source: str) -> list[str]:
+def _cache_folders(source: str) -> list[str]:
     """Where code of functions from the folder `source` may lie: `NUMBA_CACHE_DIR` if that is set,
     else beside them or the user's own."""
     apart = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
@@ -199,17 +207,17 @@ def _folders(source: str) -> list[str]:
 
 
 @cache
-def _digest_of(file: str) -> str:
+def _source_digest(file: str) -> str:
     """Of a file and of all kernels beside it, since they call each other."""
     files = {Path(file), *Path(file).parent.glob("*_kernels.py")}
     return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(files))).hexdigest()
 
 
-def _tell(folders: str) -> None:
+def _warn_not_cached(folders: str) -> None:
     """Once a process."""
-    if _told:
+    if _warned_folders:
         return
-    _told.append(folders)
+    _warned_folders.append(folders)
     print(
         "topoloc compiles anew in every process, a minute in all: machine code cannot be kept"
         f" ({folders}). While a container's image is built, `python -c 'import topoloc;"

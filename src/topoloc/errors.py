@@ -52,7 +52,7 @@ class TrajectoryError(TopolocError):
     """A trajectory that is malformed or fits no frame of the recording."""
 
 
-class SessionKnownError(TrajectoryError):
+class DuplicateSessionError(TrajectoryError):
     """A recording that is to join a map and is in it already."""
 
 
@@ -68,7 +68,7 @@ class EmptyMapError(MapError):
     """A map without a single usable node."""
 
 
-class UnknownMapError(MapError):
+class MapNotFoundError(MapError):
     """No map of this name."""
 
 
@@ -76,7 +76,7 @@ class AtlasError(MapError):
     """An atlas that cannot be opened, read or written, or a tile that it cannot take."""
 
 
-class StoreError(AtlasError):
+class ObjectStoreError(AtlasError):
     """An object store that does not answer, or whose files cannot be kept here: nothing is said of
     what they hold, and later it may go."""
 
@@ -105,7 +105,7 @@ class GeoreferenceError(TopolocError):
     """A place that is none on earth, or points that do not determine where a map lies."""
 
 
-class FeatureKindError(TopolocError):
+class FeatureTypeError(TopolocError):
     """Features of an unknown kind, or fitted weights that cannot be read; the text names the kinds
     or the file."""
 

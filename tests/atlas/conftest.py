@@ -10,7 +10,7 @@ from uuid import uuid4
 import pytest
 
 from topoloc.atlas.editing import create_atlas, new_tiles
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.open import open_sequence
 

@@ -15,7 +15,7 @@ from schemas import check_result
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
-from topoloc.errors import StoreError
+from topoloc.errors import ObjectStoreError
 
 Complaint = Callable[..., str]
 
@@ -83,7 +83,7 @@ def test_a_history_ends_where_the_store_is_silent(
 
     def silent(self: Atlas, tile: Tile) -> Path:
         asked.append(tile.tile_id)
-        raise StoreError("the store does not answer")
+        raise ObjectStoreError("the store does not answer")
 
     monkeypatch.setattr(Atlas, "map_path", silent)
     assert main(["history", str(atlas)]) == 1

@@ -158,7 +158,7 @@ def test_two_writers_at_once_lose_nothing(
     def made(new: NewTile, store: Store) -> Tile:
         return replace(ready, tile_id=new.tile_id, world=new.world)
 
-    monkeypatch.setattr(editing, "tile_of", made)
+    monkeypatch.setattr(editing, "store_tile", made)
     begin, failures = threading.Barrier(2), list[BaseException]()
 
     def write(writer: str) -> None:
@@ -219,18 +219,18 @@ def test_a_writer_that_comes_too_late_begins_anew(
     clash of ids with it is told."""
     where = str(tmp_path / "campus")
     create_atlas(where, [])
-    made: Callable[[NewTile, Store], Tile] = editing.tile_of
+    made: Callable[[NewTile, Store], Tile] = editing.store_tile
 
     def meanwhile(new: NewTile, store: Store) -> Tile:
-        monkeypatch.setattr(editing, "tile_of", made)
+        monkeypatch.setattr(editing, "store_tile", made)
         add_tiles(where, new_tiles([str(room_map)], "first"))
         return made(new, store)
 
-    monkeypatch.setattr(editing, "tile_of", meanwhile)
+    monkeypatch.setattr(editing, "store_tile", meanwhile)
     add_tiles(where, new_tiles([str(room_map)], "second"))
     assert _tiles(where) == ["first", "second"]
     remove_tiles(where, ["first"])
-    monkeypatch.setattr(editing, "tile_of", meanwhile)
+    monkeypatch.setattr(editing, "store_tile", meanwhile)
     with pytest.raises(AtlasError, match="has a tile first already"):
         add_tiles(where, new_tiles([str(room_map)], "first"))
 

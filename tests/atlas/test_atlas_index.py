@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.global_descriptors import (
+    compute_global_descriptors,
+    load_global_descriptors,
+    save_global_descriptors,
+)
 from topoloc.atlas.index import AtlasIndex
-from topoloc.atlas.place_vectors import place_vectors, read_vectors, write_vectors
 from topoloc.errors import AtlasError
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -55,44 +59,44 @@ def test_vectors_of_a_map_are_kept_and_those_of_another_vocabulary_are_not_compa
     room_map: Path, tmp_path: Path
 ):
     with TopoMetricMap.load(room_map) as topomap:
-        vectors = place_vectors(topomap)
+        vectors = compute_global_descriptors(topomap)
         assert len(vectors["surf"]) == len(topomap.summaries)
     assert np.allclose(np.linalg.norm(vectors["surf"], axis=1), 1.0, atol=1e-5)
-    write_vectors(tmp_path / "places", vectors)
+    save_global_descriptors(tmp_path / "places", vectors)
     from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
     vocabulary = shared_vocabulary("surf")
     assert vocabulary is not None
     assert np.allclose(
-        read_vectors(tmp_path / "places", {"surf": vocabulary.version})["surf"],
+        load_global_descriptors(tmp_path / "places", {"surf": vocabulary.version})["surf"],
         vectors["surf"],
         atol=1e-3,
     )
     with pytest.raises(AtlasError, match="another version"):
-        read_vectors(tmp_path / "places", {"surf": "0"})
+        load_global_descriptors(tmp_path / "places", {"surf": "0"})
 
 
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04 and no more", b"\x93NUMPY", b"text"])
 def test_damaged_vectors_are_refused(data: bytes, tmp_path: Path):
     (tmp_path / "places").write_bytes(data)
     with pytest.raises(AtlasError, match="damaged"):
-        read_vectors(tmp_path / "places", {})
+        load_global_descriptors(tmp_path / "places", {})
 
 
 def test_pictures_look_like_their_own_tile(atlas: Path):
     from built_room import unseen_views
     from tiny_world import CAMERA
     from topoloc.features.extraction import extract_features
-    from topoloc.features.kinds import FeatureConfig
+    from topoloc.features.feature_types import FeatureConfig
     from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
     index, vocabulary = Atlas.open(str(atlas)).index, shared_vocabulary("surf")
     assert vocabulary is not None
     for seed, tile in ((0, "room"), (1, "other")):
         image, _ = unseen_views(seed)[1]
-        vector = vocabulary.vector(
+        global_descriptor = vocabulary.global_descriptor(
             extract_features(image, FeatureConfig()), CAMERA.width, CAMERA.height
         )
-        (first, likeness), (_, second) = index.rank({"surf": vector}, 2)
+        (first, likeness), (_, second) = index.rank({"surf": global_descriptor}, 2)
         assert first == tile
         assert likeness > second + 0.1

@@ -15,13 +15,13 @@ from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.editing import add_tiles, new_tiles
-from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import query
-from topoloc.localization.asking import Asking
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.query_session import QuerySession
 from topoloc.localization.result import Localization, NotLocalized, result_from_json
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -36,7 +36,7 @@ def _localizer(
 ) -> AtlasLocalizer:
     return AtlasLocalizer(
         Atlas.open(str(where)),
-        Maps([], Localizer, budget),
+        MapCache([], Localizer, budget),
         config,
         (warn if warn is not None else []).append,
     )
@@ -86,13 +86,13 @@ def test_a_result_names_its_tile_in_json(asked: AtlasLocalizer):
 
 def test_features_are_extracted_once_for_all_tiles(atlas: Path, monkeypatch: pytest.MonkeyPatch):
     kinds = list[str]()
-    extract = query.extract_normalized
+    extract = query.extract_from_normalized
 
     def counted(normalized: np.ndarray, config: query.FeatureConfig) -> query.Features:
         kinds.append(config.kind)
         return extract(normalized, config)
 
-    monkeypatch.setattr(query, "extract_normalized", counted)
+    monkeypatch.setattr(query, "extract_from_normalized", counted)
     _localizer(atlas, AtlasConfig(settled_gap=2.0, hopeless_gap=2.0)).localize(
         unseen_views(seed=2)[0][0], CAMERA
     )
@@ -104,9 +104,11 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
     atlas: Path, monkeypatch: pytest.MonkeyPatch, least_likeness: float, num_asked: int
 ):
     asked = list[str]()
-    by_all_means = Asking.by_all_means
+    localize_exhaustive = QuerySession.localize_exhaustive
     monkeypatch.setattr(
-        Asking, "by_all_means", lambda self: asked.append(self.features) or by_all_means(self)
+        QuerySession,
+        "localize_exhaustive",
+        lambda self: asked.append(self.features) or localize_exhaustive(self),
     )
     config = AtlasConfig(settled_gap=2.0, hopeless_gap=2.0, least_likeness=least_likeness)
     result = _localizer(atlas, config).localize(unseen_views(seed=2)[0][0], CAMERA)
@@ -131,9 +133,11 @@ def test_a_look_alike_that_cannot_come_near_is_left_at_that(
 ):
     """Neither does it cost a glance, nor is it named."""
     asked = list[str]()
-    glance = Asking.at_a_glance
+    glance = QuerySession.localize_coarse_only
     monkeypatch.setattr(
-        Asking, "at_a_glance", lambda self: asked.append(self.features) or glance(self)
+        QuerySession,
+        "localize_coarse_only",
+        lambda self: asked.append(self.features) or glance(self),
     )
     wide = AtlasConfig(settled_gap=2.0, hopeless_gap=2.0, alike_gap=2.0, num_glanced=1)
     result = _localizer(atlas, wide).localize(unseen_views()[0][0], CAMERA)
@@ -233,7 +237,7 @@ def test_one_tile_can_be_asked_alone_near_a_pose(asked: AtlasLocalizer):
 
 
 def test_tiles_are_closed_where_memory_is_little(atlas: Path):
-    maps = Maps([], Localizer, 1)
+    maps = MapCache([], Localizer, 1)
     localizer = AtlasLocalizer(Atlas.open(str(atlas)), maps)
     for seed in (0, 1, 0):
         localizer.localize(unseen_views(seed)[1][0], CAMERA)

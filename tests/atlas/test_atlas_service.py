@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from topoloc.apps.service.application import Access, make_application
+from topoloc.apps.service.application import Access, create_application
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.atlas.editing import add_tiles, new_tiles, remove_tiles
-from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.map_cache import MapCache
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
@@ -26,8 +26,8 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 @pytest.fixture
 def client(own_atlas: Path) -> Iterator[TestClient]:
-    application = make_application(
-        Maps([str(own_atlas)], Localizer, 100_000_000), ServiceConfig(workers=1), Access()
+    application = create_application(
+        MapCache([str(own_atlas)], Localizer, 100_000_000), ServiceConfig(workers=1), Access()
     )
     with TestClient(application, base_url="http://127.0.0.1") as client:
         yield client

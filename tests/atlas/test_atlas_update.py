@@ -21,11 +21,11 @@ from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Tile
 from topoloc.errors import AtlasError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.tile_choice import TileChoiceConfig, chosen_tile
-from topoloc.lifelong.tile_update import edited_tile
+from topoloc.lifelong.tile_editing import edit_tile
+from topoloc.lifelong.tile_selection import TileSelectionConfig, select_tile
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization
-from topoloc.mapping.edit import editing
+from topoloc.mapping.edit import edit_map
 from topoloc.mapping.topomap import TopoMetricMap
 
 Complaint = Callable[..., str]
@@ -68,7 +68,7 @@ def _map(where: object, tile_id: str) -> bytes:
 
 def _note(path: Path, text: str) -> None:
     """An edit that changes a map's history alone."""
-    with editing(path) as edit:
+    with edit_map(path) as edit:
         edit.commit(edit.topomap, text)
 
 
@@ -161,7 +161,7 @@ def test_who_replaced_the_tile_meanwhile_is_not_overwritten(
         _note(path, f"try {len(num_nodes)}")
         return len(num_nodes)
 
-    tile, tries = edited_tile(somewhere, "hall", edit)
+    tile, tries = edit_tile(somewhere, "hall", edit)
     assert (tries, tile.num_nodes, tile.world, tile.recipe) == (2, num_nodes[1], "campus", None)
     assert num_nodes[0] != num_nodes[1]
     assert _notes(somewhere, "hall") == ["try 2"]
@@ -179,7 +179,7 @@ def test_others_who_are_always_faster_are_left_alone(
         add_tiles(somewhere, new_tiles([str(theirs)], "hall"), replaces=True)
 
     with pytest.raises(AtlasError, match="was replaced by others 5 times"):
-        edited_tile(somewhere, "hall", edit)
+        edit_tile(somewhere, "hall", edit)
     assert _notes(somewhere, "hall") == ["theirs"] * 5
     assert Atlas.open(somewhere).tile("hall").num_nodes > 0
 
@@ -192,8 +192,8 @@ def test_joins_world_and_recipe_stay_what_they_are(somewhere: str, room_map: Pat
     tiles = Atlas.open(somewhere).manifest.by_id
     pose = Rigid3(np.eye(3), np.array([3.0, 1.0, 0.0]))
     before = add_joins(somewhere, [Join("hall", "yard", pose, 1e-4 * np.eye(6), 20)], tiles)
-    edited_tile(somewhere, "yard", lambda path: _note(path, "one"))
-    tile, _ = edited_tile(somewhere, "hall", lambda path: _note(path, "two"))
+    edit_tile(somewhere, "yard", lambda path: _note(path, "one"))
+    tile, _ = edit_tile(somewhere, "hall", lambda path: _note(path, "two"))
     after = Atlas.open(somewhere).manifest
     assert [join.to_json() for join in after.joins] == [join.to_json() for join in before.joins]
     assert {one.in_joint_world.joint for one in after.tiles} == {"hall"}
@@ -214,11 +214,11 @@ def test_nothing_is_left_and_nothing_changed_where_it_fails(
         raise TrajectoryError("it does not fit")
 
     with pytest.raises(TrajectoryError, match="does not fit"):
-        edited_tile(str(own_atlas), "room", fails)
+        edit_tile(str(own_atlas), "room", fails)
     file = own_atlas / Atlas.open(str(own_atlas)).tile("room").map.name
     file.write_bytes(file.read_bytes()[:-1] + b"x")
     with pytest.raises(AtlasError, match="its checksum is another"):
-        edited_tile(str(own_atlas), "room", lambda path: None)
+        edit_tile(str(own_atlas), "room", lambda path: None)
     assert (own_atlas / "atlas.json").read_bytes() == before
     assert list(scratch.iterdir()) == []
 
@@ -236,10 +236,10 @@ def test_a_recording_is_of_the_tile_that_most_pictures_name_or_of_none(
     own_atlas: Path, room_map: Path
 ):
     add_tiles(str(own_atlas), [NewTile("annex", room_map, "room")])
-    tiles, config = Atlas.open(str(own_atlas)).manifest.by_id, TileChoiceConfig()
+    tiles, config = Atlas.open(str(own_atlas)).manifest.by_id, TileSelectionConfig()
 
     def chosen(**counts: int) -> Tile:
-        return chosen_tile("walk", 12, _answers(**counts), tiles, config)
+        return select_tile("walk", 12, _answers(**counts), tiles, config)
 
     assert chosen(room=3).tile_id == "room"
     assert chosen(room=6, other=2).tile_id == "room"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from topoloc.atlas.manifest import StoredFile, Tile
-from topoloc.atlas.verdict import Heard, joint_result
+from topoloc.atlas.tile_results import TileResult, merge_tile_results
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.provenance import Provenance
@@ -43,15 +43,15 @@ def _pose(evidence: Evidence, x: float = 0.0, probability: float = 0.95) -> Loca
 
 
 def _heard(
-    tile: Tile, result: Localization | NotLocalized, is_full: bool = True, **more: Any
-) -> Heard:
-    return Heard(
-        tile, result, (result,) if isinstance(result, Localization) else (), is_full, **more
+    tile: Tile, result: Localization | NotLocalized, is_exhaustive: bool = True, **more: Any
+) -> TileResult:
+    return TileResult(
+        tile, result, (result,) if isinstance(result, Localization) else (), is_exhaustive, **more
     )
 
 
 def test_the_only_tile_that_vouches_answers():
-    result = joint_result(
+    result = merge_tile_results(
         [_heard(_tile("a"), NotLocalized("not_in_map")), _heard(_tile("b"), _pose(STRONG))]
     )
     assert isinstance(result, Localization)
@@ -61,8 +61,8 @@ def test_the_only_tile_that_vouches_answers():
 
 def test_a_pose_with_far_more_for_it_leads_and_pays_for_its_rival():
     rivals = [_heard(_tile("a"), _pose(WEAK)), _heard(_tile("b"), _pose(STRONG))]
-    for heard in (rivals, rivals[::-1]):
-        result = joint_result(heard)
+    for tile_results in (rivals, rivals[::-1]):
+        result = merge_tile_results(tile_results)
         assert isinstance(result, Localization)
         assert result.provenance.tile == "b"
         assert 0.5 < result.probability < 0.95
@@ -70,10 +70,10 @@ def test_a_pose_with_far_more_for_it_leads_and_pays_for_its_rival():
 
 @pytest.mark.parametrize("second_is_full", [True, False])
 def test_two_poses_with_as_much_for_them_are_both_named(second_is_full: bool):
-    result = joint_result(
+    result = merge_tile_results(
         [
             _heard(_tile("a"), _pose(FAIR)),
-            _heard(_tile("b"), _pose(FAIR, x=3.0), is_full=second_is_full),
+            _heard(_tile("b"), _pose(FAIR, x=3.0), is_exhaustive=second_is_full),
         ]
     )
     assert isinstance(result, NotLocalized)
@@ -86,10 +86,10 @@ def test_two_poses_with_as_much_for_them_are_both_named(second_is_full: bool):
 def test_the_same_pose_in_two_tiles_of_one_world_is_one():
     a, b = _tile("a", "house"), _tile("b", "house")
     assert isinstance(
-        joint_result([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=0.01))]), Localization
+        merge_tile_results([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=0.01))]), Localization
     )
     assert isinstance(
-        joint_result([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=5.0))]), NotLocalized
+        merge_tile_results([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=5.0))]), NotLocalized
     )
 
 
@@ -99,22 +99,23 @@ def test_tiles_that_lie_in_the_atlas_are_compared_there():
         replace(_tile(name), atlas_from_world=pose)
         for name, pose in (("a", Rigid3.identity()), ("b", shift))
     )
-    agreed = joint_result([_heard(a, _pose(FAIR, x=12.0)), _heard(b, _pose(FAIR, x=2.0))])
+    agreed = merge_tile_results([_heard(a, _pose(FAIR, x=12.0)), _heard(b, _pose(FAIR, x=2.0))])
     assert isinstance(agreed, Localization)
     assert agreed.provenance.atlas_from_cam is not None
     assert np.allclose(agreed.provenance.atlas_from_cam.translation, [12.0, 0.0, 0.0])
     assert isinstance(
-        joint_result([_heard(a, _pose(FAIR, x=2.0)), _heard(b, _pose(FAIR, x=2.0))]), NotLocalized
+        merge_tile_results([_heard(a, _pose(FAIR, x=2.0)), _heard(b, _pose(FAIR, x=2.0))]),
+        NotLocalized,
     )
 
 
 def test_a_refusal_is_that_of_the_tile_that_knows_most():
     few, more = NotLocalized("too_few_matches"), NotLocalized("not_in_map", num_inliers=9)
-    heard = [
+    tile_results = [
         _heard(_tile("a"), few),
         _heard(_tile("b"), more),
-        _heard(_tile("c"), replace(more, num_inliers=99), is_full=False),
+        _heard(_tile("c"), replace(more, num_inliers=99), is_exhaustive=False),
     ]
-    result = joint_result(heard)
+    result = merge_tile_results(tile_results)
     assert isinstance(result, NotLocalized)
     assert (result.reason, result.provenance.tile) == ("not_in_map", "b")

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topoloc.atlas import index_files, place_shard
+from topoloc.atlas import descriptor_shard, index_files
+from topoloc.atlas.descriptor_shard import DescriptorShard
+from topoloc.atlas.global_descriptors import GlobalDescriptors
 from topoloc.atlas.index_files import OpenedIndex, open_index
 from topoloc.atlas.manifest import StoredFile, Tile
-from topoloc.atlas.place_shard import PlaceShard
-from topoloc.atlas.place_vectors import PlaceVectors
 from topoloc.errors import AtlasError
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
@@ -66,7 +66,7 @@ class Campus:
         self.read.clear()
         return open_index(tiles, self._read, self.folder)
 
-    def _read(self, tile: Tile) -> PlaceVectors:
+    def _read(self, tile: Tile) -> GlobalDescriptors:
         self.read.append(tile.tile_id)
         if tile.tile_id == "broken":
             raise AtlasError("broken is damaged")
@@ -94,9 +94,9 @@ class Campus:
 @pytest.fixture
 def campus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Campus:
     """Twelve tiles; more than 500 places are a shard, which holds at most 900."""
-    monkeypatch.setattr(index_files, "MAX_EXACT_PLACES", 500)
-    monkeypatch.setattr(index_files, "SHARD_PLACES", 900)
-    monkeypatch.setattr(place_shard, "MAX_ROWS_COMPARED", 100)
+    monkeypatch.setattr(index_files, "MAX_EXACT_DESCRIPTORS", 500)
+    monkeypatch.setattr(index_files, "SHARD_DESCRIPTORS", 900)
+    monkeypatch.setattr(descriptor_shard, "MAX_ROWS_COMPARED", 100)
     made = Campus(tmp_path / "index")
     made.add(*(f"t{number:02d}" for number in range(12)))
     return made
@@ -134,11 +134,11 @@ def test_few_tiles_that_come_are_compared_and_many_become_a_shard(campus: Campus
 
 def test_a_small_shard_is_made_one_with_what_comes(campus: Campus, monkeypatch: pytest.MonkeyPatch):
     campus.open()
-    monkeypatch.setattr(index_files, "SHARD_PLACES", 10_000)
+    monkeypatch.setattr(index_files, "SHARD_DESCRIPTORS", 10_000)
     campus.add(*(f"many{number}" for number in range(10)))
     campus.check(campus.open())
     assert sorted(campus.read) == [f"many{number}" for number in range(10)]
-    assert sorted(len(PlaceShard.open(path).vectors) for path in campus.files) == [
+    assert sorted(len(DescriptorShard.open(path).vectors) for path in campus.files) == [
         720,
         1320,
     ]  # the smaller may be open elsewhere
@@ -146,7 +146,7 @@ def test_a_small_shard_is_made_one_with_what_comes(campus: Campus, monkeypatch: 
     for path in campus.files:
         os.utime(path, (long_ago, long_ago))
     campus.check(campus.open())
-    assert [len(PlaceShard.open(path).vectors) for path in campus.files] == [1320]
+    assert [len(DescriptorShard.open(path).vectors) for path in campus.files] == [1320]
 
 
 def test_tiles_that_are_removed_or_replaced_are_not_named(campus: Campus):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from topoloc.atlas.joins import Join
-from topoloc.atlas.joint_worlds import adjusted
+from topoloc.atlas.joint_worlds import adjust_joins
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
@@ -71,7 +71,7 @@ def _manifest(joins: list[Join], **worlds: str) -> Manifest:
 
 def test_three_worlds_in_a_loop_share_what_does_not_close():
     joins = [_join("a", "b", _off(1)), _join("b", "c", _off(2)), _join("a", "c", _off(3))]
-    found = adjusted(joins, EACH_ITS_OWN, {})
+    found = adjust_joins(joins, EACH_ITS_OWN, {})
     misses = []
     for name in "bc":
         true = WORLDS["a"] @ WORLDS[name].inverse()
@@ -97,7 +97,7 @@ def test_a_join_that_contradicts_what_more_pictures_say_is_left_out():
         _join("a", "c", wrong, num_agreeing=9),
         _join("c", "d"),
     ]
-    found = adjusted(joins, EACH_ITS_OWN, {})
+    found = adjust_joins(joins, EACH_ITS_OWN, {})
     assert [(join.pair, join.residual is None) for join in found.joins] == [
         (("a", "b"), False),
         (("a", "c"), True),
@@ -113,7 +113,7 @@ def test_a_join_that_contradicts_what_more_pictures_say_is_left_out():
 
 
 def test_uncertainty_grows_with_the_way():
-    found = adjusted([_join("a", "b"), _join("b", "c"), _join("c", "d")], EACH_ITS_OWN, {})
+    found = adjust_joins([_join("a", "b"), _join("b", "c"), _join("c", "d")], EACH_ITS_OWN, {})
     traces = [float(np.trace(found.places[name].covariance)) for name in "abcd"]
     assert traces[0] == 0.0
     assert traces == sorted(traces)
@@ -126,7 +126,7 @@ def test_joins_do_not_move_what_knows_its_place_on_earth():
         "b": Rigid3.identity(),
         "d": Rigid3(np.eye(3), np.array([1000.0, 0.0, 0.0])),
     }
-    found = adjusted(
+    found = adjust_joins(
         [_join("b", "c", num_agreeing=30), _join("c", "d", num_agreeing=10)], EACH_ITS_OWN, on_earth
     )
     assert [join.residual is None for join in found.joins] == [False, True]

@@ -16,15 +16,15 @@ import pytest
 from fastapi.testclient import TestClient
 
 from topoloc.apps.service import served_atlases
-from topoloc.apps.service.application import Access, make_application
+from topoloc.apps.service.application import Access, create_application
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.stores.object_store import ObjectStore
-from topoloc.atlas import tile_fetches
+from topoloc.atlas import tile_fetcher
 from topoloc.atlas.atlas import Atlas, store_at
 from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles, remove_tiles
-from topoloc.atlas.open_maps import Maps
-from topoloc.atlas.tile_fetches import TileAwaited, TileFetches
-from topoloc.errors import AtlasError, MapError, StoreError
+from topoloc.atlas.map_cache import MapCache
+from topoloc.atlas.tile_fetcher import TileFetcher, TilePending
+from topoloc.errors import AtlasError, MapError, ObjectStoreError
 from topoloc.localization.localizer import Localizer
 
 
@@ -65,14 +65,14 @@ def _in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 @contextmanager
 def _served(
     *sources: object, fetch_s: float = 20.0, max_bytes: int = 100_000_000
-) -> Iterator[tuple[TestClient, Maps]]:
+) -> Iterator[tuple[TestClient, MapCache]]:
     """A service of these with one worker."""
     config = ServiceConfig(workers=1, fetch_s=fetch_s)
-    maps = Maps(
-        [str(source) for source in sources], Localizer, max_bytes, TileFetches(config.fetch_s).path
+    maps = MapCache(
+        [str(source) for source in sources], Localizer, max_bytes, TileFetcher(config.fetch_s).path
     )
     with TestClient(
-        make_application(maps, config, Access()), base_url="http://127.0.0.1"
+        create_application(maps, config, Access()), base_url="http://127.0.0.1"
     ) as client:
         yield client, maps
 
@@ -130,9 +130,9 @@ def test_it_answers_as_the_atlas_in_a_folder(store: str, atlas: Path, queries: P
             assert _timeless(_asked(client, path, queries)) == _timeless(
                 _asked(plain, path, queries)
             )
-        before = maps.lend("room")
+        before = maps.acquire_map("room")
         _asked(client, "/v1/maps/room/localize", queries)
-        assert maps.lend("room") is before  # it is not opened anew at each request
+        assert maps.acquire_map("room") is before  # it is not opened anew at each request
 
 
 def test_a_stream_is_followed_in_a_tile(store: str, queries: Path):
@@ -155,7 +155,7 @@ def test_tiles_are_closed_beyond_the_budget(in_memory: str, queries: Path):
 def test_what_is_written_to_the_store_is_noticed(
     store: str, room_map: Path, queries: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(served_atlases, "LOOK_S", 0.1)
+    monkeypatch.setattr(served_atlases, "POLL_INTERVAL_S", 0.1)
     with _served(store) as (client, maps):
         assert _asked(client, "/v1/localize", queries)["map"] == "room"
         remove_tiles(store, ["room"])
@@ -167,7 +167,7 @@ def test_what_is_written_to_the_store_is_noticed(
 
 
 def test_a_look_reads_no_manifest_that_it_knows(in_memory: str, monkeypatch: pytest.MonkeyPatch):
-    maps, read = Maps([in_memory], Localizer, 1), list[str]()
+    maps, read = MapCache([in_memory], Localizer, 1), list[str]()
     cat_file = (files := ObjectStore(in_memory)._files).cat_file
     monkeypatch.setattr(
         type(files),
@@ -238,8 +238,8 @@ def test_a_tile_that_comes_late_is_waited_for(
 def test_what_was_opened_answers_while_the_store_is_gone(
     in_memory: str, queries: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    monkeypatch.setattr(served_atlases, "LOOK_S", 0.02)
-    monkeypatch.setattr(tile_fetches, "_FAILED_S", 0.2)
+    monkeypatch.setattr(served_atlases, "POLL_INTERVAL_S", 0.02)
+    monkeypatch.setattr(tile_fetcher, "_RETRY_AFTER_S", 0.2)
 
     def gone(*args: object, **more: object) -> None:
         raise OSError("the network is unreachable")
@@ -288,15 +288,15 @@ def test_a_missing_or_rotten_tile_is_named_and_the_others_answer(
 
 
 def test_a_tile_is_fetched_once_for_all_who_ask(in_memory: str, silent_tiles: threading.Event):
-    atlas, fetches = Atlas.open(in_memory), TileFetches(30.0)
-    awaited = list[TileAwaited]()
+    atlas, fetches = Atlas.open(in_memory), TileFetcher(30.0)
+    awaited = list[TilePending]()
     for _ in range(3):
-        with pytest.raises(TileAwaited) as raised:
+        with pytest.raises(TilePending) as raised:
             fetches.path(atlas, atlas.tile("room"))
         awaited.append(raised.value)
     assert len({id(one.fetch) for one in awaited}) == 1
     silent_tiles.set()
-    path = awaited[0].fetch.ended.result(20.0)
+    path = awaited[0].fetch.future.result(20.0)
     assert isinstance(path, Path)
     assert fetches.path(atlas, atlas.tile("room")) == path
 
@@ -304,12 +304,12 @@ def test_a_tile_is_fetched_once_for_all_who_ask(in_memory: str, silent_tiles: th
 def test_so_many_tiles_of_one_store_come_at_a_time(
     in_memory: str, silent_tiles: threading.Event, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(tile_fetches, "_MAX_AT_A_TIME", 1)
-    atlas, fetches = Atlas.open(in_memory), TileFetches(30.0)
-    with pytest.raises(TileAwaited):
+    monkeypatch.setattr(tile_fetcher, "_MAX_CONCURRENT_FETCHES", 1)
+    atlas, fetches = Atlas.open(in_memory), TileFetcher(30.0)
+    with pytest.raises(TilePending):
         fetches.path(atlas, atlas.tile("room"))
     with pytest.raises(
-        StoreError, match=r"tile other is not here yet, and 1 others are being fetched"
+        ObjectStoreError, match=r"tile other is not here yet, and 1 others are being fetched"
     ):
         fetches.path(atlas, atlas.tile("other"))
 
@@ -323,10 +323,10 @@ def test_what_is_no_atlas_is_not_served(
         (str(tmp_path / "no.topo"), "no such map"),
     ):
         with pytest.raises(MapError, match=said):
-            Maps([where], Localizer, 1)
+            MapCache([where], Localizer, 1)
     monkeypatch.setattr(type(ObjectStore(in_memory)._files), "ls", lambda *_, **__: 1 / 0)
-    with pytest.raises(StoreError, match="does not answer"):
-        Maps([in_memory], Localizer, 1)
+    with pytest.raises(ObjectStoreError, match="does not answer"):
+        MapCache([in_memory], Localizer, 1)
 
 
 def test_a_cache_folder_that_cannot_be_written_is_said(
@@ -335,7 +335,7 @@ def test_a_cache_folder_that_cannot_be_written_is_said(
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "file"))
     atlas = Atlas.open(in_memory)
-    with pytest.raises(StoreError, match="cannot keep"):
+    with pytest.raises(ObjectStoreError, match="cannot keep"):
         atlas.map_path(atlas.tile("room"))
     assert isinstance(store_at(in_memory), ObjectStore)
     with pytest.raises(AtlasError, match="cannot keep"):

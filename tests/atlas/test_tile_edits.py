@@ -16,8 +16,8 @@ from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.atlas.manifest import Manifest
-from topoloc.lifelong.tile_update import edited_tile
-from topoloc.mapping.edit import editing, undo_edit
+from topoloc.lifelong.tile_editing import edit_tile
+from topoloc.mapping.edit import edit_map, undo_edit
 
 Complaint = Callable[..., str]
 ORIGIN = "51.5,-0.17,30,90"
@@ -94,17 +94,17 @@ def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(
 def test_an_undo_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
     own_atlas: Path, complaint: Complaint
 ):
-    edited_tile(str(own_atlas), "room", _note)
+    edit_tile(str(own_atlas), "room", _note)
     atlas = Atlas.open(str(own_atlas))
     undo = atlas.tile("room").undo
     assert undo is not None
     assert Manifest.from_bytes(atlas.manifest.to_bytes(), "here").by_id["room"].undo == undo
-    path = atlas.store.local(undo.name, undo.sha256)
+    path = atlas.store.local_path(undo.name, undo.sha256)
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     assert "checksum" in (tile_problem(atlas, atlas.tile("room")) or "")
     assert "checksum" in complaint("undo", own_atlas, "--tile", "room")
-    edited_tile(str(own_atlas), "other", _note)
-    undone = edited_tile(str(own_atlas), "other", undo_edit)[1]
+    edit_tile(str(own_atlas), "other", _note)
+    undone = edit_tile(str(own_atlas), "other", undo_edit)[1]
     assert undone.name == "note"
 
 
@@ -140,7 +140,7 @@ def test_what_cannot_be_meant_is_said(
 
 
 def _note(path: Path) -> None:
-    with editing(path) as edit:
+    with edit_map(path) as edit:
         edit.commit(edit.topomap, "note")
 
 
@@ -151,7 +151,7 @@ def test_an_edit_in_an_object_store_is_taken_back(
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "cache"))
     where = f"memory://{uuid4().hex}/campus"
     create_atlas(where, new_tiles([str(room_map)]))
-    edited_tile(where, "room", _note)
+    edit_tile(where, "room", _note)
     assert Atlas.open(where).tile("room").undo is not None
     assert main(["undo", where, "--tile", "room"]) == 0
     atlas = Atlas.open(where)

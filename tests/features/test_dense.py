@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.features.dense import Planes, TwoLevels
+from topoloc.features.dense import SingleLevelDescriptors, TwoLevelDescriptors
 
 STRIDE = 4.0
 
@@ -28,22 +28,24 @@ def _points(num: int) -> np.ndarray:
 
 def test_points_agree_where_they_are_seen_whatever_the_length_of_the_descriptors():
     planes, points = _scene(), _points(200)
-    brighter = Planes(7.0 * planes, STRIDE)
-    assert brighter.agrees(points, _of_points(planes, points)).all()
+    brighter = SingleLevelDescriptors(7.0 * planes, STRIDE)
+    assert brighter.check_agreement(points, _of_points(planes, points)).all()
 
 
 @pytest.mark.parametrize(("steps", "share"), [(1, 1.0), (2, 0.0), (4, 0.0)])
 def test_one_grid_step_is_forgiven_and_no_more(steps: int, share: float):
     planes, points = _scene(), _points(200)
     descriptors = _of_points(planes, points + np.array([steps * STRIDE, 0.0]))
-    assert Planes(planes, STRIDE).agrees(points, descriptors).mean() == share
+    assert (
+        SingleLevelDescriptors(planes, STRIDE).check_agreement(points, descriptors).mean() == share
+    )
 
 
 def test_points_of_elsewhere_agree_by_chance_alone():
     points = _points(2000)
     other = np.random.default_rng(5).normal(size=(len(points), 16)).astype(np.float32)
     other /= np.linalg.norm(other, axis=1, keepdims=True)
-    share = Planes(_scene(), STRIDE).agrees(points, other).mean()
+    share = SingleLevelDescriptors(_scene(), STRIDE).check_agreement(points, other).mean()
     assert share == pytest.approx(9 / 81, abs=0.03)  # one step around each of 81
 
 
@@ -51,9 +53,18 @@ def test_points_at_the_border_and_none_at_all():
     planes = _scene()
     corners = np.array([[0.0, 0.0], [127.4, 95.4], [-0.5, 95.4]])
     assert (
-        Planes(planes, STRIDE).agrees(corners, _of_points(planes, np.maximum(corners, 0.0))).all()
+        SingleLevelDescriptors(planes, STRIDE)
+        .check_agreement(corners, _of_points(planes, np.maximum(corners, 0.0)))
+        .all()
     )
-    assert len(Planes(planes, STRIDE).agrees(np.zeros((0, 2)), np.zeros((0, 16), np.float32))) == 0
+    assert (
+        len(
+            SingleLevelDescriptors(planes, STRIDE).check_agreement(
+                np.zeros((0, 2)), np.zeros((0, 16), np.float32)
+            )
+        )
+        == 0
+    )
 
 
 def test_two_levels_are_the_sum_of_the_coarse_one_enlarged_and_the_fine_one_weighted():
@@ -65,14 +76,16 @@ def test_two_levels_are_the_sum_of_the_coarse_one_enlarged_and_the_fine_one_weig
         [cv2.resize(coarse[..., k], (16, 12), interpolation=cv2.INTER_LINEAR) for k in range(16)],
         axis=-1,
     )
-    whole = Planes(np.ascontiguousarray((enlarged + fine @ weights).transpose(2, 0, 1)), STRIDE)
-    levels = TwoLevels(coarse, fine, weights, STRIDE)
+    whole = SingleLevelDescriptors(
+        np.ascontiguousarray((enlarged + fine @ weights).transpose(2, 0, 1)), STRIDE
+    )
+    levels = TwoLevelDescriptors(coarse, fine, weights, STRIDE)
     assert levels.size == whole.size == 16
     points = rng.uniform(-0.5, [63.4, 47.4], (500, 2)).astype(np.float32)
     points[:4] = [(-0.5, -0.5), (63.4, 47.4), (0.0, 47.4), (63.4, 0.0)]
-    np.testing.assert_allclose(levels.at(points), whole.at(points), atol=2e-6)
+    np.testing.assert_allclose(levels.sample(points), whole.sample(points), atol=2e-6)
     np.testing.assert_allclose(levels._grid, whole._grid, atol=2e-6)
-    descriptors = whole.at(rng.permutation(points))
+    descriptors = whole.sample(rng.permutation(points))
     np.testing.assert_array_equal(
-        levels.agrees(points, descriptors), whole.agrees(points, descriptors)
+        levels.check_agreement(points, descriptors), whole.check_agreement(points, descriptors)
     )

@@ -9,7 +9,7 @@ from topoloc.features.extraction import (
     NORMALIZATIONS,
     FeatureConfig,
     extract_features,
-    extract_normalized,
+    extract_from_normalized,
     normalize_image,
 )
 from topoloc.features.matching import MatchingConfig, match_features
@@ -47,7 +47,7 @@ def test_the_two_steps_are_the_whole_and_threads_do_not_matter():
     config = FeatureConfig()
     image = picture()
     whole = extract_features(image, config)
-    stepwise = extract_normalized(
+    stepwise = extract_from_normalized(
         normalize_image(image, config, num_threads=1), config, num_threads=1
     )
     for field in dataclasses.fields(whole):

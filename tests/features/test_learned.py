@@ -11,10 +11,10 @@ import pytest
 from tiny_network import STRIDE, cells, write_network
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features import learned
-from topoloc.features.dense import Planes
-from topoloc.features.kinds import check_available, learned_kind
+from topoloc.features.dense import SingleLevelDescriptors
+from topoloc.features.feature_types import check_available, default_learned_type
 from topoloc.features.learned import LearnedConfig, extract_learned, run_network
-from topoloc.features.learned_kernels import find_maxima, refined, sample_descriptors
+from topoloc.features.learned_kernels import find_maxima, refine_subpixel, sample_descriptors
 
 CONFIG = LearnedConfig("xfeat", 64, min_score=0.05)
 
@@ -44,7 +44,7 @@ def test_key_points_lie_at_the_tops_to_a_fraction_of_a_pixel():
     centres = [(20.3, 15.8), (40.0, 30.0), (55.5, 9.25), (9.9, 38.6)]
     scores = _bumps(centres, 48, 64)
     pixels, found = find_maxima(scores, 48, 64, 4, np.float32(0.1))
-    points = refined(scores, pixels)
+    points = refine_subpixel(scores, pixels)
     order = np.argsort(-found)
     np.testing.assert_allclose(points[order], centres, atol=0.01)
     np.testing.assert_allclose(found[order], [0.9, 0.8, 0.7, 0.6], atol=0.06)
@@ -149,7 +149,7 @@ def test_pictures_of_any_size_are_continued_by_their_border(network: Path, heigh
     picture = np.random.default_rng(2).integers(0, 256, (height, width), dtype=np.uint8)
     answer = run_network(picture, "xfeat")
     assert answer.places is None
-    assert isinstance(answer.dense, Planes)
+    assert isinstance(answer.dense, SingleLevelDescriptors)
     scores, dense = answer.scores, answer.dense.planes
     assert scores.shape == (32 * -(-height // 32), 32 * -(-width // 32))
     assert dense.shape == (64, scores.shape[0] // STRIDE, scores.shape[1] // STRIDE)
@@ -175,7 +175,7 @@ def test_features_are_the_strongest_first_with_the_descriptors_of_their_places(n
     assert (np.diff(features.responses) < 0).all()
     assert (np.ptp(features.sizes_px), np.ptp(features.angles)) == (0.0, 0.0)
     dense = run_network(picture, "xfeat").dense
-    assert isinstance(dense, Planes)
+    assert isinstance(dense, SingleLevelDescriptors)
     expected = _bilinear(dense.planes, features.points_img, STRIDE)
     np.testing.assert_allclose(features.descriptors, expected, atol=1e-4)
     np.testing.assert_array_equal(
@@ -250,14 +250,14 @@ def test_without_onnx_runtime_the_extra_is_named(network: Path, monkeypatch: pyt
     for ask in (
         lambda: extract_learned(np.zeros((64, 64), np.uint8), CONFIG),
         lambda: check_available("xfeat"),
-        learned_kind,
+        default_learned_type,
     ):
         with pytest.raises(MissingExtraError, match=r"pip install 'topoloc\[learned\]'"):
             ask()
 
 
 def test_learned_features_are_those_of_the_network_that_comes_along():
-    assert learned_kind() == "topoloc-net"
+    assert default_learned_type() == "topoloc-net"
     check_available("surf")
     with pytest.raises(WeightsError, match="`topoloc weights get edgepoint2-s64`"):
         check_available("edgepoint2-s64")

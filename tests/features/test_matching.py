@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from topoloc.features.matching import (
     Matcher,
     MatchingConfig,
-    alike_pairs,
+    find_similar_pairs,
     match_features,
     match_pooled,
 )
@@ -209,14 +209,14 @@ def test_more_of_the_same_features_are_matched_as_if_they_were_the_first(method:
     matcher = Matcher(query, train, (points, radii), config)
     for count in (120, 201, None):
         found, at_once = (
-            matcher.of_first(count),
+            matcher.match_first(count),
             match_pooled(query[:count], train, points, radii, config),
         )
         assert np.array_equal(found.query_idx, at_once.query_idx)
         assert np.array_equal(found.train_idx, at_once.train_idx)
         assert np.array_equal(found.distances, at_once.distances)
     first, every = (
-        set(Matcher(query, train, (points, radii), config).of_first(120).query_idx),
+        set(Matcher(query, train, (points, radii), config).match_first(120).query_idx),
         set(found.query_idx),
     )
     assert len(first - every) > 50
@@ -236,7 +236,7 @@ def test_pairs_that_are_alike_are_all_that_have_this_product_in_their_order(
     num_few: int, num_many: int, size: int
 ):
     few, many = random_descriptors(1, num_few, size), random_descriptors(2, num_many, size)
-    rows, columns = alike_pairs(few, many, 0.2)
+    rows, columns = find_similar_pairs(few, many, 0.2)
     expected = np.nonzero(few @ many.T >= np.float32(0.2))
     np.testing.assert_array_equal(rows, expected[0])
     np.testing.assert_array_equal(columns, expected[1])

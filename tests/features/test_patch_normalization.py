@@ -14,7 +14,7 @@ def picture(seed: int, height: int, width: int, contrast: float = 255.0) -> np.n
 def naive(image: np.ndarray, config: PatchNormalizationConfig) -> np.ndarray:
     """The paper's equation word for word, weights of the window given by its boxes; not yet
     rounded."""
-    first, second = (np.ones(side) for side in config.boxes())
+    first, second = (np.ones(side) for side in config.box_sizes())
     profile = np.convolve(first, second)
     weights = np.outer(profile, profile) / profile.sum() ** 2
     padded = np.pad(image.astype(np.float64), config.window_px // 2, mode="reflect")
@@ -42,7 +42,7 @@ def test_is_the_equation_rounded(seed, height, width, shape, window_px, epsilon)
 def test_the_papers_own_form():
     config = PatchNormalizationConfig.paper()
     image = picture(3, 70, 90)
-    assert config.boxes() == (17, 1)
+    assert config.box_sizes() == (17, 1)
     assert config.epsilon < 0.01
     assert np.abs(patch_normalize(image, config) - naive(image, config)).max() <= 0.5 + 1e-3
 

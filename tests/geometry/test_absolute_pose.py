@@ -14,7 +14,7 @@ from topoloc.geometry.absolute_pose import (
 )
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3, covariance_of_inverse, position_covariance
+from topoloc.geometry.rigid import Rigid3, inverse_covariance, position_covariance
 from topoloc.geometry.stereo import depth_sigmas, ray_covariances
 
 PINHOLE = CAMERAS["PINHOLE"]
@@ -291,15 +291,15 @@ def test_covariance_of_the_inverse_follows_its_perturbations():
     covariance = root @ root.T
     expected = by_xi @ covariance @ by_xi.T
     np.testing.assert_allclose(
-        covariance_of_inverse(cam_from_world, covariance), expected, atol=1e-4 * expected.max()
+        inverse_covariance(cam_from_world, covariance), expected, atol=1e-4 * expected.max()
     )
     of_position = position_covariance(cam_from_world, covariance)
     np.testing.assert_allclose(
         of_position, by_position @ covariance @ by_position.T, rtol=1e-4, atol=1e-4
     )
     np.testing.assert_allclose(
-        covariance_of_inverse(
-            cam_from_world.inverse(), covariance_of_inverse(cam_from_world, covariance)
+        inverse_covariance(
+            cam_from_world.inverse(), inverse_covariance(cam_from_world, covariance)
         ),
         covariance,
     )

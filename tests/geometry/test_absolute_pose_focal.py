@@ -11,10 +11,10 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 
 CAM_FROM_WORLD = Rigid3(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 1.0]))
-UNKNOWN = RoughCamera.unknown(640, 480)
+UNKNOWN = UncalibratedCamera.unknown(640, 480)
 CONFIG = AbsolutePoseConfig(max_reprojection_error_px=8.0)
 
 
@@ -106,7 +106,7 @@ def test_the_same_matches_give_the_same_bytes_and_useless_ones_change_nothing():
 def test_the_inliers_gather_where_some_are_near_and_most_are_far():
     """What is near agrees with a wrong focal length, too: a few rounds leave it at that, and the
     far ones out."""
-    street = RoughCamera.unknown(1241, 376)
+    street = UncalibratedCamera.unknown(1241, 376)
     for seed in range(12):
         rng, camera = np.random.default_rng(seed), street.with_focal(720.0)
         near = rng.uniform([0, 100, 5.0], [1240, 300, 6.5], (48, 3))
@@ -151,7 +151,7 @@ def test_a_start_is_refined_and_the_focal_length_stays_in_its_range():
     )
     assert found is not None
     assert found[1].fx == pytest.approx(600.0, rel=0.01)
-    narrow = RoughCamera.noted(640, 480, 500.0)
+    narrow = UncalibratedCamera.from_focal_guess(640, 480, 500.0)
     found = estimate_pose_and_focal(pixels, points, narrow, CONFIG, point_covariances=covariances)
     assert found is not None
     assert found[1].fx <= narrow.max_focal
@@ -177,4 +177,4 @@ def test_a_rough_camera_keeps_its_field_of_view_when_its_picture_is_resized():
 )
 def test_a_rough_camera_needs_a_range(focals: tuple[float, float]):
     with pytest.raises(CalibrationError, match="a range of focal lengths"):
-        RoughCamera(640, 480, *focals)
+        UncalibratedCamera(640, 480, *focals)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
-from topoloc.geometry.calibration_check import calibration_of_picture, camera_of_picture
+from topoloc.geometry.calibration_check import corrected_camera, estimate_image_calibration
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 
@@ -47,11 +47,11 @@ def test_the_camera_is_found_again(scale: float, dx_px: float, dy_px: float):
     pose = estimate_absolute_pose(pixels, points, calibrated, point_covariances=covariances)
     assert pose is not None
     rows = pose.inliers
-    found = calibration_of_picture(
+    found = estimate_image_calibration(
         pixels[rows], points[rows], covariances[rows], calibrated, pose.cam_from_world, 0.5
     )
     assert found is not None
-    camera, sigmas = camera_of_picture(calibrated, found), np.sqrt(np.diag(found.covariance))
+    camera, sigmas = corrected_camera(calibrated, found), np.sqrt(np.diag(found.covariance))
     assert abs(np.log(camera.fx / TRUE.fx)) < max(4.0 * sigmas[0], 0.01)
     assert abs(camera.cx - TRUE.cx) < max(
         4.0 * sigmas[1] * TRUE.fx, 4.0, 0.2 * abs(dx_px)
@@ -69,10 +69,12 @@ def test_a_wall_seen_straight_says_little_of_the_focal_length():
         np.tile(1e-6 * np.eye(3), (200, 1, 1)),
     )
     pixels = pinhole.img_from_cam(wall) + rng.normal(0.0, 0.5, (200, 2))
-    found = calibration_of_picture(pixels, wall, covariances, pinhole, Rigid3.identity(), 0.5)
+    found = estimate_image_calibration(pixels, wall, covariances, pinhole, Rigid3.identity(), 0.5)
     assert found is None or np.sqrt(found.covariance[0, 0]) > 0.02
 
 
 def test_too_few_points_say_nothing():
     pixels, points, covariances = room(np.random.default_rng(2), 10)
-    assert calibration_of_picture(pixels, points, covariances, TRUE, CAM_FROM_WORLD, 0.5) is None
+    assert (
+        estimate_image_calibration(pixels, points, covariances, TRUE, CAM_FROM_WORLD, 0.5) is None
+    )

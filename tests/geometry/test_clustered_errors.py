@@ -7,7 +7,7 @@ import pytest
 
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.clustered_errors import coherence
+from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -38,7 +38,7 @@ def coherence_of(seed: int, moved: float) -> tuple[float, float]:
     assert pose is not None
     xi = pose.cam_from_world.inverse().log()
     rows = pose.inliers
-    found = coherence(
+    found = compute_variance_inflation(
         points_img[rows], points[rows], NO_COVARIANCES[rows], CAMERA, pose.cam_from_world, CONFIG
     )
     return found, float(xi @ np.linalg.solve(pose.covariance, xi))
@@ -64,9 +64,11 @@ def test_what_was_moved_shows_and_widens_as_much_as_it_is_off():
 def test_of_few_matches_nothing_is_said(count: int):
     points_img, points = seen(0, 0.05, max(count, 1))
     arguments = points_img[:count], points[:count], NO_COVARIANCES[:count]
-    assert coherence(*arguments, CAMERA, Rigid3.identity(), CONFIG) == 1.0
+    assert compute_variance_inflation(*arguments, CAMERA, Rigid3.identity(), CONFIG) == 1.0
     crowded = np.full((9, 2), 100.0) + np.arange(9)[:, None]
     assert (
-        coherence(crowded, np.ones((9, 3)), NO_COVARIANCES[:9], CAMERA, Rigid3.identity(), CONFIG)
+        compute_variance_inflation(
+            crowded, np.ones((9, 3)), NO_COVARIANCES[:9], CAMERA, Rigid3.identity(), CONFIG
+        )
         == 1.0
     )

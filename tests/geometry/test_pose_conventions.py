@@ -6,12 +6,12 @@ import pytest
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.pose_conventions import (
     AXES,
-    MEANINGS,
+    CONVENTION_DESCRIPTIONS,
     ROTATIONS,
     UNITS,
-    PoseReading,
-    meaning,
-    mended,
+    PoseConventions,
+    describe_conventions,
+    undo_pose_conventions,
 )
 from topoloc.geometry.rigid import Rigid3, exp_so3
 
@@ -29,9 +29,15 @@ def with_axes(pose: Rigid3, right: list[float], down: list[float], forward: list
 
 
 def test_camera_axes_are_turned():
-    assert_same(mended(with_axes(POSE, [1, 0, 0], [0, -1, 0], [0, 0, -1]), ["opengl"]), POSE)
-    assert_same(mended(with_axes(POSE, [0, -1, 0], [0, 0, -1], [1, 0, 0]), ["flu"]), POSE)
-    assert_same(mended(with_axes(POSE, [0, 1, 0], [0, 0, 1], [1, 0, 0]), ["frd"]), POSE)
+    assert_same(
+        undo_pose_conventions(with_axes(POSE, [1, 0, 0], [0, -1, 0], [0, 0, -1]), ["opengl"]), POSE
+    )
+    assert_same(
+        undo_pose_conventions(with_axes(POSE, [0, -1, 0], [0, 0, -1], [1, 0, 0]), ["flu"]), POSE
+    )
+    assert_same(
+        undo_pose_conventions(with_axes(POSE, [0, 1, 0], [0, 0, 1], [1, 0, 0]), ["frd"]), POSE
+    )
 
 
 def test_left_handed_worlds_are_mirrored():
@@ -40,9 +46,12 @@ def test_left_handed_worlds_are_mirrored():
     def mirrored(pose: Rigid3) -> Rigid3:
         return Rigid3(mirror @ pose.rotation @ mirror, mirror @ pose.translation)
 
-    assert_same(mended(mirrored(POSE), ["unity"]), POSE)
+    assert_same(undo_pose_conventions(mirrored(POSE), ["unity"]), POSE)
     body = mirrored(with_axes(POSE, [0, -1, 0], [0, 0, -1], [1, 0, 0]))
-    assert_same(mended(Rigid3(body.rotation, 100.0 * body.translation), ["unreal", "cm"]), POSE)
+    assert_same(
+        undo_pose_conventions(Rigid3(body.rotation, 100.0 * body.translation), ["unreal", "cm"]),
+        POSE,
+    )
 
 
 def test_a_quaternion_read_in_the_wrong_order():
@@ -50,24 +59,32 @@ def test_a_quaternion_read_in_the_wrong_order():
     as_read = Rigid3.from_quat_wxyz(
         np.array([z, w, x, y]), POSE.translation
     )  # "w x y z" taken for x, y, z, w
-    assert_same(mended(as_read, ["wxyz"]), POSE)
+    assert_same(undo_pose_conventions(as_read, ["wxyz"]), POSE)
 
 
 def test_units_bodies_and_combinations():
-    assert_same(mended(Rigid3(POSE.rotation, 1000.0 * POSE.translation), ["mm"]), POSE)
-    assert_same(mended(Rigid3(POSE.rotation, POSE.translation / 0.42), ["scale=0.42"]), POSE)
+    assert_same(
+        undo_pose_conventions(Rigid3(POSE.rotation, 1000.0 * POSE.translation), ["mm"]), POSE
+    )
+    assert_same(
+        undo_pose_conventions(Rigid3(POSE.rotation, POSE.translation / 0.42), ["scale=0.42"]), POSE
+    )
     w, x, y, z = BODY_FROM_CAM.quat_wxyz()
     text = "inverse,body=" + ",".join(
         str(number) for number in (*BODY_FROM_CAM.translation, x, y, z, w)
     )
-    assert_same(PoseReading.of(text).mend((POSE @ BODY_FROM_CAM.inverse()).inverse()), POSE)
+    assert_same(
+        PoseConventions.of(text).undo_conventions((POSE @ BODY_FROM_CAM.inverse()).inverse()), POSE
+    )
 
 
 def test_what_the_option_says():
-    assert PoseReading.of("wxyz, shift=-0.25,clock=1e6") == PoseReading(("wxyz",), 1e6, -0.25)
-    assert PoseReading.of(None) == PoseReading.of("") == PoseReading()
-    assert set(ROTATIONS) | set(UNITS) | set(AXES) <= set(MEANINGS)
-    assert "millimetres" in meaning(["opengl", "mm"])
+    assert PoseConventions.of("wxyz, shift=-0.25,clock=1e6") == PoseConventions(
+        ("wxyz",), 1e6, -0.25
+    )
+    assert PoseConventions.of(None) == PoseConventions.of("") == PoseConventions()
+    assert set(ROTATIONS) | set(UNITS) | set(AXES) <= set(CONVENTION_DESCRIPTIONS)
+    assert "millimetres" in describe_conventions(["opengl", "mm"])
 
 
 @pytest.mark.parametrize(
@@ -86,4 +103,4 @@ def test_what_the_option_says():
 )
 def test_what_makes_no_sense_is_an_error(text: str):
     with pytest.raises(TrajectoryError):
-        PoseReading.of(text)
+        PoseConventions.of(text)

@@ -58,8 +58,10 @@ def test_the_truth_is_found_among_twice_as_many_outliers(seed, num_right, num_wr
     order = rng.permutation(len(estimates))
     found = find_consensus([estimates[k] for k in order], covariances[order], CONFIG)
     assert found is not None
-    assert not found.agrees[order >= num_right].any()
-    assert np.count_nonzero(found.agrees) >= num_right - 1  # one may be beyond its own covariance
+    assert not found.is_inlier[order >= num_right].any()
+    assert (
+        np.count_nonzero(found.is_inlier) >= num_right - 1
+    )  # one may be beyond its own covariance
     assert in_sigma(found.a_from_b, a_from_b, found.covariance) < 6.0
 
 
@@ -131,7 +133,7 @@ def test_the_order_of_the_estimates_does_not_matter(seed):
     )
     assert first is not None
     assert second is not None
-    np.testing.assert_array_equal(first.agrees[order], second.agrees)
+    np.testing.assert_array_equal(first.is_inlier[order], second.is_inlier)
     np.testing.assert_allclose(first.a_from_b.matrix(), second.a_from_b.matrix(), atol=1e-9)
 
 
@@ -143,7 +145,7 @@ def test_of_very_many_a_sample_of_hypotheses_is_enough():
     ]
     found = find_consensus(estimates, covariances, ConsensusConfig(max_hypotheses=100))
     assert found is not None
-    assert np.count_nonzero(found.agrees) == 100
+    assert np.count_nonzero(found.is_inlier) == 100
 
 
 def test_fewer_than_asked_for_say_nothing():

@@ -17,11 +17,11 @@ from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.apps.cli import main
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.map_facts.building import build_map
-from topoloc.localization.query import Picture
+from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
-from topoloc.mapping.checking import damages
+from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.recordings.recording import SequenceView
 
 OTHER_WORLD = Rigid3(exp_so3(np.array([0.1, 0.4, -0.8])), np.array([-4.0, 7.0, 1.0]))
@@ -60,7 +60,7 @@ def test_two_maps_become_one_in_the_world_of_the_first(maps: tuple[Path, Path], 
     facts = json.loads(said.read_text())
     assert facts["agreeing"] >= 5
     assert facts["nodes_added"] > 0
-    assert damages(out) == []
+    assert find_map_damage(out) == []
     with TopoMetricMap.load(out) as topomap:
         assert [session.name for session in topomap.sessions] == ["left", "right"]
         added = [summary for summary in topomap.summaries if summary.session_id == 1]
@@ -111,8 +111,8 @@ def test_what_cannot_be_merged_is_named(
 def test_a_nodes_features_are_localized_as_its_picture_is(maps: tuple[Path, Path]):
     with TopoMetricMap.load(maps[0]) as first, TopoMetricMap.load(maps[1]) as second:
         node = second.nodes[0]
-        result = Localizer(first).ask(
-            Picture.of_features({second.kind: node.features}, node.camera)
+        result = Localizer(first).localize_query(
+            QueryImage.of_features({second.kind: node.features}, node.camera)
         )[0]
         assert isinstance(result, Localization)
         assert (

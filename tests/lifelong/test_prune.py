@@ -17,16 +17,16 @@ from tiny_world import CAMERA
 from topoloc import Localizer, TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
-from topoloc.lifelong.prune import with_points
+from topoloc.lifelong.prune import select_landmarks
 from topoloc.localization.result import Localization
-from topoloc.mapping.checking import damages
-from topoloc.mapping.edit import editing
-from topoloc.mapping.sums import LandmarkSums
+from topoloc.mapping.edit import edit_map
+from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.landmark_statistics import LandmarkStatistics
 
 
-def _counts(num_points: int, expected: int, seen: np.ndarray) -> LandmarkSums:
+def _counts(num_points: int, expected: int, seen: np.ndarray) -> LandmarkStatistics:
     rows = np.arange(num_points)
-    return LandmarkSums.of(
+    return LandmarkStatistics.of(
         1,
         rows,
         np.zeros((num_points, 3, 3)),
@@ -40,12 +40,20 @@ def _with_later_session(
     path: Path, seen_of: Callable[[int], np.ndarray], expected: int = 6
 ) -> None:
     """As if a second session had looked at every node."""
-    with editing(path) as edit:
+    with edit_map(path) as edit:
         topomap = edit.topomap
         nodes = []
         for node in topomap.nodes:
             num = len(node.features)
-            nodes.append(replace(node, sums=[*node.sums, _counts(num, expected, seen_of(num))]))
+            nodes.append(
+                replace(
+                    node,
+                    session_statistics=[
+                        *node.session_statistics,
+                        _counts(num, expected, seen_of(num)),
+                    ],
+                )
+            )
         sessions = [*topomap.sessions, replace(topomap.sessions[0], session_id=1, name="later")]
         edit.commit(replace(topomap, nodes=nodes, sessions=sessions), "later")
 
@@ -75,8 +83,11 @@ def test_landmarks_that_are_gone_go_and_no_others(room_map: Path, tmp_path: Path
     assert _num_points(path) == [num - -(-num // 4) for num in before]
     with TopoMetricMap.load(path) as topomap:
         np.testing.assert_array_equal(topomap.nodes[2].features.points_img, kept)
-        assert [sums.session_id for sums in topomap.nodes[2].sums] == [0, 1]
-    assert damages(path) == []
+        assert [
+            session_statistics.session_id
+            for session_statistics in topomap.nodes[2].session_statistics
+        ] == [0, 1]
+    assert find_map_damage(path) == []
     assert max(_errors_m(path)) < 0.02
     assert main(["prune", str(path)]) == 0
     assert main(["undo", str(path)]) == 0
@@ -120,7 +131,7 @@ def test_a_size_is_kept_and_the_map_still_localizes(room_map: Path, tmp_path: Pa
     facts = json.loads(said.read_text())
     assert facts["bytes"] == path.stat().st_size
     assert facts["landmarks_dropped"] > 0
-    assert damages(path) == []
+    assert find_map_damage(path) == []
     assert max(_errors_m(path)) < 0.02
 
 
@@ -151,9 +162,9 @@ def test_points_of_a_node_go_with_what_sessions_know_of_them(room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
         node = topomap.nodes[0]
         kept = np.arange(1, len(node.features), 3)
-        fewer = with_points(node, kept)
+        fewer = select_landmarks(node, kept)
         assert fewer.summary.num_points == len(fewer.features) == len(fewer.points_cam) == len(kept)
-        for before, after in zip(node.sums, fewer.sums, strict=True):
+        for before, after in zip(node.session_statistics, fewer.session_statistics, strict=True):
             of = {
                 int(row): int(count)
                 for row, count in zip(before.rows, before.expected, strict=True)

@@ -30,11 +30,11 @@ from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.lifelong.update import UpdateConfig, update_map
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
-from topoloc.mapping.checking import damages
-from topoloc.mapping.edit import editing
+from topoloc.mapping.edit import edit_map
+from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.recordings.recording import SequenceView
 
 ON = np.arange(3.0, 24.0, 0.75)
@@ -112,7 +112,7 @@ def test_a_session_goes_on_from_what_is_mapped(map_file: Path, second_half: Path
     changes = json.loads(said.read_text())["updates"][0]
     assert changes["nodes_added"] > 0
     assert changes["agreeing"] >= 5
-    assert damages(map_file) == []
+    assert find_map_damage(map_file) == []
     with TopoMetricMap.load(map_file) as topomap:
         assert [session.name for session in topomap.sessions] == ["room", "on"]
         assert topomap.edits[-1].changes is not None
@@ -167,18 +167,26 @@ def test_stretches_that_nothing_joins_are_each_held_by_the_map(map_file: Path, s
 def test_a_session_that_shows_nothing_new_adds_counts_alone(map_file: Path, tmp_path: Path):
     again = write_stereo_recording(tmp_path / "again", indices=np.arange(0.25, 5.5, 0.25).tolist())
     with TopoMetricMap.load(map_file) as topomap:
-        before = [(node.points_cam.copy(), len(list(node.sums))) for node in topomap.nodes]
+        before = [
+            (node.points_cam.copy(), len(list(node.session_statistics))) for node in topomap.nodes
+        ]
     assert main(["update", str(map_file), str(again)]) == 0
     with TopoMetricMap.load(map_file) as topomap:
         assert len(topomap.summaries) == len(before)
         num_sums = 0
         for node, (points_cam, num) in zip(topomap.nodes, before, strict=True):
             np.testing.assert_array_equal(node.points_cam, points_cam)
-            of_session = [sums for sums in node.sums if sums.session_id == 1]
-            num_sums += len(list(node.sums)) - num
-            for sums in of_session:
-                assert (sums.seen <= sums.expected).all()
-                assert sums.seen.sum() > 0.3 * sums.expected.sum(), "what is there is seen again"
+            of_session = [
+                session_statistics
+                for session_statistics in node.session_statistics
+                if session_statistics.session_id == 1
+            ]
+            num_sums += len(list(node.session_statistics)) - num
+            for session_statistics in of_session:
+                assert (session_statistics.seen <= session_statistics.expected).all()
+                assert session_statistics.seen.sum() > 0.3 * session_statistics.expected.sum(), (
+                    "what is there is seen again"
+                )
         assert num_sums > 0
 
 
@@ -217,7 +225,7 @@ def test_a_changed_room_is_learnt_from_a_single_camera(map_file: Path, tmp_path:
     ]
     assert np.median(inliers[1]) > 1.3 * np.median(inliers[0]) + 20
     assert max(_off(after, asked)) < 0.02
-    assert damages(map_file) == []
+    assert find_map_damage(map_file) == []
 
 
 def test_a_session_that_does_not_fit_changes_nothing(
@@ -265,7 +273,7 @@ def test_a_map_that_is_read_only_stays_as_it_is(
 @pytest.mark.skipif(os.name == "nt", reason="no locks")
 def test_the_second_of_two_updates_at_once_waits_and_says_so(map_file: Path, second_half: Path):
     words = [sys.executable, "-m", "topoloc", "update", str(map_file), str(second_half)]
-    with editing(map_file) as edit:
+    with edit_map(map_file) as edit:
         second = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert second.stderr is not None
         assert second.stderr.readline() == "another process edits this map; waiting for it ...\n"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from tiny_world import CAMERA
+from topoloc.features.feature_types import SURF, FeatureConfig
 from topoloc.features.features import Features, Matches
-from topoloc.features.kinds import SURF, FeatureConfig
 from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.evidence import Evidence
-from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PoseFit
@@ -20,7 +20,7 @@ from topoloc.localization.query import Query
 from topoloc.localization.search import Search
 from topoloc.retrieval.coarse import NodeScore
 
-WEIGHTS = weights_of("surf")
+WEIGHTS = load_fitted_weights("surf")
 CANDIDATES = [NodeScore(3, 0.5)]
 EXACT = 1e-8 * np.eye(6)
 
@@ -91,10 +91,12 @@ def believed(hypotheses: list[Hypothesis], config: LocalizerConfig | None = None
     """A search that came upon these hypotheses, in this order. Its map is not open: what is
     believed asks it nothing."""
     query = Query(np.zeros((CAMERA.height, CAMERA.width), np.uint8), CAMERA, 1.0, FeatureConfig())
-    resolved = (config or LocalizerConfig()).for_kind(SURF)
+    resolved = (config or LocalizerConfig()).for_feature_type(SURF)
     not_open = object.__new__(OpenMap)
     not_open.node_ids, not_open.kind = list(range(10)), SURF
-    search = Search(query, not_open, resolved, WEIGHTS, rho=0.0, ranked=CANDIDATES)
+    search = Search(
+        query, not_open, resolved, WEIGHTS, correlated_error_share=0.0, ranked=CANDIDATES
+    )
     for hypothesis in hypotheses:
-        search.belief = search.belief.given(hypothesis, resolved.evidence, WEIGHTS.rivals)
+        search.belief = search.belief.with_hypothesis(hypothesis, resolved.evidence, WEIGHTS.rivals)
     return search

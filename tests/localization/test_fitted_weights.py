@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 
-from topoloc.errors import FeatureKindError
-from topoloc.features.kinds import find_kind
-from topoloc.localization.fitted_weights import WEIGHTS_FOLDER, read_weights, weights_of
+from topoloc.errors import FeatureTypeError
+from topoloc.features.feature_types import find_feature_type
+from topoloc.localization.fitted_weights import WEIGHTS_FOLDER, load_fitted_weights, read_weights
 
 
 @pytest.mark.parametrize("path", sorted(WEIGHTS_FOLDER.iterdir()), ids=lambda path: path.name)
 def test_every_file_that_ships_is_of_a_kind_and_says_where_it_comes_from(path: Path):
-    weights = weights_of(path.stem)
+    weights = load_fitted_weights(path.stem)
     assert weights.kind == path.stem
-    assert find_kind(weights.kind).name == weights.kind
+    assert find_feature_type(weights.kind).name == weights.kind
     assert weights.calibration_error is not None
     assert 0.0 < weights.calibration_error < 0.1
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", weights.date)
@@ -29,18 +29,18 @@ def test_every_file_that_ships_is_of_a_kind_and_says_where_it_comes_from(path: P
 
 def test_what_is_written_is_read_again(tmp_path: Path):
     path = tmp_path / "surf.json"
-    path.write_text(json.dumps(weights_of("surf").to_json()))
-    assert read_weights(path) == weights_of("surf")
+    path.write_text(json.dumps(load_fitted_weights("surf").to_json()))
+    assert read_weights(path) == load_fitted_weights("surf")
 
 
 def test_a_kind_without_a_file_takes_those_of_surf_and_is_not_calibrated():
-    stand_in = weights_of("no such kind")
+    stand_in = load_fitted_weights("no such kind")
     assert not stand_in.is_calibrated
-    assert stand_in.evidence == weights_of("surf").evidence
+    assert stand_in.evidence == load_fitted_weights("surf").evidence
 
 
 def _changed(change: Callable[[dict[str, Any]], Any]) -> str:
-    read = weights_of("surf").to_json()
+    read = load_fitted_weights("surf").to_json()
     change(read)
     return json.dumps(read)
 
@@ -78,7 +78,7 @@ def _changed(change: Callable[[dict[str, Any]], Any]) -> str:
 def test_a_damaged_file_is_told_in_one_line(text: str, said: str, tmp_path: Path):
     path = tmp_path / "surf.json"
     path.write_text(text)
-    with pytest.raises(FeatureKindError, match=re.escape(said)) as raised:
+    with pytest.raises(FeatureTypeError, match=re.escape(said)) as raised:
         read_weights(path)
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from topoloc.features.feature_types import SURF
 from topoloc.features.features import Features
-from topoloc.features.kinds import SURF
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.guided import (
     GuidedConfig,
-    count_by_chance,
-    expected_key_points,
+    count_chance_matches,
     match_guided,
-    visible_points,
+    predict_key_points,
+    select_visible_points,
 )
 from topoloc.localization.local_map import LocalMap
 from topoloc.mapping.topomap import NodeSummary, TopoNode
@@ -89,7 +89,7 @@ def test_every_point_in_view_is_matched_with_itself(cam_from_world: Rigid3):
     node = _node(np.random.default_rng(0))
     local_map = LocalMap.of_node(node)
     matches = match_guided(_seen(node, cam_from_world), local_map, cam_from_world, CAMERA, GUIDED)
-    num_visible = len(visible_points(local_map, cam_from_world, CAMERA)[0])
+    num_visible = len(select_visible_points(local_map, cam_from_world, CAMERA)[0])
     assert num_visible > 100
     assert len(matches) > 0.95 * num_visible
     assert np.array_equal(matches.query_idx, matches.train_idx)
@@ -106,7 +106,7 @@ def test_what_is_elsewhere_or_turned_or_of_another_size_is_no_match(wrong: dict[
 
 def test_a_key_point_is_matched_once_though_two_nodes_hold_it():
     node = _node(np.random.default_rng(2))
-    twice = LocalMap.pooled([LocalMap.of_node(node), LocalMap.of_node(node)])
+    twice = LocalMap.concatenate([LocalMap.of_node(node), LocalMap.of_node(node)])
     matches = match_guided(_seen(node, POSES[0]), twice, POSES[0], CAMERA, GUIDED)
     assert len(set(matches.query_idx.tolist())) == len(matches) > 100
 
@@ -114,14 +114,14 @@ def test_a_key_point_is_matched_once_though_two_nodes_hold_it():
 def test_nothing_is_visible_behind_the_camera():
     local_map = LocalMap.of_node(_node(np.random.default_rng(3)))
     backwards = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
-    assert len(visible_points(local_map, backwards, CAMERA)[0]) == 0
+    assert len(select_visible_points(local_map, backwards, CAMERA)[0]) == 0
 
 
 def test_chance_finds_next_to_nothing_among_descriptors_that_differ():
     node = _node(np.random.default_rng(4))
     features = _seen(node, POSES[0])
     assert len(match_guided(features, LocalMap.of_node(node), POSES[0], CAMERA, GUIDED)) > 100
-    assert count_by_chance(features, LocalMap.of_node(node), POSES[0], CAMERA, GUIDED) < 5
+    assert count_chance_matches(features, LocalMap.of_node(node), POSES[0], CAMERA, GUIDED) < 5
 
 
 def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
@@ -137,7 +137,7 @@ def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
     found = len(
         match_guided(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config)
     )
-    by_chance = count_by_chance(
+    by_chance = count_chance_matches(
         _seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config
     )
     assert by_chance > 0.5 * found > 10
@@ -170,12 +170,12 @@ def test_a_lens_without_distortion_expects_points_where_one_with_next_to_none_do
         Rigid3(np.eye(3), np.array([0, 0, -3.0])),
     ):
         plain, by_camera = (
-            expected_key_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens)
+            predict_key_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens)
         )
         np.testing.assert_allclose(plain, by_camera, rtol=1e-6)
         assert 0 < np.isnan(plain[:, 0]).sum() < len(plain)
         (rows, pixels), (lens_rows, lens_pixels) = (
-            visible_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens)
+            select_visible_points(local_map, cam_from_world, camera) for camera in (CAMERA, lens)
         )
         np.testing.assert_array_equal(rows, lens_rows)
         np.testing.assert_allclose(pixels, lens_pixels, rtol=1e-9)

@@ -238,7 +238,7 @@ def test_the_trace_holds_all_that_was_tried_and_the_answer_follows_from_it(
         if tried.hypothesis is not None:
             assert tried.hypothesis.source == tried.source
             assert tried.hypothesis.fit is tried.refined
-            belief = belief.given(tried.hypothesis, evidence, weights)
+            belief = belief.with_hypothesis(tried.hypothesis, evidence, weights)
     best = belief.best(weights)
     if isinstance(result, Localization):
         assert best is not None

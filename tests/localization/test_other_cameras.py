@@ -14,7 +14,7 @@ from tiny_world import CAMERA, path_pose, render, room
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
 
@@ -59,7 +59,9 @@ def test_a_camera_of_many_more_pixels_is_as_good_as_the_map_s_own(lens: str, loc
     camera = CAMERA.rescaled(factor * CAMERA.width, factor * CAMERA.height)
     known = {
         "calibrated": camera,
-        "focal length noted": RoughCamera.noted(camera.width, camera.height, 1.05 * camera.fx),
+        "focal length noted": UncalibratedCamera.from_focal_guess(
+            camera.width, camera.height, 1.05 * camera.fx
+        ),
         "unknown": None,
     }
     panels = room()
@@ -87,7 +89,7 @@ def test_a_camera_of_many_more_pixels_is_as_good_as_the_map_s_own(lens: str, loc
 def test_the_points_seen_by_a_finer_camera_are_in_its_own_pixels(localizer: Localizer):
     camera = CAMERA.rescaled(3 * CAMERA.width, 3 * CAMERA.height)
     truth = path_pose(5.5)
-    result, named = localizer.localize_near(render(room(), truth, camera)[0], camera, None)
+    result, named = localizer.localize_with_inliers(render(room(), truth, camera)[0], camera, None)
     assert isinstance(result, Localization)
     ((_, seen),) = named
     expected = camera.img_from_cam(truth.inverse().apply(seen.points_world))
@@ -115,10 +117,12 @@ def test_a_camera_that_nobody_has_calibrated(localizer: Localizer):
 
 
 def test_a_focal_length_that_is_about_right_is_corrected(localizer: Localizer):
-    rough = RoughCamera.noted(CAMERA.width, CAMERA.height, 1.08 * CAMERA.fx)
+    uncalibrated = UncalibratedCamera.from_focal_guess(
+        CAMERA.width, CAMERA.height, 1.08 * CAMERA.fx
+    )
     focals = []
     for picture, _ in unseen_views():
-        result = localizer.localize(picture, rough)
+        result = localizer.localize(picture, uncalibrated)
         assert isinstance(result, Localization)
         focals.append(result.focal_length_px)
     assert np.median(focals) == pytest.approx(CAMERA.fx, rel=0.02)

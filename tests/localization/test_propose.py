@@ -14,10 +14,10 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import asking, propose, refine
+from topoloc.localization import propose, query_session, refine
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.config import LocalizerConfig, LookAlikesConfig, ViewpointsConfig
-from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, SimilarPlacesConfig
+from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
@@ -26,8 +26,8 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 LIGHTS = (0.055, 0.05, 0.045)
 ONLY_RETRIEVAL = LocalizerConfig(
-    look_alikes=LookAlikesConfig(max_groups=0),
-    viewpoints=ViewpointsConfig(num_nodes=0),
+    look_alikes=SimilarPlacesConfig(max_groups=0),
+    viewpoints=NodeViewpointsConfig(num_nodes=0),
     max_repetitions=0,
 )
 
@@ -116,9 +116,9 @@ def test_dark_images_are_localized_that_are_not_without_viewpoints(room: TopoMet
         for k, (picture, truth) in enumerate(unseen_views())
     ]
     num_right, sources = {}, []
-    for num_nodes in (0, ViewpointsConfig().num_nodes):
+    for num_nodes in (0, NodeViewpointsConfig().num_nodes):
         localizer = Localizer(
-            room, LocalizerConfig(viewpoints=ViewpointsConfig(num_nodes=num_nodes))
+            room, LocalizerConfig(viewpoints=NodeViewpointsConfig(num_nodes=num_nodes))
         )
         errors = []
         for picture, truth in views:
@@ -132,13 +132,13 @@ def test_dark_images_are_localized_that_are_not_without_viewpoints(room: TopoMet
             sources += _sources(trace) if num_nodes == 0 else []
         assert max(errors, default=0.0) < 0.25
         num_right[num_nodes] = len(errors)
-    assert num_right[ViewpointsConfig().num_nodes] > num_right[0]
+    assert num_right[NodeViewpointsConfig().num_nodes] > num_right[0]
     assert "viewpoints" not in sources
 
 
 def _never_clear(room: TopoMetricMap, config: LocalizerConfig | None = None) -> Localizer:
     """Every image is treated as one that is not clear."""
-    weights = weights_of("surf")
+    weights = load_fitted_weights("surf")
     return Localizer(
         room,
         config,
@@ -168,7 +168,7 @@ def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_i
     trace = Trace()
     _never_clear(room).localize(unseen_views()[2][0], CAMERA, trace=trace)
     fits = [tried.first for tried in trace.tried if tried.source == "viewpoints"]
-    assert 1 <= len(fits) <= ViewpointsConfig().max_poses
+    assert 1 <= len(fits) <= NodeViewpointsConfig().max_poses
     assert [fit.num_inliers for fit in fits] == sorted(
         (fit.num_inliers for fit in fits), reverse=True
     )
@@ -180,7 +180,7 @@ def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_i
 
 
 def test_only_so_many_viewpoints_are_followed_up_as_are_asked_for(room: TopoMetricMap):
-    config = LocalizerConfig(viewpoints=ViewpointsConfig(max_poses=1))
+    config = LocalizerConfig(viewpoints=NodeViewpointsConfig(max_poses=1))
     trace = Trace()
     _never_clear(room, config).localize(unseen_views()[2][0], CAMERA, trace=trace)
     assert _sources(trace).count("viewpoints") == 1
@@ -265,22 +265,22 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(
 ):
     followed = list[tuple[Search, Proposal]]()
 
-    def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
+    def evaluate_proposal(search: Search, proposal: Proposal) -> Hypothesis | None:
         followed.append((search, proposal))
-        return refine.hypothesis_of(search, proposal)
+        return refine.evaluate_proposal(search, proposal)
 
-    monkeypatch.setattr(asking, "hypothesis_of", hypothesis_of)
+    monkeypatch.setattr(query_session, "evaluate_proposal", evaluate_proposal)
     for picture, _ in unseen_views():
         followed.clear()
         assert isinstance(Localizer(room).localize(picture, CAMERA), Localization)
         search, proposal = followed[0]
-        assert refine.is_found_already(search, proposal)
+        assert refine.is_already_found(search, proposal)
         pose = proposal.fit.pose
         assert pose is not None
         beside = replace(
             pose, cam_from_world=Rigid3(np.eye(3), np.array([0.3, 0.0, 0.0])) @ pose.cam_from_world
         )
-        assert not refine.is_found_already(
+        assert not refine.is_already_found(
             search, replace(proposal, fit=replace(proposal.fit, pose=beside))
         )
-        assert not refine.is_found_already(replace(search, belief=Belief()), proposal)
+        assert not refine.is_already_found(replace(search, belief=Belief()), proposal)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from topoloc.errors import QueryError
-from topoloc.features.kinds import FeatureConfig
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.query import Query, check_size, reduced_image
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.query import Query, check_image_size, reduce_image
 
 MAP_FOCAL = 300.0
 IMAGE = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)
@@ -25,7 +25,7 @@ def _camera(focal: float) -> Camera:
 
 @pytest.mark.parametrize("image", [IMAGE, RGB], ids=["grey", "RGB"])
 def test_a_finer_picture_is_reduced_to_the_map_s_pixels_a_radian(image: np.ndarray):
-    reduced, camera = reduced_image(image, _camera(600.0), MAP_FOCAL, 1.15, 1600)
+    reduced, camera = reduce_image(image, _camera(600.0), MAP_FOCAL, 1.15, 1600)
     assert reduced.shape == (240, 320, *image.shape[2:])
     assert camera == _camera(600.0).rescaled(320, 240)
     np.testing.assert_allclose(
@@ -37,36 +37,39 @@ def test_a_finer_picture_is_reduced_to_the_map_s_pixels_a_radian(image: np.ndarr
 
 @pytest.mark.parametrize("focal", [100.0, 300.0, 340.0])
 def test_a_picture_that_is_coarser_or_about_as_fine_stays_as_it_is(focal: float):
-    reduced, camera = reduced_image(IMAGE, _camera(focal), MAP_FOCAL, 1.15, 1600)
+    reduced, camera = reduce_image(IMAGE, _camera(focal), MAP_FOCAL, 1.15, 1600)
     assert reduced is IMAGE
     assert camera == _camera(focal)
 
 
 def test_the_longest_side_holds_for_coarse_pictures_too():
-    reduced, camera = reduced_image(IMAGE, _camera(100.0), MAP_FOCAL, 1.15, 320)
+    reduced, camera = reduce_image(IMAGE, _camera(100.0), MAP_FOCAL, 1.15, 320)
     assert reduced.shape == (240, 320)
     assert camera == _camera(100.0).rescaled(320, 240)
 
 
 def test_a_rough_camera_is_finer_as_far_as_its_whole_range_is():
-    maybe, surely = RoughCamera(640, 480, 200.0, 1500.0), RoughCamera(640, 480, 600.0, 1500.0)
-    assert reduced_image(IMAGE, maybe, MAP_FOCAL, 1.15, 1600) == (IMAGE, maybe)
-    reduced, lens = reduced_image(IMAGE, surely, MAP_FOCAL, 1.15, 1600)
+    maybe, surely = (
+        UncalibratedCamera(640, 480, 200.0, 1500.0),
+        UncalibratedCamera(640, 480, 600.0, 1500.0),
+    )
+    assert reduce_image(IMAGE, maybe, MAP_FOCAL, 1.15, 1600) == (IMAGE, maybe)
+    reduced, lens = reduce_image(IMAGE, surely, MAP_FOCAL, 1.15, 1600)
     assert reduced.shape == (240, 320)
-    assert lens == RoughCamera(320, 240, 300.0, 750.0)
+    assert lens == UncalibratedCamera(320, 240, 300.0, 750.0)
 
 
 def test_a_picture_of_hardly_a_pixel_keeps_one():
-    reduced, _ = reduced_image(
+    reduced, _ = reduce_image(
         IMAGE[:2, :40], Camera.pinhole(40, 2, 9000.0, 9000.0, 19.5, 0.5), MAP_FOCAL, 1.15, 1600
     )
     assert reduced.shape == (1, 1)
 
 
 def test_a_camera_of_another_size_is_an_error():
-    check_size(RGB, _camera(300.0))
+    check_image_size(RGB, _camera(300.0))
     with pytest.raises(QueryError, match="the image is 640x480, its camera 480x640"):
-        check_size(RGB, RoughCamera.unknown(480, 640))
+        check_image_size(RGB, UncalibratedCamera.unknown(480, 640))
 
 
 def test_features_are_extracted_when_first_wanted_and_once():
@@ -81,13 +84,15 @@ def test_features_are_extracted_when_first_wanted_and_once():
 
 
 def test_a_query_is_late_from_its_deadline_on():
-    assert not Query(IMAGE, _camera(300.0), 1.0, FeatureConfig()).is_late
+    assert not Query(IMAGE, _camera(300.0), 1.0, FeatureConfig()).is_past_deadline
     now = time.perf_counter()
-    assert not Query(IMAGE, _camera(300.0), 1.0, FeatureConfig(), deadline=now + 1e3).is_late
-    assert Query(IMAGE, _camera(300.0), 1.0, FeatureConfig(), deadline=now - 1e-3).is_late
+    assert not Query(
+        IMAGE, _camera(300.0), 1.0, FeatureConfig(), deadline=now + 1e3
+    ).is_past_deadline
+    assert Query(IMAGE, _camera(300.0), 1.0, FeatureConfig(), deadline=now - 1e-3).is_past_deadline
 
 
 def test_of_a_camera_that_is_roughly_known_the_likeliest_stands_in():
     assert Query(IMAGE, _camera(300.0), 1.0, FeatureConfig()).camera == _camera(300.0)
-    rough = RoughCamera(640, 480, 200.0, 1500.0)
-    assert 200.0 < Query(IMAGE, rough, 1.0, FeatureConfig()).camera.fx < 1500.0
+    uncalibrated = UncalibratedCamera(640, 480, 200.0, 1500.0)
+    assert 200.0 < Query(IMAGE, uncalibrated, 1.0, FeatureConfig()).camera.fx < 1500.0

@@ -18,7 +18,7 @@ from built_room import built_room, unseen_views
 from schemas import SCHEMA, check_result
 from tiny_world import CAMERA, render, room
 from topoloc.errors import ResultError
-from topoloc.geometry.calibration_check import CalibrationDoubt
+from topoloc.geometry.calibration_check import CalibrationMismatch
 from topoloc.geometry.geodesy import CAM_FROM_BODY, GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.evidence import Evidence
@@ -68,7 +68,7 @@ SUSPECTED = replace(
     LOCALIZED,
     evidence=Evidence(60, 55, 140, 160, 3, 0.4, 0.3, 0.8, 12),
     noise_share=0.25,
-    calibration_doubt=CalibrationDoubt(
+    calibration_doubt=CalibrationMismatch(
         261.5,
         0.5,
         300.0,
@@ -176,7 +176,7 @@ def test_streams_fit_the_schema_and_say_their_times(tiny_recording: Path):
         assert line["t_ns"] == 100_000_000 * number
         assert line["localized"] == ("geopose" in line)
         assert line["camera"] == CAMERA.to_json()
-    check_result(tracker.miss(10**9, NotLocalized("unreadable")).to_json("none"))
+    check_result(tracker.process_missing(10**9, NotLocalized("unreadable")).to_json("none"))
 
 
 def test_a_geopose_leads_back_to_the_pose():

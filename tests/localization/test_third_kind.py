@@ -13,12 +13,12 @@ import pytest
 from built_room import unseen_views
 from corner_patches import CORNER_PATCHES
 from tiny_world import CAMERA
-from topoloc.errors import FeatureKindError
-from topoloc.features.kinds import KINDS, FeatureConfig
+from topoloc.errors import FeatureTypeError
+from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
@@ -27,9 +27,9 @@ from topoloc.recordings.open import open_sequence
 
 @pytest.fixture(scope="module")
 def registered() -> Iterator[None]:
-    KINDS[CORNER_PATCHES.name] = CORNER_PATCHES
+    FEATURE_TYPES[CORNER_PATCHES.name] = CORNER_PATCHES
     yield
-    del KINDS[CORNER_PATCHES.name]
+    del FEATURE_TYPES[CORNER_PATCHES.name]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_until_weights_are_fitted_its_answers_say_so(path: Path):
     line = Localizer(topomap).localize(picture, CAMERA).to_json("")
     assert line["localized"] is True
     assert line["calibrated"] is False
-    fitted = replace(weights_of(CORNER_PATCHES.name), calibration_error=0.02)
+    fitted = replace(load_fitted_weights(CORNER_PATCHES.name), calibration_error=0.02)
     assert "calibrated" not in Localizer(topomap, weights=fitted).localize(picture, CAMERA).to_json(
         ""
     )
@@ -89,8 +89,8 @@ def test_a_map_of_a_kind_that_is_not_there_is_refused_in_one_line(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     topomap = TopoMetricMap.load(path)
-    monkeypatch.delitem(KINDS, CORNER_PATCHES.name)
+    monkeypatch.delitem(FEATURE_TYPES, CORNER_PATCHES.name)
     with pytest.raises(
-        FeatureKindError, match="no features of kind 'corner-patches'; there are surf, sift"
+        FeatureTypeError, match="no features of kind 'corner-patches'; there are surf, sift"
     ):
         Localizer(topomap)

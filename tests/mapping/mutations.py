@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.mapping.points import array_packed
-from topoloc.mapping.schema import ORDER, TABLES, checksum_of
-from topoloc.mapping.writing import digest_of
+from topoloc.mapping.map_writing import compute_map_digest
+from topoloc.mapping.point_encoding import compress_array
+from topoloc.mapping.schema import SORT_COLUMNS, TABLES, compute_checksum
 
 Rng = np.random.Generator
 POINTS = {
@@ -109,20 +109,20 @@ def forge(database: sqlite3.Connection) -> None:
     found: dict[str, list[bytes]] = {}
     for table, columns in TABLES.items():
         rows = database.execute(
-            f"SELECT rowid, {', '.join(columns)} FROM {table} ORDER BY {ORDER[table]}"
+            f"SELECT rowid, {', '.join(columns)} FROM {table} ORDER BY {SORT_COLUMNS[table]}"
         ).fetchall()
         found[table] = [
-            checksum_of(table, row[1:]) for row in rows if table != "map" or row[1] != "digest"
+            compute_checksum(table, row[1:]) for row in rows if table != "map" or row[1] != "digest"
         ]
         for row in rows:
             database.execute(
                 f"UPDATE {table} SET checksum = ? WHERE rowid = ?",
-                (checksum_of(table, row[1:]), row[0]),
+                (compute_checksum(table, row[1:]), row[0]),
             )
-    digest = digest_of(found)
+    digest = compute_map_digest(found)
     database.execute(
         "UPDATE map SET value = ?, checksum = ? WHERE key = 'digest'",
-        (digest, checksum_of("map", ("digest", digest))),
+        (digest, compute_checksum("map", ("digest", digest))),
     )
 
 
@@ -189,7 +189,7 @@ def _floats(database: sqlite3.Connection, rng: Rng) -> str:
             _try(
                 database,
                 f"UPDATE {table} SET {column} = ? WHERE rowid = ?",
-                array_packed(array),
+                compress_array(array),
                 row[0],
             )
             return f"a number {value} packed in {table}.{column}"
@@ -235,7 +235,7 @@ def _agreed(database: sqlite3.Connection, rng: Rng) -> str:
             name: (dtype, size if name == "descriptors" else width)
             for name, (dtype, width) in POINTS.items()
         }
-        blobs = [array_packed(np.ones((n, width), dtype)) for dtype, width in shapes.values()]
+        blobs = [compress_array(np.ones((n, width), dtype)) for dtype, width in shapes.values()]
         changes = ", ".join(f"{name} = ?" for name in shapes)
         statement = (
             f"UPDATE {prefix}node_points SET descriptor_size = ?, num_points = ?, {changes} WHERE"

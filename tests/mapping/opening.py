@@ -16,8 +16,8 @@ import numpy as np
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.contradictions import contradictions
-from topoloc.mapping.checking import damages
+from topoloc.localization.map_facts.contradictions import find_contradictions
+from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -59,10 +59,10 @@ def _asked(path: Path, picture: np.ndarray, camera: Camera) -> str:
 
 
 def _checked(path: Path) -> str:
-    found = damages(path)
+    found = find_map_damage(path)
     if not found:
         with TopoMetricMap.load(path) as topomap:
-            found = [str(contradiction) for contradiction in contradictions(topomap)]
+            found = [str(contradiction) for contradiction in find_contradictions(topomap)]
     return found[0] if found else "ok"
 
 

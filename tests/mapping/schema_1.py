@@ -10,10 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from topoloc.mapping.entries import TopoNode
-from topoloc.mapping.points import arrays_of
-from topoloc.mapping.schema import APPLICATION_ID, SCHEMA_1, SIDE
+from topoloc.mapping.map_writing import _arrays_bytes, _pose_to_bytes
+from topoloc.mapping.point_encoding import node_to_arrays
+from topoloc.mapping.schema import APPLICATION_ID, SCHEMA_1, VIRTUAL_PREFIX
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.writing import _arrays_bytes, _pose_bytes
 
 
 def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
@@ -21,7 +21,7 @@ def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
         database.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         database.execute("PRAGMA user_version = 1")
         for table, creation in SCHEMA_1.items():
-            if topomap.sides is not None or not table.startswith(SIDE):
+            if topomap.sides is not None or not table.startswith(VIRTUAL_PREFIX):
                 database.execute(creation)
         facts = {
             "config": asdict(topomap.config),
@@ -45,7 +45,7 @@ def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
             [(edge.source_id, edge.target_id) for edge in topomap.edges],
         )
         images = [
-            (i.recording, i.name, i.node_id, _pose_bytes(i.world_from_cam), i.jpeg)
+            (i.recording, i.name, i.node_id, _pose_to_bytes(i.world_from_cam), i.jpeg)
             for i in topomap.place_images
         ]
         database.executemany(
@@ -56,8 +56,8 @@ def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
         models = [("", model) for model in topomap.coarse_models.values()]
         if topomap.sides is not None:
             for node in topomap.sides.nodes:
-                _insert(database, node, SIDE)
-            models += [(SIDE, model) for model in topomap.sides.coarse_models.values()]
+                _insert(database, node, VIRTUAL_PREFIX)
+            models += [(VIRTUAL_PREFIX, model) for model in topomap.sides.coarse_models.values()]
         for prefix, model in models:
             row = (
                 model.name,
@@ -75,11 +75,19 @@ def _insert(database: sqlite3.Connection, node: TopoNode, prefix: str) -> None:
     (camera_id,) = database.execute(
         "SELECT camera_id FROM cameras WHERE json = ?", (camera,)
     ).fetchone()
-    row = (s.node_id, s.recording, s.name, s.t_ns, camera_id, _pose_bytes(s.world_from_cam), len(f))
+    row = (
+        s.node_id,
+        s.recording,
+        s.name,
+        s.t_ns,
+        camera_id,
+        _pose_to_bytes(s.world_from_cam),
+        len(f),
+    )
     database.execute(f"INSERT INTO {prefix}nodes VALUES (?, ?, ?, ?, ?, ?, ?)", row)
     row = (
         s.node_id,
         f.descriptors.shape[1],
-        *(array.tobytes() for array in arrays_of(node, "surf")),
+        *(array.tobytes() for array in node_to_arrays(node, "surf")),
     )
     database.execute(f"INSERT INTO {prefix}node_points VALUES (?, ?, ?, ?, ?, ?, ?)", row)

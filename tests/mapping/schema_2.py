@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mutations import forge
 
-from topoloc.mapping.points import arrays_of
+from topoloc.mapping.point_encoding import node_to_arrays
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -21,7 +21,7 @@ def write_schema_2(topomap: TopoMetricMap, path: Path) -> Path:
             ("side_", topomap.sides.nodes if topomap.sides else []),
         ):
             for node in nodes:
-                blobs = [array.tobytes() for array in arrays_of(node, topomap.kind)]
+                blobs = [array.tobytes() for array in node_to_arrays(node, topomap.kind)]
                 columns = (
                     "points_img = ?, shapes = ?, descriptors = ?, points_cam = ?, sqrt_covs = ?"
                 )

@@ -18,7 +18,7 @@ from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.landmarks import LandmarkConfig
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.mapping.topomap import Edge, TopoMetricMap, TopoNode
-from topoloc.recordings.recording import left_frame
+from topoloc.recordings.recording import read_left_frame
 
 ALONE = BuildConfig(nodes=NodeConfig(d_thresh=0.35, lambda_rot=1.0), other_kinds=())
 
@@ -51,7 +51,7 @@ def test_a_map_whose_parts_lie_on_disk_while_it_is_made_is_the_same(
     tiny_recording: Path, tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     replace(tiny_map, shared_errors=None, repetitions=None).save(tmp_path / "memory.topo")
-    monkeypatch.setattr("topoloc.shelf.DEFAULT_BYTES", 0)
+    monkeypatch.setattr("topoloc.disk_list.DEFAULT_MAX_BYTES", 0)
     build_map(topoloc.open_sequence(f"{tiny_recording}@0::2"), tiny_map.config).save(
         tmp_path / "disk.topo"
     )
@@ -191,9 +191,9 @@ class CountedHalves(CountedReads):
         super().__init__(base)
         self.halves = [0] * len(base)
 
-    def left_frame(self, index: int) -> topoloc.StereoFrame:
+    def read_left_frame(self, index: int) -> topoloc.StereoFrame:
         self.halves[index] += 1
-        return left_frame(self.base, index)
+        return read_left_frame(self.base, index)
 
 
 def test_the_right_picture_of_what_is_no_node_is_not_read(tiny_recording: Path):

@@ -16,8 +16,8 @@ from schema_1 import write_schema_1
 
 from topoloc import TopoMetricMap
 from topoloc.errors import MapError
-from topoloc.mapping.checking import damages
-from topoloc.mapping.edit import editing, undo_edit, undoable_edits
+from topoloc.mapping.edit import count_undoable_edits, edit_map, undo_edit
+from topoloc.mapping.integrity_check import find_map_damage
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def map_file(room_map: Path, tmp_path: Path) -> Path:
 
 def _without_a_node(path: Path, changes: dict | None = None) -> None:
     """A node with all that is of it goes, another one's template changes."""
-    with editing(path) as edit:
+    with edit_map(path) as edit:
         topomap, gone = edit.topomap, edit.topomap.summaries[-1].node_id
         first, *rest = list(topomap.nodes)[:-1]
         changed = replace(
@@ -47,8 +47,8 @@ def test_edits_are_taken_back_to_the_byte_the_last_one_first(map_file: Path):
     for k in range(3):
         _without_a_node(map_file, {"nodes": -1, "why": "a test"})
         files.append(map_file.read_bytes())
-        assert undoable_edits(map_file) == k + 1
-        assert damages(map_file) == []
+        assert count_undoable_edits(map_file) == k + 1
+        assert find_map_damage(map_file) == []
     with TopoMetricMap.load(map_file) as topomap:
         assert [edit.edit_id for edit in topomap.edits] == [1, 2, 3, 4]
         assert topomap.edits[1].changes == {"nodes": -1, "why": "a test"}
@@ -104,7 +104,7 @@ def test_a_damaged_undo_file_never_damages_the_map(map_file: Path, seed: int):
         undo_edit(map_file)
     except MapError:
         assert map_file.read_bytes() == edited
-    assert damages(map_file) == []
+    assert find_map_damage(map_file) == []
     assert bytes(before) != bytes(data)
 
 
@@ -115,10 +115,10 @@ def test_an_entry_for_another_file_is_not_used(map_file: Path):
     (map_file.parent / "room.topo.undo").write_bytes(
         stale
     )  # as a process leaves it that was killed before the map was renamed
-    assert undoable_edits(map_file) == 0
+    assert count_undoable_edits(map_file) == 0
     before = map_file.read_bytes()
     _without_a_node(map_file)
-    assert undoable_edits(map_file) == 1
+    assert count_undoable_edits(map_file) == 1
     undo_edit(map_file)
     assert map_file.read_bytes() == before
 
@@ -127,12 +127,12 @@ def test_the_second_edit_waits_for_the_first(map_file: Path):
     waited, done = threading.Event(), list[str]()
 
     def second() -> None:
-        with editing(map_file, waited.set) as edit:
+        with edit_map(map_file, waited.set) as edit:
             done.append("second begins")
             edit.commit(edit.topomap, "second")
 
     thread = threading.Thread(target=second)
-    with editing(map_file) as edit:
+    with edit_map(map_file) as edit:
         thread.start()
         assert waited.wait(20)
         edit.commit(edit.topomap, "first")
@@ -150,7 +150,7 @@ def test_nothing_is_left_of_an_edit_that_fails(map_file: Path):
         def __iter__(self):
             raise ZeroDivisionError
 
-    with pytest.raises(ZeroDivisionError), editing(map_file) as edit:
+    with pytest.raises(ZeroDivisionError), edit_map(map_file) as edit:
         edit.commit(replace(edit.topomap, place_images=Broken()), "broken")
     assert map_file.read_bytes() == before
     assert [path.name for path in map_file.parent.iterdir()] == ["room.topo"]

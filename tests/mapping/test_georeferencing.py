@@ -13,10 +13,15 @@ from hypothesis import strategies as st
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.mapping.georeferencing import Up, find_up, fit_georeference, georeference_by_view
+from topoloc.mapping.georeferencing import (
+    UpDirection,
+    estimate_up_direction,
+    fit_georeference,
+    georeference_from_heading,
+)
 
 ORIGIN = GeoPoint(48.2, 16.37, 170.0)
-Z_UP = find_up(
+Z_UP = estimate_up_direction(
     [Rigid3(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))]
 )
 WALK = np.array(
@@ -60,12 +65,14 @@ def off(found: Georeference, true: Georeference = TRUE) -> tuple[float, float]:
 def test_up_is_the_axis_that_the_cameras_have_up():
     assert Z_UP.axis == "z"
     assert (
-        find_up([Rigid3.identity(), Rigid3(exp_so3(np.array([0.3, 0.0, 0.0])), np.zeros(3))]).axis
+        estimate_up_direction(
+            [Rigid3.identity(), Rigid3(exp_so3(np.array([0.3, 0.0, 0.0])), np.zeros(3))]
+        ).axis
         == "-y"
     )
-    assert find_up([Rigid3.identity()], "x").axis == "x"
+    assert estimate_up_direction([Rigid3.identity()], "x").axis == "x"
     with pytest.raises(GeoreferenceError, match="up is one of"):
-        find_up([Rigid3.identity()], "w")
+        estimate_up_direction([Rigid3.identity()], "w")
 
 
 @given(heading=st.floats(0, 359), pitch=st.floats(-1.2, 1.2))
@@ -73,7 +80,7 @@ def test_the_first_picture_looks_where_it_is_said_to(heading: float, pitch: floa
     world_from_cam = Rigid3(
         Z_UP_CAMERA @ exp_so3(np.array([pitch, 0.0, 0.0])), np.array([3.0, 4.0, 1.5])
     )
-    found = georeference_by_view(world_from_cam, ORIGIN, heading, Z_UP)
+    found = georeference_from_heading(world_from_cam, ORIGIN, heading, Z_UP)
     difference = found.heading_deg(world_from_cam.rotation[:, 2]) - heading
     assert (difference + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-6)
     place = found.geopose(world_from_cam).position
@@ -89,7 +96,7 @@ Z_UP_CAMERA = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 def test_a_camera_that_looks_down_has_no_heading():
     down = Rigid3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     with pytest.raises(GeoreferenceError, match="looks up or down"):
-        georeference_by_view(down, ORIGIN, 0.0, Z_UP)
+        georeference_from_heading(down, ORIGIN, 0.0, Z_UP)
 
 
 @given(angles=st.tuples(*[st.floats(-3, 3)] * 3))
@@ -111,7 +118,7 @@ def test_gnss_is_believed_where_it_agrees():
     for k in range(0, 40, 4):  # a wall
         places[k] = TRUE.geopoint(way[k] + [15.0, 5.0, 8.0])
     fit = fit_georeference(way, places, "gnss", Z_UP)
-    assert list(np.flatnonzero(~fit.used)) == list(range(0, 40, 4))
+    assert list(np.flatnonzero(~fit.is_inlier)) == list(range(0, 40, 4))
     away, degrees = off(fit.georeference)
     assert away < 0.5
     assert degrees < 2.0
@@ -150,6 +157,6 @@ def test_an_axis_that_is_only_about_up_gives_way_to_the_points():
     tilted = Georeference(ORIGIN, Rigid3(exp_so3(np.array([0.15, 0.0, 0.0])), np.zeros(3)), "truth")
     way = np.repeat(WALK, 10, axis=0)
     fit = fit_georeference(
-        way, places_of(way, noise=0.05, true=tilted), "gnss", Up("z", math.radians(10.0))
+        way, places_of(way, noise=0.05, true=tilted), "gnss", UpDirection("z", math.radians(10.0))
     )
     assert off(fit.georeference, tilted)[1] < 0.6

@@ -13,7 +13,7 @@ import pytest
 from mutations import mutate
 
 from built_corridor import WIDE, WalkAhead, seen_ahead
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 
 OPENING = Path(__file__).with_name("opening.py")
 NUM_MUTATIONS = 100

@@ -67,7 +67,7 @@ def test_errors_shrink_and_covariances_stay_honest():
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(refined.covariances), error)
     # 3 on average were it exact; the robust weights make it a little too careful
     assert 1.5 < nees.mean() < 3.6
-    assert refined.agrees.mean() > 0.99
+    assert refined.is_consistent.mean() > 0.99
     assert refined.num_observations.sum() == sum(len(seen.rows) for seen in s.observations)
 
 
@@ -84,8 +84,8 @@ def test_a_point_that_moved_is_dropped_and_its_neighbours_are_not():
     rng = np.random.default_rng(5)
     observations = [view(s.truth, seen.cam_from_node, rng) for seen in s.observations]
     refined = refine_points(s.measured, s.covariances, observations, CONFIG)
-    assert not refined.agrees[moved].any()
-    assert refined.agrees[20:].mean() > 0.99
+    assert not refined.is_consistent[moved].any()
+    assert refined.is_consistent[20:].mean() > 0.99
 
 
 def test_one_wrong_observation_does_not_pull_a_point_away():
@@ -103,7 +103,7 @@ def test_without_observations_everything_stays_as_measured():
     refined = refine_points(s.measured, s.covariances, [], CONFIG)
     np.testing.assert_allclose(refined.points_cam, s.measured)
     np.testing.assert_allclose(refined.covariances, s.covariances, rtol=1e-6)
-    assert refined.agrees.all()
+    assert refined.is_consistent.all()
     assert refined.num_observations.tolist() == [0] * 10
 
 

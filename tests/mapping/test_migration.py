@@ -15,7 +15,7 @@ from built_corridor import WIDE, built_corridor, seen_ahead
 from topoloc.errors import MapError
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.mapping.checking import damages
+from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.mapping.sessions import Session
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -42,19 +42,19 @@ def test_schema_1_answers_the_same_bytes_and_is_saved_as_schema_3(tmp_path: Path
     assert [summary.of_node for summary in old.sides.summaries] == [
         summary.of_node for summary in new.sides.summaries
     ]
-    assert damages(tmp_path / "old.topo") == []
+    assert find_map_damage(tmp_path / "old.topo") == []
     old.save(tmp_path / "saved.topo")
     saved = TopoMetricMap.load(tmp_path / "saved.topo")
     assert answers(saved) == before
     saved.save(tmp_path / "again.topo")
     assert (tmp_path / "again.topo").read_bytes() == (tmp_path / "saved.topo").read_bytes()
-    assert damages(tmp_path / "saved.topo") == []
+    assert find_map_damage(tmp_path / "saved.topo") == []
 
 
 def test_schema_2_answers_the_same_bytes_and_is_saved_as_schema_3(tmp_path: Path):
     built_corridor().save(tmp_path / "new.topo")
     path = write_schema_2(built_corridor(), tmp_path / "old.topo")
-    assert damages(path) == []
+    assert find_map_damage(path) == []
     old, new = TopoMetricMap.load(path), TopoMetricMap.load(tmp_path / "new.topo")
     assert old.file is not None
     assert old.file.version == 2

@@ -13,16 +13,16 @@ import pytest
 
 from built_room import room_of_two_kinds, unseen_views
 from tiny_world import CAMERA
-from topoloc.errors import FeatureKindError, WeightsError
+from topoloc.errors import FeatureTypeError, WeightsError
 from topoloc.features import learned
-from topoloc.features.kinds import learned_kind
+from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
-from topoloc.mapping.checking import damages
 from topoloc.mapping.config import MapConfig
+from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
 from topoloc.retrieval.cell_grid import CellGrid
@@ -48,7 +48,7 @@ def test_both_kinds_come_back_and_are_saved_again_to_the_byte(
     assert loaded.config.other_kinds == ("sift",)
     assert set(loaded.coarse_models) == {"surf-vlad", "surf-vlad@sift"}
     for kind in loaded.kinds:
-        one, other = loaded.by_kind(kind), of_two.by_kind(kind)
+        one, other = loaded.with_feature_type(kind), of_two.with_feature_type(kind)
         assert one.shared_errors == other.shared_errors is not None
         for node, was in zip(one.nodes, other.nodes, strict=True):
             assert node.features.descriptors.shape == was.features.descriptors.shape
@@ -57,7 +57,7 @@ def test_both_kinds_come_back_and_are_saved_again_to_the_byte(
             assert node.summary.num_points == was.summary.num_points == len(node.features)
     loaded.save(tmp_path / "again.topo")
     assert (tmp_path / "again.topo").read_bytes() == path.read_bytes()
-    assert damages(path) == []
+    assert find_map_damage(path) == []
 
 
 def test_the_first_kind_is_what_it_would_be_alone(of_two: TopoMetricMap, tiny_map: TopoMetricMap):
@@ -75,11 +75,11 @@ def test_a_damaged_point_of_the_second_kind_is_found(path: Path):
         ).fetchone()
     place = content.index(packed[:40]) + 20
     path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
-    assert any("node_points" in damage for damage in damages(path))
+    assert any("node_points" in damage for damage in find_map_damage(path))
 
 
 def test_it_localizes_by_the_second_kind_alone(path: Path):
-    by_sift = TopoMetricMap.load(path).by_kind("sift")
+    by_sift = TopoMetricMap.load(path).with_feature_type("sift")
     assert (by_sift.kinds, by_sift.config.kinds, by_sift.sides) == (["sift"], ["sift"], None)
     localizer = Localizer(by_sift)
     results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
@@ -92,9 +92,9 @@ def test_it_localizes_by_the_second_kind_alone(path: Path):
 def test_it_is_itself_by_its_first_kind_and_nothing_by_one_that_it_does_not_hold(
     of_two: TopoMetricMap,
 ):
-    assert of_two.by_kind("surf") is of_two
-    with pytest.raises(FeatureKindError, match=r"no features orb \(it holds: surf, sift\)"):
-        of_two.by_kind("orb")
+    assert of_two.with_feature_type("surf") is of_two
+    with pytest.raises(FeatureTypeError, match=r"no features orb \(it holds: surf, sift\)"):
+        of_two.with_feature_type("orb")
 
 
 def test_the_cells_of_a_network_are_learnt_kept_and_asked(
@@ -108,12 +108,14 @@ def test_the_cells_of_a_network_are_learnt_kept_and_asked(
     assert len(loaded.coarse_models["surf-vlad@topoloc-net"].arrays["cell_vectors"]) == len(
         loaded.place_images
     )
-    assert damages(tmp_path / "room.topo") == []
-    likeness, asked = CellGrid.likeness, list[tuple[int, ...]]()
+    assert find_map_damage(tmp_path / "room.topo") == []
+    compute_similarity, asked = CellGrid.compute_similarity, list[tuple[int, ...]]()
     monkeypatch.setattr(
         CellGrid,
-        "likeness",
-        lambda self, cells, images: asked.append(cells.shape) or likeness(self, cells, images),
+        "compute_similarity",
+        lambda self, cells, images: (
+            asked.append(cells.shape) or compute_similarity(self, cells, images)
+        ),
     )
     for kind, expected in (("surf", []), ("topoloc-net", [(4, 6, 64)])):
         ((picture, truth), *_) = unseen_views()
@@ -124,7 +126,7 @@ def test_the_cells_of_a_network_are_learnt_kept_and_asked(
 
 
 def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path):
-    for kinds, said in ((("orb",), FeatureKindError), (("edgepoint2-s64",), WeightsError)):
+    for kinds, said in ((("orb",), FeatureTypeError), (("edgepoint2-s64",), WeightsError)):
         done: list[str] = []
         with pytest.raises(said):
             build_map(
@@ -138,10 +140,10 @@ def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path)
 def test_beside_surf_stand_the_learned_ones_that_are_here_unless_others_are_named(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    assert MapConfig().kinds == ["surf", learned_kind()]
+    assert MapConfig().kinds == ["surf", default_learned_type()]
     learned.close_networks()
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert MapConfig().kinds == ["surf"]
     assert MapConfig(other_kinds=("sift",)).kinds == ["surf", "sift"]
-    sift = MapConfig(other_kinds=("sift",)).features_of("sift")
+    sift = MapConfig(other_kinds=("sift",)).feature_config_for("sift")
     assert (sift.kind, sift.max_features) == ("sift", MapConfig().features.max_features)

@@ -13,14 +13,14 @@ import pytest
 
 from built_corridor import WIDE, WalkAhead, built_corridor, seen_ahead, seen_on_the_way_back
 from topoloc.errors import MapError
-from topoloc.evaluation.experiments import neighbours_of
+from topoloc.evaluation.query_localization import find_neighbour_ids
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
-from topoloc.mapping.entries import Edge, SideNodes
+from topoloc.mapping.entries import Edge, VirtualNodes
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoMetricMap, in_rows
+from topoloc.mapping.topomap import TopoMetricMap, node_ids_to_rows
 from topoloc.recordings.recording import SequenceView
 from topoloc_training.coarse_training import in_ids
 
@@ -52,7 +52,9 @@ def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMet
         ]
         described = [node for node in described if node.summary.of_node in alive]
         side_models = {name: in_ids(model, side_ids) for name, model in sides.coarse_models.items()}
-        sides = SideNodes([node.summary for node in described], described, side_models, sides.kind)
+        sides = VirtualNodes(
+            [node.summary for node in described], described, side_models, sides.kind
+        )
     return replace(
         topomap,
         nodes=nodes,
@@ -108,7 +110,7 @@ def test_neighbours_are_named_by_their_ids(renumbered: Path):
     distances = node_distances(
         topomap.summaries[1].world_from_cam, poses, topomap.config.lambda_rot
     )
-    near = neighbours_of(topomap, distances)
+    near = find_neighbour_ids(topomap, distances)
     assert topomap.summaries[1].node_id in near
     assert near <= {summary.node_id for summary in topomap.summaries}
 
@@ -131,7 +133,7 @@ def test_ids_of_removed_nodes_are_not_used_again(renumbered: Path):
 def test_a_model_of_removed_nodes_alone_is_a_map_error():
     model = built_corridor().coarse_models["surf-vlad"]
     with pytest.raises(MapError, match="knows none"):
-        in_rows(model, [5000, 6000])
+        node_ids_to_rows(model, [5000, 6000])
 
 
 def test_two_recordings_of_one_name_are_two_sessions(tmp_path: Path):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.features.kinds import learned_kind
+from topoloc.features.feature_types import default_learned_type
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -24,7 +24,7 @@ def test_the_quick_run_finishes_with_both_feature_types(tmp_path: Path):
     assert (out / "report.html").exists()
     for path in (out / "maps").glob("*.topo"):
         with TopoMetricMap.load(path) as topomap:
-            assert topomap.kinds[1:] == [learned_kind()], path.name
+            assert topomap.kinds[1:] == [default_learned_type()], path.name
     results = json.loads((out / "results.json").read_text(encoding="utf-8"))
     rows = {(row["queries"], row["change"]): row for row in results["ablation"]}
     for light in ("day", "night"):

@@ -8,10 +8,10 @@ import pytest
 
 from built_room import built_room
 from topoloc.demo.recordings import SHIPPED
-from topoloc.features.kinds import learned_kind
+from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import LocalizerConfig
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.topomap import TopoMetricMap
@@ -47,7 +47,7 @@ def test_every_query_has_its_own_true_node_with_two_feature_types(
     lab: TopoMetricMap,
     monkeypatch: pytest.MonkeyPatch,
 ):
-    assert lab.kinds == ["surf", learned_kind()]
+    assert lab.kinds == ["surf", default_learned_type()]
     calls = list[Rigid3 | None]()
     rank = KnownNodes.rank
 

@@ -12,8 +12,8 @@ import torch
 from built_room import built_room, unseen_views
 from topoloc.errors import WeightsError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.retrieval.network_config import PictureConfig
-from topoloc.retrieval.network_pictures import decode_picture
+from topoloc.retrieval.network_config import NetworkInputConfig
+from topoloc.retrieval.network_images import decode_stored_image
 from topoloc_paper.pose_losses import beta_loss, learnt_loss, reprojection_loss
 from topoloc_paper.posenet import PoseNet, PoseNetConfig, train_posenet
 from topoloc_training.classifier_config import AugmentationConfig, TrainingConfig
@@ -83,11 +83,15 @@ def test_it_learns_the_room_and_is_saved(loss: str, tiny_recording: Path, tmp_pa
         max_epochs=90, patience=90, learning_rate=4e-3, num_threads=1, held_out=0.0, batch_size=14
     )
     config = PoseNetConfig(
-        loss, num_hidden=64, picture=PictureConfig(48, 36), training=training, augmentation=still
+        loss,
+        num_hidden=64,
+        picture=NetworkInputConfig(48, 36),
+        training=training,
+        augmentation=still,
     )  # pyright: ignore[reportArgumentType]
     posenet = train_posenet(topomap, "compact", None, config)
     truths = [image.world_from_cam for image in topomap.place_images]
-    found = posenet.localize([decode_picture(image.jpeg) for image in topomap.place_images])
+    found = posenet.localize([decode_stored_image(image.jpeg) for image in topomap.place_images])
     errors = [
         np.linalg.norm(a.translation - b.translation) for a, b in zip(found, truths, strict=True)
     ]

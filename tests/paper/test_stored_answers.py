@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from built_room import built_room, unseen_views, write_pictures
-from topoloc.evaluation.experiments import answer_queries
-from topoloc.evaluation.metrics import Answer, summarize
+from topoloc.evaluation.metrics import EvaluatedQuery, summarize
+from topoloc.evaluation.query_localization import localize_queries
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Alternative, Localization, NotLocalized
@@ -22,7 +22,7 @@ def test_stored_answers_are_the_same_answers(tiny_recording: Path, tmp_path: Pat
     sequence = open_sequence(
         write_pictures(tmp_path / "views", [*unseen_views()[:3], *unseen_views(seed=1)[:1]])
     )
-    answers = answer_queries(Localizer(built_room(tiny_recording)), sequence, label="views")
+    answers = localize_queries(Localizer(built_room(tiny_recording)), sequence, label="views")
     assert {answer.result.localized for answer in answers} == {True, False}
     rows = json.loads(json.dumps(rows_of(answers)))
     again = answers_of(rows, "views", sequence)
@@ -46,7 +46,7 @@ def test_stored_answers_are_the_same_answers(tiny_recording: Path, tmp_path: Pat
 def test_the_alternatives_of_an_ambiguity_are_stored():
     poses = [Rigid3.identity(), Rigid3(np.eye(3), np.array([9.0, 0.0, 1.0]))]
     alternatives = tuple(Alternative(pose, 0.5 - 0.1 * k, k) for k, pose in enumerate(poses))
-    answer = Answer(
+    answer = EvaluatedQuery(
         "a.png",
         NotLocalized("ambiguous", alternatives=alternatives),
         None,

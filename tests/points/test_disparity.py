@@ -7,7 +7,7 @@ import numpy as np
 import tiny_world
 from room_frames import depth_frame, stereo_frame
 from topoloc.points.disparity import DisparityConfig, measure_disparities, measured_view
-from topoloc.points.tracking import TrackingConfig, find_corners
+from topoloc.points.point_tracking import TrackingConfig, find_corners
 
 BF = tiny_world.CAMERA.fx * tiny_world.BASELINE
 

@@ -19,13 +19,13 @@ from topoloc.points.metric_points import (
     keypoint_sigmas,
     locate_points,
 )
-from topoloc.recordings.frame_view import FrameView
+from topoloc.recordings.frame_preparation import PreparedFrame
 
 CONFIG = MetricPointsConfig()
 
 
 @pytest.fixture(scope="module")
-def room_view() -> tuple[FrameView, np.ndarray]:
+def room_view() -> tuple[PreparedFrame, np.ndarray]:
     """Left and right picture of the room, and the exact depth."""
     panels, pose = tiny_world.room(), tiny_world.path_pose(4)
     (left, depth), (right, _) = (
@@ -33,10 +33,10 @@ def room_view() -> tuple[FrameView, np.ndarray]:
         for k, p in enumerate((pose, tiny_world.right_pose(pose)))
     )
     rig = StereoRig.rectified(tiny_world.CAMERA, tiny_world.BASELINE)
-    return FrameView(left, left, tiny_world.CAMERA, Rigid3.identity(), right, rig), depth
+    return PreparedFrame(left, left, tiny_world.CAMERA, Rigid3.identity(), right, rig), depth
 
 
-def depth_view(view: FrameView, depth: np.ndarray) -> FrameView:
+def depth_view(view: PreparedFrame, depth: np.ndarray) -> PreparedFrame:
     return replace(view, right_grey=None, rig=None, depth=depth.astype(np.float32))
 
 
@@ -50,7 +50,7 @@ def depth_errors_in_sigmas(located: MetricPoints, truth: np.ndarray) -> np.ndarr
     return (located.points_cam[rows, 2] - truth[rows]) / np.sqrt(located.covariances[rows, 2, 2])
 
 
-def test_stereo_points_lie_where_they_are_seen(room_view: tuple[FrameView, np.ndarray]):
+def test_stereo_points_lie_where_they_are_seen(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     features = extract_features(view.grey, FeatureConfig())
     located = locate_points(features, view, CONFIG)
@@ -62,7 +62,7 @@ def test_stereo_points_lie_where_they_are_seen(room_view: tuple[FrameView, np.nd
     np.testing.assert_allclose(reprojected, features.points_img[located.valid], atol=1e-3)
 
 
-def test_depth_points_lie_where_they_are_seen(room_view: tuple[FrameView, np.ndarray]):
+def test_depth_points_lie_where_they_are_seen(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     features = extract_features(view.grey, FeatureConfig())
     located = locate_points(features, depth_view(view, depth), CONFIG)
@@ -72,7 +72,7 @@ def test_depth_points_lie_where_they_are_seen(room_view: tuple[FrameView, np.nda
 
 
 def test_covariances_are_positive_definite_and_largest_along_the_ray(
-    room_view: tuple[FrameView, np.ndarray],
+    room_view: tuple[PreparedFrame, np.ndarray],
 ):
     view, _ = room_view
     located = locate_points(extract_features(view.grey, FeatureConfig()), view, CONFIG)
@@ -85,7 +85,7 @@ def test_covariances_are_positive_definite_and_largest_along_the_ray(
     assert np.median(along) > 0.99
 
 
-def test_uncertain_depth_is_dropped(room_view: tuple[FrameView, np.ndarray]):
+def test_uncertain_depth_is_dropped(room_view: tuple[PreparedFrame, np.ndarray]):
     view, _ = room_view
     assert view.rig is not None
     features = extract_features(view.grey, FeatureConfig())
@@ -111,7 +111,7 @@ def points_at(points_img: list[tuple[float, float]]) -> Features:
     )
 
 
-def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[FrameView, np.ndarray]):
+def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[PreparedFrame, np.ndarray]):
     depth = np.full((240, 320), 2.0)
     depth[:, 160:] = 3.0
     depth[100:140, 40:80] = np.nan
@@ -131,13 +131,13 @@ def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[FrameView, n
     assert located.points_cam[0, 2] == pytest.approx(2.0)
 
 
-def test_no_features_give_no_points(room_view: tuple[FrameView, np.ndarray]):
+def test_no_features_give_no_points(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     for one in (view, depth_view(view, depth)):
         assert locate_points(Features.empty(64), one, CONFIG).points_cam.shape == (0, 3)
 
 
-def test_a_single_picture_has_no_points(room_view: tuple[FrameView, np.ndarray]):
+def test_a_single_picture_has_no_points(room_view: tuple[PreparedFrame, np.ndarray]):
     with pytest.raises(RecordingError, match="a stereo pair or a depth image"):
         locate_points(Features.empty(64), replace(room_view[0], right_grey=None, rig=None), CONFIG)
 

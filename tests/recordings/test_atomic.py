@@ -13,10 +13,10 @@ import pytest
 
 from topoloc.errors import TopolocError
 from topoloc.recordings.atomic import (
-    remove_all_leftovers,
-    remove_leftovers,
-    replaced_file,
-    scratch_file,
+    atomic_write,
+    remove_all_stale_files,
+    remove_stale_files,
+    temporary_file,
     write_bytes,
     write_folder,
 )
@@ -98,12 +98,12 @@ def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_no
 def test_a_scratch_file_is_its_own_while_it_is_used(tmp_path: Path):
     left = tmp_path / ".scratch.0123456789abcdef.part"
     left.write_bytes(b"of somebody who was killed")
-    with scratch_file(tmp_path / "scratch") as one:
+    with temporary_file(tmp_path / "scratch") as one:
         one.write_bytes(b"one")
-        with scratch_file(tmp_path / "scratch") as two:
+        with temporary_file(tmp_path / "scratch") as two:
             assert sorted(tmp_path.iterdir()) == sorted([one, two])
         assert one.read_bytes() == b"one"
-    with pytest.raises(KeyError), scratch_file(tmp_path / "scratch"):
+    with pytest.raises(KeyError), temporary_file(tmp_path / "scratch"):
         raise KeyError
     assert list(tmp_path.iterdir()) == []
 
@@ -113,23 +113,23 @@ def test_all_that_nobody_writes_any_more_is_removed_from_a_folder(tmp_path: Path
     kept = [tmp_path / ".hidden", tmp_path / "b.part"]
     for path in kept:
         path.write_bytes(b"")
-    with replaced_file(tmp_path / "c.topo") as held:
-        remove_all_leftovers(tmp_path)
+    with atomic_write(tmp_path / "c.topo") as held:
+        remove_all_stale_files(tmp_path)
         assert sorted(tmp_path.iterdir()) == sorted([*kept, held])
-    remove_all_leftovers(tmp_path / "nowhere")
+    remove_all_stale_files(tmp_path / "nowhere")
 
 
 def test_leftovers_of_older_versions_go_too(tmp_path: Path):
     (tmp_path / ".map.topo.1234.part").write_bytes(b"")
     (tmp_path / ".map.topo.1234.part-journal").write_bytes(b"")
-    remove_leftovers(tmp_path / "map.topo")
+    remove_stale_files(tmp_path / "map.topo")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_tried_out_beside_a_file_goes_also_when_its_process_was_killed(tmp_path: Path):
     path = tmp_path / "map.topo"
     write_bytes(path, b"old")
-    with scratch_file(path) as scratch:
+    with temporary_file(path) as scratch:
         scratch.write_bytes(b"tried")
         write_bytes(path, b"new")
         assert scratch.read_bytes() == b"tried", "a living process's stays"
@@ -143,7 +143,7 @@ def test_what_is_tried_out_beside_a_file_goes_also_when_its_process_was_killed(t
 
 
 def write_half(path: Path) -> None:
-    with replaced_file(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(b"half")
         raise ValueError("stop")
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.recordings.pictures import exif_focal_length, read_image
+from topoloc.recordings.image_io import exif_focal_length, read_image
 
 SHORT, LONG, RATIONAL = 3, 4, 5
 FOCAL, FOCAL_35MM, WIDTH, RESOLUTION, UNIT = 0x920A, 0xA405, 0xA002, 0xA20E, 0xA210

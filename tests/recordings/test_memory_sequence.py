@@ -12,7 +12,7 @@ import topoloc
 from tiny_recordings import HEIGHT, WIDTH, picture, pose
 from topoloc.errors import RecordingError
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.frame_checks import picture_problem
+from topoloc.recordings.frame_checks import find_image_problem
 from topoloc.recordings.recording import sequence_subset
 
 CAMERA = topoloc.Camera.pinhole(WIDTH, HEIGHT, 40.0, 41.0, 15.5, 11.5)
@@ -179,4 +179,4 @@ def test_numpy_integers_are_times():
     "image", [picture(0), picture(0, 3), picture(0, 3)[:, ::-1], np.asfortranarray(picture(0, 3))]
 )
 def test_pictures_that_are_good(image: np.ndarray):
-    assert picture_problem(image) is None
+    assert find_image_problem(image) is None

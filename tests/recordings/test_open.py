@@ -7,14 +7,14 @@ import pytest
 from tiny_recordings import assert_same_pose, picture, write
 from topoloc.errors import RecordingError, UnknownFormatError, UnreadableImageError
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.open import FORMATS, load_format, open_sequence
 from topoloc.recordings.recording import (
     Recording,
     SequenceView,
-    left_frame,
     natural_key,
     parse_selection,
+    read_left_frame,
     sequence_subset,
 )
 
@@ -25,7 +25,7 @@ def test_every_format_is_recognised_by_itself_alone(name: str, request: pytest.F
     assert [
         known
         for known, candidate in ((name, load_format(name)) for name in FORMATS)
-        if candidate.recognises(path) and known != "folder"
+        if candidate.can_open(path) and known != "folder"
     ] == [name]
     sequence, named = open_sequence(str(path)), open_sequence(path, format=name)
     assert isinstance(sequence, StereoSequence)
@@ -125,7 +125,7 @@ def test_a_left_frame_is_described_as_the_whole_one_and_its_other_picture_not_re
     name: str, request: pytest.FixtureRequest
 ):
     recording = sequence_subset(open_sequence(request.getfixturevalue(name)), [1])
-    whole = frame_view(recording[0], with_depth=False)
+    whole = prepare_frame(recording[0], with_depth=False)
     assert isinstance(recording, SequenceView)
     base = recording.base
     assert isinstance(base, Recording)
@@ -134,11 +134,11 @@ def test_a_left_frame_is_described_as_the_whole_one_and_its_other_picture_not_re
     other.paths[1].unlink()
     with pytest.raises(UnreadableImageError):
         recording[0]
-    left = left_frame(recording, 0)
+    left = read_left_frame(recording, 0)
     assert left.right is None
     assert left.depth is None
     assert left.world_from_cam is recording.poses[0]
-    view = frame_view(left, with_depth=False)
+    view = prepare_frame(left, with_depth=False)
     np.testing.assert_array_equal(view.picture, whole.picture)
     assert view.camera == whole.camera
     np.testing.assert_array_equal(view.view_from_cam.matrix(), whole.view_from_cam.matrix())

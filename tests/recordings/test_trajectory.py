@@ -7,17 +7,17 @@ from hypothesis import strategies as st
 
 from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
 from topoloc.errors import TopolocError, TrajectoryError
-from topoloc.geometry.pose_conventions import PoseReading
+from topoloc.geometry.pose_conventions import PoseConventions
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings import trajectory
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import Recording, SequenceView
 from topoloc.recordings.trajectory import (
     Trajectory,
-    as_read,
-    frame_poses,
-    poses_at,
+    interpolate_poses,
+    match_frame_poses,
     read_trajectory,
+    with_pose_conventions,
     with_trajectory,
     write_tum,
 )
@@ -134,15 +134,15 @@ def test_poses_between_are_interpolated_and_gaps_are_not():
     ]
     found = [
         None if pose is None else round(float(pose.translation[0]), 9)
-        for pose in poses_at(trajectory, times)
+        for pose in interpolate_poses(trajectory, times)
     ]
     assert found == [0.0, 0.25, 1.0, None, 5.0, 5.0, None, 0.0, 1.0]
-    assert poses_at(trajectory, [SECOND // 2], max_gap=1.0)[0] is not None
+    assert interpolate_poses(trajectory, [SECOND // 2], max_gap=1.0)[0] is not None
 
 
 def test_rows_have_no_times_to_look_up():
     with pytest.raises(TrajectoryError, match="row"):
-        poses_at(Trajectory([shift(0)]), [0])
+        interpolate_poses(Trajectory([shift(0)]), [0])
 
 
 def test_other_poses_for_the_same_recording(kitti: Path, tmp_path: Path):
@@ -218,8 +218,8 @@ def test_clocks_that_differ_are_said_and_mended(tmp_path: Path):
     )
     for path, option in ((late, "shift=5000"), (in_microseconds, "clock=1000")):
         with pytest.raises(TrajectoryError, match=f"--poses {option}"):
-            frame_poses(read_trajectory(path), frames, path)
-        found = with_trajectory(recording_of(frames), path, PoseReading.of(option)).poses
+            match_frame_poses(read_trajectory(path), frames, path)
+        found = with_trajectory(recording_of(frames), path, PoseConventions.of(option)).poses
         assert sum(pose is not None for pose in found) >= 18
         assert all(
             pose is None or np.allclose(pose.translation, poses[k].translation, atol=0.02)
@@ -232,7 +232,7 @@ def test_own_poses_are_read_as_told():
     sequence = SequenceView(
         recording_of([100_000_000 * k for k in range(20)]), list(range(20)), list(poses)
     )
-    read = as_read(sequence, PoseReading.of("mm,shift=0.2"))
+    read = with_pose_conventions(sequence, PoseConventions.of("mm,shift=0.2"))
     assert read.poses[-2:] == [None, None]
     np.testing.assert_allclose(
         [pose.translation[0] for pose in read.poses[:-2] if pose],
@@ -270,7 +270,7 @@ def test_read_at_once_or_line_by_line_it_is_the_same(tmp_path: Path, lines: list
     (tmp_path / "a.tum").write_text("\n".join(lines) + "\n")
     whole, by_lines = (
         read_trajectory(tmp_path / "a.tum"),
-        trajectory._trajectory_of_rows(tmp_path / "a.tum"),
+        trajectory._trajectory_from_rows(tmp_path / "a.tum"),
     )
     assert whole.t_ns == by_lines.t_ns
     for one, other in zip(whole.world_from_cam, by_lines.world_from_cam, strict=True):
@@ -285,7 +285,7 @@ def test_exact_times_are_read_at_once(tmp_path: Path, monkeypatch: pytest.Monkey
         tmp_path / "a.tum",
         Trajectory(poses, [1_700_000_000_123_456_789 + index for index in range(5)]),
     )
-    monkeypatch.setattr(trajectory, "_trajectory_of_rows", None)
+    monkeypatch.setattr(trajectory, "_trajectory_from_rows", None)
     read = read_trajectory(tmp_path / "a.tum")
     assert read.t_ns == [1_700_000_000_123_456_789 + index for index in range(5)]
     for one, other in zip(poses, read.world_from_cam, strict=True):

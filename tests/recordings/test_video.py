@@ -139,15 +139,15 @@ def test_a_clock_that_does_not_advance_is_an_error_with_the_frame(
     with pytest.raises(
         RecordingError, match=r"frame 2: at 0\.0\d0 s, but the frame before is at 0\.040 s"
     ):
-        video._times(film, 25.0)
+        video._read_times(film, 25.0)
 
 
 def test_a_container_without_times_goes_by_its_rate(film: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(video, "_open", lambda _: _Clock([0.0, 0.0, 0.0]))
-    assert video._times(film, 50.0) == [0, 20_000_000, 40_000_000]
+    assert video._read_times(film, 50.0) == [0, 20_000_000, 40_000_000]
     monkeypatch.setattr(video, "_open", lambda _: _Clock([0.0, 0.0, 0.0]))
     with pytest.raises(RecordingError, match="rate"):
-        video._times(film, 0.0)
+        video._read_times(film, 0.0)
 
 
 def test_a_frame_of_another_resolution_is_unreadable_alone(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from topoloc.retrieval.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc.retrieval.network_config import BackboneName
 
 
@@ -77,4 +77,4 @@ def test_a_shallower_backbone_gives_what_the_whole_one_has_on_its_way():
 def test_pictures_are_normalised_by_imagenets_mean_and_deviation():
     white = torch.full((1, 2, 2, 3), 255, dtype=torch.uint8)
     expected = [(1 - 0.485) / 0.229, (1 - 0.456) / 0.224, (1 - 0.406) / 0.225]
-    assert normalize_pictures(white)[0, :, 0, 0].tolist() == pytest.approx(expected, abs=1e-5)
+    assert normalize_images(white)[0, :, 0, 0].tolist() == pytest.approx(expected, abs=1e-5)

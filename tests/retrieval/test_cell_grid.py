@@ -11,16 +11,16 @@ import pytest
 
 from topoloc.errors import MapError
 from topoloc.features.extraction import extract_features
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.kinds import FeatureConfig
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.topomap import in_rows
-from topoloc.recordings.pictures import grey_image, read_image
-from topoloc.retrieval import neighbours
+from topoloc.mapping.topomap import node_ids_to_rows
+from topoloc.recordings.image_io import read_image, to_grey
+from topoloc.retrieval import descriptor_index
 from topoloc.retrieval.cell_grid import CellGrid
-from topoloc.retrieval.coarse import open_coarse
-from topoloc.retrieval.place_kernels import multiply_shifted
-from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words, placed, vlad
+from topoloc.retrieval.coarse import open_coarse_localizer
+from topoloc.retrieval.descriptor_kernels import max_shifted_products
+from topoloc.retrieval.vlad import SurfVlad, VladConfig, append_positions, learn_words, vlad
 
 NO_IMAGE = np.zeros((6, 8), np.uint8)
 ROWS, COLUMNS, CHANNELS = 4, 6, 16
@@ -35,7 +35,7 @@ def places(count: int, seed: int = 0, columns: int = COLUMNS) -> np.ndarray:
 
 
 def most_alike(grid: CellGrid, cells: np.ndarray, count: int) -> int:
-    return int(grid.likeness(cells, np.arange(count)).argmax())
+    return int(grid.compute_similarity(cells, np.arange(count)).argmax())
 
 
 def alike_by_vlad(cells: np.ndarray | None, count: int = 40) -> tuple[SurfVlad, Features]:
@@ -71,7 +71,7 @@ def test_products_are_those_of_the_columns_that_both_have():
         rng.normal(size=24).astype(np.float32),
     )
     chosen, found = np.array([3, 0, 3]), np.empty(3, np.float32)
-    multiply_shifted(rows, chosen, vector, 6, 2, found)
+    max_shifted_products(rows, chosen, vector, 6, 2, found)
     for row, product in zip(rows.reshape(5, 4, 6).astype(float)[chosen], found, strict=True):
         query = vector.reshape(4, 6)
         shifted = [
@@ -84,7 +84,7 @@ def test_products_are_those_of_the_columns_that_both_have():
 
 def test_a_picture_is_wholly_like_itself():
     cells = places(20)
-    found = CellGrid.fit(cells).likeness(cells[3], np.arange(20))
+    found = CellGrid.fit(cells).compute_similarity(cells[3], np.arange(20))
     assert found[3] == pytest.approx(1.0, abs=0.01)
     assert found.argmax() == 3
 
@@ -108,8 +108,8 @@ def test_where_vlad_cannot_tell_the_cells_do():
 
 
 def test_of_many_images_the_nearest_by_vlad_are_compared(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(neighbours, "MAX_EXACT_VECTORS", 10)
-    monkeypatch.setattr(neighbours.PlaceIndex.__init__, "__defaults__", (10,))
+    monkeypatch.setattr(descriptor_index, "MAX_EXACT_VECTORS", 10)
+    monkeypatch.setattr(descriptor_index.DescriptorIndex.__init__, "__defaults__", (10,))
     cells = places(60)
     with_cells, features = alike_by_vlad(cells, 60)
     for k in (0, 30, 59):
@@ -124,7 +124,7 @@ def test_the_stored_model_ranks_alike():
         np.int8,
         (30, CHANNELS * ROWS * COLUMNS),
     )
-    reopened = open_coarse(model)
+    reopened = open_coarse_localizer(model)
     for one in asked:
         ranked = [c.rank(NO_IMAGE, replace(features, cells=one), 30) for c in (reopened, localizer)]
         assert [score.node_id for score in ranked[0]] == [score.node_id for score in ranked[1]]
@@ -136,7 +136,7 @@ def test_the_stored_model_ranks_alike():
 def test_nodes_that_are_no_more_are_not_named():
     cells = places(6)
     localizer, features = alike_by_vlad(cells, 6)
-    left = open_coarse(in_rows(localizer.to_model(), [0, 2, 5]))
+    left = open_coarse_localizer(node_ids_to_rows(localizer.to_model(), [0, 2, 5]))
     assert [
         left.rank(NO_IMAGE, replace(features, cells=cells[k]), 1)[0].node_id for k in (0, 2, 5)
     ] == [0, 1, 2]
@@ -151,7 +151,7 @@ def test_nodes_that_are_no_more_are_not_named():
     ],
 )
 def test_one_picture_and_pictures_all_alike(cells: np.ndarray):
-    found = CellGrid.fit(cells).likeness(cells[0], np.arange(len(cells)))
+    found = CellGrid.fit(cells).compute_similarity(cells[0], np.arange(len(cells)))
     np.testing.assert_allclose(found, np.full(len(cells), 1.0 if cells.any() else 0.0), atol=0.01)
 
 
@@ -176,7 +176,9 @@ def test_cells_of_another_form_are_told():
 def test_a_damaged_model_is_told(name: str, change):
     model = alike_by_vlad(places(4), 4)[0].to_model()
     with pytest.raises(MapError, match="damaged"):
-        open_coarse(replace(model, arrays={**model.arrays, name: change(model.arrays[name])}))
+        open_coarse_localizer(
+            replace(model, arrays={**model.arrays, name: change(model.arrays[name])})
+        )
 
 
 def test_a_real_walk_by_day_is_known_by_night(shared: Path):
@@ -186,12 +188,12 @@ def test_a_real_walk_by_day_is_known_by_night(shared: Path):
     if not walks.is_dir():
         pytest.skip(f"no walks at {walks}")
     config, night = (
-        MapConfig().vlad_of("topoloc-net"),
+        MapConfig().vlad_config_for("topoloc-net"),
         [_seen(walks / "night_right", k) for k in range(0, 100, 2)],
     )
     for walk, least in (("day_right", (0.96, 1.0)), ("day_left", (0.7, 0.94))):
         mapped = [_seen(walks / walk, k) for k in range(100)]
-        found = [placed(features, 640, 360, config) for features in mapped]
+        found = [append_positions(features, 640, 360, config) for features in mapped]
         words = learn_words(np.concatenate(found), config)
         vlads = np.stack([vlad(descriptors, words) for descriptors in found])
         localizer = SurfVlad.fit(
@@ -208,7 +210,7 @@ def test_a_real_walk_by_day_is_known_by_night(shared: Path):
 
 def _seen(folder: Path, k: int) -> Features:
     picture = cv2.resize(
-        grey_image(read_image(folder / f"Image{k:03}.jpg")),
+        to_grey(read_image(folder / f"Image{k:03}.jpg")),
         (640, 360),
         interpolation=cv2.INTER_AREA,
     )

@@ -7,8 +7,8 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from topoloc.features.feature_types import FEATURE_TYPES
 from topoloc.features.features import Features
-from topoloc.features.kinds import KINDS
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 
@@ -33,7 +33,7 @@ def test_they_say_what_they_were_learned_of(kind: str):
     assert sum(about["recordings"].values()) > 500
     assert about["date"]
     assert about["command"].startswith(f"python -m topoloc_training.shared_vocabulary {kind} ")
-    assert vocabulary.words.shape[1] == KINDS[kind].descriptor_size + 2
+    assert vocabulary.words.shape[1] == FEATURE_TYPES[kind].descriptor_size + 2
     assert len(vocabulary.version) == 12
 
 
@@ -47,7 +47,7 @@ def test_pictures_of_the_same_things_have_like_vectors():
     assert vocabulary is not None
     words = vocabulary.words[:, :64]
 
-    def vector(first: int, noise_seed: int) -> np.ndarray:
+    def global_descriptor(first: int, noise_seed: int) -> np.ndarray:
         things, noise = np.random.default_rng(first), np.random.default_rng(noise_seed)
         descriptors = (
             words[first + things.integers(0, 8, 200)]
@@ -59,11 +59,11 @@ def test_pictures_of_the_same_things_have_like_vectors():
         features = Features(
             things.uniform(0, 300, (200, 2)).astype(np.float32), zero, zero, zero, unit
         )
-        return vocabulary.vector(features, 320, 320)
+        return vocabulary.global_descriptor(features, 320, 320)
 
-    one, again, other = vector(0, 1), vector(0, 2), vector(16, 3)
+    one, again, other = global_descriptor(0, 1), global_descriptor(0, 2), global_descriptor(16, 3)
     assert [float(np.linalg.norm(each)) for each in (one, again, other)] == pytest.approx(
         [1.0] * 3, abs=1e-4
     )
     assert one @ again > one @ other + 0.3
-    assert np.isfinite(vocabulary.vector(Features.empty(64), 320, 320)).all()
+    assert np.isfinite(vocabulary.global_descriptor(Features.empty(64), 320, 320)).all()

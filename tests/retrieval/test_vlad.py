@@ -15,9 +15,16 @@ from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
 from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
-from topoloc.recordings.pictures import grey_image
-from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse
-from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words, learn_words_of, placed, vlad
+from topoloc.recordings.image_io import to_grey
+from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse_localizer
+from topoloc.retrieval.vlad import (
+    SurfVlad,
+    VladConfig,
+    append_positions,
+    learn_words,
+    learn_words_from_parts,
+    vlad,
+)
 
 NO_IMAGE = np.zeros((2, 2), np.uint8)
 
@@ -38,7 +45,7 @@ def descriptors(num: int, seed: int, centres: np.ndarray | None = None) -> np.nd
     )
 
 
-def features_of(rows: np.ndarray) -> Features:
+def feature_config_for(rows: np.ndarray) -> Features:
     zero = np.zeros(len(rows), np.float32)
     return Features(np.zeros((len(rows), 2), np.float32), zero, zero, zero, rows)
 
@@ -110,7 +117,7 @@ def test_words_are_the_same_each_time():
 def test_words_of_parts_are_those_of_all(limit: int):
     parts = [descriptors(count, seed=count) for count in (50, 1, 200)]
     config = VladConfig(num_words=2, max_training_descriptors=limit)
-    words = learn_words_of([len(part) for part in parts], lambda k: parts[k], config)
+    words = learn_words_from_parts([len(part) for part in parts], lambda k: parts[k], config)
     np.testing.assert_array_equal(words, learn_words(np.concatenate(parts), config))
 
 
@@ -119,7 +126,7 @@ def test_a_place_seen_again_comes_first(dimension: int):
     localizer, rows = fitted(24, dimension=dimension)
     assert isinstance(localizer, CoarseLocalizer)
     for k, image_rows in enumerate(rows):
-        ranking = localizer.rank(NO_IMAGE, features_of(image_rows[::2]), 5)
+        ranking = localizer.rank(NO_IMAGE, feature_config_for(image_rows[::2]), 5)
         assert ranking[0].node_id == k // 2
         assert len({score.node_id for score in ranking}) == 5
         assert sorted((score.score for score in ranking), reverse=True) == [
@@ -140,7 +147,7 @@ def things(order: np.ndarray) -> Features:
 def test_the_same_things_elsewhere_in_the_picture_are_another_place(weight: float):
     orders = [np.random.default_rng(k).permutation(60) for k in range(12)]
     config = VladConfig(num_words=4, position_weight=weight)
-    seen = [placed(things(order), 200, 100, config) for order in orders]
+    seen = [append_positions(things(order), 200, 100, config) for order in orders]
     words = learn_words(np.concatenate(seen), config)
     localizer = SurfVlad.fit(words, np.stack([vlad(s, words) for s in seen]), np.arange(12), config)
     again = SurfVlad.from_model(localizer.to_model())
@@ -155,12 +162,12 @@ def test_the_same_things_elsewhere_in_the_picture_are_another_place(weight: floa
 
 def test_places_count_from_border_to_border_whatever_the_size():
     features = things(np.arange(60))
-    small = placed(features, 200, 100, VladConfig(position_weight=0.5))
+    small = append_positions(features, 200, 100, VladConfig(position_weight=0.5))
     assert small.shape == (60, 66)
     np.testing.assert_allclose(
         small[[0, -1], 64], [0.5 * (3.5 / 200 - 0.5), 0.5 * (195.25 / 200 - 0.5)], atol=1e-6
     )
-    large = placed(
+    large = append_positions(
         replace(features, points_img=2.0 * features.points_img + 0.5),
         400,
         200,
@@ -176,19 +183,19 @@ def test_maps_without_places_in_their_words_are_read():
         model,
         settings={key: value for key, value in model.settings.items() if key != "position_weight"},
     )
-    assert SurfVlad.from_model(old).rank(NO_IMAGE, features_of(rows[3]), 1)[0].node_id == 1
+    assert SurfVlad.from_model(old).rank(NO_IMAGE, feature_config_for(rows[3]), 1)[0].node_id == 1
 
 
 def test_more_images_than_dimensions():
     localizer, rows = fitted(150, images_a_node=10, num_words=2)
     assert len(rows) > 2 * 64
-    assert localizer.rank(NO_IMAGE, features_of(rows[37][::2]), 1)[0].node_id == 3
+    assert localizer.rank(NO_IMAGE, feature_config_for(rows[37][::2]), 1)[0].node_id == 3
 
 
 @pytest.mark.parametrize("num_images", [1, 2])
 def test_maps_of_one_or_two_images(num_images: int):
     localizer, rows = fitted(num_images, images_a_node=1)
-    ranking = localizer.rank(NO_IMAGE, features_of(rows[-1]), 5)
+    ranking = localizer.rank(NO_IMAGE, feature_config_for(rows[-1]), 5)
     assert len(ranking) == num_images
     assert ranking[0].node_id == num_images - 1
     assert ranking[0].score == pytest.approx(1.0, abs=1e-4)
@@ -198,7 +205,7 @@ def test_images_all_alike_are_ranked_all_the_same():
     rows, config = descriptors(400, 1), VladConfig(num_words=4, position_weight=0.0)
     words = learn_words(rows, config)
     localizer = SurfVlad.fit(words, np.tile(vlad(rows, words), (5, 1)), np.arange(5), config)
-    ranking = localizer.rank(NO_IMAGE, features_of(rows), 5)
+    ranking = localizer.rank(NO_IMAGE, feature_config_for(rows), 5)
     assert [score.node_id for score in ranking] == [0, 1, 2, 3, 4]
     assert [score.score for score in ranking] == pytest.approx([1.0] * 5, abs=1e-5)
 
@@ -214,10 +221,10 @@ def test_the_stored_model_ranks_alike():
     localizer, rows = fitted(30)
     model = localizer.to_model()
     assert model.name == "surf-vlad"
-    reopened = open_coarse(model)
+    reopened = open_coarse_localizer(model)
     for image_rows in rows:
         one, other = (
-            c.rank(NO_IMAGE, features_of(image_rows[:60]), 3) for c in (localizer, reopened)
+            c.rank(NO_IMAGE, feature_config_for(image_rows[:60]), 3) for c in (localizer, reopened)
         )
         assert one[0].node_id == other[0].node_id
         np.testing.assert_allclose([s.score for s in one], [s.score for s in other], atol=5e-3)
@@ -227,12 +234,12 @@ def share_of_near_candidates(map_part: str, query_part: str, config: BuildConfig
     """Of the queries, those with a node within 2 D_thresh (Eq. 1) among the five best."""
     topomap = build_map(topoloc.open_sequence(map_part), config)
     nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    coarse = open_coarse(topomap.coarse_models["surf-vlad"])
+    coarse = open_coarse_localizer(topomap.coarse_models["surf-vlad"])
     queries = topoloc.open_sequence(query_part)
     near = []
     for frame, pose in zip((queries[k] for k in range(len(queries))), queries.poses, strict=True):
         assert pose is not None
-        features = extract_features(grey_image(frame.image), FeatureConfig())
+        features = extract_features(to_grey(frame.image), FeatureConfig())
         candidates = [score.node_id for score in coarse.rank(frame.image, features, 5)]
         distances = node_distances(pose, nodes, topomap.config.lambda_rot)
         near.append(distances[candidates].min() <= 2 * topomap.config.d_thresh)

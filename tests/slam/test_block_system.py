@@ -21,10 +21,10 @@ def dense_of(num: int, pairs: list[tuple[int, int]], seed: int = 0) -> np.ndarra
 
 def blocks_of(dense: np.ndarray, pattern: BlockPattern, pairs: list[tuple[int, int]]) -> np.ndarray:
     blocks = pattern.empty()
-    for i, j in [*pairs, *((i, i) for i in range(len(pattern.ranks)))]:
-        place, is_first_above = pattern.place(i, j)
+    for i, j in [*pairs, *((i, i) for i in range(len(pattern.elimination_idx)))]:
+        block_idx, is_first_above = pattern.block_idx(i, j)
         block = dense[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
-        blocks[place] = block.T if is_first_above else block
+        blocks[block_idx] = block.T if is_first_above else block
     return blocks
 
 
@@ -41,11 +41,11 @@ def blocks_of(dense: np.ndarray, pattern: BlockPattern, pairs: list[tuple[int, i
 )
 def test_the_solution_is_that_of_a_dense_matrix(pairs: list[tuple[int, int]]):
     num = 12
-    dense, pattern = dense_of(num, pairs), BlockPattern.of(num, pairs)
+    dense, pattern = dense_of(num, pairs), BlockPattern.from_pairs(num, pairs)
     rights = np.random.default_rng(1).normal(size=(2, num, 6))
     solved = solve_blocks(
-        pattern, blocks_of(dense, pattern, pairs), rights[:, np.argsort(pattern.ranks)]
-    )[:, pattern.ranks]
+        pattern, blocks_of(dense, pattern, pairs), rights[:, np.argsort(pattern.elimination_idx)]
+    )[:, pattern.elimination_idx]
     expected = np.linalg.solve(dense, rights.reshape(2, -1).T).T.reshape(2, num, 6)
     np.testing.assert_allclose(solved, expected, rtol=1e-8, atol=1e-10)
 
@@ -64,7 +64,7 @@ def test_a_walk_of_several_laps_has_a_factor_that_grows_with_its_length():
         ]
 
     short, long = (
-        len(BlockPattern.of(3 * length, laps(length, 3)).rows) / (3 * length)
+        len(BlockPattern.from_pairs(3 * length, laps(length, 3)).rows) / (3 * length)
         for length in (100, 400)
     )
     assert long < 1.5 * short

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.motion_prediction import MotionHistory, Prediction, PredictionConfig, expected_one
+from topoloc.slam.motion_prediction import (
+    MotionHistory,
+    Prediction,
+    PredictionConfig,
+    select_expected_pose,
+)
 
 CONFIG = PredictionConfig()
 TENTH = 100_000_000
@@ -20,7 +25,7 @@ def walked(places: list[float]) -> MotionHistory:
     before = None
     for number, place in enumerate(places):
         pose = ahead(place)
-        history.remember(number * TENTH, pose, None if before is None else pose @ before.inverse())
+        history.add_pose(number * TENTH, pose, None if before is None else pose @ before.inverse())
         before = pose
     return history
 
@@ -66,20 +71,22 @@ def test_sigma_covers_what_acceleration_does():
 def test_nothing_is_known_before_anything_moved():
     history = MotionHistory(CONFIG)
     assert history.predict(0) is None
-    history.remember(0, ahead(0.0))
+    history.add_pose(0, ahead(0.0))
     first = history.predict(TENTH)
     assert first is not None
     assert first.sigma == np.inf
     assert first.distance(ahead(3.0)) == 0.0
-    history.stop()
+    history.reset()
     assert history.predict(TENTH) is None
 
 
 def test_the_motion_singles_out_one_of_two_or_none():
     gap = predicted(walked([0.1 * k for k in range(10)]), 5)
     near, far, half = ahead(1.42), ahead(2.42), ahead(1.9)
-    assert expected_one(gap, [far, near], CONFIG) is near
-    assert expected_one(gap, [half, ahead(0.9)], CONFIG) is None, "half a metre to either side"
-    assert expected_one(gap, [ahead(1.42), ahead(1.45)], CONFIG) is None
-    assert expected_one(gap, [far], CONFIG) is far, "alone, it has no rival"
-    assert expected_one(None, [near, far], CONFIG) is None
+    assert select_expected_pose(gap, [far, near], CONFIG) is near
+    assert select_expected_pose(gap, [half, ahead(0.9)], CONFIG) is None, (
+        "half a metre to either side"
+    )
+    assert select_expected_pose(gap, [ahead(1.42), ahead(1.45)], CONFIG) is None
+    assert select_expected_pose(gap, [far], CONFIG) is far, "alone, it has no rival"
+    assert select_expected_pose(None, [near, far], CONFIG) is None

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from topoloc.errors import TrajectoryError
-from topoloc.geometry.pose_conventions import PoseReading
+from topoloc.geometry.pose_conventions import PoseConventions
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import SequenceView
 from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
-from topoloc.slam.pose_checks import check_gaps, check_poses, judge_poses
+from topoloc.slam.pose_checks import check_pose_coverage, check_poses, evaluate_poses
 
 BODY_FROM_CAM = Rigid3(exp_so3(np.array([1.2, -1.1, 0.7])), np.array([0.3, -0.1, 0.5]))
 FLIP, FLU = (
@@ -71,16 +71,16 @@ def steps_of(poses: list[Rigid3], seed: int) -> list[MeasuredStep]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_right_poses_are_believed(seed: int):
-    verdict = judge_poses(steps_of(POSES, seed), POSES, T_NS)
-    assert verdict.is_believed
-    assert verdict.num_telling == len(steps_of(POSES, seed))
+    verdict = evaluate_poses(steps_of(POSES, seed), POSES, T_NS)
+    assert verdict.is_accepted
+    assert verdict.num_informative == len(steps_of(POSES, seed))
 
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_convention_is_named(name: str):
     spoil, conventions = WRONG[name]
-    verdict = judge_poses(steps_of(POSES, 0), [spoil(pose) for pose in POSES], T_NS)
-    assert not verdict.is_believed
+    verdict = evaluate_poses(steps_of(POSES, 0), [spoil(pose) for pose in POSES], T_NS)
+    assert not verdict.is_accepted
     assert verdict.conventions == conventions
 
 
@@ -101,52 +101,52 @@ def without_metres(steps: list[MeasuredStep]) -> list[MeasuredStep]:
 def test_a_single_camera_names_all_but_the_unit(name: str):
     spoil, conventions = WRONG[name]
     steps = without_metres(steps_of(POSES, 0))
-    assert judge_poses(steps, POSES, T_NS).is_believed
-    verdict = judge_poses(steps, [spoil(pose) for pose in POSES], T_NS)
+    assert evaluate_poses(steps, POSES, T_NS).is_accepted
+    verdict = evaluate_poses(steps, [spoil(pose) for pose in POSES], T_NS)
     assert verdict.conventions == (() if name == "mm" else conventions)
-    assert verdict.is_believed == (name == "mm")
+    assert verdict.is_accepted == (name == "mm")
 
 
 def test_of_a_single_camera_poses_that_do_not_move_are_not_believed():
     still = [Rigid3(pose.rotation, np.zeros(3)) for pose in POSES]
-    assert not judge_poses(without_metres(steps_of(POSES, 0)), still, T_NS).is_believed
+    assert not evaluate_poses(without_metres(steps_of(POSES, 0)), still, T_NS).is_accepted
 
 
 def test_the_mounting_on_a_body_is_found():
-    verdict = judge_poses(
+    verdict = evaluate_poses(
         steps_of(POSES, 0), [pose @ BODY_FROM_CAM.inverse() for pose in POSES], T_NS
     )
     (convention,) = verdict.conventions
-    mended = PoseReading.of(convention).mend(Rigid3.identity())
+    mended = PoseConventions.of(convention).undo_conventions(Rigid3.identity())
     assert np.linalg.norm(mended.translation - BODY_FROM_CAM.translation) < 0.05
     assert (mended.inverse() @ BODY_FROM_CAM).angle() < np.radians(2.0)
 
 
 def test_a_shifted_clock_is_found():
     late = [None] * 6 + list(POSES[:-6])  # frame k has the pose that frame k - 6 had
-    (convention,) = judge_poses(steps_of(POSES, 0), late, T_NS).conventions
-    assert PoseReading.of(convention).shift_s == pytest.approx(0.6, abs=0.1)
+    (convention,) = evaluate_poses(steps_of(POSES, 0), late, T_NS).conventions
+    assert PoseConventions.of(convention).shift_s == pytest.approx(0.6, abs=0.1)
 
 
 def test_poses_of_another_place_are_not_explained():
     rng = np.random.default_rng(1)
-    verdict = judge_poses(
+    verdict = evaluate_poses(
         steps_of(POSES, 0), [Rigid3.exp(rng.normal(0.0, 1.0, 6)) for _ in POSES], T_NS
     )
-    assert not verdict.is_believed
+    assert not verdict.is_accepted
     assert verdict.conventions == ()
 
 
 def test_positions_beyond_all_places_are_not_believed():
     far = [Rigid3(pose.rotation, 1e200 * pose.translation) for pose in POSES]
-    verdict = judge_poses(steps_of(POSES, 0), far, T_NS)
-    assert not verdict.is_believed
+    verdict = evaluate_poses(steps_of(POSES, 0), far, T_NS)
+    assert not verdict.is_accepted
     assert verdict.conventions == ()
 
 
 def test_a_camera_that_stands_still_tells_nothing():
     still = [MeasuredStep(k, k + 1, Rigid3.identity(), 3.0) for k in range(20)]
-    assert judge_poses(still, [pose.inverse() for pose in POSES], T_NS).is_believed
+    assert evaluate_poses(still, [pose.inverse() for pose in POSES], T_NS).is_accepted
 
 
 def test_steps_are_measured_from_pictures(tiny_recording: Path):
@@ -189,5 +189,5 @@ def test_gaps_of_more_than_half(tiny_recording: Path):
     sequence = open_sequence(tiny_recording)
     poses = [pose if k < 5 else None for k, pose in enumerate(sequence.poses)]
     with pytest.raises(TrajectoryError, match=f"only 5 of {len(sequence)} frames"):
-        check_gaps(SequenceView(sequence, list(range(len(sequence))), poses))
-    check_gaps(sequence)
+        check_pose_coverage(SequenceView(sequence, list(range(len(sequence))), poses))
+    check_pose_coverage(sequence)

@@ -15,14 +15,14 @@ from topoloc.geometry.alignment import absolute_trajectory_errors
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.points.disparity import measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
-from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceView
+from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceFeatures
 from topoloc.slam.loop_closure import LoopConfig, find_links
 from topoloc.slam.odometry import Odometry
-from topoloc.slam.place_matching import PlaceMatchingConfig, place_view
+from topoloc.slam.place_matching import PlaceMatchingConfig, extract_place_features
 from topoloc.slam.slam import SlamConfig, run_slam
-from topoloc.slam.steps import OdometryConfig
+from topoloc.slam.step_estimation import OdometryConfig
 from topoloc.slam.submap_joins import JoinConfig, find_joins, group_submaps
 
 HERE, BEYOND = np.arange(0.0, 4.8, 0.4), np.arange(6.0, 10.8, 0.4)
@@ -74,9 +74,9 @@ def tracked(*recordings: FrameList) -> tuple[list[KeyFrame], list[FramePose]]:
 
 
 def looking_at(*recordings: StereoSequence):
-    def look(keyframe: KeyFrame) -> PlaceView:
-        return place_view(
-            frame_view(recordings[keyframe.recording][keyframe.frame_idx]), PlaceMatchingConfig()
+    def look(keyframe: KeyFrame) -> PlaceFeatures:
+        return extract_place_features(
+            prepare_frame(recordings[keyframe.recording][keyframe.frame_idx]), PlaceMatchingConfig()
         )
 
     return look

@@ -7,11 +7,11 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.answer import Answered
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.pose_fit import SeenPoints
+from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.result import Alternative, Localization, NotLocalized
+from topoloc.localization.result_decision import LocalizationWithInliers
 from topoloc.localization.search import Trace
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.tracking.stream_result import StreamedPose
@@ -37,14 +37,14 @@ class PanelWall(Localizer):
         self.num_asked, self.probability = 0, 0.99
         self.topomap, self.map_id = TopoMetricMap([], [], [], [], {}), ""
 
-    def localize_near(
+    def localize_with_inliers(
         self,
         image: np.ndarray,
-        camera: Camera | RoughCamera,
+        camera: Camera | UncalibratedCamera,
         prior: Rigid3 | None,
         max_ms: float | None = None,
         trace: Trace | None = None,
-    ) -> tuple[Localization | NotLocalized, list[Answered]]:
+    ) -> tuple[Localization | NotLocalized, list[LocalizationWithInliers]]:
         self.num_asked += 1
         xs = self.xs
         if prior is not None:
@@ -64,15 +64,15 @@ class PanelWall(Localizer):
         ]
 
 
-def _answered(x: float, probability: float) -> Answered:
+def _answered(x: float, probability: float) -> LocalizationWithInliers:
     """A pose with points too few to be followed."""
     return Localization(at(x), _SIGMA, probability, int(x), [], 40, 40), _points(x)
 
 
-def _points(x: float) -> SeenPoints:
+def _points(x: float) -> PointObservations:
     points_cam = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5], [0.0, 0.1, 0.5], [0.1, 0.1, 0.5]])
     covariances = np.tile(1e-6 * np.eye(3), (4, 1, 1))
-    return SeenPoints(
+    return PointObservations(
         CAMERA.img_from_cam(points_cam).astype(np.float32),
         points_cam + np.array([x, 0.0, 0.0]),
         covariances,

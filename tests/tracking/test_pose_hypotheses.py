@@ -30,7 +30,7 @@ def seen(
 ) -> None:
     """A picture that may have been taken at any of these poses."""
     hypotheses.predict(t_ns, odom_from_cam)
-    hypotheses.weigh(t_ns, one_of(*poses), odom_from_cam)
+    hypotheses.update_weights(t_ns, one_of(*poses), odom_from_cam)
 
 
 def walked_a_second() -> PoseHypotheses:
@@ -49,37 +49,39 @@ def best_x(hypotheses: PoseHypotheses) -> float:
 def test_nothing_is_predicted_before_the_first_pose_nor_long_after_the_last():
     hypotheses = PoseHypotheses(HypothesesConfig())
     assert hypotheses.predict(SECOND) is None
-    assert hypotheses.is_decided
+    assert hypotheses.is_unambiguous
     hypotheses = walked_a_second()
     soon = hypotheses.predict(SECOND * 3 // 2)
     assert soon is not None
-    assert hypotheses.continues
+    assert hypotheses.is_track_continued
     assert translation_error(soon.world_from_cam, at(1.5)) < 0.05
     assert hypotheses.predict(SECOND * 21 // 10) is None
-    assert not hypotheses.continues
+    assert not hypotheses.is_track_continued
 
 
-@pytest.mark.parametrize(("share_new", "is_decided"), [(1.0, True), (0.05, False)])
+@pytest.mark.parametrize(("new_evidence_ratio", "is_unambiguous"), [(1.0, True), (0.05, False)])
 def test_a_pose_that_is_not_sure_is_believed_once_another_picture_says_so(
-    share_new: float, is_decided: bool
+    new_evidence_ratio: float, is_unambiguous: bool
 ):
     hypotheses = PoseHypotheses(HypothesesConfig())
-    hypotheses.weigh(0, one_of(at(0.0), sum_=0.8))
-    assert not hypotheses.is_decided
+    hypotheses.update_weights(0, one_of(at(0.0), sum_=0.8))
+    assert not hypotheses.is_unambiguous
     hypotheses.predict(STEP_NS)
-    hypotheses.weigh(STEP_NS, one_of(at(0.1), sum_=0.8), share_new=share_new)
-    assert hypotheses.is_decided == is_decided
+    hypotheses.update_weights(
+        STEP_NS, one_of(at(0.1), sum_=0.8), new_evidence_ratio=new_evidence_ratio
+    )
+    assert hypotheses.is_unambiguous == is_unambiguous
 
 
 def test_pictures_without_a_pose_count_against_what_little_speaks_for():
     doubtful, established = PoseHypotheses(HypothesesConfig()), walked_a_second()
-    doubtful.weigh(0, one_of(at(0.0), sum_=0.95))
-    assert doubtful.is_decided
+    doubtful.update_weights(0, one_of(at(0.0), sum_=0.95))
+    assert doubtful.is_unambiguous
     for hypotheses in (doubtful, established):
         for _ in range(3):
-            hypotheses.weigh(SECOND, [])
-    assert not doubtful.is_decided
-    assert established.is_decided
+            hypotheses.update_weights(SECOND, [])
+    assert not doubtful.is_unambiguous
+    assert established.is_unambiguous
 
 
 def test_odometry_carries_further():
@@ -95,8 +97,8 @@ def test_a_jump_is_believed_when_the_next_poses_agree_with_it():
     hypotheses, decided, followed = walked_a_second(), [], []
     for k in range(1, 4):
         seen(hypotheses, SECOND + k * STEP_NS, at(1.0 + 0.1 * k, z=6.0))
-        decided.append(hypotheses.is_decided)
-        followed.append(hypotheses.continues)
+        decided.append(hypotheses.is_unambiguous)
+        followed.append(hypotheses.is_track_continued)
     assert decided == [True, False, True], "in between it may be either"
     assert followed == [True, False, True]
     assert hypotheses.best is not None
@@ -128,20 +130,20 @@ def test_the_motion_decides_between_alternatives_however_improbable_the_right_on
     for k in range(1, 5):
         x = 1.0 + 0.1 * k
         hypotheses.predict(SECOND + k * STEP_NS)
-        hypotheses.weigh(
+        hypotheses.update_weights(
             SECOND + k * STEP_NS,
             [Candidate(at(x + off), SIGMA, share, 0) for off, share in shares.items()],
         )
-        assert hypotheses.is_decided
-        assert hypotheses.taken == 1
+        assert hypotheses.is_unambiguous
+        assert hypotheses.candidate_idx == 1
         assert best_x(hypotheses) == pytest.approx(x, abs=0.02)
 
 
 def test_answers_that_miss_the_true_pose_begin_a_doubt_and_no_more():
     hypotheses = walked_a_second()
     seen(hypotheses, SECOND + STEP_NS, at(5.1), at(6.1), at(7.1))
-    assert hypotheses.is_decided
-    assert hypotheses.taken is None
+    assert hypotheses.is_unambiguous
+    assert hypotheses.candidate_idx is None
     assert best_x(hypotheses) == pytest.approx(1.1, abs=0.02)
 
 
@@ -154,7 +156,7 @@ def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
             *(at(0.1 * k + panel) for panel in range(4)),
             odom_from_cam=at(0.1 * k),
         )
-        assert not hypotheses.is_decided
+        assert not hypotheses.is_unambiguous
         alternatives = hypotheses.alternatives()
         assert len(alternatives) == 4
         assert sorted(
@@ -162,7 +164,7 @@ def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
         ) == [0.0, 1.0, 2.0, 3.0]
         assert 0.9 < sum(one.probability for one in alternatives) <= 1.0
     seen(hypotheses, 8 * STEP_NS, at(2.8), odom_from_cam=at(0.8))
-    assert hypotheses.is_decided
+    assert hypotheses.is_unambiguous
     assert best_x(hypotheses) == pytest.approx(2.8, abs=0.01)
 
 
@@ -172,7 +174,7 @@ def test_the_motion_decides_between_alternatives_of_which_only_one_moves_as_the_
     for k in range(6):
         wrong = [at(x, z=20.0) for x in rng.uniform(-30, 30, 3)]
         seen(hypotheses, k * STEP_NS, *wrong, at(0.1 * k), odom_from_cam=at(0.1 * k))
-        decided.append(hypotheses.is_decided)
+        decided.append(hypotheses.is_unambiguous)
     assert not any(decided[:2])
     assert decided[-1]
     assert best_x(hypotheses) == pytest.approx(0.5, abs=0.02)
@@ -184,7 +186,7 @@ def test_followed_points_move_all_hypotheses():
     hypotheses.predict(STEP_NS)
     assert hypotheses.best is not None
     x = best_x(hypotheses)
-    hypotheses.move(at(x + 0.3), SIGMA, None)
+    hypotheses.apply_motion(at(x + 0.3), SIGMA, None)
     assert sorted(
         float(one.world_from_cam.translation[0]) for one in hypotheses.alternatives()
     ) == pytest.approx([0.3, 5.3], abs=1e-3)

@@ -13,11 +13,11 @@ from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.editing import create_atlas, new_tiles
-from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import QueryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.frame import StereoFrame
@@ -51,7 +51,9 @@ def rooms(
 
 @pytest.fixture
 def tracker(rooms: tuple[Path, list[StereoFrame]]) -> TileTracker:
-    return TileTracker(AtlasLocalizer(Atlas.open(str(rooms[0])), Maps([], Localizer, 512_000_000)))
+    return TileTracker(
+        AtlasLocalizer(Atlas.open(str(rooms[0])), MapCache([], Localizer, 512_000_000))
+    )
 
 
 def test_a_walk_is_followed_from_tile_to_tile(
@@ -70,7 +72,7 @@ def test_a_walk_is_followed_from_tile_to_tile(
         assert translation_error(answer.result.world_from_cam, frame.world_from_cam) < 0.05
         tiles.append(answer.result.provenance.tile)
     assert tiles == 5 * ["room"] + 5 * ["other"]
-    missed = tracker.miss(t_ns + STEP_NS, NotLocalized("unreadable"))
+    missed = tracker.process_missing(t_ns + STEP_NS, NotLocalized("unreadable"))
     assert missed.state == "predicted"
     assert missed.result.provenance.tile == "other"
     with pytest.raises(QueryError, match="goes backwards"):

@@ -243,9 +243,11 @@ def test_pictures_larger_than_those_that_points_are_followed_in(localizer: Local
 
 def test_a_picture_that_cannot_be_read_is_predicted(localizer: Localizer):
     tracker = Tracker(localizer)
-    assert tracker.miss(0, NotLocalized("unreadable")).state == "lost"
+    assert tracker.process_missing(0, NotLocalized("unreadable")).state == "lost"
     _stream(tracker, 0, 8, delay_ns=1)
-    missed = tracker.miss(room_stream()[8][0] + 1, NotLocalized("unreadable", detail="cut off"))
+    missed = tracker.process_missing(
+        room_stream()[8][0] + 1, NotLocalized("unreadable", detail="cut off")
+    )
     assert missed.state == "predicted"
     assert translation_error(_smoothed(missed), room_stream()[8][2]) < 0.03
     assert missed.to_json("")["reason"] == "unreadable"

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from topoloc.retrieval.backbones import normalize_pictures
+from topoloc.retrieval.backbones import normalize_images
 from topoloc_training.augmentation import augment
 from topoloc_training.classifier_config import AugmentationConfig
 
@@ -26,7 +26,7 @@ def varied(config: AugmentationConfig, seed: int = 0) -> torch.Tensor:
 
 
 def test_switched_off_nothing_changes():
-    torch.testing.assert_close(varied(OFF), normalize_pictures(pictures()), atol=2e-2, rtol=0)
+    torch.testing.assert_close(varied(OFF), normalize_images(pictures()), atol=2e-2, rtol=0)
 
 
 @pytest.mark.parametrize("kind", [item.name for item in fields(AugmentationConfig)])
@@ -45,8 +45,8 @@ def test_the_same_seed_gives_the_same_pictures_and_another_others():
 def test_colours_stay_colours():
     images = varied(AugmentationConfig(brightness=2.0, contrast=2.0, gamma=2.0))
     darkest, brightest = (
-        normalize_pictures(torch.zeros(1, 1, 1, 3)),
-        normalize_pictures(torch.full((1, 1, 1, 3), 255.0)),
+        normalize_images(torch.zeros(1, 1, 1, 3)),
+        normalize_images(torch.full((1, 1, 1, 3), 255.0)),
     )
     assert (images >= darkest - 1e-4).all()
     assert (images <= brightest + 1e-4).all()

@@ -15,16 +15,16 @@ from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
 from topoloc.retrieval.backbones import Backbone
 from topoloc.retrieval.cnn_fc import CnnFc
-from topoloc.retrieval.coarse import CoarseModel, open_coarse
-from topoloc.retrieval.network_config import PictureConfig
-from topoloc.retrieval.network_pictures import decode_picture
+from topoloc.retrieval.coarse import CoarseModel, open_coarse_localizer
+from topoloc.retrieval.network_config import NetworkInputConfig
+from topoloc.retrieval.network_images import decode_stored_image
 from topoloc_training import cnn_fc, frozen_maps, training
 from topoloc_training.classifier_config import AugmentationConfig, CnnFcConfig, TrainingConfig
 from topoloc_training.cnn_fc import calibrated_temperature, soft_labels
 from topoloc_training.training_set import TrainingSet
 from topoloc_training.weights import Weights, read_weights
 
-TINY = PictureConfig(64, 48)
+TINY = NetworkInputConfig(64, 48)
 
 
 def config(num_epochs: int, **settings: float) -> CnnFcConfig:
@@ -42,9 +42,9 @@ def train(room_set: TrainingSet, how: CnnFcConfig, checkpoint: Path | None = Non
 
 def test_from_nothing_it_learns_the_room(room_set: TrainingSet):
     model = train(room_set, config(110, learning_rate=3e-3))
-    localizer = open_coarse(model)
+    localizer = open_coarse_localizer(model)
     assert isinstance(localizer, CnnFc)
-    pictures = [decode_picture(jpeg) for jpeg in room_set.jpegs]
+    pictures = [decode_stored_image(jpeg) for jpeg in room_set.jpegs]
     answers = [ranking[0].node_id for ranking in localizer.rank_batch(pictures, 1)]
     assert np.mean(np.array(answers) == room_set.node_ids) > 0.9
     probabilities = localizer.probabilities([unseen_views()[0][0]])
@@ -118,7 +118,7 @@ def test_a_loss_that_is_not_finite_ends_with_the_last_good_state(
 
 
 def test_one_node_and_nodes_with_one_image(two_images: TrainingSet, room_set: TrainingSet):
-    localizer = open_coarse(train(two_images, config(1)))
+    localizer = open_coarse_localizer(train(two_images, config(1)))
     assert [(s.node_id, s.score) for s in localizer.rank(unseen_views()[0][0], NO_FEATURES, 5)] == [
         (0, 1.0)
     ]
@@ -210,7 +210,7 @@ def test_copies_are_made_once_and_as_many_as_there_is_room_for(
 def test_a_model_that_lacks_a_part_is_damaged(two_images: TrainingSet):
     model = train(two_images, config(1))
     with pytest.raises(MapError, match=r"'cnn-fc' is damaged"):
-        open_coarse(replace(model, settings={**model.settings, "num_nodes": 5}))
+        open_coarse_localizer(replace(model, settings={**model.settings, "num_nodes": 5}))
 
 
 def test_labels_are_single_or_spread_over_nodes_about_as_near(room_set: TrainingSet):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from topoloc.errors import WeightsError
-from topoloc.retrieval.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc.retrieval.efficientnet import SameConv
 from topoloc_training import efficientnet_weights
 from topoloc_training.weights import find_weights, load_features, read_weights
@@ -83,9 +83,7 @@ def test_the_first_layers_are_those_of_the_published_network(
             SameConv(32, 32, 3, groups=32, bias=False),
         ).clamp(0.0, 6.0)
         maps = layer(maps, "_blocks.0.", "_project_conv", "_bn2", nn.Conv2d(32, 16, 1, bias=False))
-        torch.testing.assert_close(
-            network(normalize_pictures(pictures)), maps, atol=1e-4, rtol=1e-4
-        )
+        torch.testing.assert_close(network(normalize_images(pictures)), maps, atol=1e-4, rtol=1e-4)
     assert maps.shape == (1, 16, 16, 20)
 
 

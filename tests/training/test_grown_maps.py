@@ -14,11 +14,11 @@ from test_place_vectors import NO_FEATURES, silent
 from built_room import built_room
 from topoloc.apps.cli import main
 from topoloc.errors import TrainingError
-from topoloc.lifelong.coarse_models import taught_places
+from topoloc.lifelong.coarse_model_update import update_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.retrieval.coarse import CoarseModel, open_coarse
-from topoloc.retrieval.network_config import PictureConfig
-from topoloc.retrieval.network_pictures import decode_picture
+from topoloc.retrieval.coarse import CoarseModel, open_coarse_localizer
+from topoloc.retrieval.network_config import NetworkInputConfig
+from topoloc.retrieval.network_images import decode_stored_image
 from topoloc_training import cnn_fc, cnn_nn
 from topoloc_training.classifier_config import (
     AugmentationConfig,
@@ -34,7 +34,7 @@ from topoloc_training.coarse_training import (
 )
 from topoloc_training.training_set import TrainingSet
 
-TINY = PictureConfig(64, 48)
+TINY = NetworkInputConfig(64, 48)
 HOW = TrainingConfig(
     max_epochs=60, patience=60, batch_size=7, held_out=0.0, num_threads=1, learning_rate=3e-3
 )
@@ -65,9 +65,9 @@ def half(grown: TopoMetricMap) -> TrainingSet:
 
 def _right(model: CoarseModel, grown: TopoMetricMap) -> np.ndarray:
     """Of each mapping picture, whether its node is named first."""
-    localizer = open_coarse(model)
+    localizer = open_coarse_localizer(model)
     ranked = [
-        localizer.rank(decode_picture(image.jpeg), NO_FEATURES, 1)[0].node_id
+        localizer.rank(decode_stored_image(image.jpeg), NO_FEATURES, 1)[0].node_id
         for image in grown.place_images
     ]
     return np.array(ranked) == [image.node_id for image in grown.place_images]
@@ -77,8 +77,8 @@ def test_vectors_of_new_pictures_join(grown: TopoMetricMap, half: TrainingSet):
     known = cnn_nn.train(half, "compact", None, CnnNnConfig(TINY), silent)
     new = [image for image in grown.place_images if image.node_id >= half.num_nodes]
     assert len(new) > 0
-    taught = taught_places(replace(grown, coarse_models={"cnn-nn": known}), {}, new)
-    assert taught.not_taught == []
+    taught = update_coarse_models(replace(grown, coarse_models={"cnn-nn": known}), {}, new)
+    assert taught.not_updated == []
     joined = taught.models["cnn-nn"].arrays
     assert np.array_equal(joined["vectors"][: len(half.jpegs)], known.arrays["vectors"])
     assert joined["node_ids"].tolist() == [*half.node_ids, *(image.node_id for image in new)]
@@ -92,7 +92,7 @@ def test_a_classifier_is_widened_and_goes_on(grown: TopoMetricMap, half: Trainin
         cnn_fc.train(half, "compact", None, CLASSIFIER, silent), list(range(half.num_nodes))
     )
     with_known = replace(grown, coarse_models={"cnn-fc": known})
-    assert taught_places(with_known, {}, list(grown.place_images)).not_taught == ["cnn-fc"]
+    assert update_coarse_models(with_known, {}, list(grown.place_images)).not_updated == ["cnn-fc"]
     config = CoarseTrainingConfig(cnn_fc=CLASSIFIER)
     widened = train_coarse(with_known, "cnn-fc", "compact", "map", config, silent)
     facts = widened.settings["trained"]

@@ -14,10 +14,10 @@ from test_weights import netvlad_tensors
 from built_room import unseen_views
 from topoloc.errors import MapError, TrainingError
 from topoloc.features.features import Features
-from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel, open_coarse
-from topoloc.retrieval.network_config import PictureConfig
-from topoloc.retrieval.network_pictures import decode_picture
-from topoloc.retrieval.vector_search import VectorSearch
+from topoloc.retrieval.coarse import CoarseLocalizer, CoarseModel, open_coarse_localizer
+from topoloc.retrieval.network_config import NetworkInputConfig
+from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
+from topoloc.retrieval.network_images import decode_stored_image
 from topoloc.retrieval.vlad_nn import VladNetwork
 from topoloc_training import cnn_nn, vlad_nn
 from topoloc_training.classifier_config import CnnNnConfig, TripletConfig, VladNnConfig
@@ -25,7 +25,7 @@ from topoloc_training.training_set import TrainingSet
 from topoloc_training.vlad_nn import tune
 from topoloc_training.weights import read_weights
 
-SMALL = PictureConfig(112, 84)
+SMALL = NetworkInputConfig(112, 84)
 NO_FEATURES = Features(
     *(np.zeros(shape, np.float32) for shape in ((0, 2), (0,), (0,), (0,), (0, 64)))
 )
@@ -48,10 +48,10 @@ def learnt(name: str, room_set: TrainingSet, weights_file: Path) -> CoarseModel:
 def test_mapping_images_are_found_and_unseen_ones_lead_near(
     name: str, room_set: TrainingSet, squeezenet_file: Path
 ):
-    localizer = open_coarse(learnt(name, room_set, squeezenet_file))
-    assert isinstance(localizer, VectorSearch)
+    localizer = open_coarse_localizer(learnt(name, room_set, squeezenet_file))
+    assert isinstance(localizer, NetworkDescriptorLocalizer)
     assert isinstance(localizer, CoarseLocalizer)
-    pictures = [decode_picture(jpeg) for jpeg in room_set.jpegs]
+    pictures = [decode_stored_image(jpeg) for jpeg in room_set.jpegs]
     rankings = localizer.rank_batch(pictures, 3)
     assert [ranking[0].node_id for ranking in rankings] == room_set.node_ids.tolist()
     assert min(ranking[0].score for ranking in rankings) > 0.95
@@ -69,8 +69,8 @@ def test_mapping_images_are_found_and_unseen_ones_lead_near(
 
 
 def test_one_picture_and_a_batch_get_the_same_vectors(room_set: TrainingSet, random_file: Path):
-    localizer = open_coarse(learnt("cnn-nn", room_set, random_file))
-    assert isinstance(localizer, VectorSearch)
+    localizer = open_coarse_localizer(learnt("cnn-nn", room_set, random_file))
+    assert isinstance(localizer, NetworkDescriptorLocalizer)
     images = [image for image, _ in unseen_views()][:3]
     single = np.concatenate([localizer.vectors([image]) for image in images])
     np.testing.assert_allclose(
@@ -87,7 +87,7 @@ def test_training_twice_gives_the_same_bytes(name: str, room_set: TrainingSet, r
 
 def test_a_map_with_one_node_answers_with_it(two_images: TrainingSet, random_file: Path):
     for name in ("cnn-nn", "vlad-nn"):
-        localizer = open_coarse(learnt(name, two_images, random_file))
+        localizer = open_coarse_localizer(learnt(name, two_images, random_file))
         ranking = localizer.rank(unseen_views()[0][0], NO_FEATURES, 4)
         assert [score.node_id for score in ranking] == [0]
 
@@ -95,7 +95,7 @@ def test_a_map_with_one_node_answers_with_it(two_images: TrainingSet, random_fil
 def test_colour_size_and_shape_of_the_query_matter_little(
     room_set: TrainingSet, squeezenet_file: Path
 ):
-    localizer = open_coarse(learnt("cnn-nn", room_set, squeezenet_file))
+    localizer = open_coarse_localizer(learnt("cnn-nn", room_set, squeezenet_file))
     image = unseen_views()[3][0]
     wider = np.pad(image, ((0, 0), (40, 40)))
     variants = [
@@ -111,9 +111,9 @@ def test_a_model_whose_arrays_do_not_fit_is_damaged(room_set: TrainingSet, rando
     model = learnt("cnn-nn", room_set, random_file)
     lacking = {name: value for name, value in model.arrays.items() if "features.4" not in name}
     with pytest.raises(MapError, match=r"'cnn-nn' is damaged: .*features\.4"):
-        open_coarse(replace(model, arrays=lacking))
+        open_coarse_localizer(replace(model, arrays=lacking))
     with pytest.raises(MapError, match="damaged"):
-        open_coarse(
+        open_coarse_localizer(
             replace(
                 model, settings={"backbone": "squeezenet1_1", "config": model.settings["config"]}
             )
@@ -126,11 +126,11 @@ def test_netvlads_own_vocabulary_is_taken_from_its_checkpoint(
     torch.save({"state_dict": netvlad_tensors(num_clusters=3)}, tmp_path / "netvlad.pth")
     weights = read_weights(tmp_path / "netvlad.pth", "vgg16")
     model = vlad_nn.train(
-        two_images, "vgg16", weights, VladNnConfig(picture=PictureConfig(40, 32)), silent
+        two_images, "vgg16", weights, VladNnConfig(picture=NetworkInputConfig(40, 32)), silent
     )
     assert model.arrays["network.pool.centroids"].shape == (3, 512)
     assert model.settings["weights"] == {"file": "netvlad.pth", "sha256": weights.sha256}
-    assert open_coarse(model).rank(unseen_views()[0][0], NO_FEATURES, 1)[0].node_id == 0
+    assert open_coarse_localizer(model).rank(unseen_views()[0][0], NO_FEATURES, 1)[0].node_id == 0
 
 
 def test_triplets_bring_near_images_together(room_set: TrainingSet):
@@ -138,7 +138,7 @@ def test_triplets_bring_near_images_together(room_set: TrainingSet):
     tuning = TripletConfig(num_epochs=3, learning_rate=1e-3, near=3.0, far=4.0, margin=0.3)
     network = VladNetwork("squeezenet1_1", 5, 8)
     pictures = np.stack(
-        [np.ascontiguousarray(decode_picture(jpeg)[:64, :64]) for jpeg in room_set.jpegs]
+        [np.ascontiguousarray(decode_stored_image(jpeg)[:64, :64]) for jpeg in room_set.jpegs]
     )
     losses = tune(network, pictures, room_set, tuning, silent)
     assert losses[-1] < losses[0]

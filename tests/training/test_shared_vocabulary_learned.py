@@ -27,8 +27,10 @@ def test_places_are_told_apart():
     }
     vocabulary = learn_vocabulary("surf", recordings, num_words=8, dimension=16)
     assert vocabulary.about["recordings"] == {"a": 12, "b": 12}
-    mapped = np.stack([vocabulary.vector(*_picture(seed, seed)) for seed in range(24)])
-    asked = np.stack([vocabulary.vector(*_picture(seed, 100 + seed)) for seed in range(24)])
+    mapped = np.stack([vocabulary.global_descriptor(*_picture(seed, seed)) for seed in range(24)])
+    asked = np.stack(
+        [vocabulary.global_descriptor(*_picture(seed, 100 + seed)) for seed in range(24)]
+    )
     assert np.array_equal(np.argmax(asked @ mapped.T, axis=1), np.arange(24))
 
 

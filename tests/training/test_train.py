@@ -17,7 +17,7 @@ import torch
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, create_atlas
-from topoloc.mapping.checking import list_coarse
+from topoloc.mapping.integrity_check import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.backbones import Backbone
 
@@ -139,7 +139,7 @@ def test_cnn_fc_needs_no_weights_and_says_what_that_costs(
         == 0
     )
     assert "knows these images alone" in capsys.readouterr().err
-    facts, *_ = list_coarse(copied_map)
+    facts, *_ = list_coarse_models(copied_map)
     assert facts["trained"]["epochs"] == 1
     assert facts["weights"] is None
 

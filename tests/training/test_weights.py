@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from topoloc.errors import WeightsError
-from topoloc.retrieval.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc_training import weights as weights_module
 from topoloc_training.weights import find_weights, load_features, read_weights
 
@@ -171,5 +171,5 @@ def test_the_published_weights_load_and_tell_pictures_apart(squeezenet_file: Pat
         .expand(2, 96, 96, 3)
     )
     with torch.inference_mode():
-        checked, plain = network(normalize_pictures(pictures)).mean(dim=(2, 3))
+        checked, plain = network(normalize_images(pictures)).mean(dim=(2, 3))
     assert torch.nn.functional.cosine_similarity(checked, plain, dim=0) < 0.7

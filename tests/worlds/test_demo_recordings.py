@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topoloc.demo.recordings import ROLES, SHIPPED, missing_recordings
+from topoloc.demo.recordings import ROLES, SHIPPED, find_missing_recordings
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.open import open_sequence
@@ -37,14 +37,14 @@ def test_rendering_begins_where_it_was_left(tmp_path: Path, monkeypatch: pytest.
         for recording in (RECORDINGS[0], RECORDINGS[3])
     ]
     monkeypatch.setattr(demo_recordings, "RECORDINGS", tuple(tiny))
-    assert missing_recordings(tmp_path) == list(ROLES)
+    assert find_missing_recordings(tmp_path) == list(ROLES)
     told: list[tuple[str, int, int]] = []
     render_recordings(tmp_path, lambda *step: told.append(step))
     frames = [step for step in told if "light" not in step[0]]
     assert frames == [
         (f"rendering {name}", done, 1) for name in ("map lap1", "night") for done in (0, 1)
     ]
-    assert set(ROLES) - set(missing_recordings(tmp_path)) == {
+    assert set(ROLES) - set(find_missing_recordings(tmp_path)) == {
         "map_lap1",
         "night",
         "pictures_of_nothing",

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from topoloc.demo.recordings import SHIPPED
-from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
-from topoloc.evaluation.metrics import Answer, summarize
+from topoloc.evaluation.metrics import EvaluatedQuery, summarize
+from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
@@ -52,7 +52,7 @@ def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
     """Rows (`stored_answers`) of every query of one recording.
 
     Raises:
-        What `opened` and `answer_queries` raise.
+        What `opened` and `localize_queries` raise.
     """
     topomap, digest = opened(bench, dataset, way.kind, way.coarse)
     sequence = queries_of(bench, dataset, label)
@@ -73,7 +73,7 @@ def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
         if way.knows_node:
             found = answer_with_known_nodes(topomap, config, sequence, known, progress, label)
         else:
-            found = answer_queries(localizer, sequence, known, progress, label)
+            found = localize_queries(localizer, sequence, known, progress, label)
         return rows_of(found)
 
     settings = {
@@ -87,7 +87,7 @@ def asked(bench: Bench, dataset: Dataset, label: str, way: Way) -> Done:
     )
 
 
-def answers(bench: Bench, dataset: Dataset, label: str, way: Way) -> list[Answer]:
+def answers(bench: Bench, dataset: Dataset, label: str, way: Way) -> list[EvaluatedQuery]:
     """The answers themselves, with their pictures at hand."""
     return answers_of(
         asked(bench, dataset, label, way).result, label, queries_of(bench, dataset, label)
@@ -132,7 +132,7 @@ def false_accepts(bench: Bench, dataset: Dataset, way: Way) -> dict[str, int]:
         given = [
             a
             for name, sequence in others
-            for a in answer_elsewhere(localizer, sequence, label=name)
+            for a in localize_out_of_map(localizer, sequence, label=name)
         ]
         return {"num_elsewhere": len(given), "accepted": sum(a.result.localized for a in given)}
 

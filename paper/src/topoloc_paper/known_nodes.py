@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.evaluation.experiments import answer_queries, frames_with_truth
-from topoloc.evaluation.metrics import Answer
+from topoloc.evaluation.metrics import EvaluatedQuery
+from topoloc.evaluation.query_localization import find_frames_with_truth, localize_queries
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.nodes import NodePoses, node_distances
@@ -55,7 +55,7 @@ def answer_with_known_nodes(
     map_from_truth: Rigid3,
     progress: Callable[[str, int, int], None],
     label: str,
-) -> list[Answer]:
+) -> list[EvaluatedQuery]:
     """Localize every frame that has a true pose, with the nodes nearest to this pose as candidates.
 
     Args:
@@ -69,12 +69,12 @@ def answer_with_known_nodes(
     """
     known_nodes = KnownNodes(topomap)
     localizer = Localizer(topomap, config, known_nodes)
-    answers: list[Answer] = []
-    frames, poses = frames_with_truth(sequence), sequence.poses
+    answers: list[EvaluatedQuery] = []
+    frames, poses = find_frames_with_truth(sequence), sequence.poses
     for done, i in enumerate(frames, start=1):
         world_from_cam = poses[i]
         assert world_from_cam is not None, "a frame with a true pose"
         known_nodes.world_from_cam = map_from_truth @ world_from_cam
-        answers += answer_queries(localizer, sequence, map_from_truth, label=label, frames=[i])
+        answers += localize_queries(localizer, sequence, map_from_truth, label=label, frames=[i])
         progress(label, done, len(frames))
     return answers

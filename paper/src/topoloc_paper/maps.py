@@ -13,18 +13,18 @@ import numpy as np
 
 from topoloc.errors import MissingExtraError
 from topoloc.features.extraction import FeatureConfig
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import write_bytes
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.network_config import PictureConfig
+from topoloc.retrieval.network_config import NetworkInputConfig
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.settings import LEARNED, Bench, sequence_digest
 from topoloc_paper.stage_code import MAPPING, TEACHING_MODULES, learning
 from topoloc_paper.stages import Done, digest_of
-from topoloc_paper.stored_answers import pose_json
+from topoloc_paper.stored_answers import pose_to_json
 from topoloc_training.classifier_config import CnnFcConfig
 from topoloc_training.coarse_training import CoarseTrainingConfig, train_coarse
 
@@ -191,10 +191,12 @@ def images_digest(topomap: TopoMetricMap) -> str:
     """A short name for what classifiers learn from: the mapping images, their poses and their
     nodes."""
     rows = [
-        [hashlib.sha256(i.jpeg).hexdigest(), i.node_id, pose_json(i.world_from_cam)]
+        [hashlib.sha256(i.jpeg).hexdigest(), i.node_id, pose_to_json(i.world_from_cam)]
         for i in topomap.place_images
     ]
-    return digest_of([rows, [pose_json(summary.world_from_cam) for summary in topomap.summaries]])
+    return digest_of(
+        [rows, [pose_to_json(summary.world_from_cam) for summary in topomap.summaries]]
+    )
 
 
 def why_not(bench: Bench, method: str) -> str | None:
@@ -210,6 +212,6 @@ def why_not(bench: Bench, method: str) -> str | None:
 
 def _training_config(bench: Bench, num_images: int) -> CoarseTrainingConfig:
     # a quarter of the work of the default; tables show what it costs
-    picture = PictureConfig(112, 84)
+    picture = NetworkInputConfig(112, 84)
     training = bench.config.training(bench.config.epochs, num_images)
     return replace(CoarseTrainingConfig(), cnn_fc=CnnFcConfig(picture=picture, training=training))

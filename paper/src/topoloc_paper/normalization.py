@@ -11,7 +11,7 @@ from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind, Normalization
 from topoloc_paper.settings import Bench
 
-KINDS: tuple[Normalization, ...] = ("none", "paper", "wide")
+FEATURE_TYPES: tuple[Normalization, ...] = ("none", "paper", "wide")
 # The images of learned features have the normalization of their network in every map.
 NORMALIZED_FEATURES = LocalizerConfig(kinds=("surf",))
 
@@ -29,7 +29,7 @@ def rows(bench: Bench, datasets: list[Dataset]) -> list[dict[str, Any]]:
 
 def _rows(bench: Bench, dataset: Dataset, label: str) -> list[dict[str, Any]]:
     found = []
-    for kind in KINDS:
+    for kind in FEATURE_TYPES:
         way = Way(MapKind.as_paper(dataset, kind), config=NORMALIZED_FEATURES)
         result = summary(bench, dataset, label, way)
         row: dict[str, Any] = {

@@ -15,9 +15,13 @@ from matplotlib.figure import Figure
 from topoloc.apps.report.figure_style import STYLE, svg_text
 from topoloc.apps.report.figures import draw_error_curves
 from topoloc.apps.report.map_figure import draw_map
-from topoloc.apps.report.page_shell import page_style
-from topoloc.apps.report.query_gallery import gallery, typical_queries, worst_queries
-from topoloc.evaluation.metrics import Answer
+from topoloc.apps.report.page_template import page_style
+from topoloc.apps.report.query_gallery import (
+    render_gallery,
+    select_typical_queries,
+    select_worst_queries,
+)
+from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import write_bytes, write_text
 from topoloc_paper import picture_figures
@@ -202,7 +206,7 @@ def _accuracy_figures(files: _Files, results: Mapping[str, Any]) -> str:
     return words + files.drawn("topological_accuracy", draw_topological_accuracy(rows))
 
 
-def _own_answers(bench: Bench, dataset: Dataset) -> list[Answer]:
+def _own_answers(bench: Bench, dataset: Dataset) -> list[EvaluatedQuery]:
     """Of all recordings, as topoloc answers by itself."""
     way = Way(MapKind.as_topoloc())
     return [answer for label in dataset.queries for answer in answers(bench, dataset, label, way)]
@@ -217,11 +221,12 @@ def _dataset_section(bench: Bench, files: _Files, dataset: Dataset) -> str:
     curves = draw_error_curves(found) if any(a.result.localized for a in found) else ()
     parts.append(f'<h3>Errors</h3><div class="halves">{"".join(curves)}</div>')
     parts.append(
-        "<h3>A typical query of each recording</h3>" + gallery(typical_queries(found), topomap)
+        "<h3>A typical query of each recording</h3>"
+        + render_gallery(select_typical_queries(found), topomap)
     )
     parts.append(
         "<h3>The best and the worst queries</h3>"
-        + gallery([*_best(found), *worst_queries(found, 3)], topomap)
+        + render_gallery([*_best(found), *select_worst_queries(found, 3)], topomap)
     )
     text = (
         "Topoloc as it comes: own nodes, surf-vlad. Lines join what was matched: green what the"
@@ -230,7 +235,7 @@ def _dataset_section(bench: Bench, files: _Files, dataset: Dataset) -> str:
     return _section(dataset.title, text, "".join(parts))
 
 
-def _best(found: Sequence[Answer]) -> list[Answer]:
+def _best(found: Sequence[EvaluatedQuery]) -> list[EvaluatedQuery]:
     localized = [a for a in found if a.result.localized and a.translation_m == a.translation_m]
     return sorted(localized, key=lambda a: a.translation_m)[:1]
 

@@ -13,7 +13,7 @@ from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoFrame
-from topoloc_paper.stored_answers import pose_json, pose_of
+from topoloc_paper.stored_answers import pose_of, pose_to_json
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +44,9 @@ def rows_of(
         truth = (
             None
             if frame.world_from_cam is None
-            else pose_json(map_from_truth @ frame.world_from_cam)
+            else pose_to_json(map_from_truth @ frame.world_from_cam)
         )
-        pose = None if answer.world_from_cam is None else pose_json(answer.world_from_cam)
+        pose = None if answer.world_from_cam is None else pose_to_json(answer.world_from_cam)
         rows.append({"query": frame.name, "pose": pose, "truth": truth, "ms": answer.ms})
     return rows
 

@@ -26,8 +26,8 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.points.metric_points import MetricPointsConfig, locate_points
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.frame_view import frame_view
-from topoloc.recordings.pictures import grey_image
+from topoloc.recordings.frame_preparation import prepare_frame
+from topoloc.recordings.image_io import to_grey
 from topoloc_paper.peer_answers import PeerAnswer
 from topoloc_paper.peer_retrieval import Retrieval
 
@@ -75,7 +75,7 @@ class PaperStep:
     def _node(self, sequence: StereoSequence, index: int) -> _Node:
         frame = sequence[index]
         assert frame.world_from_cam is not None, "a mapping frame"
-        view = frame_view(frame)
+        view = prepare_frame(frame)
         points_img, sizes, descriptors = self._features(view.grey)
         zeros = np.zeros(len(points_img), np.float32)
         located = locate_points(
@@ -109,7 +109,7 @@ class PaperStep:
         assert frame.camera is not None
         (node_id,) = self._retrieval.nodes(frame.image, 1)
         node = self._nodes[node_id]
-        points_img, _, descriptors = self._features(grey_image(frame.image))
+        points_img, _, descriptors = self._features(to_grey(frame.image))
         if len(points_img) < 2 or len(node.descriptors) < 2:
             return None
         matcher = cv2.FlannBasedMatcher(

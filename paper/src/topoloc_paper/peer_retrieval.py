@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from topoloc.features.extraction import extract_features
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import Image, StereoFrame
-from topoloc.recordings.pictures import grey_image
-from topoloc.retrieval.coarse import open_coarse
+from topoloc.recordings.image_io import to_grey
+from topoloc.retrieval.coarse import open_coarse_localizer
 from topoloc_paper.peer_answers import PeerAnswer
 
 
@@ -25,7 +25,7 @@ class Retrieval:
         self._features = topomap.config.features
         self._world_from_nodes = [summary.world_from_cam for summary in topomap.summaries]
         model = topomap.coarse_models["surf-vlad"]
-        self._coarse = open_coarse(model)
+        self._coarse = open_coarse_localizer(model)
         self.map_bytes = sum(array.nbytes for array in model.arrays.values())
 
     def nodes(self, image: Image, num: int) -> list[int]:
@@ -33,7 +33,7 @@ class Retrieval:
         return [
             score.node_id
             for score in self._coarse.rank(
-                image, extract_features(grey_image(image), self._features), num
+                image, extract_features(to_grey(image), self._features), num
             )
         ]
 

@@ -10,7 +10,7 @@ from topoloc.features.patch_normalization import PatchNormalizationConfig, patch
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.recordings.pictures import grey_image
+from topoloc.recordings.image_io import to_grey
 from topoloc_paper import posenet_baseline
 from topoloc_paper.asking import Way, answers, queries_of
 from topoloc_paper.datasets import Dataset
@@ -62,7 +62,7 @@ def normalized_pairs(bench: Bench) -> dict[str, Figure]:
         rows, names = [], []
         for name, column in zip(["mapped", *dataset.queries], columns, strict=True):
             if name in ("mapped", *list(dataset.queries)[-1:]):
-                grey = grey_image(column[0])
+                grey = to_grey(column[0])
                 paper = patch_normalize(grey, PatchNormalizationConfig.paper())
                 rows.append(
                     [grey, paper, patch_normalize(grey, PatchNormalizationConfig(65, 24.0))]

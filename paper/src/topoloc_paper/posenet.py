@@ -17,15 +17,15 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from topoloc.bounds import settings_from
+from topoloc.bounds import parse_settings
 from topoloc.errors import WeightsError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.retrieval.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc.retrieval.coarse import Image
-from topoloc.retrieval.inference import BATCH_SIZE, in_channels_last
-from topoloc.retrieval.network_config import BackboneName, PictureConfig
-from topoloc.retrieval.network_pictures import PictureShape, network_pictures
+from topoloc.retrieval.inference import BATCH_SIZE, to_channels_last
+from topoloc.retrieval.network_config import BackboneName, NetworkInputConfig
+from topoloc.retrieval.network_images import ImageShape, prepare_network_images
 from topoloc_paper.pose_losses import beta_loss, learnt_loss, reprojection_loss
 from topoloc_training.augmentation import augment
 from topoloc_training.classifier_config import AugmentationConfig, TrainingConfig
@@ -51,7 +51,7 @@ class PoseNetConfig:
     beta: float = 2.0
     """Metres that an error of the quaternion by 1 counts, with `beta`."""
     num_hidden: int = 512
-    picture: PictureConfig = field(default_factory=PictureConfig)
+    picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     augmentation: AugmentationConfig = field(
         default_factory=lambda: AugmentationConfig(crop=0.0, rotation_deg=0.0)
@@ -97,7 +97,7 @@ class PoseNet:
 
     backbone: BackboneName
     config: PoseNetConfig
-    picture_shape: PictureShape
+    picture_shape: ImageShape
     network: PoseRegressor
     held_out_m: float
     training: Training | None = None
@@ -105,7 +105,7 @@ class PoseNet:
     def localize(self, images: Sequence[Image]) -> list[Rigid3]:
         """world_from_cam of each image. PoseNet never says that it does not know."""
         pictures = torch.from_numpy(
-            network_pictures(images, self.picture_shape, self.config.picture)
+            prepare_network_images(images, self.picture_shape, self.config.picture)
         )
         translations, quaternions = _poses(self.network, pictures)
         return [
@@ -131,10 +131,10 @@ class PoseNet:
         """The inverse of `save`. Raises WeightsError."""
         try:
             content = torch.load(path, weights_only=True)
-            config = settings_from(PoseNetConfig, content["config"], "config", is_strict=False)
+            config = parse_settings(PoseNetConfig, content["config"], "config", is_strict=False)
             network = PoseRegressor(content["backbone"], config.num_hidden)
             network.load_state_dict(content["network"])
-            shape = PictureShape(*content["picture_shape"])
+            shape = ImageShape(*content["picture_shape"])
             return PoseNet(
                 content["backbone"], config, shape, network.eval(), content["held_out_m"]
             )
@@ -165,7 +165,7 @@ def train_posenet(
     progress = progress or (lambda stage, done, total: None)
     training_set = training_set_of(topomap)
     images, shape = decode_pictures(training_set)
-    pictures = torch.from_numpy(network_pictures(images, shape, config.picture))
+    pictures = torch.from_numpy(prepare_network_images(images, shape, config.picture))
     translations = torch.tensor(
         np.stack([p.translation for p in training_set.world_from_cams]), dtype=torch.float32
     )
@@ -176,7 +176,7 @@ def train_posenet(
     judged = np.flatnonzero(held_out) if held_out.any() else np.arange(len(held_out))
     torch.manual_seed(config.training.seed)
     network = PoseRegressor(backbone, config.num_hidden)
-    in_channels_last(network)
+    to_channels_last(network)
     network.centre.copy_(translations.mean(dim=0))
     network.scale.copy_(translations.std(dim=0, correction=0).clamp(min=0.05))
     pretrained = [] if weights is None else list(network.backbone.parameters())
@@ -227,7 +227,7 @@ def train_posenet(
 def _poses(network: PoseRegressor, pictures: Tensor) -> tuple[Tensor, Tensor]:
     network.eval()
     with torch.inference_mode():
-        parts = [network(normalize_pictures(batch)) for batch in pictures.split(BATCH_SIZE)]
+        parts = [network(normalize_images(batch)) for batch in pictures.split(BATCH_SIZE)]
     return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
 
 

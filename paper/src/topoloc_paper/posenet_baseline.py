@@ -16,14 +16,14 @@ import numpy as np
 
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.retrieval.network_config import PictureConfig
+from topoloc.retrieval.network_config import NetworkInputConfig
 from topoloc_paper.asking import queries_of
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind, built, path_of
 from topoloc_paper.settings import Bench, sequence_digest
 from topoloc_paper.stage_code import learning
 from topoloc_paper.stages import Done, digest_of
-from topoloc_paper.stored_answers import pose_json, pose_of
+from topoloc_paper.stored_answers import pose_of, pose_to_json
 
 if TYPE_CHECKING:
     from topoloc_paper.posenet import PoseNet, PoseNetConfig
@@ -104,8 +104,8 @@ def asked(bench: Bench, dataset: Dataset, label: str) -> dict[str, Any]:
         truths = [known @ pose for pose in sequence.poses if pose is not None]
         found = network.localize([sequence[i].image for i in posed])
         return {
-            "poses": [pose_json(pose) for pose in found],
-            "truths": [pose_json(pose) for pose in truths],
+            "poses": [pose_to_json(pose) for pose in found],
+            "truths": [pose_to_json(pose) for pose in truths],
         }
 
     settings = {"posenet": done.digest, "queries": sequence_digest(sequence)}
@@ -131,4 +131,4 @@ def _config(bench: Bench, loss: str, num_images: int) -> PoseNetConfig:
     from topoloc_paper.posenet import PoseNetConfig
 
     training = bench.config.training(bench.config.posenet_epochs, num_images)
-    return PoseNetConfig(loss, picture=PictureConfig(112, 84), training=training)  # pyright: ignore[reportArgumentType]
+    return PoseNetConfig(loss, picture=NetworkInputConfig(112, 84), training=training)  # pyright: ignore[reportArgumentType]

@@ -11,7 +11,7 @@ from topoloc.recordings.frame import StereoSequence
 from topoloc.retrieval.network_config import BackboneName
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.stages import StageStore, digest_of
-from topoloc_paper.stored_answers import pose_json
+from topoloc_paper.stored_answers import pose_to_json
 from topoloc_training.classifier_config import TrainingConfig
 
 Progress = Callable[[str, int, int], None]
@@ -136,7 +136,7 @@ class Bench:
 
 def sequence_digest(sequence: StereoSequence) -> str:
     """A short name for a recording: its frames' names and poses, and its first and last picture."""
-    poses = [None if pose is None else pose_json(pose) for pose in sequence.poses]
+    poses = [None if pose is None else pose_to_json(pose) for pose in sequence.poses]
     pictures = [
         hashlib.sha256(sequence[i].image.tobytes()).hexdigest() for i in (0, len(sequence) - 1)
     ]

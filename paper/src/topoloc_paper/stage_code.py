@@ -76,7 +76,11 @@ MAPPING = StageCode(("topoloc/mapping/build.py", _READING))
 def asking(coarse: str, *others: str) -> StageCode:
     """Queries answered by a `Localizer` with this coarse localizer; `others` are modules that take
     part."""
-    answering = ("topoloc/evaluation/experiments.py", "topoloc_paper/stored_answers.py", _READING)
+    answering = (
+        "topoloc/evaluation/query_localization.py",
+        "topoloc_paper/stored_answers.py",
+        _READING,
+    )
     return StageCode((*answering, COARSE_MODULES[coarse], *others), _COUNTING)
 
 

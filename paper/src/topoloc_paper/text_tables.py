@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from topoloc.evaluation.metrics import length_text
+from topoloc.evaluation.metrics import format_length
 
 Row = Mapping[str, Any]
 MISSING = "–"
@@ -89,7 +89,7 @@ def error_words(row: Row) -> str:
         return f"not run: {row['missing']}"
     if row.get("median_translation_m") is None:
         return f"none of {row['num_queries']} localized"
-    found = f"{length_text(row['median_translation_m'])}, {row['median_rotation_deg']:.2f}°"
+    found = f"{format_length(row['median_translation_m'])}, {row['median_rotation_deg']:.2f}°"
     return (
         found
         if row["num_localized"] == row["num_queries"]
@@ -102,7 +102,7 @@ def paper_words(row: Row) -> str:
     return (
         MISSING
         if row.get("paper_m") is None
-        else f"{length_text(row['paper_m'])}, {row['paper_deg']:.2f}°"
+        else f"{format_length(row['paper_m'])}, {row['paper_deg']:.2f}°"
     )
 
 
@@ -291,7 +291,7 @@ def targets_table(rows: Sequence[Row]) -> Table:
     """A line for each target."""
     lines = []
     for row in rows:
-        asked = length_text(row["asked_m"]) + (
+        asked = format_length(row["asked_m"]) + (
             f", {row['asked_deg']:.2f}°" if row["asked_deg"] is not None else ""
         )
         verdict = (

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from topoloc.atlas.global_descriptors import GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index import AtlasIndex
 from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
 from topoloc.atlas.manifest import Manifest, Tile
-from topoloc.atlas.place_vectors import PlaceVectors, read_vectors
 from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of
 from topoloc.errors import AtlasError
 
@@ -33,7 +33,7 @@ def is_atlas(where: str) -> bool:
     return "://" in where or os.path.isfile(Path(where) / MANIFEST)
 
 
-def whole_address(where: str) -> str:
+def absolute_address(where: str) -> str:
     """Of an atlas, as it is found from any folder."""
     return where if "://" in where else os.path.abspath(where)
 
@@ -70,16 +70,16 @@ class Atlas:
 
     def map_path(self, tile: Tile) -> Path:
         """The tile's map file. Raises AtlasError where it is missing."""
-        return self.store.local(tile.map.name, tile.map.sha256)
+        return self.store.local_path(tile.map.name, tile.map.sha256)
 
     @cached_property
     def _opened(self) -> OpenedIndex:
         return open_index(self.manifest.tiles, self.places_of, index_folder(self.store.where))
 
-    def places_of(self, tile: Tile) -> PlaceVectors:
+    def places_of(self, tile: Tile) -> GlobalDescriptors:
         """The place vectors of a tile's nodes. Raises AtlasError."""
-        return read_vectors(
-            self.store.local(tile.places.name, tile.places.sha256), tile.vocabularies
+        return load_global_descriptors(
+            self.store.local_path(tile.places.name, tile.places.sha256), tile.vocabularies
         )
 
     @property
@@ -103,7 +103,7 @@ def tile_problem(atlas: Atlas, tile: Tile) -> str | None:
     names."""
     for stored in tile.files:
         try:
-            path = atlas.store.local(stored.name, stored.sha256)
+            path = atlas.store.local_path(stored.name, stored.sha256)
             if path.stat().st_size != stored.num_bytes or sha256_of(path) != stored.sha256:
                 return f"{stored.name} is not the file that was added: its checksum is another"
         except AtlasError as error:

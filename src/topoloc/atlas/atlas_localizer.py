@@ -5,9 +5,9 @@ the tiles (`index.py`) by the cheapest kind of features. A tile that leads by fa
 by all means (`localization/localizer.py`); else the likeliest are asked at a glance, by retrieval
 alone, until a pose is clear. Where none is, the next kind of features ranks them, and more are
 asked at a glance; the most promising ones by all means until one answers. Last, tiles that look as
-much like the picture as the one that answered must not vouch for a pose as well (`verdict.py`):
-aliasing grows with the number of places. They are asked as look-alikes within a map are: one that
-agrees with far fewer of the picture's strongest features is left at that.
+much like the picture as the one that answered must not vouch for a pose as well
+(`tile_results.py`): aliasing grows with the number of places. They are asked as look-alikes within
+a map are: one that agrees with far fewer of the picture's strongest features is left at that.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from functools import cached_property
 from typing import Literal
 
 from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.atlas_query_session import AtlasQuerySession, TileRanking
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.hearing import Hearing, Ranking
-from topoloc.atlas.near import Near, tiles_in_reach
-from topoloc.atlas.open_maps import Maps, OpenedMap
-from topoloc.atlas.verdict import Heard, joint_result, of_tile
+from topoloc.atlas.location_prior import LocationPrior, tiles_in_reach
+from topoloc.atlas.map_cache import CachedMap, MapCache
+from topoloc.atlas.tile_results import TileResult, merge_tile_results, with_tile
 from topoloc.bounds import check_bounds
-from topoloc.errors import AtlasError, MapError, MissingExtraError, StoreError, WeightsError
-from topoloc.features.kinds import KINDS, FeatureConfig, check_available
+from topoloc.errors import AtlasError, MapError, MissingExtraError, ObjectStoreError, WeightsError
+from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig, check_available
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import LocalizerConfig
-from topoloc.localization.query import Picture, Query, StageClock, reduced_image, unknown_camera
-from topoloc.localization.result import Alternative, Localization, NotLocalized, at_time
+from topoloc.localization.query import Query, QueryImage, StageClock, reduce_image, unknown_camera
+from topoloc.localization.result import Alternative, Localization, NotLocalized, with_time
 from topoloc.retrieval.coarse import Image
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
-Way = Literal["by all means", "at a glance", "as a rival"]
+QueryMode = Literal["by all means", "at a glance", "as a rival"]
 """How a tile is asked; as a rival of an answer, at a glance, and only where it may be one."""
 
 
@@ -60,7 +60,7 @@ class AtlasLocalizer:
     def __init__(
         self,
         atlas: Atlas,
-        maps: Maps,
+        maps: MapCache,
         config: AtlasConfig | None = None,
         warn: Callable[[str], None] = warnings.warn,
     ) -> None:
@@ -75,13 +75,13 @@ class AtlasLocalizer:
             self._warn(note)
         for tile_id, problem in atlas.problems.items():
             self._warn(f"tile {tile_id} is asked after all others: {problem}")
-        self._reached: Mapping[str, Rigid3 | None] | None = None
-        self._nowhere = ""
+        self._tiles_in_reach: Mapping[str, Rigid3 | None] | None = None
+        self._out_of_reach_detail = ""
         self._focal = max(tile.focal_px for tile in atlas.manifest.tiles)
 
-    def near(self, near: Near | None, placed_only: bool = False) -> AtlasLocalizer:
-        """One that asks only tiles in reach of where somebody knows the camera to be (`near.py`); a
-        pose that is given is tried, too.
+    def near(self, near: LocationPrior | None, georeferenced_only: bool = False) -> AtlasLocalizer:
+        """One that asks only tiles in reach of where somebody knows the camera to be
+        (`location_prior.py`); a pose that is given is tried, too.
 
         Args:
             placed_only: only tiles that know where on earth they lie.
@@ -90,8 +90,8 @@ class AtlasLocalizer:
             AtlasError: no tile is of the world that is named.
         """
         other = copy.copy(self)
-        other._reached = tiles_in_reach(self.atlas.manifest, near, placed_only)
-        other._nowhere = (
+        other._tiles_in_reach = tiles_in_reach(self.atlas.manifest, near, georeferenced_only)
+        other._out_of_reach_detail = (
             f"no tile lies {near}" if near is not None else "no tile knows where on earth it lies"
         )
         return other
@@ -99,7 +99,7 @@ class AtlasLocalizer:
     def localize(
         self,
         image: Image,
-        camera: Camera | RoughCamera | None,
+        camera: Camera | UncalibratedCamera | None,
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
         t_ns: int | None = None,
@@ -122,49 +122,53 @@ class AtlasLocalizer:
         """
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
         deadline = float("inf") if limit is None else start + limit / 1e3
-        picture = Picture(image, camera or unknown_camera(image))
+        query_image = QueryImage(image, camera or unknown_camera(image))
         if prior is not None and tile_id is None:
             raise AtlasError("a prior is a pose in one tile's world: name the tile")
-        if tile_id is None and self._reached is not None and not self._reached:
-            return self.completed(NotLocalized("not_in_map", detail=self._nowhere), t_ns)
-        hearing, clock = Hearing(picture, deadline), StageClock()
+        if tile_id is None and self._tiles_in_reach is not None and not self._tiles_in_reach:
+            return self.with_provenance(
+                NotLocalized("not_in_map", detail=self._out_of_reach_detail), t_ns
+            )
+        session, clock = AtlasQuerySession(query_image, deadline), StageClock()
         if tile_id is None:
-            self._hear(hearing, clock)
+            self._query_tiles(session, clock)
         else:
-            self._ask(hearing, self.atlas.tile(tile_id).tile_id, 1.0, prior=prior)
-        if not hearing.heard:
+            self._query_tile(session, self.atlas.tile(tile_id).tile_id, 1.0, prior=prior)
+        if not session.tile_results:
             raise AtlasError(
                 f"no tile of the atlas {self.atlas.store.where} can be asked:"
                 f" {next(iter(self.problems.values()), 'no time')}"
             )
-        result = self._on_earth(joint_result(list(hearing.heard.values())))
+        result = self._with_geopose(merge_tile_results(list(session.tile_results.values())))
         result = replace(
             result,
-            times_ms=_all_times(hearing, clock) | {"total": 1e3 * (time.perf_counter() - start)},
+            times_ms=_merge_times(session, clock) | {"total": 1e3 * (time.perf_counter() - start)},
         )
-        return result if t_ns is None else at_time(result, t_ns)
+        return result if t_ns is None else with_time(result, t_ns)
 
-    def lend(self, tile_id: str) -> OpenedMap:
+    def acquire_map(self, tile_id: str) -> CachedMap:
         """The map of a tile, which stays open until it is given back. Raises AtlasError,
         MapError."""
-        return self._maps.lend(tile_id, self._maps.tile_path(self.atlas, self.atlas.tile(tile_id)))
+        return self._maps.acquire_map(
+            tile_id, self._maps.tile_path(self.atlas, self.atlas.tile(tile_id))
+        )
 
-    def give_back(self, opened: OpenedMap) -> None:
+    def release_map(self, opened: CachedMap) -> None:
         """The map that was lent may be closed."""
-        self._maps.give_back(opened)
+        self._maps.release_map(opened)
 
     def named(
         self, result: Localization | NotLocalized, tile_id: str
     ) -> Localization | NotLocalized:
         """What a tile's own map says, as the atlas says it: with the tile's name and its place in
         the atlas, where that is known."""
-        return self._on_earth(of_tile(result, self.atlas.tile(tile_id)))
+        return self._with_geopose(with_tile(result, self.atlas.tile(tile_id)))
 
-    def _on_earth(self, result: Localization | NotLocalized) -> Localization | NotLocalized:
+    def _with_geopose(self, result: Localization | NotLocalized) -> Localization | NotLocalized:
         """With the geoposes of tiles that know through others where on earth they lie."""
         manifest, tile_id = self.atlas.manifest, result.provenance.tile
         if isinstance(result, NotLocalized):
-            alternatives = [self._alternative_on_earth(one) for one in result.alternatives]
+            alternatives = [self._georeference_alternative(one) for one in result.alternatives]
             return replace(result, alternatives=tuple(alternatives)) if alternatives else result
         place = (
             manifest.georeference_of(manifest.by_id[tile_id])
@@ -177,7 +181,7 @@ class AtlasLocalizer:
             else replace(result, geopose=place.geopose(result.world_from_cam))
         )
 
-    def _alternative_on_earth(self, one: Alternative) -> Alternative:
+    def _georeference_alternative(self, one: Alternative) -> Alternative:
         manifest = self.atlas.manifest
         place = (
             manifest.georeference_of(manifest.by_id[one.tile])
@@ -186,171 +190,192 @@ class AtlasLocalizer:
         )
         return one if place is None else replace(one, geopose=place.geopose(one.world_from_cam))
 
-    def completed(self, result: NotLocalized, t_ns: int | None = None) -> NotLocalized:
+    def with_provenance(self, result: NotLocalized, t_ns: int | None = None) -> NotLocalized:
         """What is said of a picture that could not be asked, with its time (nanoseconds)."""
-        return result if t_ns is None else at_time(result, t_ns)
+        return result if t_ns is None else with_time(result, t_ns)
 
-    def rank(self, picture: Picture) -> Ranking:
+    def rank(self, query_image: QueryImage) -> TileRanking:
         """The tiles that look most like the picture; behind them those whose places cannot be
         ranked."""
-        *_, ranking = self._rankings(picture, StageClock())
+        *_, ranking = self._rankings(query_image, StageClock())
         return ranking
 
-    def _rankings(self, picture: Picture, clock: StageClock) -> Iterator[Ranking]:
+    def _rankings(self, query_image: QueryImage, clock: StageClock) -> Iterator[TileRanking]:
         """As `rank`, by the cheapest kind of features; then by the next as well, until a tile
         leads."""
         sizes = (
             LocalizerConfig()
         )  # those that tiles reduce a picture by, so that they find its features extracted
-        image, lens = reduced_image(
-            picture.image, picture.camera, self._focal, sizes.max_finer, sizes.max_side_px
+        image, reduced_camera = reduce_image(
+            query_image.image, query_image.camera, self._focal, sizes.max_finer, sizes.max_side_px
         )
         unranked = [
             (tile_id, 0.0)
             for tile_id in self.atlas.problems
-            if self._reached is None or tile_id in self._reached
+            if self._tiles_in_reach is None or tile_id in self._tiles_in_reach
         ]
-        vectors, ranking = {}, Ranking()
-        for kind in self._ranked_by:
+        vectors, ranking = {}, TileRanking()
+        for kind in self._ranking_feature_types:
             vocabulary = shared_vocabulary(kind)
             assert vocabulary is not None
             features = Query(
-                image, lens, 1.0, FeatureConfig(kind=kind), clock, shared=picture.features
+                image,
+                reduced_camera,
+                1.0,
+                FeatureConfig(kind=kind),
+                clock,
+                shared=query_image.features,
             ).features
             with clock.stage("tiles"):
-                vectors[kind] = vocabulary.vector(features, lens.width, lens.height)
-                ranking = self.atlas.index.rank(vectors, self.config.num_ranked, self._reached)
+                vectors[kind] = vocabulary.global_descriptor(
+                    features, reduced_camera.width, reduced_camera.height
+                )
+                ranking = self.atlas.index.rank(
+                    vectors, self.config.num_ranked, self._tiles_in_reach
+                )
             yield ranking + unranked
-            if _gap(ranking) >= self.config.settled_gap:
+            if _ranking_margin(ranking) >= self.config.settled_gap:
                 return
         if not vectors:
             yield unranked
 
     @cached_property
-    def _ranked_by(self) -> list[str]:
+    def _ranking_feature_types(self) -> list[str]:
         """The kinds of features that tiles can be ranked by and that can be had here, the cheapest
         first."""
-        return [kind for kind in KINDS if kind in self.atlas.index.kinds and _is_available(kind)]
+        return [
+            kind for kind in FEATURE_TYPES if kind in self.atlas.index.kinds and _is_available(kind)
+        ]
 
-    def _hear(self, hearing: Hearing, clock: StageClock) -> None:
+    def _query_tiles(self, session: AtlasQuerySession, clock: StageClock) -> None:
         """Ask tiles until one answers; then those that look as much like the picture."""
-        for number, ranking in enumerate(self._rankings(hearing.picture, clock), start=1):
-            hearing.ranking = ranking
-            if _gap(self._left(ranking)) < self.config.settled_gap:
-                self._glance(
-                    hearing,
+        for number, ranking in enumerate(self._rankings(session.query_image, clock), start=1):
+            session.ranking = ranking
+            if _ranking_margin(self._readable_tiles(ranking)) < self.config.settled_gap:
+                self._query_coarse_only(
+                    session,
                     (
                         self.config.num_glanced
-                        if number >= len(self._ranked_by)
+                        if number >= len(self._ranking_feature_types)
                         else self.config.num_glanced_first
                     ),
                 )
-            if hearing.is_settled or hearing.is_late:
+            if session.is_settled or session.is_past_deadline:
                 break
-        hopeful = self._hopeful(hearing)
+        hopeful = self._candidate_tiles(session)
         for number in range(self.config.num_asked):
-            left = [one for one in self._left(hopeful) if not hearing.was_asked(one[0])]
+            left = [
+                one for one in self._readable_tiles(hopeful) if not session.is_fully_queried(one[0])
+            ]
             if number:
-                left = [one for one in left if self._is_promising(hearing, one)]
-            if not left or hearing.answers or (hearing.heard and hearing.is_late):
+                left = [one for one in left if self._is_promising(session, one)]
+            if (
+                not left
+                or session.localized_tiles
+                or (session.tile_results and session.is_past_deadline)
+            ):
                 break
-            self._ask(hearing, *max(left, key=hearing.promise))
-        while not hearing.heard and (
-            left := self._left(hearing.ranking)
+            self._query_tile(session, *max(left, key=session.query_priority))
+        while not session.tile_results and (
+            left := self._readable_tiles(session.ranking)
         ):  # those that were likely cannot be read
-            self._ask(hearing, *left[0])
-        self._hear_look_alikes(hearing)
+            self._query_tile(session, *left[0])
+        self._query_similar_tiles(session)
 
-    def _hopeful(self, hearing: Hearing) -> Ranking:
+    def _candidate_tiles(self, session: AtlasQuerySession) -> TileRanking:
         """Tiles that look not far less like the picture than the best one."""
-        ranking = self._left(hearing.ranking)
+        ranking = self._readable_tiles(session.ranking)
         return [
             one
             for one in ranking
             if one[1] >= ranking[0][1] - self.config.hopeless_gap or one[0] in self.atlas.problems
         ]
 
-    def _is_promising(self, hearing: Hearing, ranked: tuple[str, float]) -> bool:
+    def _is_promising(self, session: AtlasQuerySession, ranked: tuple[str, float]) -> bool:
         """Does a glance name a pose there, or does it look more like the picture than any place
         does? One that is not ranked may."""
         return (
-            hearing.promise(ranked) >= (0.0, self.config.least_likeness)
+            session.query_priority(ranked) >= (0.0, self.config.least_likeness)
             or ranked[0] in self.atlas.problems
         )
 
-    def _glance(self, hearing: Hearing, num_tiles: int) -> None:
+    def _query_coarse_only(self, session: AtlasQuerySession, num_tiles: int) -> None:
         """Ask the likeliest tiles at a glance, until a pose is clear."""
-        for tile_id, likeness in self._hopeful(hearing)[:num_tiles]:
-            if hearing.is_settled or hearing.is_late:
+        for tile_id, similarity in self._candidate_tiles(session)[:num_tiles]:
+            if session.is_settled or session.is_past_deadline:
                 return
-            if tile_id not in hearing.heard:
-                self._ask(hearing, tile_id, likeness, "at a glance")
+            if tile_id not in session.tile_results:
+                self._query_tile(session, tile_id, similarity, "at a glance")
 
-    def _left(self, ranking: Ranking) -> Ranking:
+    def _readable_tiles(self, ranking: TileRanking) -> TileRanking:
         """Without tiles that cannot be read."""
         return [one for one in ranking if one[0] not in self.problems]
 
-    def _hear_look_alikes(self, hearing: Hearing) -> None:
+    def _query_similar_tiles(self, session: AtlasQuerySession) -> None:
         """Tiles that look about as much like the picture as the one that answered, at a glance,
         where the cheapest test leaves open that they rival it."""
-        if not hearing.answers:
+        if not session.localized_tiles:
             return
-        least = min(answer.likeness for answer in hearing.answers) - self.config.alike_gap
+        least = min(answer.similarity for answer in session.localized_tiles) - self.config.alike_gap
         alike = [
-            (tile_id, likeness)
-            for tile_id, likeness in hearing.ranking
-            if likeness >= least and tile_id not in hearing.heard
+            (tile_id, similarity)
+            for tile_id, similarity in session.ranking
+            if similarity >= least and tile_id not in session.tile_results
         ]
-        for tile_id, likeness in alike[: self.config.num_alike]:
-            if not hearing.is_late:
-                self._ask(hearing, tile_id, likeness, "as a rival")
+        for tile_id, similarity in alike[: self.config.num_alike]:
+            if not session.is_past_deadline:
+                self._query_tile(session, tile_id, similarity, "as a rival")
         for one in [
-            one for one in hearing.heard.values() if one.is_clear and not one.is_full
+            one for one in session.tile_results.values() if one.is_clear and not one.is_exhaustive
         ]:  # it may be the answer itself
-            self._ask(hearing, one.tile.tile_id, one.likeness)
+            self._query_tile(session, one.tile.tile_id, one.similarity)
 
-    def _ask(
+    def _query_tile(
         self,
-        hearing: Hearing,
+        session: AtlasQuerySession,
         tile_id: str,
-        likeness: float,
-        way: Way = "by all means",
+        similarity: float,
+        mode: QueryMode = "by all means",
         prior: Rigid3 | None = None,
     ) -> None:
         """Put the picture to a tile; where that cannot be read, the others answer."""
         if tile_id in self.problems:
-            hearing.heard.pop(tile_id, None)
+            session.tile_results.pop(tile_id, None)
             return
         tile = self.atlas.tile(tile_id)
         try:
-            with self._maps.lent(tile_id, self._maps.tile_path(self.atlas, tile)) as opened:
+            with self._maps.use_map(tile_id, self._maps.tile_path(self.atlas, tile)) as opened:
                 known = (
                     prior
-                    if prior is not None or self._reached is None
-                    else self._reached.get(tile_id)
+                    if prior is not None or self._tiles_in_reach is None
+                    else self._tiles_in_reach.get(tile_id)
                 )
-                before, asking = hearing.begun.get(tile_id, (None, None))
-                if asking is None or before is not opened:
-                    asking = opened.localizer.asking(hearing.picture, known, hearing.left_ms)
-                hearing.begun[tile_id] = opened, asking
-                if way == "as a rival" and not hearing.may_be_rival(asking):
+                before, query_session = session.map_sessions.get(tile_id, (None, None))
+                if query_session is None or before is not opened:
+                    query_session = opened.localizer.query_session(
+                        session.query_image, known, session.remaining_ms
+                    )
+                session.map_sessions[tile_id] = opened, query_session
+                if mode == "as a rival" and not session.can_be_rival(query_session):
                     return
                 result, named = (
-                    asking.by_all_means() if way == "by all means" else asking.at_a_glance()
+                    query_session.localize_exhaustive()
+                    if mode == "by all means"
+                    else query_session.localize_coarse_only()
                 )
-        except StoreError:  # what the tile would have said nobody knows
+        except ObjectStoreError:  # what the tile would have said nobody knows
             raise
         except MapError as error:
             self.problems[tile_id] = str(error)
-            hearing.heard.pop(tile_id, None)
+            session.tile_results.pop(tile_id, None)
             self._warn(f"tile {tile_id} is not asked: {error}")
             return
-        hearing.heard[tile_id] = Heard(
-            tile, result, tuple(one for one, _ in named), way == "by all means", likeness
+        session.tile_results[tile_id] = TileResult(
+            tile, result, tuple(one for one, _ in named), mode == "by all means", similarity
         )
 
 
-def _gap(ranking: Ranking) -> float:
+def _ranking_margin(ranking: TileRanking) -> float:
     """By how much the likeliest tile leads the next one; infinite of one tile alone."""
     return ranking[0][1] - ranking[1][1] if len(ranking) > 1 else float("inf")
 
@@ -363,11 +388,11 @@ def _is_available(kind: str) -> bool:
     return True
 
 
-def _all_times(hearing: Hearing, clock: StageClock) -> dict[str, float]:
+def _merge_times(session: AtlasQuerySession, clock: StageClock) -> dict[str, float]:
     """Milliseconds of each stage, of all tiles together; `tiles` is that of ranking them, without
     the features."""
     total = clock.times_ms()
-    for _, asking in hearing.begun.values():
-        for stage, ms in asking.times_ms.items():
+    for _, query_session in session.map_sessions.values():
+        for stage, ms in query_session.times_ms.items():
             total[stage] = total.get(stage, 0.0) + ms
     return total

@@ -16,24 +16,24 @@ from pathlib import Path
 import numpy as np
 
 from topoloc.atlas.atlas import store_at
+from topoloc.atlas.global_descriptors import compute_global_descriptors, save_global_descriptors
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import TILES, Manifest, StoredFile, Tile, check_tile_id
-from topoloc.atlas.place_vectors import place_vectors, write_vectors
 from topoloc.atlas.store import MANIFEST, Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.geometry.geodesy import Georeference
-from topoloc.mapping.contents import map_id_of
-from topoloc.mapping.edit import undoable_edits
+from topoloc.mapping.contents import get_map_id
+from topoloc.mapping.edit import count_undoable_edits
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.undo_log import path_of_log
-from topoloc.recordings.atomic import scratch_file
+from topoloc.mapping.undo_log import undo_log_path
+from topoloc.recordings.atomic import temporary_file
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 GRACE_S = 3600.0
 """So long files stay that no manifest names any more: readers may have just read the manifest
 before."""
 _MAX_TRIES = 1000
-Change = Callable[[Manifest, float], Manifest]
+ManifestEdit = Callable[[Manifest, float], Manifest]
 """From a manifest to the next one, at this time (seconds of Unix time). May be called several
 times."""
 
@@ -80,7 +80,9 @@ def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
     exists = AtlasError(f"{where} is an atlas already; `topoloc atlas add` adds to it")
     if store.manifest() is not None:
         raise exists
-    after = Manifest().with_tiles({tile.tile_id: tile for tile in _put(store, new)}, time.time())
+    after = Manifest().with_tiles(
+        {tile.tile_id: tile for tile in _store_tiles(store, new)}, time.time()
+    )
     if not store.commit(None, after.to_bytes()):
         raise exists
     return after
@@ -105,17 +107,17 @@ def add_tiles(
         MapError: a map is missing, damaged or empty.
     """
     store = store_at(where)
-    _check_free(
+    _check_ids_free(
         _read(store, creates)[1], new, replaces
     )  # before the work begins, and again with each try
-    added = {tile.tile_id: tile for tile in _put(store, new)}
+    added = {tile.tile_id: tile for tile in _store_tiles(store, new)}
 
     def with_added(manifest: Manifest, now: float) -> Manifest:
-        _check_free(manifest, new, replaces)
+        _check_ids_free(manifest, new, replaces)
         return manifest.with_tiles(manifest.by_id | added, now)
 
-    after = _changed(store, with_added, grace_s, creates)
-    _keep_files(store, new, list(added.values()))
+    after = _commit_change(store, with_added, grace_s, creates)
+    _restore_files(store, new, list(added.values()))
     return after
 
 
@@ -131,20 +133,20 @@ def replace_tile(
         MapError: the map is missing, damaged or empty.
     """
     store = store_at(where)
-    tile = tile_of(new, store)
+    tile = store_tile(new, store)
 
     def with_replaced(manifest: Manifest, now: float) -> Manifest:
         there = manifest.by_id.get(before.tile_id)
         if there is None or (there.map.sha256, there.world) != (before.map.sha256, before.world):
-            raise _OtherTileError
+            raise _TileChangedError
         joins = [join for join in manifest.joins if before.tile_id in join.pair]
         return manifest.with_tiles(manifest.by_id | {tile.tile_id: tile}, now, joins)
 
     try:
-        after = _changed(store, with_replaced, grace_s)
-    except _OtherTileError:
+        after = _commit_change(store, with_replaced, grace_s)
+    except _TileChangedError:
         return None
-    _keep_files(store, [new], [tile])
+    _restore_files(store, [new], [tile])
     return after
 
 
@@ -162,7 +164,7 @@ def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) 
             now,
         )
 
-    return _changed(store, without, grace_s)
+    return _commit_change(store, without, grace_s)
 
 
 def add_joins(
@@ -182,40 +184,40 @@ def add_joins(
             manifest.by_id, now, [join for join in joins if there.issuperset(join.pair)]
         )
 
-    return _changed(store_at(where), with_joins, grace_s)
+    return _commit_change(store_at(where), with_joins, grace_s)
 
 
-def tile_of(new: NewTile, store: Store) -> Tile:
+def store_tile(new: NewTile, store: Store) -> Tile:
     """What the manifest says of a map; its files are put into the store. Raises MapError,
     AtlasError."""
-    scratch = scratch_file(Path(tempfile.gettempdir()) / "topoloc-tile.places")
+    scratch = temporary_file(Path(tempfile.gettempdir()) / "topoloc-tile.places")
     with TopoMetricMap.load(new.path) as topomap, scratch as places:
         if len(topomap.summaries) == 0:
             raise EmptyMapError(f"map {new.path} has no nodes")
-        vectors = place_vectors(topomap)
+        vectors = compute_global_descriptors(topomap)
         versions = {
             kind: vocabulary.version
             for kind in vectors
             if (vocabulary := shared_vocabulary(kind)) is not None
         }
-        write_vectors(places, vectors)
-        tile = _described(new, topomap, versions)
-        vectors = _stored(store, f"{new.tile_id}.places", places)
+        save_global_descriptors(places, vectors)
+        tile = _describe_tile(new, topomap, versions)
+        vectors = _store_file(store, f"{new.tile_id}.places", places)
     undo = (
-        _stored(store, f"{new.tile_id}.undo", path_of_log(new.path))
-        if undoable_edits(new.path)
+        _store_file(store, f"{new.tile_id}.undo", undo_log_path(new.path))
+        if count_undoable_edits(new.path)
         else None
     )
     return replace(
         tile,
-        map=_stored(store, f"{new.tile_id}.topo", new.path),
+        map=_store_file(store, f"{new.tile_id}.topo", new.path),
         places=vectors,
         recipe=new.recipe,
         undo=undo,
     )
 
 
-def _stored(store: Store, name: str, path: Path) -> StoredFile:
+def _store_file(store: Store, name: str, path: Path) -> StoredFile:
     """A file put into the store, under this name and what it holds."""
     sha256 = sha256_of(path)
     stem, _, suffix = name.rpartition(".")
@@ -224,27 +226,27 @@ def _stored(store: Store, name: str, path: Path) -> StoredFile:
     return stored
 
 
-def _put(store: Store, new: Sequence[NewTile]) -> list[Tile]:
-    return [tile_of(one, store) for one in new]
+def _store_tiles(store: Store, new: Sequence[NewTile]) -> list[Tile]:
+    return [store_tile(one, store) for one in new]
 
 
-def _keep_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> None:
+def _restore_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> None:
     """Put those again that were swept just before they were named: old files of the same
     contents."""
     names = set(store.ages())
     for one, tile in zip(new, tiles, strict=True):
         if not {stored.name for stored in tile.files} <= names:
-            tile_of(one, store)
+            store_tile(one, store)
 
 
-class _OtherTileError(Exception):
+class _TileChangedError(Exception):
     """Another writer was faster."""
 
 
 _UNKNOWN = StoredFile("", "", 0)
 
 
-def _described(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[str, str]) -> Tile:
+def _describe_tile(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[str, str]) -> Tile:
     """All but the files."""
     centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
     first_rows = {
@@ -256,7 +258,7 @@ def _described(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[str, 
         map=_UNKNOWN,
         places=_UNKNOWN,
         vocabularies=vocabularies,
-        map_id=map_id_of(topomap),
+        map_id=get_map_id(topomap),
         map_version=topomap.version,
         kinds=tuple(topomap.kinds),
         num_nodes=len(topomap.summaries),
@@ -288,7 +290,7 @@ def _read(store: Store, creates: bool = False) -> tuple[bytes | None, Manifest]:
     return data, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
 
 
-def _check_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> None:
+def _check_ids_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> None:
     there = manifest.by_id
     taken = [
         tile.tile_id
@@ -303,7 +305,9 @@ def _check_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> N
         )
 
 
-def _changed(store: Store, change: Change, grace_s: float, creates: bool = False) -> Manifest:
+def _commit_change(
+    store: Store, change: ManifestEdit, grace_s: float, creates: bool = False
+) -> Manifest:
     """Read, change and commit until nobody came in between; then remove what nobody names."""
     for _ in range(_MAX_TRIES):
         before, manifest = _read(store, creates)

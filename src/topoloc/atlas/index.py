@@ -9,17 +9,17 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from topoloc.atlas.place_shard import PlaceShard
-from topoloc.atlas.place_vectors import PlaceVectors
-from topoloc.retrieval.place_kernels import multiply_rows
+from topoloc.atlas.descriptor_shard import DescriptorShard
+from topoloc.atlas.global_descriptors import GlobalDescriptors
+from topoloc.retrieval.descriptor_kernels import multiply_rows
 
 
-class _Places(Protocol):
+class _TileRanker(Protocol):
     def rank(
-        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_asked: Bool[np.ndarray, " t"]
+        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_selected: Bool[np.ndarray, " t"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
         """The numbers of the tiles with the most similar places, and how similar these are;
-        `is_asked` says of each tile whether it may be named."""
+        `is_selected` says of each tile whether it may be named."""
         ...
 
 
@@ -29,18 +29,18 @@ class AtlasIndex:
 
     Args:
         vectors: the place vectors of each tile that are compared exactly; `tile_ids` says which.
-        shards: further places of these tiles (`place_shard.py`); each with the number in `tile_ids`
-            of each of its tiles, -1 of one that is never named.
+        shards: further places of these tiles (`descriptor_shard.py`); each with the number in
+            `tile_ids` of each of its tiles, -1 of one that is never named.
     """
 
     def __init__(
         self,
         tile_ids: Sequence[str],
-        vectors: Sequence[PlaceVectors],
-        shards: Sequence[tuple[PlaceShard, Sequence[int]]] = (),
+        vectors: Sequence[GlobalDescriptors],
+        shards: Sequence[tuple[DescriptorShard, Sequence[int]]] = (),
     ) -> None:
         self._tile_ids, self._all = list(tile_ids), np.ones(len(tile_ids), bool)
-        self._by_kind: dict[str, list[_Places]] = {}
+        self._by_kind: dict[str, list[_TileRanker]] = {}
         for kind in {kind for one in vectors for kind in one}:
             rows = [
                 number for number, one in enumerate(vectors) if kind in one and len(one[kind]) > 0
@@ -78,20 +78,22 @@ class AtlasIndex:
                 that tells most the last.
             among: only these tiles are named; None: all.
         """
-        is_asked = (
+        is_selected = (
             self._all
             if among is None
             else np.array([tile_id in among for tile_id in self._tile_ids], bool)
         )
-        likeness: dict[int, float] = {}
+        similarity: dict[int, float] = {}
         for kind, vector in by_kind.items():
-            found = self._found(kind, np.ascontiguousarray(vector, np.float32), num_tiles, is_asked)
+            found = self._found(
+                kind, np.ascontiguousarray(vector, np.float32), num_tiles, is_selected
+            )
             if not found:
                 continue
             best = max(found.values())
-            shift = best - max(likeness.values(), default=best)
-            likeness = {row: before + shift for row, before in likeness.items()} | found
-        ranked = sorted(((value, -row) for row, value in likeness.items()), reverse=True)
+            shift = best - max(similarity.values(), default=best)
+            similarity = {row: before + shift for row, before in similarity.items()} | found
+        ranked = sorted(((value, -row) for row, value in similarity.items()), reverse=True)
         return [(self._tile_ids[-row], value) for value, row in ranked[:num_tiles]]
 
     def _found(
@@ -99,11 +101,11 @@ class AtlasIndex:
         kind: str,
         vector: Float32[np.ndarray, " d"],
         num_tiles: int,
-        is_asked: Bool[np.ndarray, " t"],
+        is_selected: Bool[np.ndarray, " t"],
     ) -> dict[int, float]:
         """The likeness of the likeliest tiles by one kind of features; a tile lies in one part of
         the index."""
-        pairs = [part.rank(vector, num_tiles, is_asked) for part in self._by_kind.get(kind, ())]
+        pairs = [part.rank(vector, num_tiles, is_selected) for part in self._by_kind.get(kind, ())]
         found = sorted(
             (
                 (float(value), -int(row))
@@ -123,26 +125,26 @@ class _ExactTiles:
         self._tiles, self._firsts = np.unique(of_tile, return_index=True)
 
     def rank(
-        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_asked: Bool[np.ndarray, " t"]
+        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_selected: Bool[np.ndarray, " t"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
         similarities = np.empty(len(self._vectors), np.float32)
         multiply_rows(self._vectors, vector, similarities)
         best = np.maximum.reduceat(similarities, self._firsts)
         order = np.argsort(-best, kind="stable")
-        order = order[is_asked[self._tiles[order]]][:num_tiles]
+        order = order[is_selected[self._tiles[order]]][:num_tiles]
         return self._tiles[order], best[order]
 
 
 class _NumberedShard:
     """A shard whose tiles go by the numbers of the index; those of none are never named."""
 
-    def __init__(self, shard: PlaceShard, numbers: Int[np.ndarray, " s"]) -> None:
+    def __init__(self, shard: DescriptorShard, numbers: Int[np.ndarray, " s"]) -> None:
         self._shard, self._numbers = shard, numbers
 
     def rank(
-        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_asked: Bool[np.ndarray, " t"]
+        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_selected: Bool[np.ndarray, " t"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
         tiles, similarities = self._shard.rank(
-            vector, num_tiles, (self._numbers >= 0) & is_asked[self._numbers]
+            vector, num_tiles, (self._numbers >= 0) & is_selected[self._numbers]
         )
         return self._numbers[tiles], similarities

@@ -22,19 +22,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float16
 
+from topoloc.atlas.descriptor_shard import DescriptorShard, ShardTile
+from topoloc.atlas.global_descriptors import GlobalDescriptors
 from topoloc.atlas.index import AtlasIndex
 from topoloc.atlas.manifest import Tile
-from topoloc.atlas.place_shard import PlaceShard, ShardTile
-from topoloc.atlas.place_vectors import PlaceVectors
-from topoloc.errors import AtlasError, StoreError
+from topoloc.errors import AtlasError, ObjectStoreError
 from topoloc.features.network_files import cache_folder
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
-MAX_EXACT_PLACES, SHARD_PLACES = 20_000, 1 << 20
+MAX_EXACT_DESCRIPTORS, SHARD_DESCRIPTORS = 20_000, 1 << 20
 """So many places that lie in no shard are compared one by one; so many places a shard holds, but
 for those of one tile."""
-_MAX_UNSEEN, _UNUSED_S = 0.25, 86_400.0
-ReadPlaces = Callable[[Tile], PlaceVectors]
+_MAX_STALE_SHARE, _UNUSED_S = 0.25, 86_400.0
+LoadDescriptors = Callable[[Tile], GlobalDescriptors]
 _Rows = tuple[ShardTile, Float16[np.ndarray, "_ _"]]
 
 
@@ -48,10 +48,10 @@ class OpenedIndex:
 
 
 @dataclass(frozen=True, eq=False)
-class _Kept:
+class _LiveShard:
     """A shard, and which of its tiles count."""
 
-    shard: PlaceShard
+    shard: DescriptorShard
     is_live: list[bool]
 
     @property
@@ -80,7 +80,7 @@ def index_folder(where: str) -> Path:
     return cache_folder() / "indexes" / hashlib.sha256(place.encode()).hexdigest()[:16]
 
 
-def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedIndex:
+def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> OpenedIndex:
     """The index over these tiles by what lies in `folder`; what is lacking there is made, and kept
     there where that can be written.
 
@@ -90,13 +90,13 @@ def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedI
     Raises:
         StoreError: what `read` raised.
     """
-    work = _Opening(tiles, folder)
-    kept = {kind: work.kept(kind) for kind in work.versions}
-    few = work.read_rest(kept, read)
+    work = _IndexBuilder(tiles, folder)
+    live_shards = {kind: work.live_shards(kind) for kind in work.versions}
+    few = work.load_missing(live_shards, read)
     for kind, vectors in few.items():
-        if sum(len(rows) for _, rows in vectors) > MAX_EXACT_PLACES:
-            kept[kind] = work.with_new_shards(kind, kept[kind], vectors)
-    work.remove_unused(kept)
+        if sum(len(rows) for _, rows in vectors) > MAX_EXACT_DESCRIPTORS:
+            live_shards[kind] = work.with_new_shards(kind, live_shards[kind], vectors)
+    work.remove_unused(live_shards)
     ids = [tile.tile_id for tile in tiles]
     exact = dict[str, dict[str, np.ndarray]]()
     for kind, vectors in few.items():
@@ -111,7 +111,7 @@ def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedI
                 for tile, live in zip(one.shard.tiles, one.is_live, strict=True)
             ],
         )
-        for of_kind in kept.values()
+        for of_kind in live_shards.values()
         for one in of_kind
     ]
     return OpenedIndex(
@@ -122,7 +122,7 @@ def open_index(tiles: Sequence[Tile], read: ReadPlaces, folder: Path) -> OpenedI
 
 
 @dataclass(eq=False)
-class _Opening:
+class _IndexBuilder:
     """The work of opening an index."""
 
     tiles: Sequence[Tile]
@@ -142,23 +142,23 @@ class _Opening:
         }
 
     @cached_property
-    def stored(self) -> list[PlaceShard]:
+    def stored(self) -> list[DescriptorShard]:
         """The shards that lie in the folder, the largest first. One that is damaged is removed, and
         made anew where it is lacking."""
-        shards = list[PlaceShard]()
+        shards = list[DescriptorShard]()
         for path in sorted(self.folder.glob("*.index")):
             try:
-                shards.append(PlaceShard.open(path))
+                shards.append(DescriptorShard.open(path))
             except AtlasError as error:
                 self.notes.append(f"the index is made anew: {error}")
                 with suppress(OSError):
                     path.unlink()
         return sorted(shards, key=lambda shard: (-len(shard.vectors), shard.name))
 
-    def kept(self, kind: str) -> list[_Kept]:
+    def live_shards(self, kind: str) -> list[_LiveShard]:
         """The shards of this kind most of whose tiles are the atlas's, as they are now; a tile
         counts in the first one that has it."""
-        kept, seen = list[_Kept](), set[str]()
+        live_shards, seen = list[_LiveShard](), set[str]()
         for shard in self.stored:
             if (shard.kind, shard.vocabulary) != (kind, self.versions[kind]):
                 continue
@@ -166,20 +166,25 @@ class _Opening:
                 self._checksums.get(tile.tile_id) == tile.sha256 and tile.tile_id not in seen
                 for tile in shard.tiles
             ]
-            one = _Kept(shard, is_live)
-            if one.num_live >= (1.0 - _MAX_UNSEEN) * len(shard.vectors):
-                kept.append(one)
+            one = _LiveShard(shard, is_live)
+            if one.num_live >= (1.0 - _MAX_STALE_SHARE) * len(shard.vectors):
+                live_shards.append(one)
                 seen.update(tile.tile_id for tile in one.live)
-        return kept
+        return live_shards
 
-    def read_rest(self, kept: dict[str, list[_Kept]], read: ReadPlaces) -> dict[str, list[_Rows]]:
+    def load_missing(
+        self, live_shards: dict[str, list[_LiveShard]], read: LoadDescriptors
+    ) -> dict[str, list[_Rows]]:
         """The place vectors, by kind, of tiles that lie in no shard of it; as soon as they fill one
-        they are made one of those `kept`."""
+        they are made one of those `live_shards`."""
         known = {
             kind: {tile.tile_id for one in of_kind for tile in one.live}
-            for kind, of_kind in kept.items()
+            for kind, of_kind in live_shards.items()
         }
-        rest, num_rows = {kind: list[_Rows]() for kind in kept}, dict.fromkeys(kept, 0)
+        rest, num_rows = (
+            {kind: list[_Rows]() for kind in live_shards},
+            dict.fromkeys(live_shards, 0),
+        )
         for tile in self.tiles:
             ours = [
                 kind
@@ -192,7 +197,7 @@ class _Opening:
             try:
                 vectors = read(tile)
             except (
-                StoreError
+                ObjectStoreError
             ):  # says nothing of the tile, and the next one would be waited for as long
                 raise
             except AtlasError as error:
@@ -207,35 +212,37 @@ class _Opening:
                         )
                     )
                     num_rows[kind] += len(rows)
-                if num_rows[kind] >= SHARD_PLACES:
-                    kept[kind].append(self._new_shard(kind, rest[kind]))
+                if num_rows[kind] >= SHARD_DESCRIPTORS:
+                    live_shards[kind].append(self._new_shard(kind, rest[kind]))
                     num_rows[kind] = sum(one.num_rows for one, _ in rest[kind])
         return rest
 
-    def with_new_shards(self, kind: str, kept: Sequence[_Kept], rest: list[_Rows]) -> list[_Kept]:
+    def with_new_shards(
+        self, kind: str, live_shards: Sequence[_LiveShard], rest: list[_Rows]
+    ) -> list[_LiveShard]:
         """All of them in shards; those that are less than half full are made one with the rest,
         which is emptied."""
-        full = [one for one in kept if one.num_live >= SHARD_PLACES // 2]
-        pending = [row for one in kept if one not in full for row in one.rows()] + rest
+        full = [one for one in live_shards if one.num_live >= SHARD_DESCRIPTORS // 2]
+        pending = [row for one in live_shards if one not in full for row in one.rows()] + rest
         rest.clear()
         while pending:
             full.append(self._new_shard(kind, pending))
         return full
 
-    def _new_shard(self, kind: str, pending: list[_Rows]) -> _Kept:
+    def _new_shard(self, kind: str, pending: list[_Rows]) -> _LiveShard:
         """A shard of the first of these tiles, as many as it holds, which are taken out of the
         list."""
         sizes = np.cumsum([tile.num_rows for tile, _ in pending])
-        count = max(1, int(np.searchsorted(sizes, SHARD_PLACES, "right")))
+        count = max(1, int(np.searchsorted(sizes, SHARD_DESCRIPTORS, "right")))
         tiles = [tile for tile, _ in pending[:count]]
-        shard = PlaceShard(kind, self.versions[kind], tiles, _taken(pending, count))
-        return _Kept(self._saved(shard), [True] * count)
+        shard = DescriptorShard(kind, self.versions[kind], tiles, _take_vectors(pending, count))
+        return _LiveShard(self._save_shard(shard), [True] * count)
 
-    def _saved(self, shard: PlaceShard) -> PlaceShard:
+    def _save_shard(self, shard: DescriptorShard) -> DescriptorShard:
         """As it lies in its file, of which only pages that are asked come into memory; where that
         cannot be written, as it is."""
         try:
-            return PlaceShard.open(shard.save(self.folder))
+            return DescriptorShard.open(shard.save(self.folder))
         except (OSError, AtlasError) as error:
             text = "the index stays in memory, and is made at each opening: cannot write"
             if not any(note.startswith(text) for note in self.notes):
@@ -244,9 +251,9 @@ class _Opening:
                 )
             return shard
 
-    def remove_unused(self, kept: dict[str, list[_Kept]]) -> None:
+    def remove_unused(self, live_shards: dict[str, list[_LiveShard]]) -> None:
         """Files that nobody has opened for a day; of those used now it is said that they are."""
-        used = {one.shard.name for of_kind in kept.values() for one in of_kind}
+        used = {one.shard.name for of_kind in live_shards.values() for one in of_kind}
         for path in self.folder.glob("*.index"):
             with suppress(OSError):
                 if path.name in used:
@@ -255,7 +262,7 @@ class _Opening:
                     path.unlink()
 
 
-def _taken(pending: list[_Rows], count: int) -> Float16[np.ndarray, "n d"]:
+def _take_vectors(pending: list[_Rows], count: int) -> Float16[np.ndarray, "n d"]:
     """The vectors of the first tiles, which are let go of one by one: they are half of a
     gigabyte."""
     num_rows = sum(tile.num_rows for tile, _ in pending[:count])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.atlas.manifest_values import ID, count, covariance_of, matching, number, pose_of
+from topoloc.atlas.manifest_values import ID, count, matching, number, parse_covariance, parse_pose
 from topoloc.geometry.rigid import Rigid3, skew
 
 
@@ -48,8 +48,8 @@ class Join:
         return Join(
             first=matching(ID, row["first"], "a join's tile"),
             second=matching(ID, row["second"], "a join's tile"),
-            first_from_second=pose_of(row["first_from_second"], "first_from_second"),
-            covariance=covariance_of(row["covariance"], "a join's covariance", is_definite=True),
+            first_from_second=parse_pose(row["first_from_second"], "first_from_second"),
+            covariance=parse_covariance(row["covariance"], "a join's covariance", is_definite=True),
             num_agreeing=count(row["num_agreeing"], "num_agreeing"),
             residual=None if residual is None else number(residual, "residual"),
         )
@@ -85,8 +85,8 @@ class JointPose:
         """The inverse of `to_json`. Raises ValueError, TypeError, KeyError, TrajectoryError."""
         return JointPose(
             joint=matching(ID, row["world"], "a joint world"),
-            joint_from_world=pose_of(row["joint_from_world"], "joint_from_world"),
-            covariance=covariance_of(
+            joint_from_world=parse_pose(row["joint_from_world"], "joint_from_world"),
+            covariance=parse_covariance(
                 row["covariance"], "a joint pose's covariance", is_definite=False
             ),
         )

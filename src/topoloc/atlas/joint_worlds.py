@@ -18,29 +18,34 @@ from jaxtyping import Float
 
 from topoloc.atlas.joins import Join, JointPose
 from topoloc.geometry.geodesy import GeoPoint
-from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
-from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph, residuals_in_sigma
+from topoloc.geometry.rigid import Rigid3, inverse_covariance
+from topoloc.slam.pose_graph import (
+    Edge,
+    PoseGraphConfig,
+    compute_normalized_residuals,
+    optimize_pose_graph,
+)
 
 if TYPE_CHECKING:
     from topoloc.atlas.manifest import Tile
 
-MAX_APART_M = 100.0
+MAX_WORLD_OFFSET_M = 100.0
 """Two worlds whose places on earth are known are not joined to lie further from there than this."""
 
 
-def placed(
+def place_tiles(
     tiles: Mapping[str, Tile], joins: Sequence[Join], origin: GeoPoint | None
 ) -> tuple[tuple[Tile, ...], tuple[Join, ...]]:
     """Tiles in the order of their ids with their places in joint worlds and in the atlas's, and all
     joins adjusted."""
-    ordered = [_on_earth(tiles[tile_id], origin) for tile_id in sorted(tiles)]
+    ordered = [_place_by_georeference(tiles[tile_id], origin) for tile_id in sorted(tiles)]
     known = {
         tile.world: tile.atlas_from_world
         for tile in reversed(ordered)
         if tile.atlas_from_world is not None
     }
-    all_adjusted = adjusted(joins, {tile.tile_id: tile.world for tile in ordered}, known)
-    in_order: list[Tile] = []
+    all_adjusted = adjust_joins(joins, {tile.tile_id: tile.world for tile in ordered}, known)
+    parallel_map: list[Tile] = []
     for tile in ordered:
         joint = all_adjusted.places.get(tile.world)
         pose = tile.atlas_from_world or known.get(tile.world)
@@ -51,11 +56,11 @@ def placed(
             if pose is None or tile.geo_box is not None or origin is None
             else _geo_box(origin, pose, tile.box_world)
         )
-        in_order.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
-    return tuple(in_order), all_adjusted.joins
+        parallel_map.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
+    return tuple(parallel_map), all_adjusted.joins
 
 
-def _on_earth(tile: Tile, origin: GeoPoint | None) -> Tile:
+def _place_by_georeference(tile: Tile, origin: GeoPoint | None) -> Tile:
     """A tile with what its own georeference says of its place in the atlas's world, which is
     east-north-up at `origin`, and no more."""
     known = tile.georeference
@@ -81,7 +86,7 @@ def _geo_box(
 
 
 @dataclass(frozen=True, eq=False)
-class Adjusted:
+class AdjustedJoins:
     """Joins with what they are missed by, and where each world lies that they join with another
     one, by its name."""
 
@@ -89,9 +94,9 @@ class Adjusted:
     places: Mapping[str, JointPose]
 
 
-def adjusted(
+def adjust_joins(
     joins: Sequence[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]
-) -> Adjusted:
+) -> AdjustedJoins:
     """All joins brought to agree, but for those that contradict others.
 
     Args:
@@ -105,9 +110,9 @@ def adjusted(
     )
     dropped: list[Join] = []
     while True:
-        far = _first_far_apart(kept, worlds, atlas_from_worlds)
+        far = _first_inconsistent_join(kept, worlds, atlas_from_worlds)
         if far is None:
-            places = _optimised(kept, worlds, atlas_from_worlds, config)
+            places = _optimize_worlds(kept, worlds, atlas_from_worlds, config)
             residuals = _residuals(kept, worlds, places)
             if not kept or max(residuals) <= config.max_residual:
                 break
@@ -117,10 +122,10 @@ def adjusted(
     used = [
         replace(join, residual=residual) for join, residual in zip(kept, residuals, strict=True)
     ]
-    return Adjusted(tuple(sorted([*used, *dropped], key=lambda join: join.pair)), places)
+    return AdjustedJoins(tuple(sorted([*used, *dropped], key=lambda join: join.pair)), places)
 
 
-def _first_far_apart(
+def _first_inconsistent_join(
     joins: Iterable[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]
 ) -> Join | None:
     """The first join that, with those before it, says of a world that it lies elsewhere than where
@@ -136,7 +141,7 @@ def _first_far_apart(
         both = one | other
         if not (
             one.isdisjoint(atlas_from_worlds) or other.isdisjoint(atlas_from_worlds)
-        ) and _is_torn(
+        ) and _is_inconsistent(
             _groups(
                 [known for known in taken if worlds[known.first] in both], worlds, atlas_from_worlds
             ),
@@ -147,7 +152,7 @@ def _first_far_apart(
     return None
 
 
-def _is_torn(
+def _is_inconsistent(
     groups: Mapping[str, Mapping[str, JointPose]], atlas_from_worlds: Mapping[str, Rigid3]
 ) -> bool:
     """Does a world lie elsewhere by joins than it is known to?"""
@@ -156,13 +161,13 @@ def _is_torn(
             apart = (
                 atlas_from_worlds[anchor] @ group[name].joint_from_world
             ).inverse() @ atlas_from_worlds[name]
-            if np.linalg.norm(apart.translation) > MAX_APART_M:
+            if np.linalg.norm(apart.translation) > MAX_WORLD_OFFSET_M:
                 return True
     return False
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class _WorldLink:
     """From a world to the world `to`: `pose` brings the latter into the former."""
 
     to: str
@@ -176,24 +181,28 @@ def _groups(
 ) -> dict[str, dict[str, JointPose]]:
     """The worlds that joins connect, by the name of the one that gives them its coordinates; each
     lies where the ways lead that most pictures speak for."""
-    ways: dict[str, list[_Way]] = {}
+    links: dict[str, list[_WorldLink]] = {}
     for join in joins:
         one, other, pose = worlds[join.first], worlds[join.second], join.first_from_second
-        ways.setdefault(one, []).append(_Way(other, pose, join.covariance, join.num_agreeing))
-        ways.setdefault(other, []).append(
-            _Way(
-                one, pose.inverse(), covariance_of_inverse(pose, join.covariance), join.num_agreeing
+        links.setdefault(one, []).append(
+            _WorldLink(other, pose, join.covariance, join.num_agreeing)
+        )
+        links.setdefault(other, []).append(
+            _WorldLink(
+                one, pose.inverse(), inverse_covariance(pose, join.covariance), join.num_agreeing
             )
         )
     groups, seen = dict[str, dict[str, JointPose]](), set[str]()
-    for anchor in sorted(ways, key=lambda name: (name not in anchored, name)):
+    for anchor in sorted(links, key=lambda name: (name not in anchored, name)):
         if anchor not in seen:
-            groups[anchor] = _reached(anchor, ways)
+            groups[anchor] = _reachable_worlds(anchor, links)
             seen |= groups[anchor].keys()
     return groups
 
 
-def _reached(anchor: str, ways: Mapping[str, Sequence[_Way]]) -> dict[str, JointPose]:
+def _reachable_worlds(
+    anchor: str, links: Mapping[str, Sequence[_WorldLink]]
+) -> dict[str, JointPose]:
     """Every world that joins lead to, each time by the join from what is reached that most pictures
     speak for."""
     places = dict[str, JointPose]()
@@ -205,23 +214,23 @@ def _reached(anchor: str, ways: Mapping[str, Sequence[_Way]]) -> dict[str, Joint
             continue
         places[name] = place
         adjoint = place.joint_from_world.adjoint()
-        for way in ways[name]:
-            if way.to not in places:
-                covariance = place.covariance + adjoint @ way.covariance @ adjoint.T
+        for link in links[name]:
+            if link.to not in places:
+                covariance = place.covariance + adjoint @ link.covariance @ adjoint.T
                 count += 1
                 heapq.heappush(
                     queue,
                     (
-                        -way.num_agreeing,
+                        -link.num_agreeing,
                         count,
-                        way.to,
-                        JointPose(anchor, place.joint_from_world @ way.pose, covariance),
+                        link.to,
+                        JointPose(anchor, place.joint_from_world @ link.pose, covariance),
                     ),
                 )
     return places
 
 
-def _optimised(
+def _optimize_worlds(
     joins: Sequence[Join],
     worlds: Mapping[str, str],
     anchored: Mapping[str, Rigid3],
@@ -229,16 +238,16 @@ def _optimised(
 ) -> dict[str, JointPose]:
     """Where each world lies, all joins adjusted; the covariance is that of one way alone, which is
     no less."""
-    placed = dict[str, JointPose]()
+    place_tiles = dict[str, JointPose]()
     for anchor, group in _groups(joins, worlds, anchored).items():
         names = [anchor, *(name for name in group if name != anchor)]
         rows = {name: row for row, name in enumerate(names)}
         edges = [_edge(join, worlds, rows) for join in joins if worlds[join.first] in rows]
         poses = [group[name].joint_from_world.inverse() for name in names]
-        poses = optimise_graph(poses, edges, config) if len(edges) >= len(names) else poses
+        poses = optimize_pose_graph(poses, edges, config) if len(edges) >= len(names) else poses
         for name, world_from_joint in zip(names, poses, strict=True):
-            placed[name] = replace(group[name], joint_from_world=world_from_joint.inverse())
-    return placed
+            place_tiles[name] = replace(group[name], joint_from_world=world_from_joint.inverse())
+    return place_tiles
 
 
 def _edge(join: Join, worlds: Mapping[str, str], rows: Mapping[str, int]) -> Edge:
@@ -259,4 +268,6 @@ def _residuals(
         {name: row for row, name in enumerate(names)},
         [places[name].joint_from_world.inverse() for name in names],
     )
-    return residuals_in_sigma(poses, [_edge(join, worlds, rows) for join in joins]).tolist()
+    return compute_normalized_residuals(
+        poses, [_edge(join, worlds, rows) for join in joins]
+    ).tolist()

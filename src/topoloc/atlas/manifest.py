@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.atlas.joins import Join, JointPose
-from topoloc.atlas.joint_worlds import placed as placed_tiles
+from topoloc.atlas.joint_worlds import place_tiles as placed_tiles
 from topoloc.atlas.manifest_values import ID, count, matching, number, of
 from topoloc.errors import AtlasError, GeoreferenceError, TrajectoryError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
@@ -47,8 +47,8 @@ class StoredFile:
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """A map of the atlas. `places` are its place vectors (`place_vectors.py`), by vocabularies of
-    these versions, by kind of features.
+    """A map of the atlas. `places` are its place vectors (`global_descriptors.py`), by vocabularies
+    of these versions, by kind of features.
 
     `box_world` holds the least and the largest coordinates of its nodes' cameras in the map's own
     world, metres; `focal_px` the focal length of its finest camera. `georeference` is the map's,
@@ -191,8 +191,8 @@ class Manifest:
                 ),
                 None,
             )
-        placed, adjusted_joins = placed_tiles(tiles, self._joins_of(tiles, joins), origin)
-        after = Manifest(self.serial + 1, placed, origin, {}, adjusted_joins)
+        place_tiles, adjusted_joins = placed_tiles(tiles, self._select_joins(tiles, joins), origin)
+        after = Manifest(self.serial + 1, place_tiles, origin, {}, adjusted_joins)
         retired = dict.fromkeys(self.files, now) | dict(self.retired)
         return replace(
             after,
@@ -201,7 +201,7 @@ class Manifest:
             },
         )
 
-    def _joins_of(self, tiles: Mapping[str, Tile], further: Sequence[Join]) -> list[Join]:
+    def _select_joins(self, tiles: Mapping[str, Tile], further: Sequence[Join]) -> list[Join]:
         """Joins between these tiles; of two between the same ones the last."""
         same = {
             name
@@ -235,7 +235,7 @@ class Manifest:
         """The inverse of `to_bytes`. Raises AtlasError, which says `where`, whatever else the bytes
         are."""
         try:
-            return _manifest_of(json.loads(data))
+            return _parse_manifest(json.loads(data))
         except (
             ValueError,
             TypeError,
@@ -264,7 +264,7 @@ def check_tile_id(tile_id: str) -> None:
         )
 
 
-def _manifest_of(data: Any) -> Manifest:
+def _parse_manifest(data: Any) -> Manifest:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise ValueError(f"'format' is not {FORMAT!r}")
     if data.get("version") != FORMAT_VERSION:
@@ -273,7 +273,7 @@ def _manifest_of(data: Any) -> Manifest:
             f" {FORMAT_VERSION}"
         )
     rows = of(list, data["tiles"], "tiles")
-    tiles = [_tile_of(of(dict, row, "a tile")) for row in rows[: MAX_TILES + 1]]
+    tiles = [_parse_tile(of(dict, row, "a tile")) for row in rows[: MAX_TILES + 1]]
     if len(tiles) > MAX_TILES or len({tile.tile_id for tile in tiles}) < len(tiles):
         raise ValueError("too many tiles, or two of one id")
     origin, retired = data["origin"], of(dict, data["retired"], "retired")
@@ -305,7 +305,7 @@ def _check_joins(joins: Sequence[Join], known: set[str]) -> None:
         raise ValueError("two joins of the same tiles")
 
 
-def _tile_of(row: dict[str, Any]) -> Tile:
+def _parse_tile(row: dict[str, Any]) -> Tile:
     box = np.array(row["box_world"], np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all():
         raise ValueError("box_world is no two points")
@@ -329,8 +329,8 @@ def _tile_of(row: dict[str, Any]) -> Tile:
         raise ValueError("geo_box is no four degrees")
     return Tile(
         tile_id=matching(ID, row["id"], "id"),
-        map=_file_of(row["map"]),
-        places=_file_of(row["places"]),
+        map=_parse_file(row["map"]),
+        places=_parse_file(row["places"]),
         vocabularies={
             kind: of(str, version, "vocabularies") for kind, version in vocabularies.items()
         },
@@ -347,10 +347,10 @@ def _tile_of(row: dict[str, Any]) -> Tile:
         atlas_from_world=None if pose is None else Rigid3.from_matrix(np.array(pose, np.float64)),
         recipe=None if recipe is None else matching(_SHA256, recipe, "recipe"),
         joint=None if joint is None else JointPose.from_json(of(dict, joint, "joint")),
-        undo=None if undo is None else _file_of(of(dict, undo, "undo")),
+        undo=None if undo is None else _parse_file(of(dict, undo, "undo")),
     )
 
 
-def _file_of(row: Any) -> StoredFile:
+def _parse_file(row: Any) -> StoredFile:
     name, sha256 = matching(_FILE, row["file"], "file"), matching(_SHA256, row["sha256"], "sha256")
     return StoredFile(name, sha256, count(row["bytes"], "bytes"))

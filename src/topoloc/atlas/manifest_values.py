@@ -47,7 +47,7 @@ def number(value: Any, what: str) -> float:
     return float(value)
 
 
-def pose_of(rows: Any, what: str) -> Rigid3:
+def parse_pose(rows: Any, what: str) -> Rigid3:
     """A pose (3x4) of a manifest. Raises ValueError, TrajectoryError."""
     matrix = np.array(rows, np.float64)
     pose = Rigid3.from_matrix(matrix)
@@ -56,7 +56,7 @@ def pose_of(rows: Any, what: str) -> Rigid3:
     return pose
 
 
-def covariance_of(rows: Any, what: str, is_definite: bool) -> Float[np.ndarray, "6 6"]:
+def parse_covariance(rows: Any, what: str, is_definite: bool) -> Float[np.ndarray, "6 6"]:
     """A covariance (6x6) of a manifest, which is exactly symmetric afterwards. Raises
     ValueError."""
     matrix = np.array(rows, np.float64)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from topoloc.atlas.atlas import Atlas, is_atlas, store_at, tile_problem
-from topoloc.atlas.editing import new_tiles, tile_of
+from topoloc.atlas.editing import new_tiles, store_tile
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.store import Store
@@ -31,28 +31,28 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
     for source in sources:
         if not is_atlas(source):
             (new,) = new_tiles([source])
-            added = {new.tile_id: tile_of(new, store)}
+            added = {new.tile_id: store_tile(new, store)}
             _check_same(source, tiles, added)
         else:
             atlas = Atlas.open(source)
             added = atlas.manifest.by_id
             _check_same(source, tiles, added)
             for tile in added.values():
-                _copy(atlas, tile, store)
+                _copy_files(atlas, tile, store)
             joins += atlas.manifest.joins
-        tiles = _with_own_worlds(tiles, added) | tiles
+        tiles = _with_unique_worlds(tiles, added) | tiles
     after = Manifest().with_tiles(tiles, time.time(), joins)
     if not store.commit(None, after.to_bytes()):
         raise AtlasError(f"{where} became an atlas meanwhile; it stays as it is")
     return after
 
 
-def _copy(atlas: Atlas, tile: Tile, store: Store) -> None:
+def _copy_files(atlas: Atlas, tile: Tile, store: Store) -> None:
     problem = tile_problem(atlas, tile)
     if problem is not None:
         raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
     for stored in tile.files:
-        store.put(stored.name, atlas.store.local(stored.name, stored.sha256))
+        store.put(stored.name, atlas.store.local_path(stored.name, stored.sha256))
 
 
 def _check_same(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile]) -> None:
@@ -64,7 +64,7 @@ def _check_same(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile
             )
 
 
-def _with_own_worlds(known: Mapping[str, Tile], added: Mapping[str, Tile]) -> dict[str, Tile]:
+def _with_unique_worlds(known: Mapping[str, Tile], added: Mapping[str, Tile]) -> dict[str, Tile]:
     """Tiles whose worlds are called as none of those that are known; but for worlds that a tile of
     both lies in, which are the same."""
     same = {added[tile_id].world: known[tile_id].world for tile_id in known.keys() & added.keys()}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Manifest, Tile
-from topoloc.errors import AtlasError, MapError, StoreError
+from topoloc.errors import AtlasError, MapError, ObjectStoreError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
@@ -41,7 +41,7 @@ class SharedWorld:
         )
 
 
-def shared_worlds(manifest: Manifest) -> list[SharedWorld]:
+def group_shared_worlds(manifest: Manifest) -> list[SharedWorld]:
     """All tiles by the worlds that they share, the one of most nodes first."""
     groups: dict[str | None, list[PlacedTile]] = {}
     for tile in manifest.tiles:
@@ -62,7 +62,7 @@ def world_of_tile(manifest: Manifest, tile: Tile) -> SharedWorld:
     return SharedWorld((PlacedTile(tile, Rigid3.identity()),), manifest.georeference_of(tile))
 
 
-def opened_tiles(
+def iter_open_tiles(
     atlas: Atlas, placed: Sequence[PlacedTile], warn: Callable[[str], None]
 ) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
     """Tiles with their maps, each open for its turn. One that cannot be read is left out, and
@@ -76,7 +76,7 @@ def opened_tiles(
     for one in placed:
         try:
             topomap = TopoMetricMap.load(atlas.map_path(one.tile))
-        except StoreError:
+        except ObjectStoreError:
             raise
         except MapError as error:
             warn(f"tile {one.tile.tile_id} is left out: {error}")

@@ -19,7 +19,7 @@ from typing import Protocol, runtime_checkable
 
 from topoloc.atlas.manifest import TILES
 from topoloc.errors import AtlasError, TopolocError
-from topoloc.recordings.atomic import remove_all_leftovers, replaced_file, write_bytes
+from topoloc.recordings.atomic import atomic_write, remove_all_stale_files, write_bytes
 
 try:
     import fcntl
@@ -56,14 +56,14 @@ class Store(Protocol):
         already counts as written now."""
         ...
 
-    def local(self, name: str, sha256: str) -> Path:
+    def local_path(self, name: str, sha256: str) -> Path:
         """A file of this machine with these contents. Raises AtlasError where it is missing or
         another, StoreError where nobody answers."""
         ...
 
-    def kept(self, name: str, sha256: str) -> Path | None:
-        """As `local`, if nothing need be fetched for it; else None. Raises AtlasError where it is
-        missing."""
+    def cached(self, name: str, sha256: str) -> Path | None:
+        """As `local_path`, if nothing need be fetched for it; else None. Raises AtlasError where it
+        is missing."""
         ...
 
     def ages(self) -> dict[str, float]:
@@ -105,7 +105,7 @@ class FolderStore:
                 write_bytes(self.folder / MANIFEST, after)
             except TopolocError as error:
                 raise AtlasError(str(error)) from None
-            remove_all_leftovers(self.folder / TILES)
+            remove_all_stale_files(self.folder / TILES)
         return True
 
     def put(self, name: str, path: Path) -> None:
@@ -116,19 +116,19 @@ class FolderStore:
                 if target.stat().st_size == path.stat().st_size:
                     os.utime(target)
                     return
-            with replaced_file(target) as temporary:
+            with atomic_write(target) as temporary:
                 shutil.copyfile(path, temporary)
         except OSError as error:
             raise AtlasError(f"cannot write {target}: {error.strerror}") from error
 
-    def local(self, name: str, sha256: str) -> Path:
+    def local_path(self, name: str, sha256: str) -> Path:
         path = self.folder / name
         if not path.is_file():
             raise AtlasError(f"{path} is missing")
         return path
 
-    def kept(self, name: str, sha256: str) -> Path | None:
-        return self.local(name, sha256)
+    def cached(self, name: str, sha256: str) -> Path | None:
+        return self.local_path(name, sha256)
 
     def ages(self) -> dict[str, float]:
         now, ages = time.time(), dict[str, float]()

@@ -25,6 +25,6 @@ ROLES: dict[str, Role] = {
 """What each recording is for, by the name of its folder."""
 
 
-def missing_recordings(folder: Path) -> list[str]:
+def find_missing_recordings(folder: Path) -> list[str]:
     """The names of the demo's recordings that are not in `folder`."""
     return [name for name in ROLES if not (folder / name).is_dir()]

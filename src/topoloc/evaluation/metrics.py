@@ -11,7 +11,7 @@ import numpy as np
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import Localization, NotLocalized, pose_json
+from topoloc.localization.result import Localization, NotLocalized, pose_to_json
 from topoloc.recordings.frame import Image
 
 # A query counts as recalled when its pose is within both (metres, degrees), of all queries.
@@ -21,13 +21,13 @@ MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class EvaluatedQuery:
     """A query with its result and its truth, which is None for an image from elsewhere: any pose
     given for that is false.
 
     `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures.
     `camera` is what it was taken with. `neighbour_ids` are the nodes that are as good as the
-    nearest one: see `neighbours_of`. `is_of_another_world`: the pose is in a world of which the
+    nearest one: see `find_neighbour_ids`. `is_in_other_world`: the pose is in a world of which the
     truth says nothing, that of another tile of an atlas, and so it is false.
     """
 
@@ -39,7 +39,7 @@ class Answer:
     read_image: Callable[[], Image] | None = None
     camera: Camera | None = None
     neighbour_ids: frozenset[int] = frozenset()
-    is_of_another_world: bool = False
+    is_in_other_world: bool = False
 
     @property
     def translation_m(self) -> float:
@@ -48,7 +48,7 @@ class Answer:
         if (
             isinstance(self.result, NotLocalized)
             or self.world_from_cam is None
-            or self.is_of_another_world
+            or self.is_in_other_world
         ):
             return float("nan")
         return translation_error(self.result.world_from_cam, self.world_from_cam)
@@ -60,7 +60,7 @@ class Answer:
         if (
             isinstance(self.result, NotLocalized)
             or self.world_from_cam is None
-            or self.is_of_another_world
+            or self.is_in_other_world
         ):
             return float("nan")
         return float(np.rad2deg(rotation_error(self.result.world_from_cam, self.world_from_cam)))
@@ -69,39 +69,41 @@ class Answer:
     def is_false_accept(self) -> bool:
         if isinstance(self.result, NotLocalized):
             return False
-        if self.world_from_cam is None or self.is_of_another_world:
+        if self.world_from_cam is None or self.is_in_other_world:
             return True
         return self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
 
     def to_json(self) -> dict[str, Any]:
         """The result's line, with its recording and its truth, which is null for an image from
         elsewhere."""
-        truth = None if self.world_from_cam is None else pose_json(self.world_from_cam)
+        truth = None if self.world_from_cam is None else pose_to_json(self.world_from_cam)
         return self.result.to_json(self.query) | {
             "recording": self.recording,
             "true_world_from_cam": truth,
         }
 
 
-def by_recording(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
+def group_by_recording(answers: Sequence[EvaluatedQuery]) -> dict[str, list[EvaluatedQuery]]:
     """The answers of each recording, in the order in which the recordings were asked first."""
-    groups: dict[str, list[Answer]] = {}
+    groups: dict[str, list[EvaluatedQuery]] = {}
     for answer in answers:
         groups.setdefault(answer.recording, []).append(answer)
     return groups
 
 
-def summarize(answers: list[Answer]) -> dict[str, Any]:
+def summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     """The evaluation as JSON, of all answers together and, under "recordings", of each recording
     alone.
 
     Counts, medians over what was localized, recall over all queries that have a truth.
     """
-    rows = [{"name": name} | _summary(group) for name, group in by_recording(answers).items()]
-    return _summary(answers) | {"recordings": rows}
+    rows = [
+        {"name": name} | _summarize(group) for name, group in group_by_recording(answers).items()
+    ]
+    return _summarize(answers) | {"recordings": rows}
 
 
-def _summary(answers: list[Answer]) -> dict[str, Any]:
+def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     with_truth = [a for a in answers if a.world_from_cam is not None]
     translation = np.array([a.translation_m for a in with_truth])
     rotation = np.array([a.rotation_deg for a in with_truth])
@@ -131,7 +133,7 @@ def _summary(answers: list[Answer]) -> dict[str, Any]:
         "neighbour_accuracy": float(np.mean(near)) if near else None,
         "num_elsewhere": len(answers) - len(with_truth),
         "false_accepts": sum(a.is_false_accept for a in answers),
-        "not_localized": _reasons(answers),
+        "not_localized": _count_reasons(answers),
         "median_times_ms": {
             stage: _median(np.array([a.result.times_ms.get(stage, 0.0) for a in answers]))
             for stage in stages
@@ -139,7 +141,7 @@ def _summary(answers: list[Answer]) -> dict[str, Any]:
     }
 
 
-def _reasons(answers: list[Answer]) -> dict[str, int]:
+def _count_reasons(answers: list[EvaluatedQuery]) -> dict[str, int]:
     reasons = [a.result.reason for a in answers if isinstance(a.result, NotLocalized)]
     return {reason: reasons.count(reason) for reason in sorted(set(reasons))}
 
@@ -148,7 +150,7 @@ def _median(values: np.ndarray) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
-def length_text(metres: float, digits: int | None = None) -> str:
+def format_length(metres: float, digits: int | None = None) -> str:
     """Metres for people: in cm below one."""
     if metres >= 1.0:
         return f"{metres:.{2 if digits is None else digits}f} m"

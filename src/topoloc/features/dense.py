@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from topoloc.features.learned_kernels import (
-    is_most_similar_here,
-    levels_of_unit_length,
+    combine_levels,
+    is_local_best_match,
+    normalize_descriptors,
     sample_descriptors,
     sample_levels,
-    turned_to_unit_length,
 )
 
 _RADIUS = 4  # grid steps to each side among which the most similar descriptor is sought
@@ -38,23 +38,23 @@ class DenseDescriptors(ABC):
         """Numbers a descriptor."""
 
     @abstractmethod
-    def at(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+    def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
         """Descriptors of unit length between those of the grid, bilinear."""
 
     @abstractmethod
-    def _unit_grid(self) -> Float32[np.ndarray, "rows columns d"]:
+    def _normalized_grid(self) -> Float32[np.ndarray, "rows columns d"]:
         """All of the grid, of unit length."""
 
     @cached_property
     def _grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        return self._unit_grid()
+        return self._normalized_grid()
 
-    def agrees(
+    def check_agreement(
         self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]
     ) -> Bool[np.ndarray, " n"]:
         """Is the descriptor most like each of these, of all within 4 grid steps to each side of its
         point, at most one step off?"""
-        return is_most_similar_here(
+        return is_local_best_match(
             self._grid,
             points_img.astype(np.float32),
             descriptors,
@@ -64,7 +64,7 @@ class DenseDescriptors(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class Planes(DenseDescriptors):
+class SingleLevelDescriptors(DenseDescriptors):
     """As most networks give them: one plane a number, not of unit length."""
 
     planes: Float32[np.ndarray, "d rows columns"]
@@ -74,15 +74,15 @@ class Planes(DenseDescriptors):
     def size(self) -> int:
         return self.planes.shape[0]
 
-    def at(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+    def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
         return sample_descriptors(self.planes, points_img, np.float32(self.stride_px))
 
-    def _unit_grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        return turned_to_unit_length(self.planes)
+    def _normalized_grid(self) -> Float32[np.ndarray, "rows columns d"]:
+        return normalize_descriptors(self.planes)
 
 
 @dataclass(frozen=True, eq=False)
-class TwoLevels(DenseDescriptors):
+class TwoLevelDescriptors(DenseDescriptors):
     """As a network gives them that only ever adds two levels up: `coarse`, enlarged to twice its
     rows and columns (bilinear), and `fine` times `weights`. Both are linear, and far fewer
     descriptors are asked for than there are: so they are added up where they are."""
@@ -96,10 +96,10 @@ class TwoLevels(DenseDescriptors):
     def size(self) -> int:
         return self.coarse.shape[2]
 
-    def at(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+    def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
         return sample_levels(
             self.coarse, self.fine, self.weights, points_img, np.float32(self.stride_px)
         )
 
-    def _unit_grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        return levels_of_unit_length(self.coarse, self.fine, self.weights)
+    def _normalized_grid(self) -> Float32[np.ndarray, "rows columns d"]:
+        return combine_levels(self.coarse, self.fine, self.weights)

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.features import Features
-from topoloc.features.kinds import FeatureConfig, find_kind
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 
 NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
@@ -34,7 +34,7 @@ def extract_features(
         FeatureKindError: there is no such kind.
     """
     return replace(
-        extract_normalized(normalize_image(image, config, num_threads), config, num_threads),
+        extract_from_normalized(normalize_image(image, config, num_threads), config, num_threads),
         dense=None,
     )
 
@@ -43,12 +43,14 @@ def normalize_image(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None
 ) -> UInt8[np.ndarray, "h w"]:
     """First step of `extract_features`: the picture that key points are sought in."""
-    normalization = NORMALIZATIONS[config.normalization or find_kind(config.kind).normalization]
+    normalization = NORMALIZATIONS[
+        config.normalization or find_feature_type(config.kind).normalization
+    ]
     return image if normalization is None else patch_normalize(image, normalization, num_threads)
 
 
-def extract_normalized(
+def extract_from_normalized(
     normalized: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None
 ) -> Features:
     """Second step of `extract_features`: the features of what `normalize_image` gave."""
-    return find_kind(config.kind).extract(normalized, config, num_threads)
+    return find_feature_type(config.kind).extract(normalized, config, num_threads)

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int32, Shaped
 
 from topoloc.features.dense import DenseDescriptors
 
-_OF_EACH = ("points_img", "sizes_px", "angles", "responses", "descriptors")
+_ARRAY_FIELDS = ("points_img", "sizes_px", "angles", "responses", "descriptors")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,16 +37,16 @@ class Features:
 
     def select(self, rows: Shaped[np.ndarray, " m"]) -> Features:
         """The features of these rows (indices or a boolean mask)."""
-        return Features._of_each([getattr(self, name)[rows] for name in _OF_EACH])
+        return Features._from_arrays([getattr(self, name)[rows] for name in _ARRAY_FIELDS])
 
     @staticmethod
     def concatenate(parts: list[Features]) -> Features:
-        return Features._of_each(
-            [np.concatenate([getattr(part, name) for part in parts]) for name in _OF_EACH]
+        return Features._from_arrays(
+            [np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAY_FIELDS]
         )
 
     @staticmethod
-    def _of_each(arrays: list[np.ndarray]) -> Features:
+    def _from_arrays(arrays: list[np.ndarray]) -> Features:
         points_img, sizes_px, angles, responses, descriptors = arrays
         return Features(points_img, sizes_px, angles, responses, descriptors)
 

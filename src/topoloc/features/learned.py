@@ -21,15 +21,15 @@ from jaxtyping import Float32, UInt8
 
 from topoloc import compiled
 from topoloc.errors import WeightsError
-from topoloc.features.dense import DenseDescriptors, Planes, TwoLevels
+from topoloc.features.dense import DenseDescriptors, SingleLevelDescriptors, TwoLevelDescriptors
 from topoloc.features.features import Features
-from topoloc.features.learned_kernels import find_maxima, refined
-from topoloc.features.network_files import KnownNetwork, find_network, open_network
+from topoloc.features.learned_kernels import find_maxima, refine_subpixel
+from topoloc.features.network_files import NetworkInfo, find_network, open_network
 
 _SIDE_MULTIPLE = 32
 _BORDER_PX = 4
 _CELLS = (4, 6)  # rows and columns of the picture that places are known by
-SIZE_PX = 16.0
+KEY_POINT_SIZE_PX = 16.0
 """The size that all these key points are said to have."""
 
 
@@ -55,8 +55,8 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
         WeightsError: the network's file is missing, damaged or another network's.
     """
     height, width = image.shape
-    answer = run_network(image, config.network, config.num_threads)
-    scores, dense = answer.scores, answer.dense
+    network_output = run_network(image, config.network, config.num_threads)
+    scores, dense = network_output.scores, network_output.dense
     if dense.size != config.descriptor_size:
         raise WeightsError(
             f"the network {config.network} gives descriptors of {dense.size} numbers, not"
@@ -64,14 +64,21 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
         )
     pixels, found = find_maxima(scores, height, width, _BORDER_PX, np.float32(config.min_score))
     order = np.argsort(-found, kind="stable")[: config.max_features]
-    points_img = refined(scores, pixels[order])
-    sizes, angles = np.full(len(order), SIZE_PX, np.float32), np.zeros(len(order), np.float32)
+    points_img = refine_subpixel(scores, pixels[order])
+    sizes, angles = (
+        np.full(len(order), KEY_POINT_SIZE_PX, np.float32),
+        np.zeros(len(order), np.float32),
+    )
     of_picture = (height / scores.shape[0], width / scores.shape[1])
-    cells = None if answer.places is None else mean_cells(answer.places, *of_picture)
-    return Features(points_img, sizes, angles, found[order], dense.at(points_img), cells, dense)
+    cells = (
+        None
+        if network_output.places is None
+        else compute_cell_means(network_output.places, *of_picture)
+    )
+    return Features(points_img, sizes, angles, found[order], dense.sample(points_img), cells, dense)
 
 
-def mean_cells(
+def compute_cell_means(
     level: Float32[np.ndarray, "c h w"], height_share: float, width_share: float
 ) -> Float32[np.ndarray, "rows columns c"]:
     """Means of a network's level over a grid of cells, of that share of its rows and columns that
@@ -87,11 +94,11 @@ def mean_cells(
 
 def check_network(network: str) -> None:
     """Is the network there? Raises as `extract_learned`."""
-    _opened(network, find_network(network))
+    _open_session(network, find_network(network))
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkAnswer:
+class NetworkOutput:
     """Scores of the pixels, descriptors, and the level by which places are known again, where the
     network has one."""
 
@@ -102,12 +109,12 @@ class NetworkAnswer:
 
 def run_network(
     image: UInt8[np.ndarray, "h w"], network: str, num_threads: int | None = None
-) -> NetworkAnswer:
+) -> NetworkOutput:
     """What a network says of a picture, which is continued by its border to the sides asked."""
     height, width = image.shape
     padding = [(0, -side % _SIDE_MULTIPLE) for side in (height, width)]
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
-    session = _session(
+    session = _session_for_size(
         network,
         find_network(network),
         num_threads or compiled.num_threads(),
@@ -118,16 +125,18 @@ def run_network(
     of = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
     scores, places = of["scores"][0, 0], of.get("places")
     if "coarse" in of:
-        dense = TwoLevels(
+        dense = TwoLevelDescriptors(
             of["coarse"][0], of["fine"][0], of["fine_weights"], len(scores) / of["fine"].shape[1]
         )
     else:
-        dense = Planes(of["descriptors"][0], len(scores) / of["descriptors"].shape[2])
-    return NetworkAnswer(scores, dense, None if places is None else places[0])
+        dense = SingleLevelDescriptors(
+            of["descriptors"][0], len(scores) / of["descriptors"].shape[2]
+        )
+    return NetworkOutput(scores, dense, None if places is None else places[0])
 
 
 @functools.lru_cache(maxsize=6)
-def _session(
+def _session_for_size(
     network: str, path: Path, num_threads: int, size: tuple[int, int], process_id: int
 ) -> Any:
     """The network made ready for pictures of one size, in some 10 ms, after which each takes 0.8 of
@@ -135,21 +144,21 @@ def _session(
 
     Each holds some 100 bytes a pixel, so few are kept.
     """
-    return _named(network, path, *open_network(path, num_threads, size))
+    return _check_network_name(network, path, *open_network(path, num_threads, size))
 
 
 @functools.lru_cache(maxsize=16)
-def _opened(network: str, path: Path) -> Any:
-    return _named(network, path, *open_network(path, num_threads=1))
+def _open_session(network: str, path: Path) -> Any:
+    return _check_network_name(network, path, *open_network(path, num_threads=1))
 
 
 def close_networks() -> None:
     """Let go of all networks that are open; the next picture opens its own again."""
-    _session.cache_clear()
-    _opened.cache_clear()
+    _session_for_size.cache_clear()
+    _open_session.cache_clear()
 
 
-def _named(network: str, path: Path, known: KnownNetwork, session: Any) -> Any:
+def _check_network_name(network: str, path: Path, known: NetworkInfo, session: Any) -> Any:
     if known.name != network:
         raise WeightsError(f"network {path}: holds {known.name}, not {network}")
     return session

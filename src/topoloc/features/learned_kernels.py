@@ -23,11 +23,11 @@ def find_maxima(scores, height, width, border, min_score):
     )  # the largest along each row's window, of as many rows as a window has
     around = np.empty(num_columns, np.float32)
     for y in range(border - _RADIUS, min(height - border + _RADIUS, height) if num_columns else 0):
-        _largest_of_windows(scores[y], border, along[y % len(along)])
+        _max_along_windows(scores[y], border, along[y % len(along)])
         middle = y - _RADIUS
         if middle < border:
             continue
-        _largest_of_rows(along, around)
+        _max_over_rows(along, around)
         row = scores[middle][border : border + num_columns]
         for x in range(num_columns):
             if (
@@ -41,7 +41,7 @@ def find_maxima(scores, height, width, border, min_score):
 
 
 @kernel()
-def _largest_of_windows(row, border, out):
+def _max_along_windows(row, border, out):
     """The largest score within two pixels along a row, of each from `border` on."""
     n = len(out)
     a, b, c = (
@@ -58,7 +58,7 @@ def _largest_of_windows(row, border, out):
 
 
 @kernel()
-def _largest_of_rows(rows, out):
+def _max_over_rows(rows, out):
     a, b, c, d, e = rows[0], rows[1], rows[2], rows[3], rows[4]
     for x in range(len(out)):
         above = a[x] if a[x] > b[x] else b[x]
@@ -79,19 +79,19 @@ def _is_first_maximum(scores, y, x):
 
 
 @kernel()
-def refined(scores, pixels):
+def refine_subpixel(scores, pixels):
     """Pixels (x, y) moved to the top of the parabola through the scores of each and its
     neighbours."""
     points = np.empty((len(pixels), 2), np.float32)
     for k in range(len(pixels)):
         x, y = pixels[k, 0], pixels[k, 1]
-        points[k, 0] = x + _top(scores[y, x - 1], scores[y, x], scores[y, x + 1])
-        points[k, 1] = y + _top(scores[y - 1, x], scores[y, x], scores[y + 1, x])
+        points[k, 0] = x + _parabola_vertex(scores[y, x - 1], scores[y, x], scores[y, x + 1])
+        points[k, 1] = y + _parabola_vertex(scores[y - 1, x], scores[y, x], scores[y + 1, x])
     return points
 
 
 @kernel()
-def _top(before, here, after):
+def _parabola_vertex(before, here, after):
     """Where the parabola through the logarithms of three scores, at -1, 0 and 1, has its top;
     within half a pixel."""
     a, b, c = (
@@ -137,7 +137,7 @@ def sample_descriptors(dense, points_img, stride):
 
 
 @kernel()
-def turned_to_unit_length(planes):
+def normalize_descriptors(planes):
     """(rows, columns, d) descriptors of unit length, of (d, rows, columns) of any."""
     size, rows, columns = planes.shape
     grid = np.empty((rows, columns, size), np.float32)
@@ -156,8 +156,8 @@ def turned_to_unit_length(planes):
 
 @kernel(fastmath={"contract"})
 def sample_levels(coarse, fine, weights, points_img, stride):
-    """As `sample_descriptors`, of the sum of two levels (`dense.TwoLevels`) whose finer grid has
-    that stride."""
+    """As `sample_descriptors`, of the sum of two levels (`dense.TwoLevelDescriptors`) whose finer
+    grid has that stride."""
     rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
     out, mixed = np.empty((len(points_img), size), np.float32), np.empty(fine.shape[2], np.float32)
     for k in range(len(points_img)):
@@ -176,7 +176,7 @@ def sample_levels(coarse, fine, weights, points_img, stride):
         for below in range(2):
             for right in range(2):
                 share = (t if below else 1 - t) * (s if right else 1 - s)
-                _add_coarse(coarse, y + below, x + right, share, value)
+                _add_coarse_level(coarse, y + below, x + right, share, value)
                 for i in range(len(mixed)):
                     mixed[i] += share * fine[y + below, x + right, i]
         for i in range(0, len(mixed), 4):
@@ -198,9 +198,9 @@ def sample_levels(coarse, fine, weights, points_img, stride):
 
 
 @kernel(fastmath={"contract", "reassoc"})
-def levels_of_unit_length(coarse, fine, weights):
-    """(rows, columns, d) descriptors of unit length, of two levels (`dense.TwoLevels`), whose
-    columns and k are multiples of four."""
+def combine_levels(coarse, fine, weights):
+    """(rows, columns, d) descriptors of unit length, of two levels (`dense.TwoLevelDescriptors`),
+    whose columns and k are multiples of four."""
     rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
     grid = np.empty((rows, columns, size), np.float32)
     blend, sums = np.empty((coarse.shape[1] + 2, size), np.float32), np.empty(4 * size, np.float32)
@@ -220,7 +220,7 @@ def levels_of_unit_length(coarse, fine, weights):
                     most = np.float32(0.75) * here[j]
                     sums[2 * half * size + j] = most + np.float32(0.25) * before[j]
                     sums[2 * half * size + size + j] = most + np.float32(0.25) * after[j]
-            _add_fine(fine[y], x, by_four, size, sums)
+            _add_fine_level(fine[y], x, by_four, size, sums)
             for k in range(4):
                 total = np.float32(1e-12)
                 for j in range(size):
@@ -244,7 +244,7 @@ def _blend_rows(coarse, y, out):
 
 
 @kernel(fastmath={"contract", "reassoc"})
-def _add_fine(row, x, by_four, size, sums):
+def _add_fine_level(row, x, by_four, size, sums):
     """Adds what the finer level says of four pixels from x on; `sums` holds one descriptor after
     the other, `by_four` four weights of k."""
     for k in range(by_four.shape[0]):
@@ -277,7 +277,7 @@ def _add_fine(row, x, by_four, size, sums):
 
 
 @kernel(fastmath={"contract"})
-def _add_coarse(coarse, y, x, share, out):
+def _add_coarse_level(coarse, y, x, share, out):
     """Adds this share of the coarser of two levels, enlarged, at a point of the finer grid."""
     above, left = max((y - 1) // 2, 0), max((x - 1) // 2, 0)
     below, right = min((y + 1) // 2, coarse.shape[0] - 1), min((x + 1) // 2, coarse.shape[1] - 1)
@@ -295,7 +295,7 @@ def _add_coarse(coarse, y, x, share, out):
 
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})
-def is_most_similar_here(grid, points_img, descriptors, stride, radius):
+def is_local_best_match(grid, points_img, descriptors, stride, radius):
     """For each point: is the descriptor most like its own, of those within `radius` grid steps to
     each side, within one step of it?"""
     rows, columns, size = grid.shape

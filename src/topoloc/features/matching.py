@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from topoloc.bounds import Between
-from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Matches
-from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_alike, find_nearest
+from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_nearest, find_similar
+from topoloc.features.parallel import parallel_for_rows
 
-_LOWES_RATIO = 0.8
+_LOWE_RATIO = 0.8
 _FLANN_KDTREE = 1
 _FLANN_NEIGHBOURS = 8  # of these the nearest that is no twin is the rival
 _NO_POINTS = np.zeros((0, 3), np.float32)
@@ -47,8 +47,8 @@ class MatchingConfig:
         return self if self.ratio is not None else replace(self, ratio=ratio)
 
 
-_ANY_NEAREST = MatchingConfig(ratio=0.0)
-_Compared = tuple[int, float, Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]
+_NO_RATIO_TEST = MatchingConfig(ratio=0.0)
+_TrainSet = tuple[int, float, Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]
 """How many train features there are, the ratio, and their points and radii."""
 
 
@@ -60,7 +60,7 @@ def match_features(
 ) -> Matches:
     """Matches between two images, at most one for a query feature, in the order of the query
     features."""
-    return Matcher(query_descriptors, train_descriptors, None, config, num_threads).of_first()
+    return Matcher(query_descriptors, train_descriptors, None, config, num_threads).match_first()
 
 
 def match_pooled(
@@ -79,10 +79,10 @@ def match_pooled(
     """
     return Matcher(
         query_descriptors, train_descriptors, (train_points_world, train_radii), config, num_threads
-    ).of_first()
+    ).match_first()
 
 
-def alike_pairs(
+def find_similar_pairs(
     few: Float32[np.ndarray, "n d"], many: Float32[np.ndarray, "m d"], min_similarity: float
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """Rows of `few` and of `many` whose descriptors have a scalar product of at least
@@ -91,7 +91,7 @@ def alike_pairs(
     if len(few) and len(many):
         # the few are what is kept at hand, so that nothing of the many is laid out anew
         packed = _packed(few)
-        found, count = find_alike(
+        found, count = find_similar(
             _padded(many, packed), packed, len(few), np.float32(min_similarity), found, count
         )
     found = found[:count]
@@ -112,30 +112,30 @@ class Matcher:
         self,
         query_descriptors: Float32[np.ndarray, "n d"],
         train_descriptors: Float32[np.ndarray, "m d"],
-        of_map: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]] | None,
+        map_points: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]] | None,
         config: MatchingConfig,
         num_threads: int | None = None,
     ) -> None:
         self._query, self._train = query_descriptors, train_descriptors
         self._points, self._radii = (
             (_NO_POINTS, _NO_RADII)
-            if of_map is None
-            else (each.astype(np.float32) for each in of_map)
+            if map_points is None
+            else (each.astype(np.float32) for each in map_points)
         )
-        self._config, self._num_threads = config.resolved(_LOWES_RATIO), num_threads
+        self._config, self._num_threads = config.resolved(_LOWE_RATIO), num_threads
         self._nearest = np.zeros(0, np.int32), np.zeros(0, np.float32)
         self._packed = _packed(train_descriptors)
         self._column_largest = np.full(TILE * len(self._packed), -np.inf, np.float32)
 
-    def of_first(self, count: int | None = None) -> Matches:
+    def match_first(self, count: int | None = None) -> Matches:
         """Matches of so many query features, all without a number; no fewer than were asked for
         before."""
         query = self._query[:count]
         if len(query) == 0 or len(self._train) == 0:
             return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
         if self._config.method == "flann":
-            return self._by_flann(query)
-        train_idx, products = self._of_rows(query)
+            return self._match_with_flann(query)
+        train_idx, products = self._match_rows(query)
         query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
         if self._config.mutual:
             query_idx = query_idx[products[query_idx] >= self._column_largest[train_idx[query_idx]]]
@@ -144,7 +144,7 @@ class Matcher:
             )  # of equal ones the first
         return _matches(query_idx, train_idx, products)
 
-    def _of_rows(
+    def _match_rows(
         self, query: Float32[np.ndarray, "n d"]
     ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
         """The nearest train row of each query row, -1 where the ratio test fails, and their scalar
@@ -153,7 +153,7 @@ class Matcher:
         more = _nearest(
             query[len(train_idx) :],
             self._packed,
-            self._compared_with,
+            self._train_set,
             self._column_largest,
             self._num_threads,
         )
@@ -161,21 +161,21 @@ class Matcher:
         return self._nearest
 
     @property
-    def _compared_with(self) -> _Compared:
+    def _train_set(self) -> _TrainSet:
         assert self._config.ratio is not None
         return len(self._train), self._config.ratio, self._points, self._radii
 
-    def _by_flann(self, query: Float32[np.ndarray, "n d"]) -> Matches:
+    def _match_with_flann(self, query: Float32[np.ndarray, "n d"]) -> Matches:
         train_idx, products = _nearest_flann(
             query, self._train, self._points, self._radii, self._config
         )
         query_idx = np.flatnonzero(train_idx >= 0).astype(np.int32)
         if self._config.mutual and len(query_idx):
-            asked, of_asked = np.unique(train_idx[query_idx], return_inverse=True)
+            queried, queried_inverse = np.unique(train_idx[query_idx], return_inverse=True)
             back_idx = Matcher(
-                self._train[asked], query, None, _ANY_NEAREST, self._num_threads
-            )._of_rows(self._train[asked])[0]
-            query_idx = query_idx[back_idx[of_asked] == query_idx]
+                self._train[queried], query, None, _NO_RATIO_TEST, self._num_threads
+            )._match_rows(self._train[queried])[0]
+            query_idx = query_idx[back_idx[queried_inverse] == query_idx]
         return _matches(query_idx, train_idx, products)
 
 
@@ -192,7 +192,7 @@ def _matches(
 def _nearest(
     query: Float32[np.ndarray, "n d"],
     packed: Float32[np.ndarray, "tiles groups width"],
-    compared: _Compared,
+    compared: _TrainSet,
     column_largest: Float32[np.ndarray, " columns"],
     num_threads: int | None,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
@@ -200,19 +200,21 @@ def _nearest(
     product; `column_largest` is lifted."""
     padded = _padded(query, packed)
     nearest_idx, products = np.empty(len(query), np.int32), np.empty(len(query), np.float32)
-    of_bands = list[np.ndarray]()
+    band_maxima = list[np.ndarray]()
 
     def run(first_pair: int, last_pair: int) -> None:
-        rows, of_band = (
+        rows, band_maximum = (
             slice(ROWS * first_pair, ROWS * last_pair),
             np.full_like(column_largest, -np.inf),
         )
-        find_nearest(padded[rows], packed, *compared, nearest_idx[rows], products[rows], of_band)
-        of_bands.append(of_band)
+        find_nearest(
+            padded[rows], packed, *compared, nearest_idx[rows], products[rows], band_maximum
+        )
+        band_maxima.append(band_maximum)
 
-    run_in_bands(run, len(padded) // ROWS, num_threads)
-    for of_band in of_bands:
-        np.maximum(column_largest, of_band, out=column_largest)
+    parallel_for_rows(run, len(padded) // ROWS, num_threads)
+    for band_maximum in band_maxima:
+        np.maximum(column_largest, band_maximum, out=column_largest)
     return nearest_idx, products
 
 
@@ -263,14 +265,14 @@ def _nearest_flann(
         others = [
             other
             for other in neighbours[1:]
-            if not _are_twins(points, radii, best.trainIdx, other.trainIdx)
+            if not _are_duplicates(points, radii, best.trainIdx, other.trainIdx)
         ]
         if config.ratio <= 0.0 or not others or best.distance < config.ratio * others[0].distance:
             nearest_idx[row] = best.trainIdx
     return nearest_idx, products
 
 
-def _are_twins(
+def _are_duplicates(
     points: Float32[np.ndarray, "p 3"], radii: Float32[np.ndarray, " p"], a: int, b: int
 ) -> bool:
     return len(points) > 0 and bool(

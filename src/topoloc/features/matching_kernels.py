@@ -52,7 +52,7 @@ def multiply(query, packed, out):
 
 
 @kernel()
-def find_alike(query, packed, num_columns, least, found, count):
+def find_similar(query, packed, num_columns, least, found, count):
     """Append (row, column) of all products of at least `least` to `found` (k, 2), which holds
     `count` of them; returns the (grown) array and the new count. `query` and `packed` as of
     `multiply`; columns from `num_columns` on do not count."""
@@ -78,7 +78,7 @@ def find_alike(query, packed, num_columns, least, found, count):
 
 
 @kernel()
-def _are_twins(points, radii, a, b):
+def _are_duplicates(points, radii, a, b):
     squared = np.float32(0.0)
     for axis in range(3):
         squared += (points[a, axis] - points[b, axis]) ** 2
@@ -108,15 +108,15 @@ def find_nearest(
         for k in range(min(stop, len(out_winner)) - start):
             row = table[k]
             row[num_columns:] = -np.inf  # so that whole tiles can be looked at
-            best = _largest(row, lanes, column_largest)
+            best = _row_maximum(row, lanes, column_largest)
             out_product[start + k] = best
             out_winner[start + k] = (
-                -1 if best == -np.inf else _unrivalled(row, lanes, best, ratio, points, radii)
+                -1 if best == -np.inf else _find_unambiguous(row, lanes, best, ratio, points, radii)
             )
 
 
 @kernel()
-def _largest(row, lanes, column_largest):
+def _row_maximum(row, lanes, column_largest):
     """Of whole tiles of products; those that are NaN do not count. `lanes[j]` becomes the largest
     of the columns j of all tiles."""
     lanes[:] = -np.inf
@@ -136,7 +136,7 @@ def _largest(row, lanes, column_largest):
 
 
 @kernel()
-def _unrivalled(row, lanes, best, ratio, points, radii):
+def _find_unambiguous(row, lanes, best, ratio, points, radii):
     """The first column with the largest product, -1 if it has a rival; only lanes that hold such
     columns are gone through."""
     winner = len(row)
@@ -157,7 +157,7 @@ def _unrivalled(row, lanes, best, ratio, points, radii):
                 if (
                     row[column] >= limit
                     and column != winner
-                    and (len(points) == 0 or not _are_twins(points, radii, winner, column))
+                    and (len(points) == 0 or not _are_duplicates(points, radii, winner, column))
                 ):
                     return -1
     return winner

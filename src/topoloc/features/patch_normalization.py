@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.features.bands import run_in_bands
+from topoloc.features.parallel import parallel_for_rows
 from topoloc.features.patch_normalization_kernels import normalize_band
 
 
 @dataclass(frozen=True)
 class PatchNormalizationConfig:
-    """How to normalise; `PatchNormalizationConfig.paper()` is the paper's own form."""
+    """How to normalise; `PatchNormalizationConfig.paper` is the paper's own form."""
 
     window_px: Annotated[int, Between(3, 127)] = 17
     """Side of the window, odd."""
@@ -50,7 +50,7 @@ class PatchNormalizationConfig:
         """Square 17x17 windows, epsilon a mere guard against division by zero."""
         return PatchNormalizationConfig(window_px=17, epsilon=1e-3, shape="square")
 
-    def boxes(self) -> tuple[int, int]:
+    def box_sizes(self) -> tuple[int, int]:
         """Sides of the two boxes that are applied one after the other; together they reach over
         `window_px`."""
         if self.shape == "square":
@@ -69,7 +69,7 @@ def patch_normalize(
     The picture is reflected at its borders (the border row itself not repeated). Where sigma +
     epsilon is 0, N is 0. The result is the same, byte for byte, for any `num_threads`.
     """
-    first_box, second_box = config.boxes()
+    first_box, second_box = config.box_sizes()
     radius = config.window_px // 2
     padded = cv2.copyMakeBorder(image, radius, radius, radius, radius, cv2.BORDER_REFLECT_101)
     normalized = np.empty_like(image, order="C")
@@ -86,5 +86,5 @@ def patch_normalize(
             config.gain,
         )
 
-    run_in_bands(run, len(image), num_threads)
+    parallel_for_rows(run, len(image), num_threads)
     return normalized

@@ -6,7 +6,7 @@ from topoloc.compiled import kernel
 
 
 @kernel()
-def _slide(values, width, out):
+def _sliding_sum(values, width, out):
     """out[x] = the sum of values[x : x + width]."""
     total = np.int32(0)
     for x in range(width - 1):
@@ -75,15 +75,15 @@ def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsi
         for x in range(inner_width):
             rows[x] -= ring[slot, x]
             rows_sq[x] -= ring_sq[slot, x]
-        _slide(columns, first_box, ring[slot])
-        _slide(columns_sq, first_box, ring_sq[slot])
+        _sliding_sum(columns, first_box, ring[slot])
+        _sliding_sum(columns_sq, first_box, ring_sq[slot])
         for x in range(inner_width):
             rows[x] += ring[slot, x]
             rows_sq[x] += ring_sq[slot, x]
         if step < height_of_window - 1:
             continue
-        _slide(rows, second_box, sums)
-        _slide(rows_sq, second_box, sums_sq)
+        _sliding_sum(rows, second_box, sums)
+        _sliding_sum(rows_sq, second_box, sums_sq)
         y = first_row + step - height_of_window + 1
         centre = padded[y + radius, radius : radius + width]
         _normalize_row(

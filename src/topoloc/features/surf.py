@@ -24,18 +24,18 @@ from jaxtyping import Float32, Int32, Int64, UInt8
 
 from topoloc.bounds import AtLeast, Between
 from topoloc.compiled import num_threads
-from topoloc.features.bands import run_in_bands
 from topoloc.features.features import Features
+from topoloc.features.parallel import parallel_for_rows
 from topoloc.features.surf_descriptor_kernels import describe, orient, smooth_rows
 from topoloc.features.surf_detector_kernels import detect_band, integral_image, split_columns
 
 DESCRIPTOR_LENGTH = 64
-SMALLEST_FILTER_PX = 9  # whose sigma is 1.2 pixels (Bay et al. 2008, 3.3)
+MIN_FILTER_PX = 9  # whose sigma is 1.2 pixels (Bay et al. 2008, 3.3)
 FILTER_INCREMENT_PX = 6
-SIGMA_OF_FILTER = 1.2 / SMALLEST_FILTER_PX
+SIGMA_PER_FILTER_PX = 1.2 / MIN_FILTER_PX
 PATCH_SAMPLES = 21
 # 32-bit sums hold a filter response up to this side (whole box 1 by 5/9 of it, values of 255).
-LARGEST_FILTER_PX = 3600
+MAX_FILTER_PX = 3600
 # Sample spacings in pixels, from that of the smallest key points on, for which smoothed images are
 # made.
 LEVEL_RATIO = 1.2
@@ -71,11 +71,11 @@ class SurfConfig:
                 "SURF: threshold and max_features must be at least 0, the other numbers at least"
                 f" 1: {self}"
             )
-        if (SMALLEST_FILTER_PX + FILTER_INCREMENT_PX * (self.num_layers + 1)) << (
+        if (MIN_FILTER_PX + FILTER_INCREMENT_PX * (self.num_layers + 1)) << (
             self.num_octaves - 1
-        ) > LARGEST_FILTER_PX:
+        ) > MAX_FILTER_PX:
             raise ValueError(
-                f"SURF: filters beyond {LARGEST_FILTER_PX} px, fewer octaves or layers are needed:"
+                f"SURF: filters beyond {MAX_FILTER_PX} px, fewer octaves or layers are needed:"
                 f" {self}"
             )
 
@@ -93,21 +93,23 @@ def extract_surf(image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfi
     if len(found) == 0:
         return Features.empty(DESCRIPTOR_LENGTH)
     points, sizes = np.ascontiguousarray(found[:, :2]), found[:, 2].copy()
-    angles, descriptors = _describe(integral, points, sizes * np.float32(SIGMA_OF_FILTER), config)
+    angles, descriptors = _describe(
+        integral, points, sizes * np.float32(SIGMA_PER_FILTER_PX), config
+    )
     return Features(points, sizes, angles, found[:, 3].copy(), descriptors)
 
 
 def _filter_sizes(octave: int, num_layers: int) -> Int64[np.ndarray, " layers"]:
     """Filter sizes of an octave in pixels, with the layer below and the one above those in which
     maxima are sought."""
-    return (SMALLEST_FILTER_PX + FILTER_INCREMENT_PX * np.arange(num_layers + 2)) << octave
+    return (MIN_FILTER_PX + FILTER_INCREMENT_PX * np.arange(num_layers + 2)) << octave
 
 
 def _pattern_edges(sizes: Int64[np.ndarray, " layers"]) -> Int64[np.ndarray, "layers 10"]:
     """Where the lobes of a 9x9 second-derivative pattern begin and end when it is scaled to each
     size, in pixels."""
     return np.rint(
-        np.outer((sizes / SMALLEST_FILTER_PX).astype(np.float32), np.arange(10, dtype=np.float32))
+        np.outer((sizes / MIN_FILTER_PX).astype(np.float32), np.arange(10, dtype=np.float32))
     ).astype(np.int64)
 
 
@@ -129,7 +131,7 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
     def detect_part(part: int, _: int) -> None:
         for octave, edges in octaves.items():
             step, size = 1 << octave, int(edges[-1, -1])
-            first, last = _borders(height // step, part, num_parts)
+            first, last = _part_bounds(height // step, part, num_parts)
             columns, top, rows = edges, 0, integral
             if step > 1:
                 top, bottom = (
@@ -162,19 +164,21 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
     # system after each call.
     scratch = np.empty((num_parts, largest_split(-(-height // num_parts))), np.int32)
     found: dict[tuple[int, int], Float32[np.ndarray, "m 4"]] = {}
-    run_in_bands(detect_part, num_parts, num_parts)
+    parallel_for_rows(detect_part, num_parts, num_parts)
     # By octave, then row: the order, and so the ranking of equal responses, does not depend on the
     # number of parts.
     return np.concatenate([found[key] for key in sorted(found)])
 
 
-def _borders(num_rows: int, part: int, num_parts: int) -> tuple[int, int]:
+def _part_bounds(num_rows: int, part: int, num_parts: int) -> tuple[int, int]:
     """First row and the one after the last of a part."""
     return num_rows * part // num_parts, num_rows * (part + 1) // num_parts
 
 
-def _part_of(rows: Int64[np.ndarray, " n"], part: int, num_parts: int) -> Int64[np.ndarray, " m"]:
-    first, last = _borders(len(rows), part, num_parts)
+def _select_part(
+    rows: Int64[np.ndarray, " n"], part: int, num_parts: int
+) -> Int64[np.ndarray, " m"]:
+    first, last = _part_bounds(len(rows), part, num_parts)
     return rows[first:last]
 
 
@@ -227,14 +231,14 @@ def _describe(
 
     def prepare_part(part: int, _: int) -> None:
         for level in levels.values():
-            first, last = _borders(len(level.pixels), part, num_parts)
+            first, last = _part_bounds(len(level.pixels), part, num_parts)
             smooth_rows(integral, level.box, level.share, level.step, level.pixels, first, last)
         if not config.upright:
-            orient(integral, points, scales, _part_of(downwards, part, num_parts), angles)
+            orient(integral, points, scales, _select_part(rows_by_y, part, num_parts), angles)
 
     def describe_part(part: int, _: int) -> None:
         for k, level in levels.items():
-            rows = _part_of(downwards[level_idx[downwards] == k], part, num_parts)
+            rows = _select_part(rows_by_y[level_idx[rows_by_y] == k], part, num_parts)
             describe(
                 level.pixels,
                 level.offset,
@@ -247,8 +251,8 @@ def _describe(
             )
 
     # From the top of the image down, so that a thread finds what it reads in its own core's cache.
-    downwards = np.argsort(points[:, 1], kind="stable")
-    run_in_bands(prepare_part, num_parts, num_parts)
+    rows_by_y = np.argsort(points[:, 1], kind="stable")
+    parallel_for_rows(prepare_part, num_parts, num_parts)
     directions = np.full_like(angles, 1.5 * np.pi) if config.upright else angles
-    run_in_bands(describe_part, num_parts, num_parts)
+    parallel_for_rows(describe_part, num_parts, num_parts)
     return angles, descriptors

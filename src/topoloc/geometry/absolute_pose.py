@@ -25,7 +25,7 @@ from topoloc.geometry.rigid import Rigid3
 
 _Array = np.ndarray
 _MIN_POINTS = 4
-_MAX_WIDENING = 3.0
+_MAX_THRESHOLD_SCALE = 3.0
 # OpenCV draws five points a sample and refines no candidate: what PoseLib does in milliseconds
 # would take it a second.
 _OPENCV_MAX_ITERATIONS = 1000
@@ -37,7 +37,7 @@ CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Wels
 # M-estimator's variance over
 # the inverse of its information.
 _MEAN_WEIGHTED_SQUARE = 0.6302
-_VARIANCE_OF_ESTIMATE = 0.8265
+_ESTIMATOR_VARIANCE = 0.8265
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Matches:
     point_covariances: Float[np.ndarray, "n 3 3"] | Float[np.ndarray, "0 3 3"]
 
     @staticmethod
-    def of(
+    def from_pixels(
         points_img: _Array,
         normalized: Float[np.ndarray, "n 2"],
         points_world: _Array,
@@ -110,7 +110,7 @@ class Matches:
             point_covariances=np.ascontiguousarray(point_covariances, dtype=np.float64),
         )
 
-    def arguments(
+    def kernel_args(
         self, cam_from_world: Rigid3
     ) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array]:
         """What all kernels take."""
@@ -157,7 +157,7 @@ def estimate_absolute_pose(
     if priorities is not None:
         order = order[np.argsort(-priorities[order], kind="stable")]
     covariances = np.zeros((0, 3, 3)) if point_covariances is None else point_covariances[order]
-    matches = Matches.of(
+    matches = Matches.from_pixels(
         points_img[order],
         normalized[order],
         points_world[order],
@@ -165,7 +165,7 @@ def estimate_absolute_pose(
         camera,
         config.key_point_sigma_px,
     )
-    if not spans_a_plane(matches.points_world) or not spans_a_plane(
+    if not is_non_collinear(matches.points_world) or not is_non_collinear(
         np.insert(matches.normalized, 2, 0.0, axis=1)
     ):
         return None
@@ -176,7 +176,7 @@ def estimate_absolute_pose(
         cam_from_world = solve(matches, camera, config, priorities is not None)
     if cam_from_world is None:
         return None
-    return _with_evidence(cam_from_world, matches, camera, config, order, len(points_img))
+    return _with_covariance(cam_from_world, matches, camera, config, order, len(points_img))
 
 
 def _solve_with_poselib(
@@ -185,11 +185,11 @@ def _solve_with_poselib(
     # A pinhole of the same focal length in pixels that are already undistorted: thresholds keep
     # their meaning, and every model works alike. PoseLib adds no half pixel of its own.
     undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    found = ransac_pose(undistorted, matches.points_world, camera, config, is_sorted)
+    found = estimate_pose_ransac(undistorted, matches.points_world, camera, config, is_sorted)
     return _refine_on_inliers(found[0], matches, camera, config) if found else None
 
 
-def ransac_pose(
+def estimate_pose_ransac(
     undistorted: Float[np.ndarray, "n 2"],
     points_world: Float[np.ndarray, "n 3"],
     camera: Camera,
@@ -221,14 +221,16 @@ def ransac_pose(
         "seed": config.seed,
     }
     bundle = {"max_iterations": 0}  # the refinement on the inliers replaces it
-    pose, told = poselib.estimate_absolute_pose(undistorted, points_world, pinhole, ransac, bundle)
+    pose, ransac_info = poselib.estimate_absolute_pose(
+        undistorted, points_world, pinhole, ransac, bundle
+    )
     matrix = np.asarray(pose.Rt, dtype=np.float64)
     if not np.isfinite(matrix).all():
         return None
     loss = (
-        float(told["model_score"]) * ((camera.fx + camera.fy) / 2) ** 2
+        float(ransac_info["model_score"]) * ((camera.fx + camera.fy) / 2) ** 2
     )  # PoseLib's is on the plane z = 1
-    return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), int(told["num_inliers"]), loss
+    return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), int(ransac_info["num_inliers"]), loss
 
 
 def _refine_on_inliers(
@@ -236,7 +238,7 @@ def _refine_on_inliers(
 ) -> Rigid3 | None:
     for _ in range(2):  # the second time with the inliers of the first
         inliers = select_inliers(cam_from_world, matches, camera, config)
-        if not spans_a_plane(matches.points_world[inliers]):
+        if not is_non_collinear(matches.points_world[inliers]):
             return None
         cam_from_world = refine_pose(cam_from_world, matches, inliers, config.max_refinement_steps)
     return cam_from_world
@@ -247,7 +249,7 @@ def refine_pose(
 ) -> Rigid3:
     """The pose at which the active matches fit best, from one nearby."""
     rotation, translation = refine(
-        *matches.arguments(cam_from_world), active, CAUCHY_SCALE, max_steps
+        *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, max_steps
     )
     return Rigid3(rotation, translation)
 
@@ -286,7 +288,7 @@ def _solve_with_opencv(
     return Rigid3(cv2.Rodrigues(rotation)[0], translation[:, 0].copy())
 
 
-def _with_evidence(
+def _with_covariance(
     cam_from_world: Rigid3,
     matches: Matches,
     camera: Camera,
@@ -295,22 +297,22 @@ def _with_evidence(
     num_points: int,
 ) -> AbsolutePose | None:
     active = select_inliers(cam_from_world, matches, camera, config)
-    if np.count_nonzero(active) < _MIN_POINTS or not spans_a_plane(matches.points_world[active]):
+    if np.count_nonzero(active) < _MIN_POINTS or not is_non_collinear(matches.points_world[active]):
         return None
-    scale = _noise_scale(squared_errors(*matches.arguments(cam_from_world))[active])
+    scale = _estimate_noise_scale(squared_errors(*matches.kernel_args(cam_from_world))[active])
     information, *_ = normal_equations(
-        *matches.arguments(cam_from_world), active, CAUCHY_SCALE * scale, 6
+        *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE * scale, 6
     )
-    inverse = _inverse(information)
+    inverse = _invert_information(information)
     if inverse is None:
         return None
-    covariance = _VARIANCE_OF_ESTIMATE * scale**2 * inverse
+    covariance = _ESTIMATOR_VARIANCE * scale**2 * inverse
     inliers = np.zeros(num_points, dtype=np.bool_)
     inliers[order] = active
     return AbsolutePose(cam_from_world, inliers, covariance)
 
 
-def _noise_scale(squares: Float[np.ndarray, " n"]) -> float:
+def _estimate_noise_scale(squares: Float[np.ndarray, " n"]) -> float:
     """How many times larger than assumed the noise is, at least 1, of squared whitened residuals
     (Huber's proposal 2, 1964).
 
@@ -329,7 +331,7 @@ def _noise_scale(squares: Float[np.ndarray, " n"]) -> float:
     return float(np.sqrt(variance))
 
 
-def _inverse(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] | None:
+def _invert_information(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] | None:
     """Its inverse, None where it does not fix all six degrees of freedom."""
     diagonal = np.sqrt(np.diag(information))
     if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
@@ -356,13 +358,13 @@ def select_inliers(
         return errors_px <= limit_px
     # A plain threshold would cut the errors of uncertain points short, and what is left would look
     # too precise.
-    squares = squared_errors(*matches.arguments(cam_from_world))
+    squares = squared_errors(*matches.kernel_args(cam_from_world))
     return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (
-        errors_px <= _MAX_WIDENING * limit_px
+        errors_px <= _MAX_THRESHOLD_SCALE * limit_px
     )
 
 
-def spans_a_plane(points: Float[np.ndarray, "n 3"]) -> bool:
+def is_non_collinear(points: Float[np.ndarray, "n 3"]) -> bool:
     """At least four points, not all on a line."""
     if len(points) < _MIN_POINTS:
         return False

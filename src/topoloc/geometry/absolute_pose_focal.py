@@ -21,20 +21,22 @@ from topoloc.geometry.absolute_pose import (
     AbsolutePoseConfig,
     Matches,
     estimate_absolute_pose,
-    ransac_pose,
+    estimate_pose_ransac,
+    is_non_collinear,
     refine_pose,
     select_inliers,
-    spans_a_plane,
 )
-from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_definite
+from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_cholesky
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 
-_Finite = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]
+_FiniteMatches = tuple[
+    Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]
+]
 """Pixels, points of the world (metres) and their covariances (m^2)."""
 
-_STEP = 1.25
+_FOCAL_STEP = 1.25
 _MIN_INLIERS = 4  # any sample agrees with three
 # Of RANSAC for each focal length: where one match in four is right, all of them miss it once in a
 # hundred times. The focal lengths beside the right one find most of its inliers too, by samples of
@@ -48,16 +50,16 @@ _MAX_STARTS = 2
 _MAX_ROUNDS = 20
 # How far the principal point lies from the middle (standard deviation, of the longer side); it
 # trades places with a rotation.
-_CENTRE_SHARE = 0.01
+_PRINCIPAL_POINT_SIGMA = 0.01
 # Weak prior on the logarithm of the focal length (standard deviation): without it, what is seen of
 # a wall alone fixes none.
-_PRIOR = 0.7
+_LOG_FOCAL_SIGMA = 0.7
 
 
 def estimate_pose_and_focal(
     points_img: Float[np.ndarray, "n 2"],
     points_world: Float[np.ndarray, "n 3"],
-    rough: RoughCamera,
+    uncalibrated: UncalibratedCamera,
     config: AbsolutePoseConfig,
     *,
     point_covariances: Float[np.ndarray, "n 3 3"],
@@ -70,8 +72,8 @@ def estimate_pose_and_focal(
         start: a pose and a camera that are nearly right already: they are refined, and no others
             are sought.
 
-    The focal length found lies in `rough`'s range. The covariance is that of the pose whatever the
-    focal length.
+    The focal length found lies in `uncalibrated`'s range. The covariance is that of the pose
+    whatever the focal length.
     """
     usable = (
         np.isfinite(points_img).all(axis=1)
@@ -79,8 +81,12 @@ def estimate_pose_and_focal(
         & np.isfinite(point_covariances).all(axis=(1, 2))
     )
     finite = points_img[usable], points_world[usable], point_covariances[usable]
-    starts = [start] if start else _search(finite, rough, config)
-    refined = [one for each in starts if (one := _refined_together(each, finite, rough, config))]
+    starts = [start] if start else _search_focal_lengths(finite, uncalibrated, config)
+    refined = [
+        one
+        for each in starts
+        if (one := _refine_pose_and_focal(each, finite, uncalibrated, config))
+    ]
     if not refined:
         return None
     _, cam_from_world, camera = max(refined, key=lambda one: one[0])
@@ -95,41 +101,52 @@ def estimate_pose_and_focal(
     if pose is None:
         return None
     information, _ = _normal_equations(
-        pose.cam_from_world, _matches(finite, camera, config), pose.inliers[usable], camera, rough
+        pose.cam_from_world,
+        _matches(finite, camera, config),
+        pose.inliers[usable],
+        camera,
+        uncalibrated,
     )
-    covariance = _whatever_the_focal(pose.covariance, information)
+    covariance = _add_focal_uncertainty(pose.covariance, information)
     return (
         replace(
             pose,
-            covariance=covariance + _whatever_the_centre(points_world[pose.inliers], pose, camera),
+            covariance=covariance
+            + _principal_point_covariance(points_world[pose.inliers], pose, camera),
         ),
         camera,
     )
 
 
-def _search(
-    finite: _Finite, rough: RoughCamera, config: AbsolutePoseConfig
+def _search_focal_lengths(
+    finite: _FiniteMatches, uncalibrated: UncalibratedCamera, config: AbsolutePoseConfig
 ) -> list[tuple[Rigid3, Camera]]:
     """Poses with the focal lengths that explain most; the middle ones are tried first: a right one
     makes the rest short."""
     points_img, points_world, _ = finite
     if len(points_img) < _MIN_INLIERS:
         return []
-    num_steps = max(1, math.ceil(math.log(rough.max_focal / rough.min_focal) / math.log(_STEP)))
+    num_steps = max(
+        1,
+        math.ceil(
+            math.log(uncalibrated.max_focal / uncalibrated.min_focal) / math.log(_FOCAL_STEP)
+        ),
+    )
     exponents = sorted((np.arange(num_steps) + 0.5) / num_steps, key=lambda one: abs(one - 0.5))
     found: list[tuple[float, Rigid3, Camera]] = []
     most = _MIN_INLIERS - 1
     for k, exponent in enumerate(exponents):
-        camera = rough.with_focal(
-            rough.min_focal * (rough.max_focal / rough.min_focal) ** float(exponent)
+        camera = uncalibrated.with_focal(
+            uncalibrated.min_focal
+            * (uncalibrated.max_focal / uncalibrated.min_focal) ** float(exponent)
         )
-        enough = _num_iterations(most / len(points_img), config.confidence)
+        enough = _num_ransac_iterations(most / len(points_img), config.confidence)
         quick = replace(
             config,
             max_iterations=min(config.max_iterations, _MAX_ITERATIONS, enough),
             seed=config.seed + k,
         )
-        cam_from_world, num_inliers, loss = ransac_pose(
+        cam_from_world, num_inliers, loss = estimate_pose_ransac(
             points_img, points_world, camera, quick
         ) or (None, 0, math.inf)
         if cam_from_world is not None and num_inliers >= _MIN_INLIERS:
@@ -141,7 +158,7 @@ def _search(
     return [(cam_from_world, camera) for _, cam_from_world, camera in found[:_MAX_STARTS]]
 
 
-def _num_iterations(share: float, confidence: float) -> int:
+def _num_ransac_iterations(share: float, confidence: float) -> int:
     """So many samples of three hit right matches alone once, at this confidence, where this share
     is right."""
     return max(
@@ -149,8 +166,11 @@ def _num_iterations(share: float, confidence: float) -> int:
     )
 
 
-def _refined_together(
-    start: tuple[Rigid3, Camera], finite: _Finite, rough: RoughCamera, config: AbsolutePoseConfig
+def _refine_pose_and_focal(
+    start: tuple[Rigid3, Camera],
+    finite: _FiniteMatches,
+    uncalibrated: UncalibratedCamera,
+    config: AbsolutePoseConfig,
 ) -> tuple[int, Rigid3, Camera] | None:
     """The pose and the camera that fit the inliers best, and how many these are; they are chosen
     anew each round."""
@@ -160,27 +180,34 @@ def _refined_together(
         matches = _matches(finite, camera, config)
         inliers = select_inliers(cam_from_world, matches, camera, config)
         num_inliers = int(np.count_nonzero(inliers))
-        if not spans_a_plane(matches.points_world[inliers]):
+        if not is_non_collinear(matches.points_world[inliers]):
             return None
         cam_from_world = refine_pose(cam_from_world, matches, inliers, config.max_refinement_steps)
-        information, gradient = _normal_equations(cam_from_world, matches, inliers, camera, rough)
-        is_definite, step = solve_definite(information, -gradient)
+        information, gradient = _normal_equations(
+            cam_from_world, matches, inliers, camera, uncalibrated
+        )
+        is_definite, step = solve_cholesky(information, -gradient)
         if not is_definite:
             return None
         focal = float(
             np.clip(
-                camera.fx * math.exp(np.clip(step[6], -0.2, 0.2)), rough.min_focal, rough.max_focal
+                camera.fx * math.exp(np.clip(step[6], -0.2, 0.2)),
+                uncalibrated.min_focal,
+                uncalibrated.max_focal,
             )
         )
         if abs(math.log(focal / camera.fx)) < 1e-4:
             break
-        camera, cam_from_world = rough.with_focal(focal), Rigid3.exp(step[:6]) @ cam_from_world
+        camera, cam_from_world = (
+            uncalibrated.with_focal(focal),
+            Rigid3.exp(step[:6]) @ cam_from_world,
+        )
     return num_inliers, cam_from_world, camera
 
 
-def _matches(finite: _Finite, camera: Camera, config: AbsolutePoseConfig) -> Matches:
+def _matches(finite: _FiniteMatches, camera: Camera, config: AbsolutePoseConfig) -> Matches:
     pixels, points_world, covariances = finite
-    return Matches.of(
+    return Matches.from_pixels(
         pixels,
         camera.normalized_from_img(pixels),
         points_world,
@@ -195,20 +222,20 @@ def _normal_equations(
     matches: Matches,
     active: Bool[np.ndarray, " n"],
     camera: Camera,
-    rough: RoughCamera,
+    uncalibrated: UncalibratedCamera,
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
     """Gauss-Newton's, by the left perturbation of the pose and the logarithm of the focal length,
     with the prior on that."""
     information, gradient, *_ = normal_equations(
-        *matches.arguments(cam_from_world), active, CAUCHY_SCALE, 7
+        *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, 7
     )
-    middle = math.sqrt(rough.min_focal * rough.max_focal)
-    information[6, 6] += 1.0 / _PRIOR**2
-    gradient[6] += math.log(camera.fx / middle) / _PRIOR**2
+    middle = math.sqrt(uncalibrated.min_focal * uncalibrated.max_focal)
+    information[6, 6] += 1.0 / _LOG_FOCAL_SIGMA**2
+    gradient[6] += math.log(camera.fx / middle) / _LOG_FOCAL_SIGMA**2
     return information, gradient
 
 
-def _whatever_the_focal(
+def _add_focal_uncertainty(
     covariance: Float[np.ndarray, "6 6"], information: Float[np.ndarray, "7 7"]
 ) -> Float[np.ndarray, "6 6"]:
     """The pose's covariance at a fixed focal length, and what the focal length's own uncertainty
@@ -219,7 +246,7 @@ def _whatever_the_focal(
     return covariance + variance * np.outer(by_focal, by_focal)
 
 
-def _whatever_the_centre(
+def _principal_point_covariance(
     points_world: Float[np.ndarray, "n 3"], pose: AbsolutePose, camera: Camera
 ) -> Float[np.ndarray, "6 6"]:
     """What a principal point away from the middle adds to the pose's covariance: the pose moves so
@@ -233,4 +260,6 @@ def _whatever_the_centre(
     shifts = np.zeros((2 * len(u), 2))
     shifts[: len(u), 0] = shifts[len(u) :, 1] = 1.0 / camera.fx
     by_centre = np.linalg.lstsq(jacobian, shifts, rcond=None)[0]
-    return (_CENTRE_SHARE * max(camera.width, camera.height)) ** 2 * by_centre @ by_centre.T
+    return (
+        (_PRINCIPAL_POINT_SIGMA * max(camera.width, camera.height)) ** 2 * by_centre @ by_centre.T
+    )

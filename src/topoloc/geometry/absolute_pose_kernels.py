@@ -7,7 +7,9 @@ from topoloc.compiled import kernel
 
 
 @kernel()
-def _whitened(rotation, translation, normalized, covariances, points_world, point_covariances, i):
+def _whiten_residual(
+    rotation, translation, normalized, covariances, points_world, point_covariances, i
+):
     """(u, v, 1/z, e, S^-1, e' S^-1 e) of match i, with e = projected - observed on the plane z = 1;
     the last is infinite behind.
 
@@ -70,7 +72,7 @@ def squared_errors(rotation, translation, normalized, covariances, points_world,
     """Squared Mahalanobis length of each match's reprojection error; infinite behind the camera."""
     squares = np.empty(len(normalized))
     for i in range(len(normalized)):
-        squares[i] = _whitened(
+        squares[i] = _whiten_residual(
             rotation, translation, normalized, covariances, points_world, point_covariances, i
         )[8]
     return squares
@@ -106,7 +108,7 @@ def normal_equations(
     for i in range(len(normalized)):
         if not active[i]:
             continue
-        u, v, w, e0, e1, i00, i01, i11, squared = _whitened(
+        u, v, w, e0, e1, i00, i01, i11, squared = _whiten_residual(
             rotation, translation, normalized, covariances, points_world, point_covariances, i
         )
         if squared == np.inf:
@@ -134,7 +136,7 @@ def normal_equations(
 
 
 @kernel()
-def squared_pulls(
+def score_outer_products(
     rotation,
     translation,
     normalized,
@@ -150,10 +152,10 @@ def squared_pulls(
     together."""
     count = len(normalized)
     active = np.ones(1, np.bool_)
-    information, alone, together = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
-    pulls, of_cells = np.zeros((count, 6)), np.zeros((num_cells, 6))
+    information, independent, clustered = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
+    gradients, cell_gradients = np.zeros((count, 6)), np.zeros((num_cells, 6))
     for i in range(count):
-        own, pulls[i], _, _ = normal_equations(
+        own, gradients[i], _, _ = normal_equations(
             rotation,
             translation,
             normalized[i : i + 1],
@@ -165,18 +167,18 @@ def squared_pulls(
             6,
         )
         information += own
-    mean = pulls.sum(axis=0) / max(count, 1)
+    mean = gradients.sum(axis=0) / max(count, 1)
     for i in range(count):
         for a in range(6):
-            pulls[i, a] -= mean[a]
-            of_cells[cells[i], a] += pulls[i, a]
+            gradients[i, a] -= mean[a]
+            cell_gradients[cells[i], a] += gradients[i, a]
     for a in range(6):
         for b in range(6):
             for i in range(count):
-                alone[a, b] += pulls[i, a] * pulls[i, b]
+                independent[a, b] += gradients[i, a] * gradients[i, b]
             for c in range(num_cells):
-                together[a, b] += of_cells[c, a] * of_cells[c, b]
-    return information, alone, together
+                clustered[a, b] += cell_gradients[c, a] * cell_gradients[c, b]
+    return information, independent, clustered
 
 
 @kernel()
@@ -205,7 +207,7 @@ def refine(
         6,
     )
     for _ in range(max_steps):
-        is_definite, step = solve_definite(information, -gradient)
+        is_definite, step = solve_cholesky(information, -gradient)
         if not is_definite:
             break
         turn = _exp_so3(step[3:])
@@ -237,7 +239,7 @@ def refine(
 
 
 @kernel()
-def solve_definite(matrix, right):
+def solve_cholesky(matrix, right):
     """(True, x) with matrix @ x = right by Cholesky's decomposition; (False, _) if not positive
     definite."""
     n = len(right)

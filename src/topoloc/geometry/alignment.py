@@ -23,7 +23,7 @@ _MIN_SPREAD = 1e-6
 _SIGMA_TRANSLATION, _SIGMA_ROTATION = 0.05, 0.02  # m, rad
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
-_SHORTEST_FOR_KITTI = 200.0
+_MIN_KITTI_LENGTH = 200.0
 
 
 def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> Rigid3:
@@ -206,12 +206,14 @@ def relative_drift(
             " poses"
         )
     positions = np.array([pose.translation for pose in true_world_from_cams]).reshape(-1, 3)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
-    lengths = KITTI_LENGTHS if way[-1] >= _SHORTEST_FOR_KITTI else SHORT_LENGTHS
+    path_lengths = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    )
+    lengths = KITTI_LENGTHS if path_lengths[-1] >= _MIN_KITTI_LENGTH else SHORT_LENGTHS
     translations, rotations = [], []
     for length in lengths:
-        for first, last in enumerate(np.searchsorted(way, way + length).tolist()):
-            if last >= len(way):
+        for first, last in enumerate(np.searchsorted(path_lengths, path_lengths + length).tolist()):
+            if last >= len(path_lengths):
                 break
             true_motion = true_world_from_cams[first].inverse() @ true_world_from_cams[last]
             motion = world_from_cams[first].inverse() @ world_from_cams[last]

@@ -21,19 +21,19 @@ from topoloc.geometry.calibration_check_kernels import calibration_equations
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.geometry.rigid import Rigid3
 
-_ROUNDS = 3
+_NUM_ITERATIONS = 3
 _MAX_POINTS = 256  # evenly among all: their noise is the least of what is unknown
 _CAUCHY_SCALE = 2.3849
 # standard deviation; without any, a wall seen straight leaves the focal length and the distance
 # open together
-_PRIOR = 0.3
+_PRIOR_SIGMA = 0.3
 _MIN_POINTS = 20
-DOUBT_LENGTHS = ("focal_length_px", "focal_sigma_px", "calibrated_focal_length_px")
-"""The first fields of a `CalibrationDoubt`, which are its JSON's keys as well."""
+MISMATCH_FOCAL_FIELDS = ("focal_length_px", "focal_sigma_px", "calibrated_focal_length_px")
+"""The first fields of a `CalibrationMismatch`, which are its JSON's keys as well."""
 
 
 @dataclass(frozen=True, eq=False)
-class PictureCalibration:
+class ImageCalibration:
     """What a picture says of its camera: the focal length as `scale` times the calibrated one, the
     principal point's place beside the calibrated one (`offset`, focal lengths; x, y), `covariance`
     of the logarithm of the scale and of the offset, and the pose that goes with them."""
@@ -45,7 +45,7 @@ class PictureCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenCamera:
+class IntrinsicsDeviation:
     """What a picture says of its camera beside the calibration, whatever the picture's size.
 
     `deviation` is the logarithm of the focal length over the calibrated one, and the principal
@@ -60,7 +60,7 @@ class SeenCamera:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationDoubt:
+class CalibrationMismatch:
     """What the picture says of its camera, against the calibration: pixels of the image as it came.
 
     `shift` is the left perturbation by which the pose differs that the picture's own camera leads
@@ -70,44 +70,47 @@ class CalibrationDoubt:
     focal_length_px: float
     focal_sigma_px: float
     calibrated_focal_length_px: float
-    centre_px: Float[np.ndarray, " 2"]
-    calibrated_centre_px: Float[np.ndarray, " 2"]
-    is_of_focal_length: bool
-    is_of_centre: bool
+    principal_point_px: Float[np.ndarray, " 2"]
+    calibrated_principal_point_px: Float[np.ndarray, " 2"]
+    has_focal_mismatch: bool
+    has_principal_point_mismatch: bool
     shift: Float[np.ndarray, " 6"]
 
     def __str__(self) -> str:
         parts = []
-        if self.is_of_focal_length:
+        if self.has_focal_mismatch:
             measured = f"f = {self.focal_length_px:.0f} +- {max(self.focal_sigma_px, 0.5):.0f} px"
             parts.append(f"{measured}, the calibration {self.calibrated_focal_length_px:.0f}")
-        if self.is_of_centre:
-            (x, y), (cx, cy) = self.centre_px, self.calibrated_centre_px
+        if self.has_principal_point_mismatch:
+            (x, y), (cx, cy) = self.principal_point_px, self.calibrated_principal_point_px
             parts.append(
                 f"the principal point at ({x:.0f}, {y:.0f}), the calibration ({cx:.0f}, {cy:.0f})"
             )
         return f"the picture says {'; '.join(parts)}"
 
     def to_json(self) -> dict[str, Any]:
-        of = {"focal_length": self.is_of_focal_length, "principal_point": self.is_of_centre}
+        of = {
+            "focal_length": self.has_focal_mismatch,
+            "principal_point": self.has_principal_point_mismatch,
+        }
         return {
-            **{key: getattr(self, key) for key in DOUBT_LENGTHS},
-            "of": [name for name, is_said in of.items() if is_said],
+            **{key: getattr(self, key) for key in MISMATCH_FOCAL_FIELDS},
+            "of": [name for name, is_off in of.items() if is_off],
             "shift": self.shift.tolist(),
-            "principal_point_px": self.centre_px.tolist(),
-            "calibrated_principal_point_px": self.calibrated_centre_px.tolist(),
+            "principal_point_px": self.principal_point_px.tolist(),
+            "calibrated_principal_point_px": self.calibrated_principal_point_px.tolist(),
             "detail": str(self),
         }
 
 
-def calibration_of_picture(
+def estimate_image_calibration(
     points_img: Float[np.ndarray, "n 2"],
     points_world: Float[np.ndarray, "n 3"],
     point_covariances: Float[np.ndarray, "n 3 3"],
     camera: Camera,
     cam_from_world: Rigid3,
     sigma_px: float,
-) -> PictureCalibration | None:
+) -> ImageCalibration | None:
     """From n pixels of points (metres), beginning at a pose found with the calibration; None from
     too few, or where nothing follows."""
     if len(points_img) < _MIN_POINTS:
@@ -121,7 +124,7 @@ def calibration_of_picture(
     observed = camera.normalized_from_img(points_img)
     pose, free = cam_from_world, np.zeros(3)  # logarithm of the scale, offset
     information, squares = np.eye(9), np.zeros(len(rows))
-    for _ in range(_ROUNDS):
+    for _ in range(_NUM_ITERATIONS):
         rotation, translation = (
             np.ascontiguousarray(pose.rotation),
             np.ascontiguousarray(pose.translation),
@@ -130,8 +133,8 @@ def calibration_of_picture(
         information, gradient, squares = calibration_equations(
             rotation, translation, free, *of_points
         )
-        information[6:, 6:] += np.eye(3) / _PRIOR**2
-        gradient[6:] += free / _PRIOR**2
+        information[6:, 6:] += np.eye(3) / _PRIOR_SIGMA**2
+        gradient[6:] += free / _PRIOR_SIGMA**2
         try:
             step = -np.linalg.solve(information, gradient)
         except np.linalg.LinAlgError:
@@ -143,10 +146,10 @@ def calibration_of_picture(
         float(np.median(squares)) / (2.0 * math.log(2.0)), 0.05
     )  # a chi-square of two has its median at 2 ln 2
     covariance = np.linalg.inv(information)[6:, 6:] * noise
-    return PictureCalibration(math.exp(free[0]), free[1:], covariance, pose)
+    return ImageCalibration(math.exp(free[0]), free[1:], covariance, pose)
 
 
-def camera_of_picture(camera: Camera, found: PictureCalibration) -> Camera:
+def corrected_camera(camera: Camera, found: ImageCalibration) -> Camera:
     """The camera that a picture speaks of; its distortion is left as it is."""
     focal = np.array([camera.fx, camera.fy])
     (fx, fy), (cx, cy) = (
@@ -163,11 +166,13 @@ def camera_of_picture(camera: Camera, found: PictureCalibration) -> Camera:
     )
 
 
-def seen_beside(
-    calibrated: Camera, camera: Camera, found: PictureCalibration, place: int
-) -> SeenCamera:
+def compute_intrinsics_deviation(
+    calibrated: Camera, camera: Camera, found: ImageCalibration, place: int
+) -> IntrinsicsDeviation:
     """What was found with `camera`, beside the calibration that the picture came with; both of one
     picture size."""
-    own = camera_of_picture(camera, found)
+    own = corrected_camera(camera, found)
     way = np.array([own.cx - calibrated.cx, own.cy - calibrated.cy]) / calibrated.fx
-    return SeenCamera(np.array([math.log(own.fx / calibrated.fx), *way]), found.covariance, place)
+    return IntrinsicsDeviation(
+        np.array([math.log(own.fx / calibrated.fx), *way]), found.covariance, place
+    )

@@ -30,11 +30,11 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-_LEAST_FOCAL, _MOST_FOCAL = (
+_MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = (
     1e-3,
     1e4,
 )  # times the longer side of the picture; real lenses have 0.2 to 100
-_TWO_FOCAL = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
+_TWO_FOCAL_MODELS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,9 @@ class Camera:
                 f" = {self.fx:g}"
             )
         side = max(self.width, self.height)
-        if not all(_LEAST_FOCAL < focal / side < _MOST_FOCAL for focal in (self.fx, self.fy)):
+        if not all(
+            _MIN_FOCAL_RATIO < focal / side < _MAX_FOCAL_RATIO for focal in (self.fx, self.fy)
+        ):
             raise CalibrationError(
                 f"no lens has a focal length of {self.fx:g}, {self.fy:g} pixels with a picture of"
                 f" {side} pixels"
@@ -189,7 +191,7 @@ class Camera:
         Models with one focal length become their two-focal siblings where the two scales differ.
         """
         scale_x, scale_y = width / self.width, height / self.height
-        model = self.model if scale_x == scale_y else _TWO_FOCAL.get(self.model, self.model)
+        model = self.model if scale_x == scale_y else _TWO_FOCAL_MODELS.get(self.model, self.model)
         values = {name: self._param(name) for name in MODELS[model]}
         for name, value in (
             ("f", self.fx * scale_x),
@@ -205,7 +207,7 @@ class Camera:
     def to_colmap(self) -> tuple[str, int, int, tuple[float, ...]]:
         """(model, width, height, params) as COLMAP writes them: there the centre of the top-left
         pixel is (0.5, 0.5)."""
-        return self.model, self.width, self.height, self._shifted(0.5)
+        return self.model, self.width, self.height, self._shift_principal_point(0.5)
 
     @staticmethod
     def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) -> Camera:
@@ -215,9 +217,9 @@ class Camera:
             CalibrationError: a model that is not known here, or parameters that are not usable.
         """
         camera = Camera(model, width, height, tuple(float(value) for value in params))
-        return replace(camera, params=camera._shifted(-0.5))
+        return replace(camera, params=camera._shift_principal_point(-0.5))
 
-    def _shifted(self, offset_px: float) -> tuple[float, ...]:
+    def _shift_principal_point(self, offset_px: float) -> tuple[float, ...]:
         named = zip(MODELS[self.model], self.params, strict=True)
         return tuple(value + offset_px if name in ("cx", "cy") else value for name, value in named)
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.absolute_pose import CAUCHY_SCALE, AbsolutePoseConfig, Matches
-from topoloc.geometry.absolute_pose_kernels import squared_pulls
+from topoloc.geometry.absolute_pose_kernels import score_outer_products
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 
@@ -23,7 +23,7 @@ _COLUMNS, _ROWS = 8, 6
 _MIN_CELLS = 6  # with matches in fewer of them nothing is said
 
 
-def coherence(
+def compute_variance_inflation(
     points_img: Float[np.ndarray, "n 2"],
     points_world: Float[np.ndarray, "n 3"],
     point_covariances: Float[np.ndarray, "n 3 3"],
@@ -39,7 +39,7 @@ def coherence(
             (m^2).
     """
     normalized = camera.normalized_from_img(points_img)
-    matches = Matches.of(
+    matches = Matches.from_pixels(
         points_img, normalized, points_world, point_covariances, camera, config.key_point_sigma_px
     )
     columns = np.clip((points_img[:, 0] + 0.5) * _COLUMNS / camera.width, 0, _COLUMNS - 1).astype(
@@ -49,8 +49,8 @@ def coherence(
     used, cells = np.unique(rows * _COLUMNS + columns, return_inverse=True)
     if len(used) < _MIN_CELLS:
         return 1.0
-    information, alone, together = squared_pulls(
-        *matches.arguments(cam_from_world), cells, len(used), CAUCHY_SCALE
+    information, independent, clustered = score_outer_products(
+        *matches.kernel_args(cam_from_world), cells, len(used), CAUCHY_SCALE
     )
     if not (
         np.isfinite(information).all() and np.linalg.matrix_rank(information, hermitian=True) == 6
@@ -60,7 +60,7 @@ def coherence(
         len(used) - 3.0
     )  # the pose follows from the same pulls, which makes their sums smaller
     variance_alone, variance_together = (
-        np.trace(np.linalg.solve(information, pulls)) for pulls in (alone, together)
+        np.trace(np.linalg.solve(information, gradients)) for gradients in (independent, clustered)
     )
     return (
         max(1.0, float(of_fit * variance_together / variance_alone))

@@ -16,7 +16,7 @@ from jaxtyping import Float
 _MAX_TAN = 20.0  # 87 deg off the axis: beyond it the plane z = 1 is of no use
 _NUM_SAMPLES = 4000
 _MAX_NEWTON_STEPS = 50
-_CONVERGED = 1e-13
+_CONVERGENCE_TOLERANCE = 1e-13
 
 
 def distort_rational(
@@ -77,7 +77,7 @@ def undistort_rational(
             redistorted, jacobian = distort_rational(coefficients, normalized)
             residual = distorted - redistorted
             error = np.abs(residual).max(axis=1, initial=0.0)
-            if not np.any(error > _CONVERGED):
+            if not np.any(error > _CONVERGENCE_TOLERANCE):
                 break
             a, b, d = jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 1]
             determinant = a * d - b * b
@@ -105,7 +105,7 @@ def undistort_fisheye(
         for _ in range(_MAX_NEWTON_STEPS):
             value, slope = _fisheye_polynomial(coefficients, theta)
             error = np.abs(theta_d - value)
-            if not np.any(error > _CONVERGED):
+            if not np.any(error > _CONVERGENCE_TOLERANCE):
                 break
             theta = np.clip(theta + (theta_d - value) / slope, 0.0, limit)
         scale = np.where(theta_d > 1e-9, np.tan(theta) / np.maximum(theta_d, 1e-9), 1.0)

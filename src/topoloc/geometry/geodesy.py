@@ -21,7 +21,7 @@ from topoloc.geometry.rigid import Rigid3
 SEMI_MAJOR = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
 _SEMI_MINOR = SEMI_MAJOR * (1.0 - FLATTENING)
-_E2 = FLATTENING * (2.0 - FLATTENING)
+_ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 _MAX_HEIGHT = 1e8  # metres
 # Axes of a camera as a body (x forward, y left, z up) in its own (x right, y down, z forward), as
 # the OSCP's reference server has them.
@@ -54,13 +54,13 @@ class GeoPoint:
     def ecef(self) -> Float[np.ndarray, "3"]:
         """Earth-centred, earth-fixed, metres."""
         lat, lon = math.radians(self.lat), math.radians(self.lon)
-        normal = SEMI_MAJOR / math.sqrt(1.0 - _E2 * math.sin(lat) ** 2)
+        normal = SEMI_MAJOR / math.sqrt(1.0 - _ECCENTRICITY_SQUARED * math.sin(lat) ** 2)
         across = (normal + self.h) * math.cos(lat)
         return np.array(
             [
                 across * math.cos(lon),
                 across * math.sin(lon),
-                (normal * (1.0 - _E2) + self.h) * math.sin(lat),
+                (normal * (1.0 - _ECCENTRICITY_SQUARED) + self.h) * math.sin(lat),
             ]
         )
 
@@ -73,12 +73,20 @@ class GeoPoint:
         beta = math.atan2(SEMI_MAJOR * z, _SEMI_MINOR * across)
         lat = 0.0
         for _ in range(5):
-            up = z + _E2 / (1.0 - _E2) * _SEMI_MINOR * math.sin(beta) ** 3
-            lat = math.atan2(up, across - _E2 * SEMI_MAJOR * math.cos(beta) ** 3)
+            up = (
+                z
+                + _ECCENTRICITY_SQUARED
+                / (1.0 - _ECCENTRICITY_SQUARED)
+                * _SEMI_MINOR
+                * math.sin(beta) ** 3
+            )
+            lat = math.atan2(up, across - _ECCENTRICITY_SQUARED * SEMI_MAJOR * math.cos(beta) ** 3)
             beta = math.atan2((1.0 - FLATTENING) * math.sin(lat), math.cos(lat))
-        normal = SEMI_MAJOR / math.sqrt(1.0 - _E2 * math.sin(lat) ** 2)
+        normal = SEMI_MAJOR / math.sqrt(1.0 - _ECCENTRICITY_SQUARED * math.sin(lat) ** 2)
         height = (
-            across * math.cos(lat) + z * math.sin(lat) - normal * (1.0 - _E2 * math.sin(lat) ** 2)
+            across * math.cos(lat)
+            + z * math.sin(lat)
+            - normal * (1.0 - _ECCENTRICITY_SQUARED * math.sin(lat) ** 2)
         )
         return GeoPoint(math.degrees(lat), math.degrees(math.atan2(y, x)), height)
 

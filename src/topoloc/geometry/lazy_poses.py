@@ -14,10 +14,10 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True, eq=False)
 class LazyPoses(Sequence[Rigid3]):
-    """A pose a row, which `pose_of` makes of it."""
+    """A pose a row, which `to_pose` makes of it."""
 
     rows: Float[np.ndarray, "n c"]
-    pose_of: Callable[[Float[np.ndarray, " c"]], Rigid3]
+    to_pose: Callable[[Float[np.ndarray, " c"]], Rigid3]
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -28,25 +28,25 @@ class LazyPoses(Sequence[Rigid3]):
     def __getitem__(self, index: slice) -> Sequence[Rigid3]: ...
     def __getitem__(self, index: int | slice) -> Rigid3 | Sequence[Rigid3]:
         return (
-            LazyPoses(self.rows[index], self.pose_of)
+            LazyPoses(self.rows[index], self.to_pose)
             if isinstance(index, slice)
-            else self.pose_of(self.rows[index])
+            else self.to_pose(self.rows[index])
         )
 
 
-def pose_of_quaternion(row: Float[np.ndarray, "7"]) -> Rigid3:
+def pose_from_quaternion(row: Float[np.ndarray, "7"]) -> Rigid3:
     """Of a position (metres) and a quaternion (x, y, z, w), which need not be of unit length.
     Raises TrajectoryError: it has none."""
     return Rigid3.from_quat_wxyz(row[[6, 3, 4, 5]], row[:3])
 
 
-def _pose_of_matrix(row: Float[np.ndarray, "12"]) -> Rigid3:
+def _pose_from_matrix(row: Float[np.ndarray, "12"]) -> Rigid3:
     """Of the upper 3x4 of a matrix, row by row, whose rotation is one."""
     matrix = row.reshape(3, 4)
     return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
 
 
-def poses_of_matrices(
+def poses_from_matrices(
     numbers: Float[np.ndarray, "n 12"], tolerance: float
 ) -> tuple[LazyPoses, Bool[np.ndarray, " n"]]:
     """Poses of matrices' upper rows, made exact (Newton's iteration for the polar factor), and
@@ -60,4 +60,4 @@ def poses_of_matrices(
     for _ in range(4):
         rotations = 0.5 * rotations @ (3.0 * np.eye(3) - rotations.transpose(0, 2, 1) @ rotations)
     matrices[:, :, :3] = rotations
-    return LazyPoses(matrices.reshape(-1, 12), _pose_of_matrix), is_rotation
+    return LazyPoses(matrices.reshape(-1, 12), _pose_from_matrix), is_rotation

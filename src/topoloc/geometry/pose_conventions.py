@@ -19,48 +19,53 @@ from jaxtyping import Float
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 
-Mend = Callable[[Rigid3], Rigid3]
+PoseConversion = Callable[[Rigid3], Rigid3]
 
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0])
 _FORWARD_LEFT_UP = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body_from_cam
 _FORWARD_RIGHT_DOWN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
-def _scaled(pose: Rigid3, factor: float) -> Rigid3:
+def _scale_pose(pose: Rigid3, factor: float) -> Rigid3:
     return Rigid3(pose.rotation, factor * pose.translation)
 
 
-def _turned(pose: Rigid3, body_from_cam: Float[np.ndarray, "3 3"]) -> Rigid3:
+def _rotate_camera_axes(pose: Rigid3, body_from_cam: Float[np.ndarray, "3 3"]) -> Rigid3:
     return Rigid3(pose.rotation @ body_from_cam, pose.translation)
 
 
-def _w_first(pose: Rigid3) -> Rigid3:
+def _reorder_quaternion(pose: Rigid3) -> Rigid3:
     w, x, y, z = pose.quat_wxyz()
     return Rigid3.from_quat_wxyz(
         np.array([x, y, z, w]), pose.translation
     )  # what was taken for x is w, for y is x, and so on
 
 
-def _mirrored(pose: Rigid3) -> Rigid3:
+def _mirror_pose(pose: Rigid3) -> Rigid3:
     return Rigid3(_MIRROR_Y @ pose.rotation @ _MIRROR_Y, _MIRROR_Y @ pose.translation)
 
 
-_WITH_NUMBERS = ("scale=FACTOR", "body=X,Y,Z,QX,QY,QZ,QW", "shift=SECONDS", "clock=FACTOR")
+_PARAMETRIC_CONVENTIONS = (
+    "scale=FACTOR",
+    "body=X,Y,Z,QX,QY,QZ,QW",
+    "shift=SECONDS",
+    "clock=FACTOR",
+)
 UNITS = {"mm": 0.001, "cm": 0.01, "feet": 0.3048}
 """Metres of each."""
-ROTATIONS: dict[str, Mend] = {
-    "wxyz": _w_first,
+ROTATIONS: dict[str, PoseConversion] = {
+    "wxyz": _reorder_quaternion,
     "transposed": lambda pose: Rigid3(pose.rotation.T.copy(), pose.translation),
 }
-DIRECTIONS: dict[str, Mend] = {"inverse": lambda pose: pose.inverse()}
-AXES: dict[str, Mend] = {
-    "opengl": lambda pose: _turned(pose, np.diag([1.0, -1.0, -1.0])),
-    "flu": lambda pose: _turned(pose, _FORWARD_LEFT_UP),
-    "frd": lambda pose: _turned(pose, _FORWARD_RIGHT_DOWN),
-    "unity": _mirrored,
-    "unreal": lambda pose: _turned(_mirrored(pose), _FORWARD_LEFT_UP),
+DIRECTIONS: dict[str, PoseConversion] = {"inverse": lambda pose: pose.inverse()}
+AXES: dict[str, PoseConversion] = {
+    "opengl": lambda pose: _rotate_camera_axes(pose, np.diag([1.0, -1.0, -1.0])),
+    "flu": lambda pose: _rotate_camera_axes(pose, _FORWARD_LEFT_UP),
+    "frd": lambda pose: _rotate_camera_axes(pose, _FORWARD_RIGHT_DOWN),
+    "unity": _mirror_pose,
+    "unreal": lambda pose: _rotate_camera_axes(_mirror_pose(pose), _FORWARD_LEFT_UP),
 }
-MEANINGS = {
+CONVENTION_DESCRIPTIONS = {
     "mm": "in millimetres",
     "cm": "in centimetres",
     "feet": "in feet",
@@ -79,19 +84,19 @@ MEANINGS = {
 
 
 @dataclass(frozen=True)
-class PoseReading:
+class PoseConventions:
     """How the poses of a file become ours: `conventions` undone in turn. The file's times, as read,
-    times `clock`, are the pictures' plus `shift_s`."""
+    times `time_scale`, are the pictures' plus `shift_s`."""
 
     conventions: tuple[str, ...] = ()
-    clock: float = 1.0
+    time_scale: float = 1.0
     shift_s: float = 0.0
 
-    def mend(self, pose: Rigid3) -> Rigid3:
-        return mended(pose, self.conventions)
+    def undo_conventions(self, pose: Rigid3) -> Rigid3:
+        return undo_pose_conventions(pose, self.conventions)
 
     @staticmethod
-    def of(text: str | None) -> PoseReading:
+    def of(text: str | None) -> PoseConventions:
         """``wxyz,body=1,2,3,0,0,0,1,shift=0.2``: a part that begins with a number belongs to the
         one before.
 
@@ -112,52 +117,56 @@ class PoseReading:
         }
         conventions = tuple(part for part in parts if part.partition("=")[0] not in times)
         for convention in conventions:
-            mend_of(convention)
-        clock = _numbers("clock", times["clock"], 1)[0] if "clock" in times else 1.0
-        if clock <= 0.0:
+            find_conversion(convention)
+        time_scale = _parse_numbers("clock", times["clock"], 1)[0] if "clock" in times else 1.0
+        if time_scale <= 0.0:
             raise TrajectoryError("poses 'clock': the factor must be above 0")
-        return PoseReading(
-            conventions, clock, _numbers("shift", times["shift"], 1)[0] if "shift" in times else 0.0
+        return PoseConventions(
+            conventions,
+            time_scale,
+            _parse_numbers("shift", times["shift"], 1)[0] if "shift" in times else 0.0,
         )
 
 
-def mended(pose: Rigid3, conventions: Sequence[str]) -> Rigid3:
+def undo_pose_conventions(pose: Rigid3, conventions: Sequence[str]) -> Rigid3:
     """One pose, with these conventions undone in turn. Raises TrajectoryError: there is no such
     convention."""
     for convention in conventions:
-        pose = mend_of(convention)(pose)
+        pose = find_conversion(convention)(pose)
     return pose
 
 
-def meaning(conventions: Sequence[str]) -> str:
+def describe_conventions(conventions: Sequence[str]) -> str:
     """What poses are that need these, in words."""
-    return ", ".join(MEANINGS[convention.partition("=")[0]] for convention in conventions)
+    return ", ".join(
+        CONVENTION_DESCRIPTIONS[convention.partition("=")[0]] for convention in conventions
+    )
 
 
-def mend_of(convention: str) -> Mend:
+def find_conversion(convention: str) -> PoseConversion:
     """What undoes a convention, written as `--poses` takes it. Raises TrajectoryError: there is
     none of that name."""
     name, _, value = convention.partition("=")
     if name in ("scale", "body"):
-        numbers = _numbers(convention, value, 1 if name == "scale" else 7)
+        numbers = _parse_numbers(convention, value, 1 if name == "scale" else 7)
         if name == "scale":
             if numbers[0] <= 0.0:
                 raise TrajectoryError(f"poses {convention!r}: the scale must be above 0")
-            return lambda pose: _scaled(pose, numbers[0])
+            return lambda pose: _scale_pose(pose, numbers[0])
         body_from_cam = Rigid3.from_quat_wxyz(
             np.array([numbers[6], *numbers[3:6]]), np.array(numbers[:3])
         )
         return lambda pose: pose @ body_from_cam
     if name in UNITS and not value:
-        return lambda pose: _scaled(pose, UNITS[name])
+        return lambda pose: _scale_pose(pose, UNITS[name])
     found = (ROTATIONS | DIRECTIONS | AXES).get(convention)
     if found is None:
-        known = ", ".join([*UNITS, *ROTATIONS, *DIRECTIONS, *AXES, *_WITH_NUMBERS])
+        known = ", ".join([*UNITS, *ROTATIONS, *DIRECTIONS, *AXES, *_PARAMETRIC_CONVENTIONS])
         raise TrajectoryError(f"poses {convention!r}: not known; known are {known}")
     return found
 
 
-def _numbers(convention: str, value: str, count: int) -> list[float]:
+def _parse_numbers(convention: str, value: str, count: int) -> list[float]:
     try:
         numbers = [float(number) for number in value.split(",")]
     except ValueError:

@@ -54,21 +54,21 @@ def estimate_relative_pose(
         "params": [focal, 0.0, 0.0],
     }
     ransac = {"max_epipolar_error": _MAX_EPIPOLAR_ERROR_PX, "seed": 0}
-    pose, said = poselib.estimate_relative_pose(
+    pose, ransac_info = poselib.estimate_relative_pose(
         focal * rays[0][kept], focal * rays[1][kept], pinhole, pinhole, ransac, {}
     )
     matrix, inliers = np.asarray(pose.Rt, dtype=np.float64), np.zeros(len(first_img), bool)
-    inliers[kept] = said["inliers"]
-    way = float(np.linalg.norm(matrix[:, 3]))
-    if not np.isfinite(matrix).all() or way == 0.0 or not inliers.any():
+    inliers[kept] = ransac_info["inliers"]
+    distance = float(np.linalg.norm(matrix[:, 3]))
+    if not np.isfinite(matrix).all() or distance == 0.0 or not inliers.any():
         return None
-    turned = (
+    rotated = (
         np.column_stack([rays[0][inliers], np.ones(np.count_nonzero(inliers))]) @ matrix[:, :3].T
     )
-    seen = np.column_stack([rays[1][inliers], np.ones(len(turned))])
-    cosines = np.sum(turned * seen, axis=1) / (
-        np.linalg.norm(turned, axis=1) * np.linalg.norm(seen, axis=1)
+    seen = np.column_stack([rays[1][inliers], np.ones(len(rotated))])
+    cosines = np.sum(rotated * seen, axis=1) / (
+        np.linalg.norm(rotated, axis=1) * np.linalg.norm(seen, axis=1)
     )
     if np.median(np.arccos(np.clip(cosines, -1.0, 1.0))) < _MIN_PARALLAX:
         return None
-    return RelativePose(Rigid3(matrix[:, :3].copy(), matrix[:, 3] / way), inliers)
+    return RelativePose(Rigid3(matrix[:, :3].copy(), matrix[:, 3] / distance), inliers)

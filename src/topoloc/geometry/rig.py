@@ -12,7 +12,7 @@ from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3, log_so3
 
-_NUM_OUTLINE = 101
+_NUM_OUTLINE_POINTS = 101
 _MAX_ANGLE = np.deg2rad(60.0)
 
 
@@ -103,8 +103,8 @@ def rectify(rig: StereoRig) -> Rectification:
     return Rectification(
         rig=StereoRig(left, right, Rigid3(np.eye(3), np.array([-rig.baseline, 0.0, 0.0]))),
         rectified_from_left=Rigid3(rotation_left, np.zeros(3)),
-        left_map=_map(rig.left, left, rotation_left),
-        right_map=_map(rig.right, right, rotation_right),
+        left_map=_compute_remap(rig.left, left, rotation_left),
+        right_map=_compute_remap(rig.right, right, rotation_right),
     )
 
 
@@ -165,8 +165,8 @@ def _inner_rectangle(
     on them.
     """
     right, bottom = camera.width - 1.0, camera.height - 1.0
-    steps = np.linspace(0.0, 1.0, _NUM_OUTLINE)
-    zeros, ones = np.zeros(_NUM_OUTLINE), np.ones(_NUM_OUTLINE)
+    steps = np.linspace(0.0, 1.0, _NUM_OUTLINE_POINTS)
+    zeros, ones = np.zeros(_NUM_OUTLINE_POINTS), np.ones(_NUM_OUTLINE_POINTS)
     sides = []
     for x, y in ((zeros, steps), (steps, zeros), (ones, steps), (steps, ones)):
         rays = camera.rays_from_img(np.column_stack([x * right, y * bottom])) @ rotation.T
@@ -181,7 +181,7 @@ def _inner_rectangle(
     return low, high
 
 
-def _map(
+def _compute_remap(
     raw: Camera, rectified: Camera, rotation: Float[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "h w 2"]:
     x, y = np.meshgrid(

@@ -179,7 +179,7 @@ class Rigid3:
         return Rigid3(exp_so3(fraction * omega) @ self.rotation, translation)
 
 
-def covariance_of_inverse(
+def inverse_covariance(
     a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "6 6"]:
     """Covariance of the left perturbation of ``b_from_a = a_from_b.inverse()``, from that of

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
 
-_ROUNDS = 10
+_NUM_ITERATIONS = 10
 _MIN_STEP = 1e-9
 
 
@@ -50,8 +50,8 @@ class DriftConfig:
 
     def covariance(self, motion: Rigid3) -> Float[np.ndarray, "6 6"]:
         """Of a motion, m and rad."""
-        way = float(np.linalg.norm(motion.translation))
-        return diagonal_covariance(self.drift * way, self.drift_deg * way)
+        distance = float(np.linalg.norm(motion.translation))
+        return diagonal_covariance(self.drift * distance, self.drift_deg * distance)
 
 
 def diagonal_covariance(metres: float, degrees: float) -> Float[np.ndarray, "6 6"]:
@@ -59,7 +59,7 @@ def diagonal_covariance(metres: float, degrees: float) -> Float[np.ndarray, "6 6
     return np.diag(np.square([metres] * 3 + [np.deg2rad(degrees)] * 3))
 
 
-def carried(
+def propagate_estimate(
     c_from_a: Rigid3,
     a_from_b: Rigid3,
     covariance: Float[np.ndarray, "6 6"],
@@ -75,7 +75,7 @@ def carried(
 
 @dataclass(frozen=True, eq=False)
 class TransformConsensus:
-    """What the estimates where `agrees` is True say together.
+    """What the estimates where `is_inlier` is True say together.
 
     `covariance` is that of the left perturbation (m, rad); it does not shrink by estimates that
     share a picture, and grows where those that agree scatter by more than they should.
@@ -84,7 +84,7 @@ class TransformConsensus:
 
     a_from_b: Rigid3
     covariance: Float[np.ndarray, "6 6"]
-    agrees: Bool[np.ndarray, " n"]
+    is_inlier: Bool[np.ndarray, " n"]
     num_independent: int
 
 
@@ -92,7 +92,7 @@ def find_consensus(
     a_from_bs: Sequence[Rigid3],
     covariances: Float[np.ndarray, "n 6 6"],
     config: ConsensusConfig,
-    pictures: Int[np.ndarray, "n 2"] | None = None,
+    image_ids: Int[np.ndarray, "n 2"] | None = None,
 ) -> TransformConsensus | None:
     """The transform that the estimates support; None where none is supported well enough, or
     another one nearly as well.
@@ -107,29 +107,32 @@ def find_consensus(
     num = len(a_from_bs)
     if num < config.min_independent:
         return None
-    if pictures is None:
-        pictures = np.column_stack([np.arange(num), np.arange(num)])
-    distances = _mutual_distances(a_from_bs, covariances, config)
-    best, agreeing = _best_supported(distances <= config.max_sigmas, pictures)
+    if image_ids is None:
+        image_ids = np.column_stack([np.arange(num), np.arange(num)])
+    distances = _pairwise_distances(a_from_bs, covariances, config)
+    best, agreeing = _select_best_hypothesis(distances <= config.max_sigmas, image_ids)
     if agreeing < config.min_independent:
         return None
-    agrees = distances[best] <= config.max_sigmas
-    a_from_b, covariance = _refined(a_from_bs, covariances, agrees)
+    is_inlier = distances[best] <= config.max_sigmas
+    a_from_b, covariance = _refine_transform(a_from_bs, covariances, is_inlier)
     sigmas = _distances(a_from_b, covariance, a_from_bs, covariances)
-    agrees, others = sigmas <= config.max_sigmas, sigmas > config.rival_sigmas
-    num_independent = _num_independent(agrees, pictures)
-    _, rivals = _best_supported((distances <= config.max_sigmas) & others, pictures)
+    is_inlier, others = sigmas <= config.max_sigmas, sigmas > config.rival_sigmas
+    num_independent = _count_independent(is_inlier, image_ids)
+    _, rivals = _select_best_hypothesis((distances <= config.max_sigmas) & others, image_ids)
     if num_independent < config.min_independent or rivals >= max(
         config.rival_share * num_independent, 2
     ):
         return None
-    a_from_b, covariance = _refined(a_from_bs, covariances, agrees)
+    a_from_b, covariance = _refine_transform(a_from_bs, covariances, is_inlier)
     return TransformConsensus(
-        a_from_b, covariance * np.count_nonzero(agrees) / num_independent, agrees, num_independent
+        a_from_b,
+        covariance * np.count_nonzero(is_inlier) / num_independent,
+        is_inlier,
+        num_independent,
     )
 
 
-def _mutual_distances(
+def _pairwise_distances(
     a_from_bs: Sequence[Rigid3], covariances: Float[np.ndarray, "n 6 6"], config: ConsensusConfig
 ) -> Float[np.ndarray, "h n"]:
     """Of each hypothesis, a row: how far all estimates are from it, in sigma of both."""
@@ -181,8 +184,8 @@ def _residuals(hypothesis: Rigid3, a_from_bs: Sequence[Rigid3]) -> Float[np.ndar
     )
 
 
-def _best_supported(
-    agree: Bool[np.ndarray, "h n"], pictures: Int[np.ndarray, "n 2"]
+def _select_best_hypothesis(
+    agree: Bool[np.ndarray, "h n"], image_ids: Int[np.ndarray, "n 2"]
 ) -> tuple[int, int]:
     """The hypothesis that most independent estimates agree with, of equals that with most
     estimates, and how many the former are."""
@@ -191,16 +194,16 @@ def _best_supported(
     for k in np.argsort(-counts, kind="stable").tolist():
         if counts[k] <= support:
             break
-        num = _num_independent(agree[k], pictures)
+        num = _count_independent(agree[k], image_ids)
         if num > support:
             best, support = k, num
     return best, support
 
 
-def _num_independent(chosen: Bool[np.ndarray, " n"], pictures: Int[np.ndarray, "n 2"]) -> int:
+def _count_independent(chosen: Bool[np.ndarray, " n"], image_ids: Int[np.ndarray, "n 2"]) -> int:
     """How many of the chosen estimates can be had with no picture taken twice: those go first whose
     pictures have the fewest others."""
-    pairs = pictures[chosen]
+    pairs = image_ids[chosen]
     partners = sum(
         (
             counts[inverse]
@@ -220,18 +223,18 @@ def _num_independent(chosen: Bool[np.ndarray, " n"], pictures: Int[np.ndarray, "
     return num
 
 
-def _refined(
+def _refine_transform(
     a_from_bs: Sequence[Rigid3],
     covariances: Float[np.ndarray, "n 6 6"],
-    agrees: Bool[np.ndarray, " n"],
+    is_inlier: Bool[np.ndarray, " n"],
 ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
     """Weighted least squares over those that agree, from the most certain of them on; its
     covariance, scaled up to what they scatter by."""
-    rows = np.flatnonzero(agrees).tolist()
+    rows = np.flatnonzero(is_inlier).tolist()
     chosen, informations = [a_from_bs[k] for k in rows], np.linalg.inv(covariances[rows])
     mean = chosen[int(np.argmax(np.linalg.slogdet(informations).logabsdet))]
     covariance = np.linalg.inv(informations.sum(axis=0))
-    for _ in range(_ROUNDS):
+    for _ in range(_NUM_ITERATIONS):
         residuals = _residuals(mean, chosen)
         step = covariance @ np.einsum("nij,nj->i", informations, residuals)
         mean = Rigid3.exp(step) @ mean

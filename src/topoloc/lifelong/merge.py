@@ -15,17 +15,17 @@ from typing import Any
 from topoloc.bounds import check_bounds
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.asked_nodes import ask_nodes
-from topoloc.lifelong.coarse_models import PlaceView, taught_places
-from topoloc.lifelong.earlier_recall import earlier_recall
-from topoloc.lifelong.grown_sides import grown_sides
-from topoloc.lifelong.overlay import Overlay
-from topoloc.lifelong.session_poses import Progress, SessionPoses, held_by
-from topoloc.lifelong.update import UpdateConfig, is_well_held
+from topoloc.lifelong.coarse_model_update import PlaceFeatures, update_coarse_models
+from topoloc.lifelong.lazy_sequences import OverlaySequence
+from topoloc.lifelong.node_localization import localize_nodes
+from topoloc.lifelong.recall_change import measure_recall_change
+from topoloc.lifelong.session_poses import Progress, SessionPoses, align_motion_to_map
+from topoloc.lifelong.update import UpdateConfig, is_well_localized
+from topoloc.lifelong.virtual_node_update import add_virtual_nodes
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.building import with_map_facts
+from topoloc.localization.map_facts.map_building import with_map_statistics
+from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.sums import LandmarkSums
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 
 
@@ -62,28 +62,31 @@ def merge_maps(
         )
     if first.map_id is not None and first.map_id == second.map_id:
         raise MapError("they are one map in two versions; nothing is merged")
-    held = _held(first, second, config, localizer_config, progress)
+    held = _align_second_map(first, second, config, localizer_config, progress)
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
     added = [
-        row for row, answer in held.answers.items() if not is_well_held(answer, d_thresh, config)
+        row
+        for row, answer in held.answers.items()
+        if not is_well_localized(answer, d_thresh, config)
     ]
     poses = {row: pose for row, pose in enumerate(held.world_from_cams) if pose is not None}
-    merged, not_taught = _with_nodes(first, second, added, poses)
+    merged, not_updated = _add_nodes(first, second, added, poses)
     changes = {
         "nodes_of_second": len(second.summaries),
         "localized": sum(answer is not None for answer in held.answers.values()),
-        "agreeing": len(held.agreeing),
+        "agreeing": len(held.inlier_idx),
         "nodes_added": len(added),
-        "not_taught": not_taught,
+        "not_taught": not_updated,
     }
-    merged = with_map_facts(merged, progress)
+    merged = with_map_statistics(merged, progress)
     return MergedMap(
-        merged, changes | earlier_recall(first, merged, config.earlier_asked, localizer_config)
+        merged,
+        changes | measure_recall_change(first, merged, config.earlier_asked, localizer_config),
     )
 
 
-def _held(
+def _align_second_map(
     first: TopoMetricMap,
     second: TopoMetricMap,
     config: UpdateConfig,
@@ -92,24 +95,24 @@ def _held(
 ) -> SessionPoses:
     """The second map's nodes, by their rows, in the world of the first."""
     rows = range(len(second.summaries))
-    answers = ask_nodes(
+    answers = localize_nodes(
         Localizer(first, localizer_config),
         second,
         rows,
         lambda done: progress("comparing the maps", done, len(rows)),
     )
-    own = {row: summary.world_from_cam for row, summary in enumerate(second.summaries)}
+    odom = {row: summary.world_from_cam for row, summary in enumerate(second.summaries)}
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
     try:
-        return held_by("the second map", own, answers, d_thresh, config.poses)
+        return align_motion_to_map("the second map", odom, answers, d_thresh, config.poses)
     except TrajectoryError as error:
         raise TrajectoryError(
             str(error).replace("the map stays as it is", "nothing is merged")
         ) from None
 
 
-def _with_nodes(
+def _add_nodes(
     first: TopoMetricMap, second: TopoMetricMap, added: Sequence[int], poses: Mapping[int, Rigid3]
 ) -> tuple[TopoMetricMap, list[str]]:
     """The first map with these nodes of the second, and the coarse localizers that could not learn
@@ -124,39 +127,41 @@ def _with_nodes(
     new_id = {row: first_id + k for k, row in enumerate(added)}
     nodes = {
         kind: [
-            _moved(second.nodes_of(kind)[row], new_id[row], poses[row], session_ids)
+            _transform_node(second.nodes_of(kind)[row], new_id[row], poses[row], session_ids)
             for row in added
         ]
         for kind in first.kinds
     }
-    views = {kind: [_view(node) for node in of_kind] for kind, of_kind in nodes.items()}
+    views = {kind: [_place_features(node) for node in of_kind] for kind, of_kind in nodes.items()}
     summaries = [*first.summaries, *(node.summary for node in nodes[first.kind])]
-    grown = {kind: Overlay(first.nodes_of(kind), {}, nodes[kind]) for kind in first.kinds}
-    images = _images(second, new_id, poses, session_ids)
-    taught = taught_places(first, views, images)
+    extended = {
+        kind: OverlaySequence(first.nodes_of(kind), {}, nodes[kind]) for kind in first.kinds
+    }
+    images = _select_images(second, new_id, poses, session_ids)
+    updated = update_coarse_models(first, views, images)
     merged = replace(
         first,
         summaries=summaries,
-        nodes=grown.pop(first.kind),
-        other_kinds=grown,
+        nodes=extended.pop(first.kind),
+        other_kinds=extended,
         edges=sorted(
-            {*first.edges, *_edges(first, second, new_id, poses)},
+            {*first.edges, *_transfer_edges(first, second, new_id, poses)},
             key=lambda edge: (edge.source_id, edge.target_id),
         ),
-        place_images=Overlay(first.place_images, {}, images),
-        coarse_models=taught.models,
+        place_images=OverlaySequence(first.place_images, {}, images),
+        coarse_models=updated.models,
         length_m=first.length_m + second.length_m * len(added) / max(len(second.summaries), 1),
         sessions=[*first.sessions, *sessions.values()],
-        sides=_sides(first, second, new_id, poses, summaries),
+        sides=_transfer_virtual_nodes(first, second, new_id, poses, summaries),
     )
-    return merged, taught.not_taught
+    return merged, updated.not_updated
 
 
-def _view(node: TopoNode) -> PlaceView:
-    return PlaceView(node.features, node.camera.width, node.camera.height, node.summary.node_id)
+def _place_features(node: TopoNode) -> PlaceFeatures:
+    return PlaceFeatures(node.features, node.camera.width, node.camera.height, node.summary.node_id)
 
 
-def _moved(
+def _transform_node(
     node: TopoNode, node_id: int, world_from_cam: Rigid3, session_ids: Mapping[int, int]
 ) -> TopoNode:
     """A node of the second map as one of the first."""
@@ -167,15 +172,23 @@ def _moved(
         world_from_cam=world_from_cam,
         session_id=session_ids.get(of.session_id, of.session_id),
     )
-    sums = [_of_session(sums, session_ids) for sums in node.sums]
-    return replace(node, summary=summary, sums=sums)
+    session_statistics = [
+        _renumber_session(session_statistics, session_ids)
+        for session_statistics in node.session_statistics
+    ]
+    return replace(node, summary=summary, session_statistics=session_statistics)
 
 
-def _of_session(sums: LandmarkSums, session_ids: Mapping[int, int]) -> LandmarkSums:
-    return replace(sums, session_id=session_ids.get(sums.session_id, sums.session_id))
+def _renumber_session(
+    session_statistics: LandmarkStatistics, session_ids: Mapping[int, int]
+) -> LandmarkStatistics:
+    return replace(
+        session_statistics,
+        session_id=session_ids.get(session_statistics.session_id, session_statistics.session_id),
+    )
 
 
-def _images(
+def _select_images(
     second: TopoMetricMap,
     new_id: Mapping[int, int],
     poses: Mapping[int, Rigid3],
@@ -198,7 +211,7 @@ def _images(
     return found
 
 
-def _edges(
+def _transfer_edges(
     first: TopoMetricMap,
     second: TopoMetricMap,
     new_id: Mapping[int, int],
@@ -220,7 +233,7 @@ def _edges(
     }
 
 
-def _sides(
+def _transfer_virtual_nodes(
     first: TopoMetricMap,
     second: TopoMetricMap,
     new_id: Mapping[int, int],
@@ -249,4 +262,4 @@ def _sides(
                 world_from_cam=moved,
             )
             nodes.append(replace(side, summary=summary))
-    return grown_sides(first, nodes)
+    return add_virtual_nodes(first, nodes)

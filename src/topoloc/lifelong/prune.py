@@ -1,9 +1,9 @@
 """A map made smaller: read from `prune_map`. What is gone goes first, then, where it is wanted,
-descriptors' last digits (`coarse_descriptors.py`), then what adds least.
+descriptors' last digits (`descriptor_quantization.py`), then what adds least.
 
 A landmark is gone where pictures that found their other landmarks again never found this one. For a
 budget, nodes that others hold are left out while else every node would keep few landmarks
-(`fewer_nodes.py`). Every node that stays then keeps so many as fit: those with the best chance to
+(`node_pruning.py`). Every node that stays then keeps so many as fit: those with the best chance to
 be seen again, spread over the picture, for a landmark beside others tells less (submodular
 coverage: a cell of the picture counts as the root of the chances in it; Krause & Golovin 2014,
 greedy choice).
@@ -23,17 +23,17 @@ from jaxtyping import Bool, Float, Int
 
 from topoloc.bounds import AtLeast, Between, check_bounds
 from topoloc.errors import MapError
-from topoloc.lifelong.coarse_descriptors import with_coarse_descriptors
-from topoloc.lifelong.earlier_recall import earlier_recall
-from topoloc.lifelong.fewer_nodes import fewest_dropped, holds_of, without_nodes
-from topoloc.lifelong.overlay import Changed, Overlay
-from topoloc.localization.map_facts.building import with_map_facts
-from topoloc.mapping.sums import LandmarkSums, with_counts_together
+from topoloc.lifelong.descriptor_quantization import quantize_map_descriptors
+from topoloc.lifelong.lazy_sequences import OverlaySequence, TransformedSequence
+from topoloc.lifelong.node_pruning import compute_node_support, remove_nodes, select_removed_nodes
+from topoloc.lifelong.recall_change import measure_recall_change
+from topoloc.localization.map_facts.map_building import with_map_statistics
+from topoloc.mapping.landmark_statistics import LandmarkStatistics, merge_count_statistics
+from topoloc.mapping.map_writing import write_map
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
-from topoloc.mapping.writing import write_map
-from topoloc.recordings.atomic import scratch_file
+from topoloc.recordings.atomic import temporary_file
 
-_PAGES = 4096  # what an entry in the history may take
+_PAGE_SLACK_BYTES = 4096  # what an entry in the history may take
 _POINT_COLUMNS = ("points_img", "shapes", "descriptors", "points_cam", "sqrt_covs")
 
 
@@ -79,7 +79,7 @@ class _FileSize:
     on the average: its template, its walls, its pictures but for one."""
 
     size: int
-    of_point: dict[str, float]
+    bytes_per_point: dict[str, float]
     of_node: float
 
     @staticmethod
@@ -89,34 +89,36 @@ class _FileSize:
         with closing(
             sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
         ) as database:
-            of_point = {}
+            bytes_per_point = {}
             for kind in kinds:
                 points = f"SELECT {lengths}, total(num_points) FROM node_points WHERE kind = ?"
                 num_bytes, num = database.execute(points, (kind,)).fetchone()
                 of_sums = database.execute(
                     "SELECT total(length(sums)) FROM landmark_sums WHERE kind = ?", (kind,)
                 ).fetchone()[0]
-                of_point[kind] = (num_bytes + of_sums) / max(num, 1)
+                bytes_per_point[kind] = (num_bytes + of_sums) / max(num, 1)
             num, of_templates = database.execute(f"{counted} node_templates").fetchone()
             num_pictures, of_pictures = database.execute(f"{counted} place_images").fetchone()
             of_walls = database.execute(f"SELECT {lengths} FROM side_node_points").fetchone()[0]
         of_pictures *= max(1.0 - num / max(num_pictures, 1), 0.0)
         return _FileSize(
-            path.stat().st_size, of_point, (of_templates + of_walls + of_pictures) / max(num, 1)
+            path.stat().st_size,
+            bytes_per_point,
+            (of_templates + of_walls + of_pictures) / max(num, 1),
         )
 
-    def without_points(self, topomap: TopoMetricMap) -> float:
+    def bytes_without_points(self, topomap: TopoMetricMap) -> float:
         """Bytes of the map, whose file this is, without its landmarks."""
         return self.size - sum(
             of_one * sum(len(node.features) for node in topomap.nodes_of(kind))
-            for kind, of_one in self.of_point.items()
+            for kind, of_one in self.bytes_per_point.items()
         )
 
 
-def _as_written(topomap: TopoMetricMap, path: Path) -> _FileSize:
+def _measure_file_size(topomap: TopoMetricMap, path: Path) -> _FileSize:
     """Of the map's file, which is to be at `path`. Raises MapError."""
     try:
-        with scratch_file(path) as tried:
+        with temporary_file(path) as tried:
             write_map(topomap, tried)
             return _FileSize.of(tried, topomap.kinds)
     except OSError as error:
@@ -149,55 +151,69 @@ def prune_map(
     """
     config = config or PruneConfig()
     check_bounds(config)
-    counted = _with_counts_together(topomap, config)
+    counted = _merge_session_counts(topomap, config)
     if config.descriptors == "coarse":
-        counted = with_coarse_descriptors(counted, config.descriptor_step)
-    file = _FileSize.of(path, topomap.kinds) if counted is topomap else _as_written(counted, path)
-    fewer = counted if max_bytes is None else _with_fewer_nodes(counted, file, max_bytes, config)
-    file = file if fewer is counted else _as_written(fewer, path)
-    return _with_landmarks(topomap, fewer, path, file, max_bytes, config)
+        counted = quantize_map_descriptors(counted, config.descriptor_step)
+    file = (
+        _FileSize.of(path, topomap.kinds)
+        if counted is topomap
+        else _measure_file_size(counted, path)
+    )
+    fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes, config)
+    file = file if fewer is counted else _measure_file_size(fewer, path)
+    return _prune_landmarks(topomap, fewer, path, file, max_bytes, config)
 
 
-def _with_counts_together(topomap: TopoMetricMap, config: PruneConfig) -> TopoMetricMap:
+def _merge_session_counts(topomap: TopoMetricMap, config: PruneConfig) -> TopoMetricMap:
     """Sessions that only counted made two, where there are more; else the map itself."""
 
-    def together(node: TopoNode) -> TopoNode:
-        return replace(node, sums=with_counts_together(node.sums, config.min_seen_share))
+    def merge_counts(node: TopoNode) -> TopoNode:
+        return replace(
+            node,
+            session_statistics=merge_count_statistics(
+                node.session_statistics, config.min_seen_share
+            ),
+        )
 
     if not any(
-        len(list(node.sums)) > len(list(together(node).sums))
+        len(list(node.session_statistics)) > len(list(merge_counts(node).session_statistics))
         for kind in topomap.kinds
         for node in topomap.nodes_of(kind)
     ):
         return topomap
-    nodes = {kind: Changed(topomap.nodes_of(kind), together) for kind in topomap.kinds}
+    nodes = {
+        kind: TransformedSequence(topomap.nodes_of(kind), merge_counts) for kind in topomap.kinds
+    }
     return replace(topomap, nodes=nodes.pop(topomap.kind), other_kinds=nodes)
 
 
-def _with_fewer_nodes(
+def _drop_nodes(
     topomap: TopoMetricMap, file: _FileSize, max_bytes: int, config: PruneConfig
 ) -> TopoMetricMap:
     """Without the nodes that go before any keeps fewer than `few_points`; the map itself where none
     needs to."""
-    left = {
-        kind: np.array([(~_gone(node, config)).sum() for node in topomap.nodes_of(kind)])
+    remaining = {
+        kind: np.array([(~_find_vanished(node, config)).sum() for node in topomap.nodes_of(kind)])
         for kind in topomap.kinds
     }
-    with_few = sum(
-        (np.minimum(left[kind], config.few_points) * file.of_point[kind] for kind in topomap.kinds),
+    min_bytes = sum(
+        (
+            np.minimum(remaining[kind], config.few_points) * file.bytes_per_point[kind]
+            for kind in topomap.kinds
+        ),
         np.zeros(1),
     )
-    too_much = file.without_points(topomap) + float(with_few.sum()) - max_bytes
-    if too_much <= 0:
+    excess_bytes = file.bytes_without_points(topomap) + float(min_bytes.sum()) - max_bytes
+    if excess_bytes <= 0:
         return topomap
-    of_node, holds = with_few + file.of_node, holds_of(topomap, config.num_compared)
-    chosen = fewest_dropped(
-        holds, config.min_held, lambda rows: float(of_node[rows].sum()) >= too_much
+    of_node, support = min_bytes + file.of_node, compute_node_support(topomap, config.num_compared)
+    chosen = select_removed_nodes(
+        support, config.min_held, lambda rows: float(of_node[rows].sum()) >= excess_bytes
     )
-    return topomap if chosen is None else without_nodes(topomap, *chosen)
+    return topomap if chosen is None else remove_nodes(topomap, *chosen)
 
 
-def _with_landmarks(
+def _prune_landmarks(
     before: TopoMetricMap,
     topomap: TopoMetricMap,
     path: Path,
@@ -207,81 +223,91 @@ def _with_landmarks(
 ) -> PrunedMap:
     """The map without what is gone, and within its budget; `before` is what it was made of, `file`
     the size that it has."""
-    gone = {
-        kind: [_gone(node, config) for node in topomap.nodes_of(kind)] for kind in topomap.kinds
+    vanished = {
+        kind: [_find_vanished(node, config) for node in topomap.nodes_of(kind)]
+        for kind in topomap.kinds
     }
-    left = {kind: [int((~of_node).sum()) for of_node in gone[kind]] for kind in topomap.kinds}
-    largest = max(max(of_kind) for of_kind in left.values())
-    most, budget, rest = largest, max_bytes, file.without_points(topomap)
+    remaining = {
+        kind: [int((~of_node).sum()) for of_node in vanished[kind]] for kind in topomap.kinds
+    }
+    largest = max(max(of_kind) for of_kind in remaining.values())
+    most, budget, fixed_bytes = largest, max_bytes, file.bytes_without_points(topomap)
     num_nodes = len(before.summaries) - len(topomap.summaries)
     while True:
         if budget is not None:
-            most = min(most, _most_points(left, file.of_point, rest, budget, config))
+            most = min(
+                most,
+                _max_points_per_node(remaining, file.bytes_per_point, fixed_bytes, budget, config),
+            )
         if (
             topomap is before
             and most >= largest
-            and not any(of_node.any() for of_kind in gone.values() for of_node in of_kind)
+            and not any(of_node.any() for of_kind in vanished.values() for of_node in of_kind)
         ):
             return PrunedMap(
                 before, {"nodes_dropped": 0, "landmarks_gone": 0, "landmarks_dropped": 0}
             )
-        pruned = _with_fewer(topomap, gone, most, config)
+        pruned = _drop_landmarks(topomap, vanished, most, config)
         if (
             max_bytes is None
             or budget is None
-            or (written := _as_written(pruned.topomap, path).size + _PAGES) <= max_bytes
+            or (written := _measure_file_size(pruned.topomap, path).size + _PAGE_SLACK_BYTES)
+            <= max_bytes
         ):
             changes = {"nodes_dropped": num_nodes} | pruned.changes
             return replace(
                 pruned,
-                changes=changes | earlier_recall(before, pruned.topomap, config.earlier_asked),
+                changes=changes
+                | measure_recall_change(before, pruned.topomap, config.earlier_asked),
             )
         budget -= (
-            round(1.1 * (written - max_bytes)) + _PAGES
+            round(1.1 * (written - max_bytes)) + _PAGE_SLACK_BYTES
         )  # how well bytes pack is known only now
 
 
-def _with_fewer(
-    topomap: TopoMetricMap, gone: Mapping[str, list[np.ndarray]], most: int, config: PruneConfig
+def _drop_landmarks(
+    topomap: TopoMetricMap, vanished: Mapping[str, list[np.ndarray]], most: int, config: PruneConfig
 ) -> PrunedMap:
-    """Without the landmarks that are `gone` (booleans, a node), and with `most` of the others a
+    """Without the landmarks that are `vanished` (booleans, a node), and with `most` of the others a
     node."""
     pruned, num_gone, num_dropped = {}, 0, 0
     for kind in topomap.kinds:
         changed = {}
-        for row, (node, of_node) in enumerate(zip(topomap.nodes_of(kind), gone[kind], strict=True)):
+        for row, (node, of_node) in enumerate(
+            zip(topomap.nodes_of(kind), vanished[kind], strict=True)
+        ):
             rows = np.flatnonzero(~of_node)
-            kept = rows if len(rows) <= most else rows[_chosen(node, rows, most, config)]
+            kept = rows if len(rows) <= most else rows[_select_landmarks(node, rows, most, config)]
             num_gone, num_dropped = (
                 num_gone + int(of_node.sum()),
                 num_dropped + len(rows) - len(kept),
             )
             if len(kept) < len(of_node):
-                changed[row] = with_points(node, kept)
-        pruned[kind] = Overlay(topomap.nodes_of(kind), changed, [])
+                changed[row] = select_landmarks(node, kept)
+        pruned[kind] = OverlaySequence(topomap.nodes_of(kind), changed, [])
     nodes = pruned.pop(topomap.kind)
     smaller = replace(
         topomap, summaries=[node.summary for node in nodes], nodes=nodes, other_kinds=pruned
     )
     return PrunedMap(
-        with_map_facts(smaller), {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped}
+        with_map_statistics(smaller), {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped}
     )
 
 
-def with_points(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
+def select_landmarks(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
     """The node with these of its landmarks (rows in increasing order) and what sessions know of
     them."""
     new_row = np.full(len(node.features), -1)
     new_row[kept] = np.arange(len(kept))
-    sums = []
-    for of_session in node.sums:
+    session_statistics = []
+    for of_session in node.session_statistics:
         stays = new_row[of_session.rows] >= 0
         if stays.any():
             parts = (
                 getattr(of_session, name)[stays] for name in ("roots", "pulls", "expected", "seen")
             )
-            sums.append(
-                LandmarkSums(of_session.session_id, new_row[of_session.rows[stays]], *parts)
+            session_statistics.append(
+                LandmarkStatistics(of_session.session_id, new_row[of_session.rows[stays]], *parts)
             )
     stored = node.stored_descriptors
     return replace(
@@ -290,41 +316,45 @@ def with_points(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
         features=node.features.select(kept),
         points_cam=node.points_cam[kept],
         point_sqrt_covs=node.point_sqrt_covs[kept],
-        sums=sums,
+        session_statistics=session_statistics,
         stored_descriptors=None if stored is None else stored[kept],
     )
 
 
-def _gone(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"]:
+def _find_vanished(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"]:
     """The landmarks that later sessions never saw though they saw the rest, and so often that a
     landmark that is there hardly stays unseen: a session that finds a third of what is in view
     misses four pictures in a row by chance, one of five times."""
     num = len(node.features)
     expected, seen, log_missed = np.zeros(num, np.int64), np.zeros(num, np.int64), np.zeros(num)
-    for sums in node.sums:
-        later = sums.session_id != node.summary.session_id
-        if later and sums.is_seen_again(config.min_seen_share):
-            share = sums.seen.sum(dtype=np.int64) / max(int(sums.expected.sum(dtype=np.int64)), 1)
-            expected[sums.rows] += sums.expected
-            seen[sums.rows] += sums.seen
-            log_missed[sums.rows] += sums.expected * np.log1p(-min(share, 0.99))
-    gone = (
+    for session_statistics in node.session_statistics:
+        later = session_statistics.session_id != node.summary.session_id
+        if later and session_statistics.is_reobserved(config.min_seen_share):
+            share = session_statistics.seen.sum(dtype=np.int64) / max(
+                int(session_statistics.expected.sum(dtype=np.int64)), 1
+            )
+            expected[session_statistics.rows] += session_statistics.expected
+            seen[session_statistics.rows] += session_statistics.seen
+            log_missed[session_statistics.rows] += session_statistics.expected * np.log1p(
+                -min(share, 0.99)
+            )
+    vanished = (
         (expected >= config.min_expected) & (seen == 0) & (log_missed <= np.log(config.max_chance))
     )
-    return gone if gone.sum() <= config.max_gone_share * num else np.zeros(num, bool)
+    return vanished if vanished.sum() <= config.max_gone_share * num else np.zeros(num, bool)
 
 
-def _chances(node: TopoNode) -> Float[np.ndarray, " n"]:
+def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
     """Each landmark's chance to be seen by a picture that should show it, by all that sessions saw
     (Laplace's rule)."""
     expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
-    for sums in node.sums:
-        expected[sums.rows] += sums.expected
-        seen[sums.rows] += sums.seen
+    for session_statistics in node.session_statistics:
+        expected[session_statistics.rows] += session_statistics.expected
+        seen[session_statistics.rows] += session_statistics.seen
     return seen / expected
 
 
-def _chosen(
+def _select_landmarks(
     node: TopoNode, rows: Int[np.ndarray, " m"], most: int, config: PruneConfig
 ) -> Int[np.ndarray, " k"]:
     """Which of these rows a node keeps: chance by chance the one that adds most to what its cell
@@ -332,7 +362,7 @@ def _chosen(
     size = node.camera.width / config.cells
     cell = (node.features.points_img[rows] / size).astype(np.int64)
     key = cell[:, 1] * (config.cells + 1) + cell[:, 0]
-    chances, gains = _chances(node)[rows], np.empty(len(rows))
+    chances, gains = _observation_probability(node)[rows], np.empty(len(rows))
     for one in np.unique(key):
         of_cell = np.flatnonzero(key == one)
         best_first = of_cell[np.argsort(-chances[of_cell], kind="stable")]
@@ -343,32 +373,33 @@ def _chosen(
     return np.sort(np.argsort(-gains, kind="stable")[:most])
 
 
-def _most_points(
-    left: dict[str, list[int]],
-    of_point: dict[str, float],
-    rest: float,
+def _max_points_per_node(
+    remaining: dict[str, list[int]],
+    bytes_per_point: dict[str, float],
+    fixed_bytes: float,
     max_bytes: int,
     config: PruneConfig,
 ) -> int:
     """Landmarks a node of each kind so that a file fits whose bytes without landmarks are
-    `rest`."""
+    `fixed_bytes`."""
 
-    def bytes_with(most: int) -> float:
-        return rest + sum(
-            sum(min(n, most) for n in of_kind) * of_point[kind] for kind, of_kind in left.items()
+    def file_size_with(most: int) -> float:
+        return fixed_bytes + sum(
+            sum(min(n, most) for n in of_kind) * bytes_per_point[kind]
+            for kind, of_kind in remaining.items()
         )
 
-    if bytes_with(config.min_points) > max_bytes:
+    if file_size_with(config.min_points) > max_bytes:
         least, num = (
-            bytes_with(config.min_points) / 1e6,
-            max(len(of_kind) for of_kind in left.values()),
+            file_size_with(config.min_points) / 1e6,
+            max(len(of_kind) for of_kind in remaining.values()),
         )
         raise MapError(
             f"with {config.min_points} landmarks each its {num} nodes take {least:.2f} MB; nothing"
             " is dropped"
         )
-    low, high = config.min_points, max(max(of_kind) for of_kind in left.values())
+    low, high = config.min_points, max(max(of_kind) for of_kind in remaining.values())
     while low < high:
         middle = (low + high + 1) // 2
-        low, high = (middle, high) if bytes_with(middle) <= max_bytes else (low, middle - 1)
+        low, high = (middle, high) if file_size_with(middle) <= max_bytes else (low, middle - 1)
     return low

@@ -16,27 +16,32 @@ import numpy as np
 
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.adjusted_walk import adjusted_walk
-from topoloc.lifelong.motion_trust import Trust
-from topoloc.lifelong.scale_of_motion import in_metres, largest_agreement
-from topoloc.lifelong.session_calibration import check_by_other_focal_lengths, check_calibration
-from topoloc.lifelong.session_poses import Progress, SessionPoses, SessionPosesConfig, held_by
-from topoloc.lifelong.straightened_walk import straightened
+from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
+from topoloc.lifelong.noise_scale import NoiseScale
+from topoloc.lifelong.scale_estimation import find_largest_consensus, scale_to_metres
+from topoloc.lifelong.session_poses import (
+    Progress,
+    SessionPoses,
+    SessionPosesConfig,
+    align_motion_to_map,
+)
+from topoloc.lifelong.trajectory_adjustment import adjust_trajectory
+from topoloc.lifelong.trajectory_correction import correct_trajectory
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.nodes import place_nodes
+from topoloc.mapping.nodes import select_node_frames
 from topoloc.recordings.frame import StereoSequence
-from topoloc.slam.single_camera import SingleCameraOdometry
+from topoloc.slam.monocular_odometry import MonocularOdometry
 from topoloc.tracking.tracker import Tracker
 
-_REFITTED = 3
-_AROUND = 3
+_NUM_REFITS = 3
+_NUM_FRAMES_AROUND = 3
 
 
-def poses_by_map(
+def estimate_poses_by_map(
     sequence: StereoSequence,
     tracker: Tracker,
-    of_map: MapConfig,
+    map_config: MapConfig,
     config: SessionPosesConfig,
     progress: Progress,
 ) -> SessionPoses:
@@ -47,12 +52,12 @@ def poses_by_map(
         CalibrationError: it has none, or the pictures contradict it.
         UnreadableImageError, QueryError: from its pictures.
     """
-    by_map, seen, results = (
+    by_map, localized, results = (
         dict[int, Rigid3](),
         dict[int, Localization](),
         list[Localization | NotLocalized](),
     )
-    odometry = SingleCameraOdometry(config.odometry)
+    odometry = MonocularOdometry(config.odometry)
     for index, t_ns in enumerate(sequence.t_ns):
         frame = sequence[index]
         if frame.camera is None:
@@ -68,147 +73,159 @@ def poses_by_map(
             and found.smoothed is not None
             and isinstance(found.result, Localization)
         ):
-            by_map[index], seen[index] = found.smoothed, found.result
+            by_map[index], localized[index] = found.smoothed, found.result
         progress(f"localizing {sequence.name}", index + 1, len(sequence))
     check_calibration(sequence.name, results)
     if len(by_map) < config.min_agreeing:
-        check_by_other_focal_lengths(sequence, range(len(sequence)), tracker.localizer)
+        check_focal_length(sequence, range(len(sequence)), tracker.localizer)
         raise TrajectoryError(
             f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures:"
             " too few to join"
         )
-    d_thresh = of_map.nodes.d_thresh
+    d_thresh = map_config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
     clear = {
         index
-        for index, answer in seen.items()
+        for index, answer in localized.items()
         if answer.position_sigma_m <= config.max_sigma * d_thresh
     }
     poses: list[Rigid3 | None] = [
         by_map[index] if index in clear else None for index in range(len(sequence))
     ]
-    for stretch in odometry.stretches:
-        own = stretch.own_from_cams()
-        held, agreeing = held_stretch(sequence.name, own, seen, d_thresh, config)
+    for stretch in odometry.submaps:
+        odom = stretch.submap_from_cams()
+        held, inlier_idx = align_stretch_to_map(sequence.name, odom, localized, d_thresh, config)
         if held is not None:
-            anchors = {index: seen[index] for index in agreeing}
-            adjusted = adjusted_walk(
+            anchors = {index: localized[index] for index in inlier_idx}
+            adjusted = adjust_trajectory(
                 stretch, held, anchors, config.points_widened, config.adjustment
             )
-            straight = straightened(adjusted, anchors, d_thresh, config.bend)
-            held, agreeing = _undisputed(straight, seen, agreeing, d_thresh, config)
-        for index in own:
-            answer = seen[index] if index in agreeing else seen.pop(index, None)
+            corrected = correct_trajectory(adjusted, anchors, d_thresh, config.bend)
+            held, inlier_idx = _reject_contradicted(
+                corrected, localized, inlier_idx, d_thresh, config
+            )
+        for index in odom:
+            answer = localized[index] if index in inlier_idx else localized.pop(index, None)
             if held is None:
-                poses[index] = by_map[index] if index in agreeing and index in clear else None
+                poses[index] = by_map[index] if index in inlier_idx and index in clear else None
             else:
-                poses[index] = _not_denied(
+                poses[index] = _pose_if_consistent(
                     held[index] if index < len(held) else None, answer, d_thresh, config
                 )
     known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
     if not known:
-        raise TrajectoryError(f"{sequence.name}: {_why_not(seen)}; the map stays as it is")
-    asked = [known[k][0] for k in place_nodes([pose for _, pose in known], of_map.nodes)]
-    answers = {index: seen.get(index) for index in asked}
-    carried = [index for index, _ in known if index not in seen]
-    return SessionPoses(poses, answers, [index for index in asked if index in seen], carried)
+        raise TrajectoryError(
+            f"{sequence.name}: {_failure_reason(localized)}; the map stays as it is"
+        )
+    queried = [
+        known[k][0] for k in select_node_frames([pose for _, pose in known], map_config.nodes)
+    ]
+    answers = {index: localized.get(index) for index in queried}
+    propagated_idx = [index for index, _ in known if index not in localized]
+    return SessionPoses(
+        poses, answers, [index for index in queried if index in localized], propagated_idx
+    )
 
 
-def _why_not(seen: Mapping[int, Localization]) -> str:
+def _failure_reason(localized: Mapping[int, Localization]) -> str:
     """Why no frame has a pose, of the answers that agree with the motion."""
-    if not seen:
+    if not localized:
         return "what the map answers to its pictures does not agree with their motion"
-    known_to = float(np.median([answer.position_sigma_m for answer in seen.values()]))
+    known_to = float(np.median([answer.position_sigma_m for answer in localized.values()]))
     return (
         f"the map knows where its pictures were taken to {known_to:.2f} m only, which is too little"
         " to tell how long its way is"
     )
 
 
-def held_stretch(
+def align_stretch_to_map(
     name: str,
-    own: Mapping[int, Rigid3],
-    seen: Mapping[int, Localization],
+    odom: Mapping[int, Rigid3],
+    localized: Mapping[int, Localization],
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
     """A stretch of odometry in the map's world, world_from_cam by frame, None where too few answers
     hold it; and the frames of the answers that agree with it. Frames of which the map and the
     motion say different things, and either may be right, have no pose."""
-    of_it = {index: answer for index, answer in seen.items() if index in own}
-    agreeing = largest_agreement(
-        own, of_it, config.slack * d_thresh, config.slack_deg, config.scale
+    within_stretch = {index: answer for index, answer in localized.items() if index in odom}
+    inlier_idx = find_largest_consensus(
+        odom, within_stretch, config.slack * d_thresh, config.slack_deg, config.scale
     )
     held = None
     for _ in range(
-        _REFITTED
+        _NUM_REFITS
     ):  # what agrees but for the drift of the unit agrees once that is known
         metric = (
-            in_metres(own, {index: of_it[index] for index in agreeing}, config.scale)
-            if len(agreeing) >= config.min_agreeing
+            scale_to_metres(
+                odom, {index: within_stretch[index] for index in inlier_idx}, config.scale
+            )
+            if len(inlier_idx) >= config.min_agreeing
             else {}
         )
-        within = {index: answer for index, answer in of_it.items() if index in metric}
+        within = {index: answer for index, answer in within_stretch.items() if index in metric}
         if len(within) < config.min_agreeing:
-            return None, _unrivalled(own, of_it, agreeing, d_thresh, config)
+            return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config)
         try:
-            held = held_by(
-                name, metric, within, d_thresh, config, Trust()
+            held = align_motion_to_map(
+                name, metric, within, d_thresh, config, NoiseScale()
             )  # the unit's drift is no random walk
         except TrajectoryError:
-            return None, _unrivalled(own, of_it, agreeing, d_thresh, config)
-        agreeing = held.agreeing
-    if held is None or not _unrivalled(own, of_it, agreeing, d_thresh, config):
+            return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config)
+        inlier_idx = held.inlier_idx
+    if held is None or not _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config):
         return None, []
-    return _undisputed(held.world_from_cams, of_it, agreeing, d_thresh, config)
+    return _reject_contradicted(held.world_from_cams, within_stretch, inlier_idx, d_thresh, config)
 
 
-def _unrivalled(
-    own: Mapping[int, Rigid3],
-    of_it: Mapping[int, Localization],
-    agreeing: list[int],
+def _reject_ambiguous(
+    odom: Mapping[int, Rigid3],
+    within_stretch: Mapping[int, Localization],
+    inlier_idx: list[int],
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> list[int]:
     """The agreeing answers, or none of them where others agree with one another about another way:
     a place that looks like itself from the other end is answered wrongly for as long as it is in
     view."""
-    rest = {index: answer for index, answer in of_it.items() if index not in agreeing}
-    rivals = largest_agreement(own, rest, config.slack * d_thresh, config.slack_deg, config.scale)
+    rest = {index: answer for index, answer in within_stretch.items() if index not in inlier_idx}
+    rivals = find_largest_consensus(
+        odom, rest, config.slack * d_thresh, config.slack_deg, config.scale
+    )
     return (
         []
-        if len(rivals) >= max(config.min_agreeing, config.rival_share * len(agreeing))
-        else agreeing
+        if len(rivals) >= max(config.min_agreeing, config.rival_share * len(inlier_idx))
+        else inlier_idx
     )
 
 
-def _undisputed(
+def _reject_contradicted(
     poses: Sequence[Rigid3 | None],
-    seen: Mapping[int, Localization],
-    agreeing: Sequence[int],
+    localized: Mapping[int, Localization],
+    inlier_idx: Sequence[int],
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
     """The poses and the agreeing answers without those of which the map and the motion say
     different things, and either may be right; no poses where too few answers are left to hold
     them."""
-    of_it = {
+    within_stretch = {
         index: answer
-        for index, answer in seen.items()
+        for index, answer in localized.items()
         if index < len(poses) and poses[index] is not None
     }
     apart = {
         index
-        for index, answer in of_it.items()
+        for index, answer in within_stretch.items()
         if _contradicts(answer, poses[index], d_thresh, config)
     }
-    disputed = _disputed(list(of_it), apart)
-    left = [None if index in disputed else pose for index, pose in enumerate(poses)]
-    holding = [index for index in agreeing if index not in apart]
-    return (left, holding) if len(holding) >= config.min_agreeing else (None, [])
+    contradicted = _find_contradicted_frames(list(within_stretch), apart)
+    left = [None if index in contradicted else pose for index, pose in enumerate(poses)]
+    consistent = [index for index in inlier_idx if index not in apart]
+    return (left, consistent) if len(consistent) >= config.min_agreeing else (None, [])
 
 
-def _not_denied(
+def _pose_if_consistent(
     pose: Rigid3 | None, answer: Localization | None, d_thresh: float, config: SessionPosesConfig
 ) -> Rigid3 | None:
     """The pose, unless the map says another one: a node there would contradict those that say
@@ -231,7 +248,7 @@ def _contradicts(
     return off > config.contradiction * d_thresh + 3.0 * config.widened * answer.position_sigma_m
 
 
-def _disputed(answered: list[int], apart: Set[int]) -> set[int]:
+def _find_contradicted_frames(answered: list[int], apart: Set[int]) -> set[int]:
     """The frames of several answers in a row that contradict the motion, or of a single one with
     none before it, or none after it, that holds the motion; and a few around them, but for those
     beyond an answer that does. Between two that hold it the motion is right."""
@@ -246,7 +263,7 @@ def _disputed(answered: list[int], apart: Set[int]) -> set[int]:
             frames.update(
                 j
                 for index in run
-                for j in range(index - _AROUND, index + _AROUND + 1)
+                for j in range(index - _NUM_FRAMES_AROUND, index + _NUM_FRAMES_AROUND + 1)
                 if after < j < before
             )
     return frames

@@ -19,43 +19,43 @@ import numpy as np
 from jaxtyping import Int
 
 from topoloc.bounds import Above, Between, check_bounds
-from topoloc.errors import SessionKnownError
-from topoloc.geometry.rigid import covariance_of_inverse, position_covariance
-from topoloc.lifelong.coarse_models import PlaceView, taught_places
-from topoloc.lifelong.earlier_recall import earlier_recall
-from topoloc.lifelong.grown_sides import grown_sides, new_walls
-from topoloc.lifelong.observed_nodes import observe_node
-from topoloc.lifelong.overlay import Overlay
+from topoloc.errors import DuplicateSessionError
+from topoloc.geometry.rigid import inverse_covariance, position_covariance
+from topoloc.lifelong.coarse_model_update import PlaceFeatures, update_coarse_models
+from topoloc.lifelong.lazy_sequences import OverlaySequence
+from topoloc.lifelong.node_observation import observe_node
+from topoloc.lifelong.recall_change import measure_recall_change
 from topoloc.lifelong.session_poses import (
     Progress,
     SessionPoses,
     SessionPosesConfig,
-    poses_by_motion,
+    estimate_poses_by_motion,
 )
-from topoloc.lifelong.single_camera_poses import poses_by_map
+from topoloc.lifelong.single_camera_poses import estimate_poses_by_map
+from topoloc.lifelong.virtual_node_update import add_virtual_nodes, find_new_virtual_views
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.map_facts.building import with_map_facts
+from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.localization.result import Localization
-from topoloc.mapping.drafts import NodeDraft, draft_node, finish_node, observe
-from topoloc.mapping.landmarks import Observations, counted_again
+from topoloc.mapping.landmarks import Observations, count_session_observations
 from topoloc.mapping.mapping_frames import (
-    PLACE_QUALITY,
+    PLACE_JPEG_QUALITY,
     MappingFrame,
     MappingImage,
     PointLocator,
-    mapping_image,
-    posed_frames,
-    small_jpeg,
+    encode_thumbnail,
+    extract_mapping_image,
+    select_posed_frames,
 )
+from topoloc.mapping.node_drafts import NodeDraft, create_node_draft, finish_node, observe_draft
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.sessions import Light, Session, mean_light, path_of
+from topoloc.mapping.sessions import Illumination, Session, average_illumination, find_source_path
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import SequenceView
 from topoloc.tracking.tracker import Tracker
 
-_PICTURES_COMPARED = 3
+_NUM_IMAGES_COMPARED = 3
 
 
 @dataclass(frozen=True)
@@ -85,16 +85,16 @@ class MapUpdate:
 
 
 @dataclass(frozen=True, eq=False)
-class _Joined:
+class _SessionContent:
     """What the session brings: its nodes by kind of features and their side nodes, its pictures
     with the nodes that they belong to, what it saw of nodes that were there, and its light."""
 
     nodes: dict[str, list[TopoNode]]
     sides: list[TopoNode]
     images: list[PlaceImage]
-    views: dict[str, list[PlaceView]]
-    seen: dict[tuple[str, int], list[Observations]]
-    lights: list[Light]
+    views: dict[str, list[PlaceFeatures]]
+    observations: dict[tuple[str, int], list[Observations]]
+    lights: list[Illumination]
 
 
 def update_map(
@@ -122,20 +122,24 @@ def update_map(
     """
     config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
     check_bounds(config)
-    refuse_known(topomap, sequence)
+    check_session_is_new(topomap, sequence)
     localizer = Localizer(topomap, localizer_config)
     if poses_from == "map":
-        held = poses_by_map(sequence, Tracker(localizer), topomap.config, config.poses, progress)
+        held = estimate_poses_by_map(
+            sequence, Tracker(localizer), topomap.config, config.poses, progress
+        )
     else:
-        held = poses_by_motion(sequence, localizer, topomap.config, config.poses, progress)
+        held = estimate_poses_by_motion(sequence, localizer, topomap.config, config.poses, progress)
     session_id = topomap.free_ids.session
     without = [None] * (len(sequence) - len(held.world_from_cams))
-    posed = SequenceView(sequence, list(range(len(sequence))), [*held.world_from_cams, *without])
-    frames = posed_frames(posed, session_id)
-    joined = _joined(topomap, frames, held, config, progress)
-    session = _session(session_id, sequence, frames, joined, poses_from)
-    taught = taught_places(topomap, joined.views, joined.images)
-    changed = replace(_with_session(topomap, session, frames, joined), coarse_models=taught.models)
+    posed_sequence = SequenceView(
+        sequence, list(range(len(sequence))), [*held.world_from_cams, *without]
+    )
+    frames = select_posed_frames(posed_sequence, session_id)
+    content = _create_session_content(topomap, frames, held, config, progress)
+    session = _create_session(session_id, sequence, frames, content, poses_from)
+    updated = update_coarse_models(topomap, content.views, content.images)
+    changed = replace(_add_session(topomap, session, frames, content), coarse_models=updated.models)
     changes = {
         "session": session_id,
         "recording": sequence.name,
@@ -144,102 +148,106 @@ def update_map(
     }
     changes |= (
         {"poses_from": poses_from}
-        | _counts(held, joined, topomap.kind)
-        | {"not_taught": taught.not_taught}
+        | _count_changes(held, content, topomap.kind)
+        | {"not_taught": updated.not_updated}
     )
-    changed = with_map_facts(changed, progress)
+    changed = with_map_statistics(changed, progress)
     return MapUpdate(
         changed,
-        posed,
-        changes | earlier_recall(topomap, changed, config.earlier_asked, localizer_config),
+        posed_sequence,
+        changes | measure_recall_change(topomap, changed, config.earlier_asked, localizer_config),
     )
 
 
-def _counts(held: SessionPoses, joined: _Joined, kind: str) -> dict[str, Any]:
+def _count_changes(held: SessionPoses, content: _SessionContent, kind: str) -> dict[str, Any]:
     return {
-        "frames_by_odometry": len(held.carried),
+        "frames_by_odometry": len(held.propagated_idx),
         "asked": len(held.answers),
         "localized": sum(answer is not None for answer in held.answers.values()),
-        "agreeing": len(held.agreeing),
-        "nodes_added": len(joined.nodes[kind]),
-        "side_nodes_added": len(joined.sides),
-        "points_added": sum(len(node.features) for node in joined.nodes[kind]),
-        "place_images_added": len(joined.images),
+        "agreeing": len(held.inlier_idx),
+        "nodes_added": len(content.nodes[kind]),
+        "side_nodes_added": len(content.sides),
+        "points_added": sum(len(node.features) for node in content.nodes[kind]),
+        "place_images_added": len(content.images),
     }
 
 
-def refuse_known(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
+def check_session_is_new(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
     """A session that is in the map already is not doubled. Names and clocks may be those of another
     day: pictures, or paths, decide. Raises SessionKnownError."""
     if len(sequence) == 0:
         return
-    times, path = (min(sequence.t_ns), max(sequence.t_ns)), path_of(sequence)
+    times, path = (min(sequence.t_ns), max(sequence.t_ns)), find_source_path(sequence)
     for session in topomap.sessions:
         if session.name != sequence.name or session.start_ns is None or session.end_ns is None:
             continue
         if min(times[1], session.end_ns) < max(times[0], session.start_ns):
             continue
-        is_there = path is not None and path == session.recording
-        is_same_file = is_there and (session.start_ns, session.end_ns) == times
-        if is_same_file or _shows_the_same(topomap, session.session_id, sequence, is_there):
-            raise SessionKnownError(
+        is_same_path = path is not None and path == session.recording
+        is_same_file = is_same_path and (session.start_ns, session.end_ns) == times
+        if is_same_file or _has_same_images(topomap, session.session_id, sequence, is_same_path):
+            raise DuplicateSessionError(
                 f"{sequence.name}: it is in the map already, as session {session.session_id}; the"
                 " map stays as it is"
             )
 
 
-def _shows_the_same(
-    topomap: TopoMetricMap, session_id: int, sequence: StereoSequence, is_there: bool
+def _has_same_images(
+    topomap: TopoMetricMap, session_id: int, sequence: StereoSequence, is_same_path: bool
 ) -> bool:
     """Whether pictures of one name are one picture, by what the map keeps of them. Of the same
-    folder (`is_there`) other pictures of the same time are the same session, too: every second
+    folder (`is_same_path`) other pictures of the same time are the same session, too: every second
     frame, and then those between."""
     rows = {name: index for index, name in enumerate(sequence.names)}
     kept = [image for image in topomap.place_images if image.session_id == session_id]
     common = [image for image in kept if image.name in rows]
     if not common:
-        return is_there and bool(kept)
+        return is_same_path and bool(kept)
     tried = [
         common[k]
-        for k in np.unique(np.linspace(0, len(common) - 1, _PICTURES_COMPARED).astype(int))
+        for k in np.unique(np.linspace(0, len(common) - 1, _NUM_IMAGES_COMPARED).astype(int))
     ]
     side = topomap.config.place_side_px
     return any(
-        small_jpeg(frame_view(sequence[rows[image.name]], False).picture, side, PLACE_QUALITY)
+        encode_thumbnail(
+            prepare_frame(sequence[rows[image.name]], False).picture, side, PLACE_JPEG_QUALITY
+        )
         == image.jpeg
         for image in tried
     )
 
 
-def _joined(
+def _create_session_content(
     topomap: TopoMetricMap,
     frames: Sequence[MappingFrame],
     held: SessionPoses,
     config: UpdateConfig,
     progress: Progress,
-) -> _Joined:
-    of_map = topomap.config
-    d_thresh, lambda_rot = of_map.nodes.d_thresh, of_map.nodes.lambda_rot
+) -> _SessionContent:
+    map_config = topomap.config
+    d_thresh, lambda_rot = map_config.nodes.d_thresh, map_config.nodes.lambda_rot
     assert d_thresh is not None
     assert lambda_rot is not None
-    locator = PointLocator(frames, of_map)
+    locator = PointLocator(frames, map_config)
     by_index = {frame.index: frame for frame in frames}
     wanted = [
         by_index[k]
         for k, answer in held.answers.items()
-        if k in by_index and not is_well_held(answer, d_thresh, config)
+        if k in by_index and not is_well_localized(answer, d_thresh, config)
     ]
-    with_sides = new_walls(topomap, [frame.world_from_cam for frame in wanted])
+    with_virtual_views = find_new_virtual_views(topomap, [frame.world_from_cam for frame in wanted])
     drafts = list[NodeDraft]()
     for done, frame in enumerate(wanted):
-        draft = draft_node(frame, frame.view(), locator, done in with_sides, of_map)
-        if len(draft.points[topomap.kind].features) >= of_map.min_node_points:
+        draft = create_node_draft(
+            frame, frame.view(), locator, done in with_virtual_views, map_config
+        )
+        if len(draft.points[topomap.kind].features) >= map_config.min_node_points:
             drafts.append(draft)
         progress("new nodes", done + 1, len(wanted))
     covered = {by_index[k] for k in held.answers if k in by_index} - {
         draft.frame for draft in drafts
     }
-    joined = _Joined(
+    content = _SessionContent(
         {kind: [] for kind in topomap.kinds},
         [],
         [],
@@ -258,40 +266,40 @@ def _joined(
         )
         is_of_new = len(to_new) > 0 and (to_new.min() <= max(d_thresh, to_old.min()))
         if is_of_new or frame in covered:
-            image = drafted.get(frame) or mapping_image(frame, frame.view(with_depth=False), of_map)
-            joined.lights.append(image.light)
+            image = drafted.get(frame) or extract_mapping_image(
+                frame, frame.view(with_depth=False), map_config
+            )
+            content.lights.append(image.light)
             if frame in covered:
-                _see_again(
-                    topomap, image, frame.session_id, np.argsort(to_old, kind="stable"), joined
+                _observe_map_nodes(
+                    topomap, image, frame.session_id, np.argsort(to_old, kind="stable"), content
                 )
             if is_of_new:
-                _observe_new(drafts, frame, image, np.argsort(to_new, kind="stable"), topomap)
-                _teach(joined, frame, image, first_id + int(to_new.argmin()))
+                _observe_new_nodes(drafts, frame, image, np.argsort(to_new, kind="stable"), topomap)
+                _add_place_image(content, frame, image, first_id + int(to_new.argmin()))
         progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
     for kind in topomap.kinds:
-        joined.nodes[kind] = [
-            finish_node(first_id + k, draft, kind, of_map) for k, draft in enumerate(drafts)
+        content.nodes[kind] = [
+            finish_node(first_id + k, draft, kind, map_config) for k, draft in enumerate(drafts)
         ]
     for k, draft in enumerate(drafts):
-        joined.sides.extend(
+        content.sides.extend(
             replace(side, summary=replace(side.summary, of_node=first_id + k))
             for side in draft.sides
         )
-    return joined
+    return content
 
 
-def is_well_held(answer: Localization | None, d_thresh: float, config: UpdateConfig) -> bool:
+def is_well_localized(answer: Localization | None, d_thresh: float, config: UpdateConfig) -> bool:
     """Whether the map needs no node where this answer was given."""
     if answer is None or answer.num_inliers < config.min_inliers:
         return False
-    of_inverse = answer.noise_share * covariance_of_inverse(
-        answer.world_from_cam, answer.covariance
-    )
+    of_inverse = answer.noise_share * inverse_covariance(answer.world_from_cam, answer.covariance)
     at_camera = position_covariance(answer.world_from_cam.inverse(), of_inverse)
     return float(np.sqrt(np.linalg.eigvalsh(at_camera)[-1])) <= config.max_sigma * d_thresh
 
 
-def _observe_new(
+def _observe_new_nodes(
     drafts: Sequence[NodeDraft],
     frame: MappingFrame,
     image: MappingImage,
@@ -300,15 +308,15 @@ def _observe_new(
 ) -> None:
     for k in nearest[: topomap.config.landmarks.nodes_per_image]:
         if frame not in drafts[k].sources:
-            drafts[k].add(observe(drafts[k], image, frame.session_id, topomap.config))
+            drafts[k].add(observe_draft(drafts[k], image, frame.session_id, topomap.config))
 
 
-def _see_again(
+def _observe_map_nodes(
     topomap: TopoMetricMap,
     image: MappingImage,
     session_id: int,
     nearest: Int[np.ndarray, " n"],
-    joined: _Joined,
+    content: _SessionContent,
 ) -> None:
     """What a picture shows of the nodes that are there."""
     config = topomap.config
@@ -316,13 +324,15 @@ def _see_again(
         cam_from_node = image.world_from_cam.inverse() @ topomap.summaries[row].world_from_cam
         for kind, features in image.features.items():
             node = topomap.nodes_of(kind)[row]
-            joined.seen[kind, row].append(
+            content.observations[kind, row].append(
                 observe_node(node, features, image.camera, cam_from_node, config, session_id)
             )
 
 
-def _teach(joined: _Joined, frame: MappingFrame, image: MappingImage, node_id: int) -> None:
-    joined.images.append(
+def _add_place_image(
+    content: _SessionContent, frame: MappingFrame, image: MappingImage, node_id: int
+) -> None:
+    content.images.append(
         PlaceImage(
             frame.sequence.name,
             frame.name,
@@ -333,16 +343,16 @@ def _teach(joined: _Joined, frame: MappingFrame, image: MappingImage, node_id: i
         )
     )
     for kind, features in image.features.items():
-        joined.views[kind].append(
-            PlaceView(features, image.camera.width, image.camera.height, node_id)
+        content.views[kind].append(
+            PlaceFeatures(features, image.camera.width, image.camera.height, node_id)
         )
 
 
-def _session(
+def _create_session(
     session_id: int,
     sequence: StereoSequence,
     frames: Sequence[MappingFrame],
-    joined: _Joined,
+    content: _SessionContent,
     poses_from: str,
 ) -> Session:
     t_ns = [frame.t_ns for frame in frames]
@@ -350,20 +360,23 @@ def _session(
     return Session(
         session_id,
         sequence.name,
-        path_of(sequence),
+        find_source_path(sequence),
         poses_from,
         min(t_ns),
         max(t_ns),
         camera,
-        mean_light(joined.lights),
+        average_illumination(content.lights),
     )
 
 
-def _with_session(
-    topomap: TopoMetricMap, session: Session, frames: Sequence[MappingFrame], joined: _Joined
+def _add_session(
+    topomap: TopoMetricMap,
+    session: Session,
+    frames: Sequence[MappingFrame],
+    content: _SessionContent,
 ) -> TopoMetricMap:
-    nodes = {kind: _with_nodes(topomap, kind, joined) for kind in topomap.kinds}
-    summaries = [*topomap.summaries, *(node.summary for node in joined.nodes[topomap.kind])]
+    nodes = {kind: _merge_nodes(topomap, kind, content) for kind in topomap.kinds}
+    summaries = [*topomap.summaries, *(node.summary for node in content.nodes[topomap.kind])]
     steps = [
         b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames)
     ]
@@ -373,29 +386,37 @@ def _with_session(
         nodes=nodes.pop(topomap.kind),
         other_kinds=nodes,
         edges=sorted(
-            {*topomap.edges, *_edges(topomap, summaries, frames)},
+            {*topomap.edges, *_find_traversed_edges(topomap, summaries, frames)},
             key=lambda edge: (edge.source_id, edge.target_id),
         ),
-        place_images=Overlay(topomap.place_images, {}, joined.images),
-        sides=grown_sides(topomap, joined.sides),
+        place_images=OverlaySequence(topomap.place_images, {}, content.images),
+        sides=add_virtual_nodes(topomap, content.sides),
         length_m=topomap.length_m + float(sum(np.linalg.norm(step) for step in steps)),
         sessions=[*topomap.sessions, session],
     )
 
 
-def _with_nodes(topomap: TopoMetricMap, kind: str, joined: _Joined) -> Overlay[TopoNode]:
+def _merge_nodes(
+    topomap: TopoMetricMap, kind: str, content: _SessionContent
+) -> OverlaySequence[TopoNode]:
     """The nodes of a kind: those that were there, with what the session saw of their points, and
     the new ones."""
     before, changed = topomap.nodes_of(kind), {}
-    for (of_kind, row), seen in joined.seen.items():
+    for (of_kind, row), observations in content.observations.items():
         if of_kind == kind:
             node = before[row]
-            sums = counted_again(len(node.features), seen, seen[0].session_id)
-            changed[row] = replace(node, sums=[*node.sums, sums]) if sums is not None else node
-    return Overlay(before, changed, joined.nodes[kind])
+            session_statistics = count_session_observations(
+                len(node.features), observations, observations[0].session_id
+            )
+            changed[row] = (
+                replace(node, session_statistics=[*node.session_statistics, session_statistics])
+                if session_statistics is not None
+                else node
+            )
+    return OverlaySequence(before, changed, content.nodes[kind])
 
 
-def _edges(
+def _find_traversed_edges(
     topomap: TopoMetricMap, summaries: Sequence[Any], frames: Sequence[MappingFrame]
 ) -> set[Edge]:
     """An edge wherever the session went from one node to another."""

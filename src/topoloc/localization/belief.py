@@ -21,11 +21,16 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.evidence import Evidence, EvidenceConfig, precision_of, strength_of
+from topoloc.localization.evidence import (
+    Evidence,
+    EvidenceConfig,
+    compute_precision_probability,
+    compute_rival_score,
+)
 from topoloc.localization.fitted_weights import RivalWeights
 from topoloc.localization.pose_fit import PoseFit
 
-MIN_LEAD = 2.0
+MIN_LOG_ODDS_MARGIN = 2.0
 """By how much the best hypothesis must lead the next one, in logarithms of odds, to be an
 answer."""
 _CHI_SQUARE_6_AT_95 = 12.592
@@ -58,26 +63,30 @@ class Hypothesis:
     @property
     def probability(self) -> float:
         """That of "here" against "nowhere" alone."""
-        return precision_of(self.evidence) / (1.0 + math.exp(-self.log_odds))
+        return compute_precision_probability(self.evidence) / (1.0 + math.exp(-self.log_odds))
 
     @property
-    def is_from_walls(self) -> bool:
-        return self.evidence.is_from_walls
+    def is_from_virtual_views(self) -> bool:
+        return self.evidence.is_from_virtual_views
 
 
-def lead(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
+def log_odds_margin(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
     """By how much `a` is likelier than `b`, in logarithms of odds."""
-    return float(_leads((a, b), weights)[0, 1])
+    return float(_log_odds_margins((a, b), weights)[0, 1])
 
 
-def _leads(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> Float[np.ndarray, "n n"]:
+def _log_odds_margins(
+    hypotheses: tuple[Hypothesis, ...], weights: RivalWeights
+) -> Float[np.ndarray, "n n"]:
     """By how much each is likelier than each: by their strengths, or their odds where one of the
     two comes from walls."""
-    strength = np.array([strength_of(one.evidence, one.log_odds, weights) for one in hypotheses])
+    scores = np.array(
+        [compute_rival_score(one.evidence, one.log_odds, weights) for one in hypotheses]
+    )
     log_odds = np.array([one.log_odds for one in hypotheses])
-    from_walls = np.array([one.is_from_walls for one in hypotheses])
+    from_walls = np.array([one.is_from_virtual_views for one in hypotheses])
     by_odds = from_walls[:, None] | from_walls
-    return np.where(by_odds, log_odds[:, None] - log_odds, strength[:, None] - strength)
+    return np.where(by_odds, log_odds[:, None] - log_odds, scores[:, None] - scores)
 
 
 def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
@@ -88,12 +97,12 @@ def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
     things in the same features; two places that look alike explain the same features by different
     points.
     """
-    way = np.linalg.norm(a.world_from_cam.translation - b.world_from_cam.translation)
-    if way < 2.0 * config.max_translation and _from_to(a, b).angle() < math.radians(
+    distance = np.linalg.norm(a.world_from_cam.translation - b.world_from_cam.translation)
+    if distance < 2.0 * config.max_translation and _relative_pose(a, b).angle() < math.radians(
         2.0 * config.max_rotation_deg
     ):
         return True
-    if a.features is not b.features or not a.stands_near(b):
+    if a.features is not b.features or not a.may_share_points(b):
         return False
     rows_a, rows_b = (
         fit.matches.query_idx[fit.pose.inliers] for fit in (a, b) if fit.pose is not None
@@ -102,14 +111,16 @@ def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
     if 2 * len(of_a) < min(len(rows_a), len(rows_b)):
         return False
     points_a, points_b = (
-        a.local_map.points_world[_columns(a)[of_a]],
-        b.local_map.points_world[_columns(b)[of_b]],
+        a.local_map.points_world[_inlier_point_idx(a)[of_a]],
+        b.local_map.points_world[_inlier_point_idx(b)[of_b]],
     )
-    radii = np.maximum(a.local_map.radii[_columns(a)[of_a]], b.local_map.radii[_columns(b)[of_b]])
+    radii = np.maximum(
+        a.local_map.radii[_inlier_point_idx(a)[of_a]], b.local_map.radii[_inlier_point_idx(b)[of_b]]
+    )
     return bool(np.mean(np.linalg.norm(points_a - points_b, axis=1) <= radii) > 0.5)
 
 
-def _columns(fit: PoseFit) -> np.ndarray:
+def _inlier_point_idx(fit: PoseFit) -> np.ndarray:
     assert fit.pose is not None
     return fit.matches.train_idx[fit.pose.inliers]
 
@@ -118,45 +129,52 @@ def _columns(fit: PoseFit) -> np.ndarray:
 class Belief:
     """The hypotheses so far, of each pose the one with the most for it.
 
-    `weighed` are all that came, for "the same pose" does not carry over: of a row of three the
-    middle one may say the same as both ends, which differ. So which are left out is decided anew
-    with each, from the strongest down, and the order in which they came counts nothing.
+    `all_hypotheses` are all that came, for "the same pose" does not carry over: of a row of three
+    the middle one may say the same as both ends, which differ. So which are left out is decided
+    anew with each, from the strongest down, and the order in which they came counts nothing.
     """
 
     hypotheses: tuple[Hypothesis, ...] = ()
-    weighed: tuple[Hypothesis, ...] = ()
-    _like: tuple[frozenset[int], ...] = ()
+    all_hypotheses: tuple[Hypothesis, ...] = ()
+    _same_pose_as: tuple[frozenset[int], ...] = ()
     """Of each of these, which of those before it say the same, by their place among them."""
 
-    def given(
+    def with_hypothesis(
         self, hypothesis: Hypothesis, config: EvidenceConfig, weights: RivalWeights
     ) -> Belief:
         """With one more hypothesis."""
-        like_it = frozenset(
-            k for k, other in enumerate(self.weighed) if _say_the_same(hypothesis, other, config)
+        same_as_new = frozenset(
+            k
+            for k, other in enumerate(self.all_hypotheses)
+            if _agree_on_pose(hypothesis, other, config)
         )
-        weighed, like = (*self.weighed, hypothesis), (*self._like, like_it)
-        places, kept = {id(one): k for k, one in enumerate(weighed)}, list[int]()
-        for k in (places[id(one)] for one in _ranked(weighed, weights)):
-            if not any(min(k, other) in like[max(k, other)] for other in kept):
+        all_hypotheses, same_pose = (
+            (*self.all_hypotheses, hypothesis),
+            (*self._same_pose_as, same_as_new),
+        )
+        places, kept = {id(one): k for k, one in enumerate(all_hypotheses)}, list[int]()
+        for k in (places[id(one)] for one in _rank_hypotheses(all_hypotheses, weights)):
+            if not any(min(k, other) in same_pose[max(k, other)] for other in kept):
                 kept.append(k)
-        return Belief(tuple(weighed[k] for k in kept), weighed, like)
+        return Belief(tuple(all_hypotheses[k] for k in kept), all_hypotheses, same_pose)
 
     def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
         """The hypotheses, the one that leads all others first."""
-        return _ranked(self.hypotheses, weights)
+        return _rank_hypotheses(self.hypotheses, weights)
 
     def best(self, weights: RivalWeights) -> Hypothesis | None:
         """The likeliest hypothesis, believed or not."""
         return self.ranked(weights)[0] if self.hypotheses else None
 
 
-def _ranked(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[Hypothesis]:
+def _rank_hypotheses(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[Hypothesis]:
     if len(hypotheses) < 2:
         return list(hypotheses)
-    leads = _leads(hypotheses, weights)
-    np.fill_diagonal(leads, np.inf)
-    least = {id(one): float(row.min()) for one, row in zip(hypotheses, leads, strict=True)}
+    log_odds_margins = _log_odds_margins(hypotheses, weights)
+    np.fill_diagonal(log_odds_margins, np.inf)
+    least = {
+        id(one): float(row.min()) for one, row in zip(hypotheses, log_odds_margins, strict=True)
+    }
     return sorted(
         hypotheses,
         key=lambda one: (one.probability >= 0.5, least[id(one)], one.log_odds),
@@ -164,7 +182,7 @@ def _ranked(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) -> list[H
     )
 
 
-def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
+def _agree_on_pose(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
     """As `is_same_pose`; also where their covariances leave open that both are right."""
     if is_same_pose(a.fit, b.fit, config):
         return True
@@ -172,7 +190,7 @@ def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
     apart = a.world_from_cam.rotation.T @ (
         b.world_from_cam.translation - a.world_from_cam.translation
     )
-    if apart @ apart > limit or (turn := _from_to(a.fit, b.fit)).angle() ** 2 > limit:
+    if apart @ apart > limit or (turn := _relative_pose(a.fit, b.fit)).angle() ** 2 > limit:
         return False  # the vector below is longer than either
     vector = turn.log()
     return (
@@ -180,6 +198,6 @@ def _say_the_same(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
     )
 
 
-def _from_to(a: PoseFit, b: PoseFit) -> Rigid3:
+def _relative_pose(a: PoseFit, b: PoseFit) -> Rigid3:
     """From the camera of one to that of the other."""
     return a.world_from_cam.inverse() @ b.world_from_cam

@@ -17,7 +17,7 @@ from topoloc.geometry.rigid import Rigid3
 MAX_ITEMS = 10_000
 
 
-def object_of(line: str | bytes | Mapping[str, Any]) -> Mapping[str, Any]:
+def parse_object(line: str | bytes | Mapping[str, Any]) -> Mapping[str, Any]:
     """A JSON line as what it says, or as what was read of it already."""
     data: Any = line
     if isinstance(line, str | bytes):
@@ -39,29 +39,33 @@ def mapping(value: Any, key: str) -> Mapping[str, Any]:
     return value
 
 
-def wanted(data: Mapping[str, Any], key: str) -> Any:
+def require(data: Mapping[str, Any], key: str) -> Any:
     """What stands under a key that must be there."""
     if key not in data:
         raise ResultError(f"no result: {key!r} is missing")
     return data[key]
 
 
-def number(value: Any, key: str, least: float = -math.inf, most: float = math.inf) -> float:
+def number(
+    value: Any, key: str, min_value: float = -math.inf, max_value: float = math.inf
+) -> float:
     """A finite number within bounds."""
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float)
-        or not least <= value <= most
+        or not min_value <= value <= max_value
         or abs(value) > 1e300
     ):  # NaN fails
-        raise ResultError(f"no result: {key!r} is no number{_within(least, most)}")
+        raise ResultError(f"no result: {key!r} is no number{_range_text(min_value, max_value)}")
     return float(value)
 
 
-def whole(value: Any, key: str, least: int = 0, most: int = 2**63 - 1) -> int:
+def integer(value: Any, key: str, min_value: int = 0, max_value: int = 2**63 - 1) -> int:
     """An integer within bounds."""
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise ResultError(f"no result: {key!r} is no integer{_within(float(least), float(most))}")
+    if isinstance(value, bool) or not isinstance(value, int) or not min_value <= value <= max_value:
+        raise ResultError(
+            f"no result: {key!r} is no integer{_range_text(float(min_value), float(max_value))}"
+        )
     return value
 
 
@@ -98,7 +102,7 @@ def rigid(value: Any, key: str) -> Rigid3:
         raise ResultError(f"no result: {key!r}: {error}") from None
 
 
-def pose_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
+def pose_to_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
     """A pose as all our JSON has it, metres; what `rigid` reads."""
     return {
         "translation": world_from_cam.translation.tolist(),
@@ -120,5 +124,9 @@ def covariance(value: Any, key: str) -> Float[np.ndarray, "6 6"]:
     return matrix
 
 
-def _within(least: float, most: float) -> str:
-    return "" if math.isinf(least) and math.isinf(most) else f" from {least:g} to {most:g}"
+def _range_text(min_value: float, max_value: float) -> str:
+    return (
+        ""
+        if math.isinf(min_value) and math.isinf(max_value)
+        else f" from {min_value:g} to {max_value:g}"
+    )

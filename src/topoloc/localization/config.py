@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.features.kinds import FeatureKind
+from topoloc.features.feature_types import FeatureType
 from topoloc.features.matching import MatchingConfig
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.localization.evidence import EvidenceConfig
@@ -16,7 +16,7 @@ from topoloc.localization.map_facts.correlated_errors import CorrelatedErrorsCon
 
 
 @dataclass(frozen=True)
-class LookAlikesConfig:
+class SimilarPlacesConfig:
     """When another part of the map that looks like the image is asked on its own."""
 
     num_ranked: Annotated[int, Between(1, 100_000)] = 48
@@ -37,7 +37,7 @@ class LookAlikesConfig:
 
 
 @dataclass(frozen=True)
-class ViewpointsConfig:
+class NodeViewpointsConfig:
     """Where an image that is not clear is compared with what nodes saw."""
 
     num_nodes: Annotated[int | None, Between(0, 10_000)] = None
@@ -61,7 +61,7 @@ class ViewpointsConfig:
 
 
 @dataclass(frozen=True)
-class WallsConfig:
+class VirtualViewSearchConfig:
     """How the walls along the way are asked."""
 
     num_places: Annotated[int, Between(0, 10_000)] = 8
@@ -125,11 +125,11 @@ class LocalizerConfig:
     min_matches: Annotated[int, AtLeast(4)] = 8
     """With fewer first matches no pose is sought."""
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
-    look_alikes: LookAlikesConfig = field(default_factory=LookAlikesConfig)
-    viewpoints: ViewpointsConfig = field(default_factory=ViewpointsConfig)
+    look_alikes: SimilarPlacesConfig = field(default_factory=SimilarPlacesConfig)
+    viewpoints: NodeViewpointsConfig = field(default_factory=NodeViewpointsConfig)
     max_repetitions: Annotated[int, Between(0, 1000)] = 64
     """Where a place repeats itself, so many other poses are looked into at most."""
-    walls: WallsConfig = field(default_factory=WallsConfig)
+    walls: VirtualViewSearchConfig = field(default_factory=VirtualViewSearchConfig)
     correlated_errors: CorrelatedErrorsConfig = field(default_factory=CorrelatedErrorsConfig)
     max_finer: Annotated[float, AtLeast(1)] = 1.15
     """An image of more than so many times the pixels a radian (focal length in pixels) of the map's
@@ -139,7 +139,7 @@ class LocalizerConfig:
     """Larger images are reduced to this width or height first: nothing is gained from more, but
     time and memory."""
 
-    def for_kind(self, kind: FeatureKind) -> LocalizerConfig:
+    def for_feature_type(self, kind: FeatureType) -> LocalizerConfig:
         """With the thresholds of this kind of features where none are set."""
         walls, viewpoints, look_alikes = self.walls, self.viewpoints, self.look_alikes
         has_shape = kind.has_scale and kind.has_angle
@@ -164,7 +164,7 @@ class LocalizerConfig:
             ),
             walls=replace(
                 walls,
-                matching=walls.matching.resolved(kind.wall_ratio),
+                matching=walls.matching.resolved(kind.virtual_view_ratio),
                 guided=walls.guided.resolved(kind),
             ),
         )

@@ -42,10 +42,10 @@ class Evidence:
     `num_visible` map points that must be in view were found where they must be seen;
     `num_by_chance` of them would be were the pose wrong. `spread` is the share of the picture's
     cells that hold one of them, `even_share` the share found of what must be in view, every part of
-    the view asked on its own (`even_share_of`), `doubt` the pose's standard deviation in its worst
-    direction over what is tolerated: 1 where the two are equal. Of walls only, `num_distinct` of
-    the points found look more like the map's point here than like any elsewhere, and
-    `num_lesser_side` are those of the wall, of the two, of which fewer were found.
+    the view asked on its own (`compute_uniform_inlier_ratio`), `doubt` the pose's standard
+    deviation in its worst direction over what is tolerated: 1 where the two are equal. Of walls
+    only, `num_distinct` of the points found look more like the map's point here than like any
+    elsewhere, and `num_lesser_side` are those of the wall, of the two, of which fewer were found.
     """
 
     num_matches: int
@@ -60,7 +60,7 @@ class Evidence:
     num_lesser_side: int | None = None
 
     @property
-    def is_from_walls(self) -> bool:
+    def is_from_virtual_views(self) -> bool:
         """Is the pose one that the walls along the way let expect, not the map's nodes?"""
         return self.num_distinct is not None
 
@@ -87,18 +87,18 @@ class EvidenceConfig:
     """Poses less probable than this are not reported."""
 
 
-def tolerated_translation(median_depth: float, config: EvidenceConfig) -> float:
+def compute_translation_tolerance(median_depth: float, config: EvidenceConfig) -> float:
     """How far (metres) a right pose may be off where the points seen are `median_depth` (metres)
     away."""
     return min(config.max_translation, config.depth_share * median_depth)
 
 
-def doubt_of(
+def compute_normalized_uncertainty(
     covariance: Float[np.ndarray, "6 6"], median_depth: float, config: EvidenceConfig
 ) -> float:
     """`Evidence.doubt`, of the covariance of the left perturbation of cam_from_world (metres,
     radians)."""
-    metres = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) / tolerated_translation(
+    metres = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) / compute_translation_tolerance(
         median_depth, config
     )
     return math.hypot(
@@ -108,12 +108,12 @@ def doubt_of(
     )
 
 
-def spread_of(points_img: Float[np.ndarray, "n 2"], width: int, height: int) -> float:
+def compute_inlier_spread(points_img: Float[np.ndarray, "n 2"], width: int, height: int) -> float:
     """`Evidence.spread` of the inliers' pixels."""
     return len(np.unique(_cells(points_img, width, height))) / (COLUMNS * ROWS)
 
 
-def even_share_of(
+def compute_uniform_inlier_ratio(
     found_img: Float[np.ndarray, "f 2"],
     visible_img: Float[np.ndarray, "v 2"],
     width: int,
@@ -142,7 +142,7 @@ def _cells(points_img: Float[np.ndarray, "n 2"], width: int, height: int) -> Int
     return rows * COLUMNS + columns
 
 
-def score_features(evidence: Evidence) -> tuple[float, ...]:
+def compute_score_features(evidence: Evidence) -> tuple[float, ...]:
     """What the regression weighs: logarithms; the added constants keep small counts from weighing
     too much."""
     e = evidence
@@ -156,35 +156,39 @@ def score_features(evidence: Evidence) -> tuple[float, ...]:
     )
 
 
-def log_odds_of(evidence: Evidence, weights: FittedWeights) -> float:
+def compute_log_odds(evidence: Evidence, weights: FittedWeights) -> float:
     """Logarithm of the odds that the pose is right."""
-    if evidence.is_from_walls:
-        features, walls = wall_score_features(evidence), weights.walls
+    if evidence.is_from_virtual_views:
+        features, walls = compute_virtual_view_features(evidence), weights.walls
         return (
-            sum(weight * x for weight, x in zip(walls.in_order, features, strict=True)) + walls.bias
+            sum(weight * x for weight, x in zip(walls.parallel_map, features, strict=True))
+            + walls.bias
         )
-    return node_log_odds(evidence, weights.evidence)
+    return compute_node_log_odds(evidence, weights.evidence)
 
 
-def node_log_odds(evidence: Evidence, weights: EvidenceWeights) -> float:
+def compute_node_log_odds(evidence: Evidence, weights: EvidenceWeights) -> float:
     """The same of a pose that the map's nodes let expect, not its walls."""
     return (
         sum(
-            weight * x for weight, x in zip(weights.in_order, score_features(evidence), strict=True)
+            weight * x
+            for weight, x in zip(
+                weights.parallel_map, compute_score_features(evidence), strict=True
+            )
         )
         + weights.bias
     )
 
 
-def strength_of(evidence: Evidence, log_odds: float, rivals: RivalWeights) -> float:
+def compute_rival_score(evidence: Evidence, log_odds: float, rivals: RivalWeights) -> float:
     """By how much more of this a pose that the nodes let expect leads another one, in logarithms of
     odds."""
     even, doubt = math.log(evidence.even_share + 0.002), math.log(max(evidence.doubt, 0.01))
     return rivals.odds * log_odds + rivals.even_share * even + rivals.doubt * doubt
 
 
-def wall_score_features(evidence: Evidence) -> tuple[float, ...]:
-    """As `score_features`, of a pose that the walls let expect."""
+def compute_virtual_view_features(evidence: Evidence) -> tuple[float, ...]:
+    """As `compute_score_features`, of a pose that the walls let expect."""
     e = evidence
     assert e.num_distinct is not None
     return (
@@ -200,16 +204,16 @@ def wall_score_features(evidence: Evidence) -> tuple[float, ...]:
     )
 
 
-def precision_of(evidence: Evidence) -> float:
+def compute_precision_probability(evidence: Evidence) -> float:
     """The probability that a pose from the right place is as precise as is asked; 1 where the odds
     count that already.
 
     A wall alone may leave a pose imprecise though the place is beyond doubt.
     """
-    return precision_at(evidence.doubt) if evidence.is_from_walls else 1.0
+    return probability_within_tolerance(evidence.doubt) if evidence.is_from_virtual_views else 1.0
 
 
-def precision_at(doubt: float) -> float:
+def probability_within_tolerance(doubt: float) -> float:
     """The probability that an error of so many times what is tolerated (one standard deviation) is
     tolerable."""
     return math.erf(1.0 / (math.sqrt(2.0) * doubt))
@@ -217,5 +221,5 @@ def precision_at(doubt: float) -> float:
 
 def is_only_imprecise(evidence: Evidence, weights: FittedWeights, config: EvidenceConfig) -> bool:
     """Would the same evidence do if the pose it gives were more precise?"""
-    log_odds = log_odds_of(replace(evidence, doubt=min(evidence.doubt, 0.3)), weights)
+    log_odds = compute_log_odds(replace(evidence, doubt=min(evidence.doubt, 0.3)), weights)
     return 1.0 / (1.0 + math.exp(-log_odds)) >= config.min_probability

@@ -16,11 +16,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from topoloc.errors import FeatureKindError
-from topoloc.features.kinds import KINDS, LEARNED
+from topoloc.errors import FeatureTypeError
+from topoloc.features.feature_types import FEATURE_TYPES, LEARNED_TYPES
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
-STAND_IN, LEARNED_STAND_IN = "surf", LEARNED[0].name
+FALLBACK_TYPE, LEARNED_FALLBACK_TYPE = "surf", LEARNED_TYPES[0].name
 """The kinds whose weights others take that have none: where no network is asked, and where one
 is."""
 
@@ -45,8 +45,8 @@ class EvidenceWeights:
     clear_log_odds: float
 
     @property
-    def in_order(self) -> tuple[float, ...]:
-        """In the order of `score_features`; without the bias."""
+    def parallel_map(self) -> tuple[float, ...]:
+        """In the order of `compute_score_features`; without the bias."""
         return (
             self.even_share,
             self.chance,
@@ -73,7 +73,7 @@ class RivalWeights:
 
 
 @dataclass(frozen=True)
-class WallWeights:
+class VirtualViewWeights:
     """Of the evidence for a pose that the walls let expect (`walls/`), in logarithms of odds.
 
     sigma_px: standard deviation of a key point found at such a slant. few_points: from n points the
@@ -95,14 +95,14 @@ class WallWeights:
     few_points: float
 
     @property
-    def in_order(self) -> tuple[float, ...]:
-        """In the order of `wall_score_features`; without the bias."""
+    def parallel_map(self) -> tuple[float, ...]:
+        """In the order of `compute_virtual_view_features`; without the bias."""
         shares = (self.found, self.chance, self.inliers, self.inlier_share, self.spread)
         return (*shares, self.distinct, self.lesser_side, self.even_share, self.doubt)
 
 
 @dataclass(frozen=True)
-class SharedErrorWeights:
+class CorrelatedErrorWeights:
     """What rho (`correlated_errors.py`) is taken to be, from what comparing neighbouring nodes
     gives.
 
@@ -131,15 +131,15 @@ class FittedWeights:
     calibration_error: float | None
     evidence: EvidenceWeights
     rivals: RivalWeights
-    walls: WallWeights
-    shared_errors: SharedErrorWeights
+    walls: VirtualViewWeights
+    shared_errors: CorrelatedErrorWeights
 
     @property
     def is_calibrated(self) -> bool:
         return self.calibration_error is not None
 
     def to_json(self) -> dict[str, Any]:
-        """What `weights_from_json` reads."""
+        """What `parse_fitted_weights` reads."""
         whole = asdict(self)
         return {name: whole.pop(name) for name in _SOURCE} | {"weights": whole}
 
@@ -147,14 +147,14 @@ class FittedWeights:
 _GROUPS = {
     "evidence": EvidenceWeights,
     "rivals": RivalWeights,
-    "walls": WallWeights,
-    "shared_errors": SharedErrorWeights,
+    "walls": VirtualViewWeights,
+    "shared_errors": CorrelatedErrorWeights,
 }
 _SOURCE = ("kind", "corpus", "date", "command", "calibration_error")
 
 
 @cache
-def weights_of(kind: str) -> FittedWeights:
+def load_fitted_weights(kind: str) -> FittedWeights:
     """The weights that ship for this kind of features; those of a kind like it, not calibrated,
     where there are none.
 
@@ -163,11 +163,15 @@ def weights_of(kind: str) -> FittedWeights:
     """
     path = WEIGHTS_FOLDER / f"{kind}.json"
     if not path.exists():
-        like = LEARNED_STAND_IN if kind in KINDS and KINDS[kind].network is not None else STAND_IN
-        return replace(weights_of(like), kind=kind, calibration_error=None)
+        like = (
+            LEARNED_FALLBACK_TYPE
+            if kind in FEATURE_TYPES and FEATURE_TYPES[kind].network is not None
+            else FALLBACK_TYPE
+        )
+        return replace(load_fitted_weights(like), kind=kind, calibration_error=None)
     weights = read_weights(path)
     if weights.kind != kind:
-        raise FeatureKindError(f"{path}: weights of {weights.kind}, not of {kind}")
+        raise FeatureTypeError(f"{path}: weights of {weights.kind}, not of {kind}")
     return weights
 
 
@@ -178,12 +182,12 @@ def read_weights(path: Path) -> FittedWeights:
         FeatureKindError: it cannot be read, or is not what `FittedWeights.to_json` gives.
     """
     try:
-        return weights_from_json(json.loads(path.read_text(encoding="utf-8")))
+        return parse_fitted_weights(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError) as error:
-        raise FeatureKindError(f"cannot read the weights in {path}: {error}") from error
+        raise FeatureTypeError(f"cannot read the weights in {path}: {error}") from error
 
 
-def weights_from_json(read: Any) -> FittedWeights:
+def parse_fitted_weights(read: Any) -> FittedWeights:
     """The opposite of `FittedWeights.to_json`; ValueError where a key is missing, unknown or of the
     wrong type."""
     _check_keys(read, {*_SOURCE, "weights"}, "the file")
@@ -193,11 +197,14 @@ def weights_from_json(read: Any) -> FittedWeights:
             raise ValueError(f"{name} is not a text")
     values: dict[str, Any] = {name: read[name] for name in _SOURCE}
     values["calibration_error"] = _number(read["calibration_error"], "calibration_error")
-    values |= {name: _group(group, read["weights"][name], name) for name, group in _GROUPS.items()}
+    values |= {
+        name: _parse_weight_group(group, read["weights"][name], name)
+        for name, group in _GROUPS.items()
+    }
     return FittedWeights(**values)
 
 
-def _group(group: type[_T], read: Any, name: str) -> _T:
+def _parse_weight_group(group: type[_T], read: Any, name: str) -> _T:
     names = [field.name for field in fields(group)]  # pyright: ignore[reportArgumentType]
     _check_keys(read, set(names), name)
     return group(*(_number(read[key], f"{name}.{key}") for key in names))

@@ -15,14 +15,14 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from topoloc.bounds import AtLeast, Between
+from topoloc.features.feature_types import FeatureType, GuidedThresholds
 from topoloc.features.features import Features, Matches
-from topoloc.features.kinds import FeatureKind, GuidedThresholds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided_kernels import (
-    expected_of_points,
     match_projections,
-    project_without_lens,
+    predict_from_pixels,
+    project_undistorted,
 )
 from topoloc.localization.local_map import LocalMap
 
@@ -50,7 +50,7 @@ class GuidedConfig:
     """By how much the best key point must lead the next one within the radius."""
 
     def resolved(
-        self, kind: FeatureKind, thresholds: GuidedThresholds | None = None
+        self, kind: FeatureType, thresholds: GuidedThresholds | None = None
     ) -> GuidedConfig:
         """With the kind's thresholds (`thresholds`, or those for key points nearby) where none is
         set.
@@ -76,20 +76,20 @@ def match_guided(
 ) -> Matches:
     """Matches of key points with map points that `cam_from_world` lets expect nearby: one map point
     a key point, the most similar."""
-    return match_expected(
-        features, local_map, expected_key_points(local_map, cam_from_world, camera), camera, config
+    return match_predicted(
+        features, local_map, predict_key_points(local_map, cam_from_world, camera), camera, config
     )
 
 
-def match_expected(
+def match_predicted(
     features: Features,
     local_map: LocalMap,
-    expected: Float32[np.ndarray, "n 5"],
+    predicted: Float32[np.ndarray, "n 5"],
     camera: Camera,
     config: GuidedConfig,
 ) -> Matches:
-    """As `match_guided`, where each map point is expected as `expected_key_points` says."""
-    found, similarities = _find(features, local_map, expected, camera, config)
+    """As `match_guided`, where each map point is expected as `predict_key_points` says."""
+    found, similarities = _match_predictions(features, local_map, predicted, camera, config)
     train_idx = np.flatnonzero(found >= 0)
     train_idx = train_idx[np.argsort(-similarities[train_idx], kind="stable")]
     query_idx, first = np.unique(found[train_idx], return_index=True)
@@ -98,7 +98,7 @@ def match_expected(
     return Matches(query_idx.astype(np.int32), train_idx.astype(np.int32), distances)
 
 
-def count_by_chance(
+def count_chance_matches(
     features: Features,
     local_map: LocalMap,
     cam_from_world: Rigid3,
@@ -107,17 +107,17 @@ def count_by_chance(
 ) -> int:
     """How many matches `match_guided` would find were the pose wrong: all map points are sought a
     third of the picture away."""
-    expected = expected_key_points(local_map, cam_from_world, camera)
+    predicted = predict_key_points(local_map, cam_from_world, camera)
     size = np.array([camera.width, camera.height], np.float32)
-    expected[:, :2] = np.mod(expected[:, :2] + size / 3.0, size)
-    found, _ = _find(features, local_map, expected, camera, config)
+    predicted[:, :2] = np.mod(predicted[:, :2] + size / 3.0, size)
+    found, _ = _match_predictions(features, local_map, predicted, camera, config)
     return len(np.unique(found[found >= 0]))
 
 
-def _find(
+def _match_predictions(
     features: Features,
     local_map: LocalMap,
-    expected: Float32[np.ndarray, "n 5"],
+    predicted: Float32[np.ndarray, "n 5"],
     camera: Camera,
     config: GuidedConfig,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
@@ -127,13 +127,13 @@ def _find(
     numbers = [threshold for threshold in thresholds if threshold is not None]
     assert len(numbers) == 4, "resolve the configuration first"
     max_scale, max_turn, min_similarity, min_margin = numbers
-    seen = np.column_stack(
+    key_points = np.column_stack(
         [features.points_img, features.sizes_px, np.cos(features.angles), np.sin(features.angles)]
     )
     return match_projections(
-        expected,
+        predicted,
         local_map.descriptors,
-        seen.astype(np.float32),
+        key_points.astype(np.float32),
         features.descriptors,
         float(camera.width),
         float(camera.height),
@@ -145,16 +145,16 @@ def _find(
     )
 
 
-def visible_points(
+def select_visible_points(
     local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
 ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 2"]]:
     """The map points that lie in the camera's view, by their rows, and where they must be seen."""
-    _, pixels = _projected(local_map, cam_from_world, camera)
+    _, pixels = _project_points(local_map, cam_from_world, camera)
     rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
     return rows, pixels[rows]
 
 
-def _projected(
+def _project_points(
     local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
     """The map points in the camera (metres), and their pixels, NaN where they are out of view."""
@@ -163,9 +163,9 @@ def _projected(
             np.ascontiguousarray(cam_from_world.rotation),
             np.ascontiguousarray(cam_from_world.translation),
         )
-        lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
-        return project_without_lens(
-            local_map.points_world, rotation, translation, *lens, camera.width, camera.height
+        intrinsics = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        return project_undistorted(
+            local_map.points_world, rotation, translation, *intrinsics, camera.width, camera.height
         )
     points_cam = cam_from_world.apply(local_map.points_world)
     pixels = camera.img_from_cam(points_cam)
@@ -178,7 +178,7 @@ def _projected(
     return points_cam, np.where(inside[:, None], pixels, np.nan)
 
 
-def expected_key_points(
+def predict_key_points(
     local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
 ) -> Float32[np.ndarray, "n 5"]:
     """Pixel, size and orientation (cosine, sine) at which each map point must be seen; NaN where it
@@ -187,17 +187,17 @@ def expected_key_points(
     The surface is taken to face the node's camera; `max_scale` and `max_turn` leave room for its
     slant.
     """
-    points_cam, pixels = _projected(local_map, cam_from_world, camera)
+    points_cam, pixels = _project_points(local_map, cam_from_world, camera)
     rotation = np.ascontiguousarray(cam_from_world.rotation)
-    return expected_of_points(
+    return predict_from_pixels(
         points_cam, pixels, local_map.sizes, local_map.directions, rotation, float(camera.fx)
     )
 
 
-def largest_shift(
+def count_consistent_displacements(
     features: Features,
     matches: Matches,
-    expected: Float32[np.ndarray, "n 5"],
+    predicted: Float32[np.ndarray, "n 5"],
     camera: Camera,
     within_px: float,
 ) -> int:
@@ -206,7 +206,7 @@ def largest_shift(
     pixels; grows with that."""
     if len(matches) == 0:
         return 0
-    shifts = features.points_img[matches.query_idx] - expected[matches.train_idx, :2]
+    shifts = features.points_img[matches.query_idx] - predicted[matches.train_idx, :2]
     apart = np.square(shifts[:, None] - shifts[None]).sum(axis=2)
     return int(
         np.count_nonzero(

@@ -10,9 +10,9 @@ from topoloc.compiled import kernel
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})
 def match_projections(
-    expected,
+    predicted,
     map_descriptors,
-    seen,
+    key_points,
     descriptors,
     width,
     height,
@@ -25,9 +25,9 @@ def match_projections(
     """For every map point the key point within `radius` pixels of where it must be seen that is
     most similar.
 
-    Rows of `expected` and `seen` are (x, y, size, cosine and sine of the angle), float32; NaN where
-    a map point is out of view. Key points whose size differs by more than the factor `max_scale`,
-    or whose angle by more than that of `min_cosine`, are others.
+    Rows of `predicted` and `key_points` are (x, y, size, cosine and sine of the angle), float32;
+    NaN where a map point is out of view. Key points whose size differs by more than the factor
+    `max_scale`, or whose angle by more than that of `min_cosine`, are others.
 
     Returns the key point's row for each map point, -1 for none, and the similarity (scalar
     product). Of several key points within the radius the best must lead by `min_margin`, unless
@@ -35,22 +35,22 @@ def match_projections(
     """
     num_columns, num_rows = int(width / radius) + 1, int(height / radius) + 1
     num_cells = num_columns * num_rows
-    cells = np.empty(len(seen), np.int64)
+    cells = np.empty(len(key_points), np.int64)
     starts = np.zeros(num_cells + 1, np.int64)
-    for k in range(len(seen)):
-        column = min(max(int(seen[k, 0] / radius), 0), num_columns - 1)
-        row = min(max(int(seen[k, 1] / radius), 0), num_rows - 1)
+    for k in range(len(key_points)):
+        column = min(max(int(key_points[k, 0] / radius), 0), num_columns - 1)
+        row = min(max(int(key_points[k, 1] / radius), 0), num_rows - 1)
         cells[k] = row * num_columns + column
         starts[cells[k] + 1] += 1
     starts = np.cumsum(starts)
-    order, free = np.empty(len(seen), np.int64), starts.copy()
-    for k in range(len(seen)):  # those of a cell in their own order
+    order, free = np.empty(len(key_points), np.int64), starts.copy()
+    for k in range(len(key_points)):  # those of a cell in their own order
         order[free[cells[k]]] = k
         free[cells[k]] += 1
-    found = np.full(len(expected), -1, np.int32)
-    similarities = np.zeros(len(expected), np.float32)
-    for n in range(len(expected)):
-        x, y = expected[n, 0], expected[n, 1]
+    found = np.full(len(predicted), -1, np.int32)
+    similarities = np.zeros(len(predicted), np.float32)
+    for n in range(len(predicted)):
+        x, y = predicted[n, 0], predicted[n, 1]
         if not (x > -radius and y > -radius and x < width + radius and y < height + radius):
             continue
         column, row = int(np.floor(x / radius)), int(np.floor(y / radius))
@@ -60,15 +60,18 @@ def match_projections(
                 cell = r * num_columns + c
                 for position in range(starts[cell], starts[cell + 1]):
                     k = order[position]
-                    dx, dy = seen[k, 0] - x, seen[k, 1] - y
-                    scale = seen[k, 2] / expected[n, 2]
+                    dx, dy = key_points[k, 0] - x, key_points[k, 1] - y
+                    scale = key_points[k, 2] / predicted[n, 2]
                     if (
                         dx * dx + dy * dy > radius * radius
                         or scale > max_scale
                         or scale * max_scale < 1
                     ):
                         continue
-                    if seen[k, 3] * expected[n, 3] + seen[k, 4] * expected[n, 4] < min_cosine:
+                    if (
+                        key_points[k, 3] * predicted[n, 3] + key_points[k, 4] * predicted[n, 4]
+                        < min_cosine
+                    ):
                         continue
                     product = np.float32(0)
                     for d in range(descriptors.shape[1]):
@@ -76,13 +79,16 @@ def match_projections(
                     if product > best:
                         if (
                             best_k < 0
-                            or abs(seen[k, 0] - seen[best_k, 0]) + abs(seen[k, 1] - seen[best_k, 1])
+                            or abs(key_points[k, 0] - key_points[best_k, 0])
+                            + abs(key_points[k, 1] - key_points[best_k, 1])
                             > 2
                         ):
                             second = best
                         best, best_k = product, k
                     elif product > second and (
-                        abs(seen[k, 0] - seen[best_k, 0]) + abs(seen[k, 1] - seen[best_k, 1]) > 2
+                        abs(key_points[k, 0] - key_points[best_k, 0])
+                        + abs(key_points[k, 1] - key_points[best_k, 1])
+                        > 2
                     ):
                         second = product
         if best_k >= 0 and best >= min_similarity and best - second >= min_margin:
@@ -91,7 +97,7 @@ def match_projections(
 
 
 @kernel(error_model="numpy")
-def project_without_lens(points_world, rotation, translation, focal, centre, width, height):
+def project_undistorted(points_world, rotation, translation, focal, centre, width, height):
     """Points in the camera (n, 3), metres, and their pixels (n, 2), NaN where they are out of view,
     of a camera without distortion."""
     points_cam, pixels = np.empty((len(points_world), 3)), np.empty((len(points_world), 2))
@@ -112,14 +118,14 @@ def project_without_lens(points_world, rotation, translation, focal, centre, wid
 
 
 @kernel(error_model="numpy")
-def expected_of_points(points_cam, pixels, sizes, directions, rotation, focal):
+def predict_from_pixels(points_cam, pixels, sizes, directions, rotation, focal):
     """Rows (x, y, size, cosine and sine of the angle), float32, at which points must be seen whose
     pixels are known; NaN where these are.
 
     `sizes` (metres) and `directions` (unit vectors, world) are those of what the points'
     descriptors describe, `focal` is in pixels.
     """
-    expected = np.full((len(pixels), 5), np.nan, np.float32)
+    predicted = np.full((len(pixels), 5), np.nan, np.float32)
     for n in range(len(pixels)):
         if not np.isfinite(pixels[n, 0]):
             continue
@@ -130,10 +136,10 @@ def expected_of_points(points_cam, pixels, sizes, directions, rotation, focal):
         )
         down = rotation[1, 0] * d[0] + rotation[1, 1] * d[1] + rotation[1, 2] * d[2] - y / z * along
         length = max(np.sqrt(right * right + down * down), 1e-9)
-        expected[n, 0], expected[n, 1], expected[n, 2] = (
+        predicted[n, 0], predicted[n, 1], predicted[n, 2] = (
             pixels[n, 0],
             pixels[n, 1],
             sizes[n] * focal / z,
         )
-        expected[n, 3], expected[n, 4] = right / length, down / length
-    return expected
+        predicted[n, 3], predicted[n, 4] = right / length, down / length
+    return predicted

@@ -53,7 +53,7 @@ class LocalMap:
         )
 
     @staticmethod
-    def pooled(parts: list[LocalMap]) -> LocalMap:
+    def concatenate(parts: list[LocalMap]) -> LocalMap:
         """The points of several nodes."""
         return LocalMap(
             *(

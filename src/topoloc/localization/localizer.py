@@ -2,11 +2,11 @@
 
 The coarse localizer names the nodes that the image may belong to; the image is patch-normalised and
 its features are matched with those of the nodes; PnP on the matches gives the camera's global pose.
-Unlike the paper's blind first choice, this is one loop of hypotheses (`asking.py`): first poses are
-proposed (`propose.py`), the cheapest and likeliest first; each is refined in the same way, its
-evidence counted (`refine.py`), and it joins what is believed (`belief.py`), until that is settled.
-A pose is reported only where the evidence for it is strong and nothing else in the map explains the
-image as well. One candidate, no guided step, no look-alikes, viewpoints and walls
+Unlike the paper's blind first choice, this is one loop of hypotheses (`query_session.py`): first
+poses are proposed (`propose.py`), the cheapest and likeliest first; each is refined in the same
+way, its evidence counted (`refine.py`), and it joins what is believed (`belief.py`), until that is
+settled. A pose is reported only where the evidence for it is strong and nothing else in the map
+explains the image as well. One candidate, no guided step, no look-alikes, viewpoints and walls
 (`num_candidates=1`, `guided.num_nodes=0`, `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`,
 `walls.num_places=0`) give the paper's own behaviour.
 """
@@ -22,17 +22,17 @@ from typing import TypeVar
 from topoloc.bounds import check_bounds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.answer import Verdict
-from topoloc.localization.asked_kind import AskedKind, kinds_to_ask
-from topoloc.localization.asking import Asking
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.feature_type_context import FeatureTypeContext, select_feature_types
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.provenance import Provenance
-from topoloc.localization.query import Picture, Query, reduced_image, unknown_camera
-from topoloc.localization.result import Localization, NotLocalized, at_time
+from topoloc.localization.query import Query, QueryImage, reduce_image, unknown_camera
+from topoloc.localization.query_session import QuerySession
+from topoloc.localization.result import Localization, NotLocalized, with_time
+from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
-from topoloc.mapping.contents import map_id_of
+from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseLocalizer, Image
 
@@ -44,8 +44,8 @@ R = TypeVar("R", bound=Localization | NotLocalized)
 class Localizer:
     """Holds an open map, its coarse localizer and the nodes used lately.
 
-    `left_out` names the map's kinds of features that are not asked because their network, or ONNX
-    Runtime, is not here, each with what it lacks.
+    `unavailable_types` names the map's kinds of features that are not asked because their network,
+    or ONNX Runtime, is not here, each with what it lacks.
 
     Args:
         coarse: names the candidate nodes instead of one of the map's own coarse localizers: any
@@ -71,11 +71,14 @@ class Localizer:
     ) -> None:
         config = config or LocalizerConfig()
         check_bounds(config)
-        self.topomap, self.map_id = topomap, map_id_of(topomap)
-        kinds, self.left_out = kinds_to_ask(topomap, config.kinds)
+        self.topomap, self.map_id = topomap, get_map_id(topomap)
+        kinds, self.unavailable_types = select_feature_types(topomap, config.kinds)
         self._kinds = [
-            AskedKind.of(
-                topomap.by_kind(kind), config, coarse, weights if kind == kinds[0] else None
+            FeatureTypeContext.of(
+                topomap.with_feature_type(kind),
+                config,
+                coarse,
+                weights if kind == kinds[0] else None,
             )
             for kind in kinds
         ]
@@ -88,7 +91,7 @@ class Localizer:
     def localize(
         self,
         image: Image,
-        camera: Camera | RoughCamera | None,
+        camera: Camera | UncalibratedCamera | None,
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
         trace: Trace | None = None,
@@ -111,47 +114,53 @@ class Localizer:
         Raises:
             QueryError: the image is no picture of 8 bits, or the camera is of another image size.
         """
-        result = self.localize_near(image, camera or unknown_camera(image), prior, max_ms, trace)[0]
-        return result if t_ns is None else at_time(result, t_ns)
+        result = self.localize_with_inliers(
+            image, camera or unknown_camera(image), prior, max_ms, trace
+        )[0]
+        return result if t_ns is None else with_time(result, t_ns)
 
-    def localize_near(
+    def localize_with_inliers(
         self,
         image: Image,
-        camera: Camera | RoughCamera,
+        camera: Camera | UncalibratedCamera,
         prior: Rigid3 | None,
         max_ms: float | None = None,
         trace: Trace | None = None,
-    ) -> Verdict:
+    ) -> ResultWithInliers:
         """As `localize`; also each pose that the result names (its own, or its alternatives) with
         the points that it stands on."""
-        return self.ask(Picture(image, camera), prior, max_ms, trace)
+        return self.localize_query(QueryImage(image, camera), prior, max_ms, trace)
 
-    def ask(
+    def localize_query(
         self,
-        picture: Picture,
+        query_image: QueryImage,
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
         trace: Trace | None = None,
-    ) -> Verdict:
-        """As `localize_near`, of a picture whose features other maps may have asked for before."""
-        return self.asking(picture, prior, max_ms, trace).by_all_means()
+    ) -> ResultWithInliers:
+        """As `localize_with_inliers`, of a picture whose features other maps may have asked for
+        before."""
+        return self.query_session(query_image, prior, max_ms, trace).localize_exhaustive()
 
-    def asking(
+    def query_session(
         self,
-        picture: Picture,
+        query_image: QueryImage,
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
         trace: Trace | None = None,
-    ) -> Asking:
+    ) -> QuerySession:
         """The same question, to be put at a glance first."""
-        searches, camera = self._searches(self._query(picture, max_ms), trace), picture.camera
+        searches, camera = (
+            self._searches(self._query(query_image, max_ms), trace),
+            query_image.camera,
+        )
 
-        def completed(verdict: Verdict) -> Verdict:
-            return self.completed(verdict[0], camera), [
-                (self.completed(one, camera), seen) for one, seen in verdict[1]
+        def with_provenance(outcome: ResultWithInliers) -> ResultWithInliers:
+            return self.with_provenance(outcome[0], camera), [
+                (self.with_provenance(one, camera), seen) for one, seen in outcome[1]
             ]
 
-        return Asking(searches, prior, completed)
+        return QuerySession(searches, prior, with_provenance)
 
     def without(self, node_ids: Iterable[int]) -> Localizer:
         """The same map as if nobody had stood at these nodes: a picture that was taken there is
@@ -165,12 +174,12 @@ class Localizer:
         other.map = other._kinds[0].map
         return other
 
-    def completed(
-        self, result: R, camera: Camera | RoughCamera | None = None, t_ns: int | None = None
+    def with_provenance(
+        self, result: R, camera: Camera | UncalibratedCamera | None = None, t_ns: int | None = None
     ) -> R:
         """The result with the map that it is of, where on earth that is, the picture's camera, and
         its time (nanoseconds)."""
-        if isinstance(camera, RoughCamera):
+        if isinstance(camera, UncalibratedCamera):
             focal = result.focal_length_px if isinstance(result, Localization) else None
             camera = None if focal is None else camera.with_focal(focal)
         of_map = Provenance(self.map_id, self.topomap.version, t_ns=t_ns, camera=camera)
@@ -199,7 +208,7 @@ class Localizer:
                 of_kind, kind.map, kind.config, kind.weights, kind.correlated_errors, trace
             )
             if searches:
-                search.before, searches[-1].is_last = searches[-1], False
+                search.previous, searches[-1].is_last = searches[-1], False
             searches.append(search)
         return searches
 
@@ -209,18 +218,18 @@ class Localizer:
         points have in common."""
         return self._kinds[0].correlated_errors
 
-    def _query(self, picture: Picture, max_ms: float | None) -> Query:
-        image, camera = picture.image, picture.camera
+    def _query(self, query_image: QueryImage, max_ms: float | None) -> Query:
+        image, camera = query_image.image, query_image.camera
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
-        reduced, lens = reduced_image(
+        reduced, reduced_camera = reduce_image(
             image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px
         )
         deadline = float("inf") if limit is None else start + limit / 1e3
         return Query(
             reduced,
-            lens,
-            image.shape[1] / lens.width,
+            reduced_camera,
+            image.shape[1] / reduced_camera.width,
             self.map.feature_config,
             deadline=deadline,
-            shared=picture.features,
+            shared=query_image.features,
         )

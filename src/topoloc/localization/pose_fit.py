@@ -14,12 +14,12 @@ from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, est
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera, usual_camera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera, nominal_camera
 from topoloc.localization.local_map import LocalMap
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPoints:
+class PointObservations:
     """Row k: the pixel at which a map point was found, its world position (metres) and the
     covariance of that (m^2)."""
 
@@ -30,15 +30,17 @@ class SeenPoints:
     def __len__(self) -> int:
         return len(self.points_img)
 
-    def select(self, rows: np.ndarray) -> SeenPoints:
-        return SeenPoints(self.points_img[rows], self.points_world[rows], self.covariances[rows])
+    def select(self, rows: np.ndarray) -> PointObservations:
+        return PointObservations(
+            self.points_img[rows], self.points_world[rows], self.covariances[rows]
+        )
 
-    def in_image(self, scale: float) -> SeenPoints:
+    def to_image_scale(self, scale: float) -> PointObservations:
         """The same in a picture that is `scale` times as wide."""
         points_img = (
             (self.points_img + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)
         ).astype(np.float32)
-        return SeenPoints(points_img, self.points_world, self.covariances)
+        return PointObservations(points_img, self.points_world, self.covariances)
 
 
 _MIN_MATCHES = 4
@@ -46,11 +48,11 @@ _MIN_MATCHES = 4
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """`lens` is what is known of the camera, `camera` the same, or, of a rough one, what comes of
-    it with the focal length found."""
+    """`input_camera` is what is known of the camera, `camera` the same, or, of a rough one, what
+    comes of it with the focal length found."""
 
     features: Features
-    lens: Camera | RoughCamera
+    input_camera: Camera | UncalibratedCamera
     camera: Camera
     local_map: LocalMap
     matches: Matches
@@ -77,20 +79,20 @@ class PoseFit:
         return self.pose.cam_from_world.inverse()
 
     @cached_property
-    def _box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    def _bounding_box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """The corners (metres, world) of what the inliers' points fill."""
         assert self.pose is not None
         columns = self.matches.train_idx[self.pose.inliers]
         points, radii = self.local_map.points_world[columns], self.local_map.radii[columns][:, None]
         return (points - radii).min(axis=0), (points + radii).max(axis=0)
 
-    def stands_near(self, other: PoseFit) -> bool:
+    def may_share_points(self, other: PoseFit) -> bool:
         """Might inliers of both be the same points of the map? Where even the boxes that they fill
         are apart they are not."""
-        (low, high), (other_low, other_high) = self._box, other._box
+        (low, high), (other_low, other_high) = self._bounding_box, other._bounding_box
         return bool(np.all(low <= other_high) and np.all(other_low <= high))
 
-    def seen_points(self, scale: float) -> SeenPoints:
+    def inlier_observations(self, scale: float) -> PointObservations:
         """The inliers of a fit with a pose, in a picture that is `scale` times as wide as that of
         the features."""
         assert self.pose is not None
@@ -102,14 +104,14 @@ class PoseFit:
             self.local_map.points_world[train_idx],
             self.local_map.covariances[train_idx],
         )
-        return SeenPoints(self.features.points_img[query_idx], points_world, covariances).in_image(
-            scale
-        )
+        return PointObservations(
+            self.features.points_img[query_idx], points_world, covariances
+        ).to_image_scale(scale)
 
 
 def fit_pose(
     features: Features,
-    lens: Camera | RoughCamera,
+    input_camera: Camera | UncalibratedCamera,
     local_map: LocalMap,
     matches: Matches,
     config: AbsolutePoseConfig,
@@ -117,22 +119,32 @@ def fit_pose(
 ) -> PoseFit:
     """Robust PnP on the matches, or the refinement of `start` (cam_from_world and the camera); with
     the focal length, of a rough camera."""
-    camera = start[1] if start else usual_camera(lens)
+    camera = start[1] if start else nominal_camera(input_camera)
     if len(matches) < _MIN_MATCHES:
-        return PoseFit(features, lens, camera, local_map, matches, None)
+        return PoseFit(features, input_camera, camera, local_map, matches, None)
     points_img = features.points_img[matches.query_idx].astype(np.float64)
     points_world, covariances = (
         local_map.points_world[matches.train_idx],
         local_map.covariances[matches.train_idx],
     )
-    if isinstance(lens, RoughCamera):
+    if isinstance(input_camera, UncalibratedCamera):
         found = estimate_pose_and_focal(
-            points_img, points_world, lens, config, point_covariances=covariances, start=start
+            points_img,
+            points_world,
+            input_camera,
+            config,
+            point_covariances=covariances,
+            start=start,
         )
         pose, camera = found or (None, camera)
     else:
         near = start[0] if start else None
         pose = estimate_absolute_pose(
-            points_img, points_world, lens, config, point_covariances=covariances, start=near
+            points_img,
+            points_world,
+            input_camera,
+            config,
+            point_covariances=covariances,
+            start=near,
         )
-    return PoseFit(features, lens, camera, local_map, matches, pose)
+    return PoseFit(features, input_camera, camera, local_map, matches, pose)

@@ -32,39 +32,45 @@ from topoloc.features.matching import Matcher
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis, is_same_pose
-from topoloc.localization.guided import largest_shift, match_expected, match_guided
+from topoloc.localization.guided import (
+    count_consistent_displacements,
+    match_guided,
+    match_predicted,
+)
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.map_facts.repetition import LEAST_SHIFT
+from topoloc.localization.map_facts.repetition import MIN_SHIFT
 from topoloc.localization.pose_fit import PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
-from topoloc.localization.walls.propose_walls import propose_walls
+from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 from topoloc.mapping.nodes import node_distances
 from topoloc.retrieval.coarse import NodeScore
 
-_BESIDE = 0.25  # radians
-_MAX_OTHERS = 3  # poses of other features that are asked
-_LEAST_FOUND_SHARE = 0.2  # of what is found at a pose, that must be found at one that is as likely
+_MAX_SAME_POSE_ANGLE = 0.25  # radians
+_MAX_OTHER_POSES = 3  # poses of other features that are asked
+_MIN_FOUND_RATIO = 0.2  # of what is found at a pose, that must be found at one that is as likely
 
 
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
     """All first poses worth a look, each made when it is asked for; only the first of them where
     another kind of features is asked next."""
     if prior is not None:
-        rows = [candidate.node_id for candidate in _near(search, prior)]
-        yield _pooled(search, "prior", rows, float(search.config.num_chance_inliers))
+        rows = [candidate.node_id for candidate in _nearest_nodes(search, prior)]
+        yield _propose_from_nodes(search, "prior", rows, float(search.config.num_chance_inliers))
         return
-    rows = _ranked(search)
-    retrieved = _pooled(search, "retrieval", rows, float(search.config.num_chance_inliers))
+    rows = _rank_nodes(search)
+    retrieved = _propose_from_nodes(
+        search, "retrieval", rows, float(search.config.num_chance_inliers)
+    )
     search.retrieved = retrieved.fit
     yield retrieved
     if search.is_last or search.is_clear:
-        yield from _of_other_features(search)
+        yield from _propose_from_other_features(search)
         yield from propose_more(search)
 
 
 def propose_more(search: Search) -> Iterator[Proposal]:
     """What is left to look at once retrieval has had its say, which was the first tried."""
-    viewpoints = [] if search.is_clear else list(_viewpoints(search))
+    viewpoints = [] if search.is_clear else list(_propose_node_viewpoints(search))
     yield from viewpoints
     assert search.retrieved is not None
     if (
@@ -72,25 +78,25 @@ def propose_more(search: Search) -> Iterator[Proposal]:
         or viewpoints
         or search.retrieved.num_inliers >= search.config.num_chance_inliers
     ):
-        yield from _look_alikes(search)
-    yield from _repetitions(search)
-    yield from propose_walls(search)
+        yield from _propose_similar_places(search)
+    yield from _propose_repetitions(search)
+    yield from propose_virtual_views(search)
 
 
-def propose_briefly(search: Search, least: float) -> Proposal | None:
+def propose_quick(search: Search, least: float) -> Proposal | None:
     """What retrieval by the strongest features alone leads to; None where fewer than `least` of
     them agree."""
-    brief = _matched(
+    quick_proposal = _match_and_fit(
         search,
         "retrieval",
-        _matcher(search, _ranked(search)),
+        _create_matcher(search, _rank_nodes(search)),
         least,
         search.config.num_first_features,
     )
-    return brief if brief.fit.num_inliers >= least else None
+    return quick_proposal if quick_proposal.fit.num_inliers >= least else None
 
 
-def _ranked(search: Search) -> list[int]:
+def _rank_nodes(search: Search) -> list[int]:
     """The rows of the nodes that the coarse localizer names, of which the best are asked
     together."""
     features = search.query.features
@@ -100,7 +106,7 @@ def _ranked(search: Search) -> list[int]:
     return [candidate.node_id for candidate in search.candidates]
 
 
-def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
+def _nearest_nodes(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
     """As many nodes as the coarse step would name; nearer ones (Eq. 1) score higher."""
     distances = search.map.distances(world_from_cam)
     rows = search.map.nearest(world_from_cam, search.config.num_candidates)
@@ -108,18 +114,18 @@ def _near(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
     return search.ranked
 
 
-def _pooled(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
+def _propose_from_nodes(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
     """These nodes' points together. The strongest features are nearly always enough, or agree in
     fewer than `least`; else all are tried."""
-    config, matcher = search.config, _matcher(search, rows)
-    proposal = _matched(search, source, matcher, least, config.num_first_features)
+    config, matcher = search.config, _create_matcher(search, rows)
+    proposal = _match_and_fit(search, source, matcher, least, config.num_first_features)
     is_open = least <= proposal.fit.num_inliers < config.num_clear_inliers
     if is_open and len(search.query.features) > config.num_first_features:
-        proposal = _matched(search, source, matcher, least)
+        proposal = _match_and_fit(search, source, matcher, least)
     return proposal
 
 
-def _matcher(search: Search, rows: list[int]) -> tuple[LocalMap, Matcher]:
+def _create_matcher(search: Search, rows: list[int]) -> tuple[LocalMap, Matcher]:
     """The points of these nodes, and what matches the query's features with them."""
     points = search.map.local_map(rows)
     return points, Matcher(
@@ -130,33 +136,33 @@ def _matcher(search: Search, rows: list[int]) -> tuple[LocalMap, Matcher]:
     )
 
 
-def _matched(
+def _match_and_fit(
     search: Search,
     source: Source,
-    of_nodes: tuple[LocalMap, Matcher],
+    points_and_matcher: tuple[LocalMap, Matcher],
     least: float,
     max_features: int | None = None,
 ) -> Proposal:
     """Matches with the points of nodes, and robust PnP, where as many as `least` may agree on a
     pose."""
-    query, (local_map, matcher) = search.query, of_nodes
+    query, (local_map, matcher) = search.query, points_and_matcher
     with query.clock.stage("matching"):
-        matches = matcher.of_first(max_features)
+        matches = matcher.match_first(max_features)
     if len(matches) < max(search.config.min_matches, least):
         return Proposal(
             source,
-            PoseFit(query.features, query.lens, query.camera, local_map, matches, None),
+            PoseFit(query.features, query.input_camera, query.camera, local_map, matches, None),
             is_guided=False,
         )
     with query.clock.stage("pnp"):
         return Proposal(
             source,
-            fit_pose(query.features, query.lens, local_map, matches, search.config.pose),
+            fit_pose(query.features, query.input_camera, local_map, matches, search.config.pose),
             is_guided=False,
         )
 
 
-def _look_alikes(search: Search) -> Iterator[Proposal]:
+def _propose_similar_places(search: Search) -> Iterator[Proposal]:
     """Parts of the map far from what is believed that look like the image about as much as the best
     node does."""
     config, best, nodes = search.config.look_alikes, search.best, search.map.node_poses
@@ -164,7 +170,7 @@ def _look_alikes(search: Search) -> Iterator[Proposal]:
         return
     least = config.min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
     left = [candidate.node_id for candidate in search.ranked if candidate.score >= least]
-    asked = {candidate.node_id for candidate in search.candidates}
+    queried = {candidate.node_id for candidate in search.candidates}
     reach = config.reach * search.map.d_thresh
     if best is not None and best.probability >= search.config.evidence.min_probability:
         far = search.map.distances(best.world_from_cam) > reach
@@ -174,14 +180,16 @@ def _look_alikes(search: Search) -> Iterator[Proposal]:
         leader = Rigid3(nodes.rotations[left[0]], nodes.centres[left[0]])
         near = node_distances(leader, nodes, search.map.lambda_rot) <= reach
         group, left = [row for row in left if near[row]], [row for row in left if not near[row]]
-        if set(group) != asked:
-            num_groups, least = num_groups + 1, least_inliers(search)
-            proposal = _pooled(search, "look-alikes", group[: search.config.num_candidates], least)
+        if set(group) != queried:
+            num_groups, least = num_groups + 1, min_rival_inliers(search)
+            proposal = _propose_from_nodes(
+                search, "look-alikes", group[: search.config.num_candidates], least
+            )
             if proposal.fit.num_inliers >= least:
                 yield proposal
 
 
-def least_inliers(search: Search) -> float:
+def min_rival_inliers(search: Search) -> float:
     """With how many of the strongest features another place must agree: more than by chance, not
     far fewer than what is believed."""
     best, config, least = search.best, search.config, float(search.config.num_chance_inliers)
@@ -194,7 +202,7 @@ def least_inliers(search: Search) -> float:
     )
 
 
-def _viewpoints(search: Search) -> Iterator[Proposal]:
+def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     """What would be seen from where a node stands, for the nodes whose displacements agree, the
     most agreeing first."""
     config, query = search.config.viewpoints, search.query
@@ -202,15 +210,15 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
     with query.clock.stage("matching"):
         for candidate in search.ranked[: config.num_nodes]:
             row = candidate.node_id
-            local_map, expected = (
+            local_map, predicted = (
                 search.map.local_map([row]),
-                search.map.expected_at_node(row, query.camera),
+                search.map.predict_at_node(row, query.camera),
             )
-            matches = match_expected(
-                query.features, local_map, expected, query.camera, config.matching
+            matches = match_predicted(
+                query.features, local_map, predicted, query.camera, config.matching
             )
-            num_alike = largest_shift(
-                query.features, matches, expected, query.camera, config.shift_px
+            num_alike = count_consistent_displacements(
+                query.features, matches, predicted, query.camera, config.shift_px
             )
             if num_alike >= config.min_alike + config.chance_share * len(matches):
                 found.append((num_alike, local_map, matches))
@@ -221,7 +229,7 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
     more = 3 if found and len(search.map.repeats(search.ranked[0].node_id)) else 1
     with query.clock.stage("pnp"):
         fits = [
-            fit_pose(query.features, query.lens, local_map, matches, quick)
+            fit_pose(query.features, query.input_camera, local_map, matches, quick)
             for _, local_map, matches in found[: more * config.max_fits]
         ]
     kept: list[PoseFit] = []
@@ -235,13 +243,13 @@ def _viewpoints(search: Search) -> Iterator[Proposal]:
             return
 
 
-def _of_other_features(search: Search) -> Iterator[Proposal]:
+def _propose_from_other_features(search: Search) -> Iterator[Proposal]:
     """The poses that other features left open, where these features did not settle it."""
-    config, before = search.config, search.before
-    if before is None or search.is_clear or config.guided.num_nodes == 0:
+    config, previous = search.config, search.previous
+    if previous is None or search.is_clear or config.guided.num_nodes == 0:
         return
-    for hypothesis in before.belief.ranked(before.weights.rivals)[:_MAX_OTHERS]:
-        fit = _around_pose(
+    for hypothesis in previous.belief.ranked(previous.weights.rivals)[:_MAX_OTHER_POSES]:
+        fit = _fit_around_pose(
             search,
             hypothesis.world_from_cam,
             hypothesis.fit.camera,
@@ -251,11 +259,11 @@ def _of_other_features(search: Search) -> Iterator[Proposal]:
             yield Proposal("other features", fit, is_guided=True)
 
 
-def _repetitions(search: Search) -> Iterator[Proposal]:
+def _propose_repetitions(search: Search) -> Iterator[Proposal]:
     """The poses that a repetition of the place allows as well as those that are believed, and
     theirs in turn."""
     config, tried, num_asked = search.config, list[Rigid3](), 0
-    waiting = [one for one in search.belief.hypotheses if not one.is_from_walls]
+    waiting = [one for one in search.belief.hypotheses if not one.is_from_virtual_views]
     while waiting and config.guided.num_nodes > 0:
         hypothesis = waiting.pop(0)
         if hypothesis.probability < config.evidence.min_probability:
@@ -263,46 +271,48 @@ def _repetitions(search: Search) -> Iterator[Proposal]:
         tried.append(hypothesis.world_from_cam)
         for move in search.map.moves(search.map.topomap.row_of(hypothesis.fit.node_id)):
             world_from_cam = Rigid3(move[:3, :3], move[:3, 3]) @ hypothesis.world_from_cam
-            if _is_beside(
+            if _is_near_any(
                 world_from_cam,
                 [*tried, *(other.world_from_cam for other in search.belief.hypotheses)],
             ):
                 continue
             if num_asked == config.max_repetitions:
                 return
-            num_asked, search.is_repeated = num_asked + 1, True
+            num_asked, search.is_repetitive = num_asked + 1, True
             tried.append(world_from_cam)
-            fit = _moved(search, world_from_cam, hypothesis)
+            fit = _fit_moved_pose(search, world_from_cam, hypothesis)
             if fit is None:
                 continue
-            before = set(map(id, search.belief.hypotheses))
+            previous = set(map(id, search.belief.hypotheses))
             yield Proposal("repetition", fit, is_guided=True, repeats=hypothesis.evidence)
-            waiting += [other for other in search.belief.hypotheses if id(other) not in before]
+            waiting += [other for other in search.belief.hypotheses if id(other) not in previous]
 
 
-def _is_beside(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
+def _is_near_any(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
     """Is a pose one of these, not a repetition of it?"""
-    way = np.linalg.norm(
+    distances = np.linalg.norm(
         np.array([other.translation for other in others]) - world_from_cam.translation, axis=1
     )
     return any(
-        (world_from_cam.inverse() @ others[k]).angle() < _BESIDE
-        for k in np.flatnonzero(way < LEAST_SHIFT)
+        (world_from_cam.inverse() @ others[k]).angle() < _MAX_SAME_POSE_ANGLE
+        for k in np.flatnonzero(distances < MIN_SHIFT)
     )
 
 
-def _moved(search: Search, world_from_cam: Rigid3, hypothesis: Hypothesis) -> PoseFit | None:
+def _fit_moved_pose(
+    search: Search, world_from_cam: Rigid3, hypothesis: Hypothesis
+) -> PoseFit | None:
     """What is found around a pose that is known to a few centimetres; None where it is far less
     than at the one that it repeats."""
-    return _around_pose(
+    return _fit_around_pose(
         search,
         world_from_cam,
         hypothesis.fit.camera,
-        _LEAST_FOUND_SHARE * hypothesis.evidence.num_found,
+        _MIN_FOUND_RATIO * hypothesis.evidence.num_found,
     )
 
 
-def _around_pose(
+def _fit_around_pose(
     search: Search, world_from_cam: Rigid3, camera: Camera, least: float
 ) -> PoseFit | None:
     """What is found around a pose; None where fewer than so many agree."""
@@ -320,5 +330,5 @@ def _around_pose(
     if len(matches) < least:
         return None
     with query.clock.stage("pnp"):
-        fit = fit_pose(query.features, query.lens, local_map, matches, config.pose, start)
+        fit = fit_pose(query.features, query.input_camera, local_map, matches, config.pose, start)
     return fit if fit.num_inliers >= least else None

@@ -35,11 +35,11 @@ class Provenance:
         camera = None if self.camera is None else self.camera.to_json()
         of_atlas: dict[str, Any] = {} if self.tile is None else {"tile": self.tile}
         if self.atlas_from_cam is not None:
-            of_atlas["atlas_from_cam"] = checked.pose_json(self.atlas_from_cam)
+            of_atlas["atlas_from_cam"] = checked.pose_to_json(self.atlas_from_cam)
         if self.joint_world is not None:
             of_atlas["joint_world"] = self.joint_world
         if self.joint_from_cam is not None:
-            of_atlas["joint_from_cam"] = checked.pose_json(self.joint_from_cam)
+            of_atlas["joint_from_cam"] = checked.pose_to_json(self.joint_from_cam)
         return of_atlas | {
             "map": self.map_id,
             "version": self.map_version,
@@ -60,9 +60,9 @@ class Provenance:
         try:
             return Provenance(
                 checked.text(data.get("map", ""), "map"),
-                checked.whole(data.get("version", 0), "version"),
+                checked.integer(data.get("version", 0), "version"),
                 checked.text(data.get("features", ""), "features"),
-                None if t_ns is None else checked.whole(t_ns, "t_ns", -(2**63)),
+                None if t_ns is None else checked.integer(t_ns, "t_ns", -(2**63)),
                 None if camera is None else Camera.from_json(camera),
                 None if tile is None else checked.text(tile, "tile"),
                 None if pose is None else checked.rigid(pose, "atlas_from_cam"),
@@ -73,4 +73,4 @@ class Provenance:
             raise ResultError(f"no result: {error}") from None
 
 
-NOTHING_KNOWN = Provenance()
+EMPTY_PROVENANCE = Provenance()

@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from topoloc.errors import QueryError
-from topoloc.features.extraction import FeatureConfig, extract_normalized, normalize_image
+from topoloc.features.extraction import FeatureConfig, extract_from_normalized, normalize_image
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rough_camera import RoughCamera, usual_camera
-from topoloc.recordings.frame_checks import picture_problem
-from topoloc.recordings.pictures import grey_image
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera, nominal_camera
+from topoloc.recordings.frame_checks import find_image_problem
+from topoloc.recordings.image_io import to_grey
 from topoloc.retrieval.coarse import Image
 
 
@@ -59,9 +59,11 @@ class SharedFeatures:
 
     def of(self, query: Query) -> Features:
         """Of the picture as it was reduced for a query."""
-        return self.once(query, None, query.extracted)
+        return self.get_or_extract(query, None, query.extract_features)
 
-    def once(self, query: Query, view: Hashable, extract: Callable[[], Features]) -> Features:
+    def get_or_extract(
+        self, query: Query, view: Hashable, extract: Callable[[], Features]
+    ) -> Features:
         """Those of a view of that picture, such as the one to its side."""
         key = (query.image.shape[1], query.image.shape[0], query.feature_config, view)
         if key not in self._kept:
@@ -92,23 +94,23 @@ class StoredFeatures(SharedFeatures):
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class QueryImage:
     """A picture with what is known of its camera, to be asked of one map or of several. Raises as
-    `check_size`."""
+    `check_image_size`."""
 
     image: Image
-    camera: Camera | RoughCamera
+    camera: Camera | UncalibratedCamera
     features: SharedFeatures = field(default_factory=SharedFeatures)
 
     def __post_init__(self) -> None:
-        check_size(self.image, self.camera)
+        check_image_size(self.image, self.camera)
 
     @staticmethod
-    def of_features(known: Mapping[str, Features], camera: Camera) -> Picture:
+    def of_features(known: Mapping[str, Features], camera: Camera) -> QueryImage:
         """One of which nothing but local features is left, by their kinds. What looks at the
         picture itself (other scales and turns of it, walls, what a network says beside its key
         points) finds nothing in it."""
-        return Picture(
+        return QueryImage(
             np.zeros((camera.height, camera.width), np.uint8),
             camera,
             StoredFeatures(known, camera.width),
@@ -117,15 +119,15 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An image with what is known of its camera (`lens`), reduced; the image as it came is `scale`
-    times as wide.
+    """An image with what is known of its camera (`input_camera`), reduced; the image as it came is
+    `scale` times as wide.
 
     `deadline` is the time (of `time.perf_counter`) after which no further hypothesis is sought;
     infinite where there is none.
     """
 
     image: Image
-    lens: Camera | RoughCamera
+    input_camera: Camera | UncalibratedCamera
     scale: float
     feature_config: FeatureConfig
     clock: StageClock = field(default_factory=StageClock)
@@ -135,33 +137,33 @@ class Query:
     @property
     def camera(self) -> Camera:
         """The calibration; of a camera that is only roughly known, the likeliest."""
-        return usual_camera(self.lens)
+        return nominal_camera(self.input_camera)
 
     @cached_property
     def grey(self) -> UInt8[np.ndarray, "h w"]:
-        return grey_image(self.image)
+        return to_grey(self.image)
 
     @cached_property
     def features(self) -> Features:
         """The local features."""
         return self.shared.of(self)
 
-    def extracted(self) -> Features:
+    def extract_features(self) -> Features:
         """Patch normalisation, then the local features."""
         with self.clock.stage("patch_normalization"):
             normalized = normalize_image(self.grey, self.feature_config)
         with self.clock.stage("features"):
-            return extract_normalized(normalized, self.feature_config)
+            return extract_from_normalized(normalized, self.feature_config)
 
     @property
-    def is_late(self) -> bool:
+    def is_past_deadline(self) -> bool:
         return time.perf_counter() > self.deadline
 
 
-def check_size(image: Image, camera: Camera | RoughCamera) -> None:
+def check_image_size(image: Image, camera: Camera | UncalibratedCamera) -> None:
     """Raises QueryError where the image is no picture of 8 bits, or the camera is of another image
     size."""
-    if problem := picture_problem(image):
+    if problem := find_image_problem(image):
         raise QueryError(problem)
     height, width = image.shape[:2]
     if (camera.width, camera.height) != (width, height):
@@ -170,17 +172,21 @@ def check_size(image: Image, camera: Camera | RoughCamera) -> None:
         )
 
 
-def unknown_camera(image: Image) -> RoughCamera:
+def unknown_camera(image: Image) -> UncalibratedCamera:
     """The camera of a picture of which nothing is known. Raises QueryError where the image is no
     picture of 8 bits."""
-    if problem := picture_problem(image):
+    if problem := find_image_problem(image):
         raise QueryError(problem)
-    return RoughCamera.unknown(image.shape[1], image.shape[0])
+    return UncalibratedCamera.unknown(image.shape[1], image.shape[0])
 
 
-def reduced_image(
-    image: Image, camera: Camera | RoughCamera, map_focal: float, max_finer: float, max_side_px: int
-) -> tuple[np.ndarray, Camera | RoughCamera]:
+def reduce_image(
+    image: Image,
+    camera: Camera | UncalibratedCamera,
+    map_focal_length: float,
+    max_finer: float,
+    max_side_px: int,
+) -> tuple[np.ndarray, Camera | UncalibratedCamera]:
     """The image with its camera, smaller where it has over `max_finer` times the map's pixels a
     radian, or a longer side.
 
@@ -189,10 +195,10 @@ def reduced_image(
             camera counts as finer only as far as its whole range is.
     """
     height, width = image.shape[:2]
-    focal = camera.min_focal if isinstance(camera, RoughCamera) else camera.fx
+    focal = camera.min_focal if isinstance(camera, UncalibratedCamera) else camera.fx
     scale = max_side_px / max(width, height)
-    if focal > max_finer * map_focal:
-        scale = min(scale, map_focal / focal)
+    if focal > max_finer * map_focal_length:
+        scale = min(scale, map_focal_length / focal)
     if scale >= 1.0:
         return image, camera
     width, height = max(1, round(width * scale)), max(1, round(height * scale))

@@ -6,16 +6,18 @@ from collections.abc import Callable
 
 from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.calibration import calibration_of
+from topoloc.recordings.calibration import parse_calibration
 from topoloc.recordings.frame import StereoFrame
 
-CameraOfSize = Callable[[int, int], Camera | RoughCamera]
+CameraOfSize = Callable[[int, int], Camera | UncalibratedCamera]
 """The camera of a picture of this width and height."""
 
 
-def camera_of_frame(frame: StereoFrame, of_size: CameraOfSize | None) -> Camera | RoughCamera:
+def select_frame_camera(
+    frame: StereoFrame, of_size: CameraOfSize | None
+) -> Camera | UncalibratedCamera:
     """What `--camera` says, else the recording; else what the picture's file says of its focal
     length, or nothing."""
     height, width = frame.image.shape[:2]
@@ -24,23 +26,23 @@ def camera_of_frame(frame: StereoFrame, of_size: CameraOfSize | None) -> Camera 
     if frame.camera is not None:
         return frame.camera
     return (
-        RoughCamera.unknown(width, height)
-        if frame.noted_focal is None
-        else RoughCamera.noted(width, height, frame.noted_focal)
+        UncalibratedCamera.unknown(width, height)
+        if frame.exif_focal_px is None
+        else UncalibratedCamera.from_focal_guess(width, height, frame.exif_focal_px)
     )
 
 
-def named_camera(text: str, topomap: TopoMetricMap | None) -> CameraOfSize:
+def parse_camera_option(text: str, topomap: TopoMetricMap | None) -> CameraOfSize:
     """What `--camera` says; `map` only where one map is asked. Raises CalibrationError."""
     if text == "map" and topomap is not None:
-        return _rescaled(topomap.nodes[0].camera)
+        return _rescaled_camera(topomap.nodes[0].camera)
     if text == "unknown":
-        return RoughCamera.unknown
-    calibration = calibration_of(text)
+        return UncalibratedCamera.unknown
+    calibration = parse_calibration(text)
     return lambda width, height: calibration(width, height).camera
 
 
-def _rescaled(camera: Camera) -> CameraOfSize:
+def _rescaled_camera(camera: Camera) -> CameraOfSize:
     def of_size(width: int, height: int) -> Camera:
         if abs(width * camera.height - height * camera.width) > max(
             camera.width, camera.height

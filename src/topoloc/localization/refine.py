@@ -19,30 +19,40 @@ from topoloc.features.matching import Matcher
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
-from topoloc.localization.evidence import Evidence, doubt_of, even_share_of, log_odds_of, spread_of
-from topoloc.localization.guided import count_by_chance, match_guided, visible_points
-from topoloc.localization.map_facts.correlated_errors import inflation
-from topoloc.localization.map_facts.repetition import copies, folded
+from topoloc.localization.evidence import (
+    Evidence,
+    compute_inlier_spread,
+    compute_log_odds,
+    compute_normalized_uncertainty,
+    compute_uniform_inlier_ratio,
+)
+from topoloc.localization.guided import count_chance_matches, match_guided, select_visible_points
+from topoloc.localization.map_facts.correlated_errors import covariance_inflation
+from topoloc.localization.map_facts.repetition import fold_repetitions, shifted_copies
 from topoloc.localization.pose_fit import PoseFit, fit_pose
-from topoloc.localization.search import Proposal, Search, Tried
-from topoloc.localization.walls.propose_walls import WallProposal, refine_wall, weigh_wall
+from topoloc.localization.search import Proposal, Search, TriedProposal
+from topoloc.localization.walls.propose_virtual_views import (
+    VirtualViewProposal,
+    refine_virtual_view_pose,
+    score_virtual_view_pose,
+)
 
-_MOST_SAID, _FEW_MATCHES = (
+_MAX_CROSS_CHECK_LOG_ODDS, _HALF_WEIGHT_MATCHES = (
     3.0,
     30.0,
 )  # odds, in logarithms, that one kind adds to another's; matches with which it is heard by half
-_NUM_COMPARED = 512  # of the points in view that are compared with dense descriptors
-_ALIKE = (
+_MAX_COMPARED_POINTS = 512  # of the points in view that are compared with dense descriptors
+_MIN_SHARED_POINT_RATIO = (
     0.75  # of the points of a believed pose, within reach of the guided step around another one
 )
-_HOPELESS = -3.0  # odds, in logarithms, that nothing can mend
+_HOPELESS_LOG_ODDS = -3.0  # odds, in logarithms, that nothing can mend
 
 
-def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
+def evaluate_proposal(search: Search, proposal: Proposal) -> Hypothesis | None:
     """The proposal followed up; None where too little was found for any evidence, or nothing new
     can be."""
     final, hypothesis = (
-        (None, None) if is_found_already(search, proposal) else _followed_up(search, proposal)
+        (None, None) if is_already_found(search, proposal) else _refine_and_score(search, proposal)
     )
     if search.first is None:
         search.first = proposal.fit if final is None or final.pose is None else final
@@ -50,42 +60,48 @@ def hypothesis_of(search: Search, proposal: Proposal) -> Hypothesis | None:
         milliseconds = search.query.clock.times_ms()["total"]
         kind = search.query.feature_config.kind
         search.trace.tried.append(
-            Tried(proposal.source, proposal.fit, final, hypothesis, milliseconds, kind)
+            TriedProposal(proposal.source, proposal.fit, final, hypothesis, milliseconds, kind)
         )
     return hypothesis
 
 
-def _followed_up(search: Search, proposal: Proposal) -> tuple[PoseFit | None, Hypothesis | None]:
-    if isinstance(proposal, WallProposal):
+def _refine_and_score(
+    search: Search, proposal: Proposal
+) -> tuple[PoseFit | None, Hypothesis | None]:
+    if isinstance(proposal, VirtualViewProposal):
         with search.query.clock.stage("walls"):
-            final = refine_wall(proposal)
-            return final, weigh_wall(proposal, final) if final is not None else None
+            final = refine_virtual_view_pose(proposal)
+            return final, score_virtual_view_pose(proposal, final) if final is not None else None
     final = refine(search, proposal) if proposal.repeats is None else proposal.fit
-    return final, weigh(search, proposal, final)
+    return final, score_pose(search, proposal, final)
 
 
-def is_found_already(search: Search, proposal: Proposal) -> bool:
+def is_already_found(search: Search, proposal: Proposal) -> bool:
     """Does the first pose show the points of a believed one in nearly the same pixels? Then the
     same would be found around it."""
     fit, config = proposal.fit, search.config
-    if fit.pose is None or proposal.repeats is not None or isinstance(proposal, WallProposal):
+    if (
+        fit.pose is None
+        or proposal.repeats is not None
+        or isinstance(proposal, VirtualViewProposal)
+    ):
         return False
     radius_px = config.guided.radius_px * max(max(fit.camera.width, fit.camera.height) / 640.0, 0.5)
     for known in search.belief.hypotheses:
         if (
-            known.is_from_walls
+            known.is_from_virtual_views
             or known.probability < config.evidence.min_probability
             or known.fit.pose is None
         ):
             continue
-        seen = known.fit.seen_points(1.0)
+        seen = known.fit.inlier_observations(1.0)
         with np.errstate(invalid="ignore"):
             apart = np.linalg.norm(
                 fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world))
                 - seen.points_img,
                 axis=1,
             )
-        if np.count_nonzero(apart < radius_px) >= _ALIKE * len(apart):
+        if np.count_nonzero(apart < radius_px) >= _MIN_SHARED_POINT_RATIO * len(apart):
             return True
     return False
 
@@ -94,15 +110,15 @@ def refine(search: Search, proposal: Proposal) -> PoseFit:
     """The pose that follows from what is found around the first one; the first one where nothing is
     to be found."""
     config, first = search.config, proposal.fit
-    final = _around(search, first)
+    final = _refit_around(search, first)
     if (
         first.num_inliers < config.num_clear_inliers
     ):  # it may have been too poor for everything to be found from it at once
-        final = max(final, _around(search, final), key=lambda fit: fit.num_inliers)
+        final = max(final, _refit_around(search, final), key=lambda fit: fit.num_inliers)
     return final
 
 
-def _around(search: Search, fit: PoseFit) -> PoseFit:
+def _refit_around(search: Search, fit: PoseFit) -> PoseFit:
     config, query = search.config, search.query
     if (
         config.guided.num_nodes == 0
@@ -119,7 +135,7 @@ def _around(search: Search, fit: PoseFit) -> PoseFit:
     with query.clock.stage("pnp"):
         return fit_pose(
             query.features,
-            query.lens,
+            query.input_camera,
             local_map,
             matches,
             config.pose,
@@ -127,7 +143,7 @@ def _around(search: Search, fit: PoseFit) -> PoseFit:
         )
 
 
-def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | None:
+def score_pose(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | None:
     """The hypothesis with its evidence; None where too little was found for any.
 
     Evidence are matches that no pose guided. The first ones will do where they make the pose clear;
@@ -143,51 +159,60 @@ def weigh(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | No
     ):
         return None
     with search.query.clock.stage("evidence"):
-        inflated = inflation(final.num_inliers, search.rho)
+        inflated = covariance_inflation(final.num_inliers, search.correlated_error_share)
         covariance = inflated * final.pose.covariance
-        evidence = _evidence(search, proposal, final, covariance)
+        evidence = _compute_evidence(search, proposal, final, covariance)
         if evidence is None:
             return None
-        log_odds = log_odds_of(evidence, search.weights)
+        log_odds = compute_log_odds(evidence, search.weights)
     return Hypothesis(proposal.source, final, evidence, covariance, 1.0 / inflated, log_odds)
 
 
-def best_case(search: Search, proposal: Proposal) -> Evidence | None:
+def compute_best_case_evidence(search: Search, proposal: Proposal) -> Evidence | None:
     """The evidence for the proposal followed up if all that no pose guided agreed with it; None
     where too little is found for any."""
     final = refine(search, proposal)
     if final.pose is None or final.num_inliers < search.config.evidence.min_found:
         return None
     with search.query.clock.stage("evidence"):
-        counted = _counted(
-            search, final, inflation(final.num_inliers, search.rho) * final.pose.covariance
+        counted = _count_found_points(
+            search,
+            final,
+            covariance_inflation(final.num_inliers, search.correlated_error_share)
+            * final.pose.covariance,
         )
-        return _at_best(replace(counted, num_by_chance=_by_chance(search, final)), final)
+        return _assume_all_agree(
+            replace(counted, num_by_chance=_count_chance_matches(search, final)), final
+        )
 
 
-def say_on(search: Search, hypothesis: Hypothesis) -> tuple[float, Hypothesis | None]:
+def cross_check_hypothesis(
+    search: Search, hypothesis: Hypothesis
+) -> tuple[float, Hypothesis | None]:
     """What these features say on a pose of others, in logarithms of odds: little where few of them
     match anything, as in the dark. And the pose that they make of it, None where it is none."""
-    final = _around(search, hypothesis.fit)
+    final = _refit_around(search, hypothesis.fit)
     if final.num_inliers < search.config.evidence.min_found:
         return 0.0, None
-    weighed = weigh(search, Proposal("other features", final, is_guided=True), final)
+    scored = score_pose(search, Proposal("other features", final, is_guided=True), final)
     num_matches = (
-        len(_unguided(search, final).of_first())
-        if weighed is None
-        else weighed.evidence.num_matches
+        len(_create_unguided_matcher(search, final).match_first())
+        if scored is None
+        else scored.evidence.num_matches
     )
-    log_odds = -_MOST_SAID if weighed is None else weighed.log_odds  # None: it is hopeless
-    return float(np.clip(log_odds, -_MOST_SAID, _MOST_SAID)) * num_matches / (
-        num_matches + _FEW_MATCHES
-    ), weighed
+    log_odds = (
+        -_MAX_CROSS_CHECK_LOG_ODDS if scored is None else scored.log_odds
+    )  # None: it is hopeless
+    return float(
+        np.clip(log_odds, -_MAX_CROSS_CHECK_LOG_ODDS, _MAX_CROSS_CHECK_LOG_ODDS)
+    ) * num_matches / (num_matches + _HALF_WEIGHT_MATCHES), scored
 
 
-def _evidence(
+def _compute_evidence(
     search: Search, proposal: Proposal, final: PoseFit, covariance: Float[np.ndarray, "6 6"]
 ) -> Evidence | None:
     """None where it is hopeless."""
-    counted, repeats = _counted(search, final, covariance), proposal.repeats
+    counted, repeats = _count_found_points(search, final, covariance), proposal.repeats
     if repeats is not None:
         unguided = (repeats.num_matches, repeats.num_inliers)
         return replace(
@@ -197,33 +222,38 @@ def _evidence(
             num_inliers=unguided[1],
         )
     assert final.pose is not None
-    counted, may_be_hopeless = replace(counted, num_by_chance=_by_chance(search, final)), True
+    counted, may_be_hopeless = (
+        replace(counted, num_by_chance=_count_chance_matches(search, final)),
+        True,
+    )
     if not proposal.is_guided:
         evidence = _with_unguided(search, counted, proposal.fit, final)
-        log_odds = log_odds_of(evidence, search.weights)
+        log_odds = compute_log_odds(evidence, search.weights)
         if log_odds > search.weights.evidence.clear_log_odds:
             return evidence
-        may_be_hopeless = log_odds < 2.0 * _HOPELESS
+        may_be_hopeless = log_odds < 2.0 * _HOPELESS_LOG_ODDS
     if (
-        log_odds_of(_at_best(counted, final), search.weights) < _HOPELESS
+        compute_log_odds(_assume_all_agree(counted, final), search.weights) < _HOPELESS_LOG_ODDS
     ):  # whatever the unguided matches say
         return None
-    matcher = _unguided(search, final)
+    matcher = _create_unguided_matcher(search, final)
     if may_be_hopeless:
         of_strongest = _with_unguided(
             search,
             counted,
-            _fit_of(final, matcher.of_first(search.config.num_first_features)),
+            _fit_without_pose(final, matcher.match_first(search.config.num_first_features)),
             final,
         )
         if (
-            log_odds_of(of_strongest, search.weights) < 2.0 * _HOPELESS
+            compute_log_odds(of_strongest, search.weights) < 2.0 * _HOPELESS_LOG_ODDS
         ):  # whatever those of the other features say
             return None
-    return _with_unguided(search, counted, _fit_of(final, matcher.of_first()), final)
+    return _with_unguided(search, counted, _fit_without_pose(final, matcher.match_first()), final)
 
 
-def _counted(search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"]) -> Evidence:
+def _count_found_points(
+    search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"]
+) -> Evidence:
     """What is found where it must be seen. `covariance` is that of the left perturbation of
     cam_from_world."""
     pose, camera = final.pose, final.camera
@@ -232,20 +262,22 @@ def _counted(search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"
         final.local_map.points_world[final.matches.train_idx[pose.inliers]]
     )[:, 2]
     found_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
-    visible, visible_img = visible_points(final.local_map, pose.cam_from_world, camera)
+    visible, visible_img = select_visible_points(final.local_map, pose.cam_from_world, camera)
     return Evidence(
         num_matches=0,
         num_inliers=0,
         num_found=final.num_inliers,
         num_visible=len(visible_img),
         num_by_chance=0,
-        spread=spread_of(found_img, camera.width, camera.height),
-        even_share=_even_share(final, visible, visible_img, found_img),
-        doubt=doubt_of(covariance, float(np.median(depths)), search.config.evidence),
+        spread=compute_inlier_spread(found_img, camera.width, camera.height),
+        even_share=_compute_uniform_inlier_ratio(final, visible, visible_img, found_img),
+        doubt=compute_normalized_uncertainty(
+            covariance, float(np.median(depths)), search.config.evidence
+        ),
     )
 
 
-def _even_share(
+def _compute_uniform_inlier_ratio(
     final: PoseFit,
     visible: Int[np.ndarray, " v"],
     visible_img: Float[np.ndarray, "v 2"],
@@ -255,17 +287,17 @@ def _even_share(
     descriptors agree with where there are such."""
     camera, dense = final.camera, final.features.dense
     if dense is not None and len(visible) > 0:
-        asked = np.unique(np.linspace(0, len(visible) - 1, _NUM_COMPARED).astype(int))
-        visible_img = visible_img[asked]
+        sampled = np.unique(np.linspace(0, len(visible) - 1, _MAX_COMPARED_POINTS).astype(int))
+        visible_img = visible_img[sampled]
         found_img = visible_img[
-            dense.agrees(visible_img, final.local_map.descriptors[visible[asked]])
+            dense.check_agreement(visible_img, final.local_map.descriptors[visible[sampled]])
         ]
-    return even_share_of(found_img, visible_img, camera.width, camera.height)
+    return compute_uniform_inlier_ratio(found_img, visible_img, camera.width, camera.height)
 
 
-def _by_chance(search: Search, final: PoseFit) -> int:
+def _count_chance_matches(search: Search, final: PoseFit) -> int:
     assert final.pose is not None
-    return count_by_chance(
+    return count_chance_matches(
         final.features,
         final.local_map,
         final.pose.cam_from_world,
@@ -274,7 +306,7 @@ def _by_chance(search: Search, final: PoseFit) -> int:
     )
 
 
-def _at_best(counted: Evidence, final: PoseFit) -> Evidence:
+def _assume_all_agree(counted: Evidence, final: PoseFit) -> Evidence:
     """As if all unguided matches agreed with the pose."""
     return replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
 
@@ -286,18 +318,24 @@ def _with_unguided(
     assert final.pose is not None
     # points that share errors differ by them from node to node, so that even true matches agree
     # with a pose less well
-    agreement_px = search.config.evidence.agreement_px * math.sqrt(1.0 + search.rho)
-    num_agreeing = _num_agreeing(
-        unguided, final.pose.cam_from_world, final.camera, agreement_px, _repeats(search, final)
+    agreement_px = search.config.evidence.agreement_px * math.sqrt(
+        1.0 + search.correlated_error_share
+    )
+    num_agreeing = _count_agreeing_matches(
+        unguided,
+        final.pose.cam_from_world,
+        final.camera,
+        agreement_px,
+        _repetition_shifts(search, final),
     )
     return replace(evidence, num_matches=len(unguided.matches), num_inliers=num_agreeing)
 
 
-def _unguided(search: Search, final: PoseFit) -> Matcher:
+def _create_unguided_matcher(search: Search, final: PoseFit) -> Matcher:
     """Of features with the points around the final pose, without any pose's say."""
     points = final.local_map
-    positions = folded(
-        points.points_world, _repeats(search, final)
+    positions = fold_repetitions(
+        points.points_world, _repetition_shifts(search, final)
     )  # copies of a point are no rivals of it
     return Matcher(
         final.features.descriptors,
@@ -307,12 +345,12 @@ def _unguided(search: Search, final: PoseFit) -> Matcher:
     )
 
 
-def _fit_of(final: PoseFit, matches: Matches) -> PoseFit:
+def _fit_without_pose(final: PoseFit, matches: Matches) -> PoseFit:
     """Matches that owe nothing to the final pose, as a fit without one."""
     return replace(final, matches=matches, pose=None)
 
 
-def _num_agreeing(
+def _count_agreeing_matches(
     unguided: PoseFit,
     cam_from_world: Rigid3,
     camera: Camera,
@@ -322,7 +360,9 @@ def _num_agreeing(
     """How many of these matches agree with a pose that is not theirs, by their point or a copy of
     it."""
     is_near = np.zeros(len(unguided.matches), bool)
-    for points_world in copies(unguided.local_map.points_world[unguided.matches.train_idx], shifts):
+    for points_world in shifted_copies(
+        unguided.local_map.points_world[unguided.matches.train_idx], shifts
+    ):
         with np.errstate(invalid="ignore"):
             offsets = (
                 camera.img_from_cam(cam_from_world.apply(points_world))
@@ -334,6 +374,6 @@ def _num_agreeing(
     return int(np.count_nonzero(is_near))
 
 
-def _repeats(search: Search, final: PoseFit) -> Float[np.ndarray, "k 3"]:
+def _repetition_shifts(search: Search, final: PoseFit) -> Float[np.ndarray, "k 3"]:
     """The shifts by which what the pose's node shows repeats itself."""
     return search.map.repeats(search.map.topomap.row_of(final.node_id))

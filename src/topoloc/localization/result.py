@@ -11,13 +11,17 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import GeoreferenceError, ResultError
-from topoloc.geometry.calibration_check import DOUBT_LENGTHS, CalibrationDoubt, SeenCamera
+from topoloc.geometry.calibration_check import (
+    MISMATCH_FOCAL_FIELDS,
+    CalibrationMismatch,
+    IntrinsicsDeviation,
+)
 from topoloc.geometry.geodesy import GeoPose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import checked_json as checked
-from topoloc.localization.checked_json import pose_json
+from topoloc.localization.checked_json import pose_to_json
 from topoloc.localization.evidence import Evidence
-from topoloc.localization.provenance import NOTHING_KNOWN, Provenance
+from topoloc.localization.provenance import EMPTY_PROVENANCE, Provenance
 from topoloc.retrieval.coarse import NodeScore
 
 Reason = Literal[
@@ -45,8 +49,8 @@ class Localization:
     milliseconds of each stage; `focal_length_px` the focal length found with the pose, None where
     the camera was calibrated. `calibration_doubt` is what the picture says against its calibration;
     covariance and probability have paid for it. `seen_camera` is what the picture says of its
-    camera in any case, for many of them to be heard together (`calibration_verdict.py`). `geopose`
-    is the camera's place on earth, of maps that know theirs (`topoloc georeference`).
+    camera in any case, for many of them to be heard together (`calibration_consistency.py`).
+    `geopose` is the camera's place on earth, of maps that know theirs (`topoloc georeference`).
     """
 
     world_from_cam: Rigid3
@@ -61,20 +65,20 @@ class Localization:
     focal_length_px: float | None = None
     noise_share: float = 1.0
     calibrated: bool = True
-    provenance: Provenance = NOTHING_KNOWN
+    provenance: Provenance = EMPTY_PROVENANCE
     geopose: GeoPose | None = None
-    calibration_doubt: CalibrationDoubt | None = None
-    seen_camera: SeenCamera | None = None
+    calibration_doubt: CalibrationMismatch | None = None
+    seen_camera: IntrinsicsDeviation | None = None
 
     @property
     def localized(self) -> Literal[True]:
         return True
 
     @property
-    def is_from_walls(self) -> bool:
+    def is_from_virtual_views(self) -> bool:
         """Was the place recognised by the walls along the way, of which the nodes around show
         another side?"""
-        return self.evidence is not None and self.evidence.is_from_walls
+        return self.evidence is not None and self.evidence.is_from_virtual_views
 
     @property
     def position_sigma_m(self) -> float:
@@ -99,7 +103,7 @@ class Localization:
         return {
             "query": query,
             "localized": True,
-            "world_from_cam": pose_json(self.world_from_cam),
+            "world_from_cam": pose_to_json(self.world_from_cam),
             "covariance": self.covariance.tolist(),
             "position_sigma_m": self.position_sigma_m,
             "rotation_sigma_deg": self.rotation_sigma_deg,
@@ -125,8 +129,8 @@ class Localization:
         Raises:
             ResultError: it is no result, or one of an image that was not localized.
         """
-        data = checked.object_of(line)
-        if checked.wanted(data, "localized") is not True:
+        data = checked.parse_object(line)
+        if checked.require(data, "localized") is not True:
             raise ResultError(
                 "the result of an image that was not localized holds no pose"
                 " (NotLocalized.from_json reads it)"
@@ -135,20 +139,20 @@ class Localization:
             data.get(key) for key in ("focal_length_px", "evidence", "calibration_doubt")
         )
         return Localization(
-            checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
-            checked.covariance(checked.wanted(data, "covariance"), "covariance"),
-            checked.number(checked.wanted(data, "probability"), "probability", 0.0, 1.0),
-            checked.whole(checked.wanted(data, "node"), "node"),
-            **_evidence_from(data),
-            evidence=None if evidence is None else _evidence_of(evidence),
+            checked.rigid(checked.require(data, "world_from_cam"), "world_from_cam"),
+            checked.covariance(checked.require(data, "covariance"), "covariance"),
+            checked.number(checked.require(data, "probability"), "probability", 0.0, 1.0),
+            checked.integer(checked.require(data, "node"), "node"),
+            **_parse_evidence_fields(data),
+            evidence=None if evidence is None else _parse_evidence(evidence),
             focal_length_px=(
                 None if focal is None else checked.number(focal, "focal_length_px", 0.0)
             ),
             noise_share=checked.number(data.get("noise_share", 1.0), "noise_share", 0.0, 1.0),
             calibrated=data.get("calibrated", True) is not False,
             provenance=Provenance.from_json(data),
-            geopose=_geopose_of(data),
-            calibration_doubt=None if doubt is None else _doubt_of(doubt),
+            geopose=_parse_geopose(data),
+            calibration_doubt=None if doubt is None else _parse_calibration_doubt(doubt),
         )
 
 
@@ -166,7 +170,7 @@ class Alternative:
 
     def to_json(self) -> dict[str, Any]:
         pose = {
-            "world_from_cam": pose_json(self.world_from_cam),
+            "world_from_cam": pose_to_json(self.world_from_cam),
             "probability": self.probability,
             "node": self.node_id,
         }
@@ -179,10 +183,10 @@ class Alternative:
         if not isinstance(data, Mapping):
             raise ResultError("no result: an alternative is an object")
         return Alternative(
-            checked.rigid(checked.wanted(data, "world_from_cam"), "world_from_cam"),
-            checked.number(checked.wanted(data, "probability"), "probability", 0.0, 1.0),
-            checked.whole(checked.wanted(data, "node"), "node"),
-            _geopose_of(data),
+            checked.rigid(checked.require(data, "world_from_cam"), "world_from_cam"),
+            checked.number(checked.require(data, "probability"), "probability", 0.0, 1.0),
+            checked.integer(checked.require(data, "node"), "node"),
+            _parse_geopose(data),
             None if data.get("tile") is None else checked.text(data["tile"], "tile"),
         )
 
@@ -201,8 +205,8 @@ class NotLocalized:
     times_ms: dict[str, float] = field(default_factory=dict)
     detail: str = ""
     alternatives: tuple[Alternative, ...] = ()
-    provenance: Provenance = NOTHING_KNOWN
-    seen_camera: SeenCamera | None = None
+    provenance: Provenance = EMPTY_PROVENANCE
+    seen_camera: IntrinsicsDeviation | None = None
 
     @property
     def localized(self) -> Literal[False]:
@@ -227,18 +231,18 @@ class NotLocalized:
         Raises:
             ResultError: it is no result, or one of an image that was localized.
         """
-        data = checked.object_of(line)
-        if checked.wanted(data, "localized") is not False:
+        data = checked.parse_object(line)
+        if checked.require(data, "localized") is not False:
             raise ResultError(
                 "the result of an image that was localized is no refusal (Localization.from_json"
                 " reads it)"
             )
-        reason = checked.wanted(data, "reason")
+        reason = checked.require(data, "reason")
         if reason not in get_args(Reason):
             raise ResultError(f"no result: the reason is none of {', '.join(get_args(Reason))}")
         return NotLocalized(
             reason,
-            **_evidence_from(data),
+            **_parse_evidence_fields(data),
             detail=checked.text(data.get("detail", ""), "detail"),
             alternatives=tuple(
                 Alternative.from_json(one)
@@ -253,7 +257,7 @@ R = TypeVar("R", bound=Localization | NotLocalized)
 
 def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | NotLocalized:
     """Either of the two. Raises ResultError where it is no result."""
-    data = checked.object_of(line)
+    data = checked.parse_object(line)
     return (
         Localization.from_json(data)
         if data.get("localized") is True
@@ -261,7 +265,7 @@ def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | No
     )
 
 
-def at_time(result: R, t_ns: int) -> R:
+def with_time(result: R, t_ns: int) -> R:
     """The result, with the time of its picture, nanoseconds."""
     return replace(result, provenance=replace(result.provenance, t_ns=t_ns))
 
@@ -276,39 +280,41 @@ def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
     }
 
 
-def _geopose_of(data: Mapping[str, Any]) -> GeoPose | None:
+def _parse_geopose(data: Mapping[str, Any]) -> GeoPose | None:
     try:
         return None if data.get("geopose") is None else GeoPose.from_json(data["geopose"])
     except GeoreferenceError as error:
         raise ResultError(f"no result: 'geopose': {error}") from None
 
 
-def _evidence_of(value: Any) -> Evidence:
+def _parse_evidence(value: Any) -> Evidence:
     data = checked.mapping(value, "evidence")
     values: dict[str, Any] = {}
     for one in fields(Evidence):
         is_missing = one.name in ("num_distinct", "num_lesser_side") and data.get(one.name) is None
-        read = checked.whole if one.name.startswith("num_") else checked.number
+        read = checked.integer if one.name.startswith("num_") else checked.number
         values[one.name] = (
-            None if is_missing else read(checked.wanted(data, one.name), f"evidence.{one.name}")
+            None if is_missing else read(checked.require(data, one.name), f"evidence.{one.name}")
         )
     return Evidence(**values)
 
 
-def _doubt_of(value: Any) -> CalibrationDoubt:
+def _parse_calibration_doubt(value: Any) -> CalibrationMismatch:
     data = checked.mapping(value, "calibration_doubt")
 
     def vector(key: str, length: int) -> np.ndarray:
-        values = [checked.number(one, key) for one in checked.items(checked.wanted(data, key), key)]
+        values = [
+            checked.number(one, key) for one in checked.items(checked.require(data, key), key)
+        ]
         if len(values) != length:
             raise ResultError(f"no result: {key!r} is no {length} numbers")
         return np.array(values)
 
-    of = checked.items(checked.wanted(data, "of"), "of")
+    of = checked.items(checked.require(data, "of"), "of")
     focal, sigma, calibrated = (
-        checked.number(checked.wanted(data, key), key, 0.0) for key in DOUBT_LENGTHS
+        checked.number(checked.require(data, key), key, 0.0) for key in MISMATCH_FOCAL_FIELDS
     )
-    return CalibrationDoubt(
+    return CalibrationMismatch(
         focal,
         sigma,
         calibrated,
@@ -320,22 +326,22 @@ def _doubt_of(value: Any) -> CalibrationDoubt:
     )
 
 
-def _evidence_from(data: Mapping[str, Any]) -> dict[str, Any]:
+def _parse_evidence_fields(data: Mapping[str, Any]) -> dict[str, Any]:
     pairs = [
         checked.items(pair, "candidates")
-        for pair in checked.items(checked.wanted(data, "candidates"), "candidates")
+        for pair in checked.items(checked.require(data, "candidates"), "candidates")
     ]
     if any(len(pair) != 2 for pair in pairs):
         raise ResultError("no result: 'candidates' are pairs of a node and its score")
-    times_ms = checked.wanted(data, "times_ms")
+    times_ms = checked.require(data, "times_ms")
     if not isinstance(times_ms, Mapping):
         raise ResultError("no result: 'times_ms' are milliseconds by the names of stages")
     return {
         "candidates": [
-            NodeScore(checked.whole(node_id, "candidates"), checked.number(score, "candidates"))
+            NodeScore(checked.integer(node_id, "candidates"), checked.number(score, "candidates"))
             for node_id, score in pairs
         ],
-        "num_matches": checked.whole(checked.wanted(data, "num_matches"), "num_matches"),
-        "num_inliers": checked.whole(checked.wanted(data, "num_inliers"), "num_inliers"),
+        "num_matches": checked.integer(checked.require(data, "num_matches"), "num_matches"),
+        "num_inliers": checked.integer(checked.require(data, "num_inliers"), "num_inliers"),
         "times_ms": {str(stage): checked.number(ms, "times_ms") for stage, ms in times_ms.items()},
     }

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from topoloc.localization.belief import Belief, Hypothesis, lead
+from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.fitted_weights import FittedWeights
@@ -17,7 +17,7 @@ from topoloc.retrieval.coarse import NodeScore
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class TriedProposal:
     """A first pose and what became of it.
 
     `refined` is the pose found around the first one (None: the first was not followed up, as where
@@ -37,7 +37,7 @@ class Tried:
 class Trace:
     """All first poses that were tried, in order."""
 
-    tried: list[Tried] = field(default_factory=list)
+    tried: list[TriedProposal] = field(default_factory=list)
 
 
 Source = Literal[
@@ -69,9 +69,9 @@ class Search:
     map: OpenMap
     config: LocalizerConfig
     weights: FittedWeights
-    rho: float
+    correlated_error_share: float
     trace: Trace | None = None
-    before: Search | None = None
+    previous: Search | None = None
     """The search by the kind of features that was asked before, and left it open."""
     is_last: bool = True
     """No other kind is asked where this one leaves it open."""
@@ -81,7 +81,7 @@ class Search:
     """What retrieval led to."""
     first: PoseFit | None = None
     """What was tried first: where nothing is believed, it says why."""
-    is_repeated: bool = False
+    is_repetitive: bool = False
     """What is believed is one of many poses from which the place looks alike."""
     is_stopped: bool = False
     """Time was up before everything was tried."""
@@ -94,7 +94,7 @@ class Search:
     @property
     def named(self) -> list[NodeScore]:
         """The same by their ids, as they are reported."""
-        return self.map.with_ids(self.candidates)
+        return self.map.with_node_ids(self.candidates)
 
     @property
     def best(self) -> Hypothesis | None:
@@ -116,6 +116,6 @@ class Search:
             return False
         best, *others = self.belief.ranked(self.weights.rivals)
         return all(
-            lead(best, other, self.weights.rivals) > self.weights.evidence.clear_log_odds
+            log_odds_margin(best, other, self.weights.rivals) > self.weights.evidence.clear_log_odds
             for other in others
         )

@@ -15,39 +15,45 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from topoloc.bounds import check_bounds
+from topoloc.disk_list import DiskList
 from topoloc.errors import EmptyMapError
-from topoloc.features.bands import in_order
-from topoloc.features.kinds import find_kind
+from topoloc.features.feature_types import find_feature_type
+from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.drafts import Drafts, NodeDraft, draft_node, finish_node, observe
 from topoloc.mapping.entries import Edge, PlaceImage, TopoNode
 from topoloc.mapping.landmarks import Observations
 from topoloc.mapping.mapping_frames import (
     MappingFrame,
     MappingImage,
     PointLocator,
-    mapping_image,
-    posed_frames,
-    view_of,
+    extract_mapping_image,
+    prepare_view,
+    select_posed_frames,
 )
-from topoloc.mapping.nodes import NearestNodes, NodeConfig, NodePoses, place_nodes
+from topoloc.mapping.node_drafts import (
+    NodeDraft,
+    NodeDrafts,
+    create_node_draft,
+    finish_node,
+    observe_draft,
+)
+from topoloc.mapping.nodes import NearestNodeSearch, NodeConfig, NodePoses, select_node_frames
 from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.sessions import (
     Edit,
-    Light,
+    Illumination,
     Session,
-    mean_light,
-    path_of,
-    poses_source_of,
+    average_illumination,
+    find_pose_source,
+    find_source_path,
     today,
 )
-from topoloc.mapping.side_nodes import gather_sides, nodes_with_sides
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.vlad import SurfVlad, learn_words_of, placed, vlad
-from topoloc.shelf import Shelf
+from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
 BuildConfig = MapConfig
 Progress = Callable[[str, int, int], None]
@@ -81,26 +87,28 @@ def build_map(
     frames = [
         frame
         for session_id, sequence in enumerate(sequences)
-        for frame in posed_frames(sequence, session_id)
+        for frame in select_posed_frames(sequence, session_id)
     ]
     locator = PointLocator(frames, config)
     node_config = _resolve_node_config(frames, locator, config)
     drafts = _draft_nodes(frames, locator, node_config, config, progress)
-    place_images, lights, coarse = _visit_all_images(frames, drafts, node_config, config, progress)
-    of_kind, sides = _finished(drafts, config)
+    place_images, lights, coarse = _process_mapping_images(
+        frames, drafts, node_config, config, progress
+    )
+    of_kind, sides = _finish_nodes(drafts, config)
     nodes = of_kind.pop(config.features.kind)
-    poses_from = poses_from or [poses_source_of(sequence) for sequence in sequences]
+    poses_from = poses_from or [find_pose_source(sequence) for sequence in sequences]
     return TopoMetricMap(
         summaries=[node.summary for node in nodes],
         nodes=nodes,
-        edges=_edges_along(frames, [image.node_id for image in place_images]),
+        edges=_connect_nodes(frames, [image.node_id for image in place_images]),
         place_images=place_images,
         coarse_models={model.name: model for model in coarse},
         config=replace(config, nodes=node_config),
-        length_m=_trajectory_length(frames),
-        sides=gather_sides(sides, config.kind_of_sides, config.sides),
+        length_m=_compute_trajectory_length(frames),
+        sides=collect_virtual_nodes(sides, config.virtual_view_type, config.sides),
         sessions=[
-            _session(k, sequence, frames, lights, poses_from[k], drafts.cameras)
+            _make_session(k, sequence, frames, lights, poses_from[k], drafts.cameras)
             for k, sequence in enumerate(sequences)
         ],
         edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
@@ -108,11 +116,11 @@ def build_map(
     )
 
 
-def _session(
+def _make_session(
     session_id: int,
     sequence: StereoSequence,
     frames: list[MappingFrame],
-    lights: list[Light],
+    lights: list[Illumination],
     poses_from: str,
     cameras: dict[int, Camera],
 ) -> Session:
@@ -120,12 +128,12 @@ def _session(
     the sessions."""
     of_session = [k for k, frame in enumerate(frames) if frame.session_id == session_id]
     t_ns = [frames[k].t_ns for k in of_session]
-    light = mean_light([lights[k] for k in of_session])
+    light = average_illumination([lights[k] for k in of_session])
     camera = cameras.get(session_id)
     return Session(
         session_id,
         sequence.name,
-        path_of(sequence),
+        find_source_path(sequence),
         poses_from,
         min(t_ns),
         max(t_ns),
@@ -146,13 +154,13 @@ def _resolve_node_config(
     )
 
     def depths(read: tuple[MappingFrame, StereoFrame]) -> Float[np.ndarray, " n"]:
-        frame, view = read[0], view_of(read[1])
-        located = locator.locate(frame, view, mapping_image(frame, view, first))[0][
+        frame, view = read[0], prepare_view(read[1])
+        located = locator.locate(frame, view, extract_mapping_image(frame, view, first))[0][
             config.features.kind
         ]
         return located.points_cam[located.valid, 2]
 
-    all_depths = np.concatenate(list(locator.for_each(depths, samples)))
+    all_depths = np.concatenate(list(locator.map_frames(depths, samples)))
     if len(all_depths) == 0:
         raise EmptyMapError(
             f"{frames[0].sequence.name}: no feature with a 3-D position in {len(samples)} pictures"
@@ -167,21 +175,26 @@ def _draft_nodes(
     node_config: NodeConfig,
     config: BuildConfig,
     progress: Progress,
-) -> Drafts:
+) -> NodeDrafts:
     """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank)
     becomes no node."""
     chosen = [
-        frames[i] for i in place_nodes([frame.world_from_cam for frame in frames], node_config)
+        frames[i]
+        for i in select_node_frames([frame.world_from_cam for frame in frames], node_config)
     ]
-    kind = find_kind(config.features.kind)
-    rows = nodes_with_sides([frame.world_from_cam for frame in chosen], node_config, config.sides)
-    with_sides = {chosen[row] for row in rows}
-    drafts = Drafts(Shelf(by_reference=frames))
+    kind = find_feature_type(config.features.kind)
+    rows = select_virtual_view_nodes(
+        [frame.world_from_cam for frame in chosen], node_config, config.sides
+    )
+    virtual_view_frames = {chosen[row] for row in rows}
+    drafts = NodeDrafts(DiskList(shared_objects=frames))
 
-    def draft_of(read: tuple[MappingFrame, StereoFrame]) -> NodeDraft:
-        return draft_node(read[0], view_of(read[1]), locator, read[0] in with_sides, config)
+    def make_draft(read: tuple[MappingFrame, StereoFrame]) -> NodeDraft:
+        return create_node_draft(
+            read[0], prepare_view(read[1]), locator, read[0] in virtual_view_frames, config
+        )
 
-    for done, draft in enumerate(locator.for_each(draft_of, chosen)):
+    for done, draft in enumerate(locator.map_frames(make_draft, chosen)):
         if len(draft.points[kind.name].features) >= config.min_node_points:
             drafts.append(draft)
         progress("nodes", done + 1, len(chosen))
@@ -193,32 +206,32 @@ def _draft_nodes(
     return drafts
 
 
-def _visit_all_images(
+def _process_mapping_images(
     frames: list[MappingFrame],
-    drafts: Drafts,
+    drafts: NodeDrafts,
     node_config: NodeConfig,
     config: BuildConfig,
     progress: Progress,
-) -> tuple[list[PlaceImage], list[Light], list[CoarseModel]]:
+) -> tuple[list[PlaceImage], list[Illumination], list[CoarseModel]]:
     """Label every mapping image with its nearest node, let it observe the points of the nodes
     around, and teach the coarse localizer of each kind of features with it; its light is measured
     on the way."""
     assert node_config.lambda_rot is not None
-    words = {kind: _words(drafts, kind, config) for kind in config.kinds}
-    nodes = NearestNodes(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
+    words = {kind: _learn_vocabulary(drafts, kind, config) for kind in config.kinds}
+    nodes = NearestNodeSearch(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
     images: list[PlaceImage] = []
     lights, vlads, cells = (
         [],
-        {kind: Shelf[np.ndarray]() for kind in config.kinds},
+        {kind: DiskList[np.ndarray]() for kind in config.kinds},
         {kind: [] for kind in config.kinds},
     )
     read = ((frame, None if frame in drafts.rows else frame.read_left()) for frame in frames)
-    visits = in_order(lambda one: _visit(*one, drafts, nodes, words, config), read)
+    visits = parallel_map(lambda one: _observe_image(*one, drafts, nodes, words, config), read)
     for done, (frame, visit) in enumerate(zip(frames, visits, strict=True)):
         for row, observed in visit.observed.items():
-            draft = drafts.shelf[row]
+            draft = drafts.disk_list[row]
             draft.add(observed)
-            drafts.shelf[row] = draft
+            drafts.disk_list[row] = draft
         image = visit.image
         for kind, features in image.features.items():
             vlads[kind].append(visit.vlads[kind])
@@ -235,7 +248,7 @@ def _visit_all_images(
         progress("images", done + 1, len(frames))
     node_ids = np.array([image.node_id for image in images])
     learnt = {
-        kind: (words[kind], vlads[kind], node_ids, config.vlad_of(kind), cells[kind])
+        kind: (words[kind], vlads[kind], node_ids, config.vlad_config_for(kind), cells[kind])
         for kind in config.kinds
     }
     first, models = (
@@ -253,7 +266,7 @@ def _visit_all_images(
 
 
 @dataclass(frozen=True, eq=False)
-class _Visit:
+class _ImageObservations:
     """What a mapping image gives: its nearest node's row, what it sees of the nodes around, by
     their rows, and its VLADs by kind."""
 
@@ -263,57 +276,68 @@ class _Visit:
     vlads: dict[str, Float32[np.ndarray, " v"]]
 
 
-def _visit(
+def _observe_image(
     frame: MappingFrame,
     read: StereoFrame | None,
-    drafts: Drafts,
-    nodes: NearestNodes,
+    drafts: NodeDrafts,
+    nodes: NearestNodeSearch,
     words: dict[str, Float32[np.ndarray, "k d"]],
     config: BuildConfig,
-) -> _Visit:
+) -> _ImageObservations:
     """`read` is None for a frame that is a node: what it shows is known already. Changes nothing,
     so that several may run at a time."""
     image = (
         drafts.image(frame)
         if read is None
-        else mapping_image(frame, view_of(read, with_depth=False), config)
+        else extract_mapping_image(frame, prepare_view(read, with_depth=False), config)
     )
     nearest = nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)).tolist()
-    around = {row: drafts.shelf[row] for row in nearest[: config.landmarks.nodes_per_image]}
+    around = {row: drafts.disk_list[row] for row in nearest[: config.landmarks.nodes_per_image]}
     observed = {
-        row: observe(draft, image, frame.session_id, config)
+        row: observe_draft(draft, image, frame.session_id, config)
         for row, draft in around.items()
         if frame not in draft.sources
     }
-    placed_of = {
-        kind: placed(of, image.camera.width, image.camera.height, config.vlad_of(kind))
+    positioned = {
+        kind: append_positions(
+            of, image.camera.width, image.camera.height, config.vlad_config_for(kind)
+        )
         for kind, of in image.features.items()
     }
-    return _Visit(
+    return _ImageObservations(
         image,
         nearest[0],
         observed,
-        {kind: vlad(described, words[kind]) for kind, described in placed_of.items()},
+        {
+            kind: vlad(vlad_descriptors, words[kind])
+            for kind, vlad_descriptors in positioned.items()
+        },
     )
 
 
-def _words(drafts: Drafts, kind: str, config: BuildConfig) -> Float32[np.ndarray, "k d"]:
-    return learn_words_of(
-        drafts.num_points[kind], lambda row: drafts.shelf[row].described(kind, config), config.vlad
+def _learn_vocabulary(
+    drafts: NodeDrafts, kind: str, config: BuildConfig
+) -> Float32[np.ndarray, "k d"]:
+    return learn_words_from_parts(
+        drafts.num_points[kind],
+        lambda row: drafts.disk_list[row].vlad_descriptors(kind, config),
+        config.vlad,
     )
 
 
-def _finished(
-    drafts: Drafts, config: BuildConfig
+def _finish_nodes(
+    drafts: NodeDrafts, config: BuildConfig
 ) -> tuple[dict[str, Sequence[TopoNode]], Sequence[TopoNode]]:
     """The nodes by their kinds of features, and all side nodes; each draft is looked at once."""
-    of_kind, sides = {kind: Shelf[TopoNode]() for kind in config.kinds}, Shelf[TopoNode]()
+    of_kind, sides = {kind: DiskList[TopoNode]() for kind in config.kinds}, DiskList[TopoNode]()
 
-    def finished(node_id: int) -> tuple[list[TopoNode], list[TopoNode]]:
-        draft = drafts.shelf[node_id]
+    def finish_nodes(node_id: int) -> tuple[list[TopoNode], list[TopoNode]]:
+        draft = drafts.disk_list[node_id]
         return [finish_node(node_id, draft, kind, config) for kind in config.kinds], draft.sides
 
-    for node_id, (nodes, of_node) in enumerate(in_order(finished, range(len(drafts.shelf)))):
+    for node_id, (nodes, of_node) in enumerate(
+        parallel_map(finish_nodes, range(len(drafts.disk_list)))
+    ):
         for kind, node in zip(config.kinds, nodes, strict=True):
             of_kind[kind].append(node)
         for side in of_node:
@@ -321,7 +345,7 @@ def _finished(
     return dict(of_kind), sides
 
 
-def _edges_along(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:
+def _connect_nodes(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:
     """An edge wherever a recording went from one node to another."""
     steps = pairwise(zip(frames, node_ids, strict=True))
     edges = {
@@ -332,7 +356,7 @@ def _edges_along(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:
     return [Edge(source, target) for source, target in sorted(edges)]
 
 
-def _trajectory_length(frames: list[MappingFrame]) -> float:
+def _compute_trajectory_length(frames: list[MappingFrame]) -> float:
     steps = [
         b.world_from_cam.translation - a.world_from_cam.translation
         for a, b in pairwise(frames)

@@ -7,15 +7,20 @@ import json
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any
 
-from topoloc.bounds import Between, settings_from
+from topoloc.bounds import Between, parse_settings
 from topoloc.errors import ConfigError, MissingExtraError, WeightsError
-from topoloc.features.kinds import SURF, FeatureConfig, find_kind, learned_kind
+from topoloc.features.feature_types import (
+    SURF,
+    FeatureConfig,
+    default_learned_type,
+    find_feature_type,
+)
 from topoloc.mapping.landmarks import LandmarkConfig
 from topoloc.mapping.nodes import NodeConfig
-from topoloc.mapping.side_nodes import SideNodesConfig
-from topoloc.mapping.validation import json_of
+from topoloc.mapping.validation import parse_json
+from topoloc.mapping.virtual_nodes import VirtualNodesConfig
 from topoloc.points.metric_points import MetricPointsConfig
-from topoloc.points.motion_points import MotionPointsConfig
+from topoloc.points.motion_triangulation import MotionTriangulationConfig
 from topoloc.retrieval.vlad import VladConfig
 
 CONFIG_VERSION = 1
@@ -33,10 +38,10 @@ class MapConfig:
     first one leaves its pose unclear. Unset: beside SURF the learned ones whose network is here, if
     any is."""
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
-    motion: MotionPointsConfig = field(default_factory=MotionPointsConfig)
+    motion: MotionTriangulationConfig = field(default_factory=MotionTriangulationConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
-    sides: SideNodesConfig = field(default_factory=SideNodesConfig)
+    sides: VirtualNodesConfig = field(default_factory=VirtualNodesConfig)
     max_node_points: Annotated[int, Between(1, 100_000)] = 800
     """Features that a node keeps, the strongest ones."""
     min_node_points: Annotated[int, Between(1, 100_000)] = 20
@@ -53,18 +58,20 @@ class MapConfig:
         if self.other_kinds is not None or self.features.kind != SURF.name:
             return [self.features.kind, *(self.other_kinds or ())]
         try:
-            return [self.features.kind, learned_kind()]
+            return [self.features.kind, default_learned_type()]
         except (MissingExtraError, WeightsError):
             return [self.features.kind]
 
     @property
-    def kind_of_sides(self) -> str:
+    def virtual_view_type(self) -> str:
         """The kind of features that side nodes are described with: that of a kind that a network
         gives, where the map has one."""
-        kinds = [find_kind(kind) for kind in self.kinds]
-        return next((kind for kind in kinds if kind.network is not None), kinds[0]).kind_of_sides
+        kinds = [find_feature_type(kind) for kind in self.kinds]
+        return next(
+            (kind for kind in kinds if kind.network is not None), kinds[0]
+        ).virtual_view_type
 
-    def features_of(self, kind: str) -> FeatureConfig:
+    def feature_config_for(self, kind: str) -> FeatureConfig:
         """The settings of the features of this kind: those of `features`, but for the picture's
         normalization, which suits the kind."""
         return (
@@ -73,11 +80,12 @@ class MapConfig:
             else replace(self.features, kind=kind, normalization=None)
         )
 
-    def vlad_of(self, kind: str) -> VladConfig:
+    def vlad_config_for(self, kind: str) -> VladConfig:
         """The settings of surf-vlad by features of this kind."""
         weight = self.vlad.position_weight
         return replace(
-            self.vlad, position_weight=find_kind(kind).position_weight if weight is None else weight
+            self.vlad,
+            position_weight=find_feature_type(kind).position_weight if weight is None else weight,
         )
 
     @property
@@ -104,10 +112,10 @@ def config_to_text(config: MapConfig) -> str:
 def config_from_text(text: str, version: int | None) -> MapConfig:
     """The inverse of `config_to_text`; files of schema 1 named no version. Raises ConfigError,
     which names the key."""
-    data = json_of(text)
+    data = parse_json(text)
     if version is not None and isinstance(data, dict) and data.pop("version", None) != version:
         raise ConfigError(f"config: of another version than {version}, which is known")
-    config = settings_from(MapConfig, data, "config")
+    config = parse_settings(MapConfig, data, "config")
     for name in ("d_thresh", "lambda_rot"):
         if getattr(config.nodes, name) is None:
             raise ConfigError(f"config.nodes.{name}: is missing")

@@ -1,5 +1,5 @@
-"""What a map holds, as `reading.py` finds it in a file and `writing.py` writes it. Data only;
-`topomap.py` makes a map of it."""
+"""What a map holds, as `map_reading.py` finds it in a file and `map_writing.py` writes it. Data
+only; `topomap.py` makes a map of it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import no_type_check
 from topoloc.geometry.geodesy import Georeference
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.entries import (
+    CorrelatedErrors,
     Edge,
     NodeSummary,
     PlaceImage,
     Repetitions,
-    SharedErrors,
-    SideNodes,
     TopoNode,
+    VirtualNodes,
 )
-from topoloc.mapping.nodes import digest_of_nodes
+from topoloc.mapping.nodes import compute_nodes_digest
 from topoloc.mapping.sessions import Edit, Session
 from topoloc.retrieval.coarse import CoarseModel
 
@@ -59,14 +59,14 @@ class MapContents:
     config: MapConfig = field(default_factory=MapConfig)
     length_m: float = 0.0
     default_coarse: str = "surf-vlad"
-    shared_errors: SharedErrors | None = None
+    shared_errors: CorrelatedErrors | None = None
     repetitions: Repetitions | None = None
-    sides: SideNodes | None = None
+    sides: VirtualNodes | None = None
     sessions: Sequence[Session] = ()
     edits: Sequence[Edit] = ()
     next_ids: NextIds = NextIds()
     other_kinds: Mapping[str, Sequence[TopoNode]] = field(default_factory=dict)
-    other_shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
+    other_shared_errors: Mapping[str, CorrelatedErrors] = field(default_factory=dict)
     map_id: str | None = None
     georeference: Georeference | None = None
 
@@ -105,7 +105,7 @@ class MapContents:
         return [self.kind, *sorted(self.other_kinds)]
 
 
-def map_id_of(contents: MapContents) -> str:
+def get_map_id(contents: MapContents) -> str:
     """The map's id, 16 hexadecimal digits; of one that was not saved yet, or by an older version,
     what its nodes make of it."""
-    return contents.map_id or digest_of_nodes(contents.summaries, _MAP_ID)
+    return contents.map_id or compute_nodes_digest(contents.summaries, _MAP_ID)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import EmptyMapError
-from topoloc.mapping.checking import list_coarse
-from topoloc.mapping.contents import map_id_of
+from topoloc.mapping.contents import get_map_id
+from topoloc.mapping.integrity_check import list_coarse_models
 from topoloc.mapping.sessions import Session
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -26,7 +26,7 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
     return {
         "path": str(path),
-        "map": map_id_of(topomap),
+        "map": get_map_id(topomap),
         "version": topomap.version,
         "georeference": None if topomap.georeference is None else topomap.georeference.to_json(),
         "bytes": path.stat().st_size,
@@ -42,7 +42,7 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
         "coarse": sorted(topomap.coarse_models),
         "default_coarse": topomap.default_coarse,
         "kinds": topomap.kinds,
-        "coarse_models": list_coarse(path),
+        "coarse_models": list_coarse_models(path),
         "config": topomap.config.to_json(),
     }
 

@@ -16,13 +16,19 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError
-from topoloc.mapping.file import MapFile
+from topoloc.mapping.map_file import MapFile
+from topoloc.mapping.map_writing import compute_map_digest, write_map
 from topoloc.mapping.schema import SCHEMA_VERSION, TABLES
 from topoloc.mapping.sessions import Edit, today
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.undo_log import add_entry, drop_entries, entries_for, path_of_log, write_before
-from topoloc.mapping.writing import digest_of, write_map
-from topoloc.recordings.atomic import replaced_file
+from topoloc.mapping.undo_log import (
+    add_undo_entry,
+    drop_undo_entries,
+    find_undo_entries,
+    undo_log_path,
+    write_previous_map,
+)
+from topoloc.recordings.atomic import atomic_write
 
 try:
     import fcntl
@@ -31,7 +37,7 @@ except ImportError:  # Windows: of two edits at once the last one wins whole
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
-Waits = Callable[[], None]
+WaitCallback = Callable[[], None]
 """Called where another process edits the map, before this one waits for it."""
 
 
@@ -56,16 +62,16 @@ class MapEdit:
         edits = self.topomap.edits
         edit = Edit(self.topomap.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
         try:
-            with replaced_file(self.path) as temporary:
+            with atomic_write(self.path) as temporary:
                 write_map(replace(changed, edits=[*edits, edit]), temporary)
-                add_entry(self.path, temporary)
+                add_undo_entry(self.path, temporary)
         except OSError as error:
             raise MapError(f"cannot write map {self.path}: {error.strerror}") from error
         return edit
 
 
 @contextmanager
-def editing(path: str | Path, waits: Waits | None = None) -> Iterator[MapEdit]:
+def edit_map(path: str | Path, on_wait: WaitCallback | None = None) -> Iterator[MapEdit]:
     """A map file to edit; while another process edits it, this one waits.
 
     Raises:
@@ -73,7 +79,7 @@ def editing(path: str | Path, waits: Waits | None = None) -> Iterator[MapEdit]:
         MapVersionError: of a schema that this version does not know.
     """
     path = Path(os.path.realpath(path))
-    with _locked(path, waits):
+    with _lock_map_file(path, on_wait):
         if (
             not os.access(path, os.W_OK) or not path.stat().st_mode & _WRITABLE
         ):  # nobody's to write, though root may
@@ -82,17 +88,17 @@ def editing(path: str | Path, waits: Waits | None = None) -> Iterator[MapEdit]:
             yield MapEdit(path, topomap)
 
 
-def undo_edit(path: str | Path, waits: Waits | None = None) -> Edit:
+def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
     """Take the last edit of a map file back, to the byte; it is what is returned.
 
     Raises:
         MapError: there is nothing to take back; the undo file is damaged; the map cannot be
             written. The map is as it was.
     """
-    with editing(path, waits) as edit:
+    with edit_map(path, on_wait) as edit:
         assert edit.topomap.file is not None, "a map that was just opened"
         last = max(edit.topomap.edits, key=lambda one: one.edit_id, default=None)
-        entries = entries_for(path_of_log(edit.path), edit.topomap.file.digest)
+        entries = find_undo_entries(undo_log_path(edit.path), edit.topomap.file.digest)
         if last is None or not entries:
             why = (
                 "it is as built"
@@ -101,25 +107,25 @@ def undo_edit(path: str | Path, waits: Waits | None = None) -> Edit:
             )
             raise MapError(f"map {path}: nothing to undo: {why}")
         try:
-            with replaced_file(edit.path) as temporary:
-                write_before(edit.path, entries[0], temporary)
-                _check(temporary, entries[0].before, path_of_log(edit.path))
-            drop_entries(edit.path, entries[0].depth)
+            with atomic_write(edit.path) as temporary:
+                write_previous_map(edit.path, entries[0], temporary)
+                _check_restored_map(temporary, entries[0].before, undo_log_path(edit.path))
+            drop_undo_entries(edit.path, entries[0].depth)
         except OSError as error:
             raise MapError(f"cannot write map {path}: {error.strerror}") from error
     return last
 
 
-def undoable_edits(path: str | Path, log: Path | None = None) -> int:
+def count_undoable_edits(path: str | Path, log: Path | None = None) -> int:
     """How many of the last edits of a map file can be taken back, by the undo file beside it or
     another one. Raises MapError."""
     path = Path(os.path.realpath(path))
     with closing(MapFile(path)) as file:
-        return len(entries_for(log or path_of_log(path), file.digest))
+        return len(find_undo_entries(log or undo_log_path(path), file.digest))
 
 
 @contextmanager
-def _locked(path: Path, waits: Waits | None) -> Iterator[None]:
+def _lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[None]:
     """The lock of the file that is at `path`: who had it may have put another file there."""
     while True:
         try:
@@ -127,7 +133,7 @@ def _locked(path: Path, waits: Waits | None) -> Iterator[None]:
         except (OSError, ValueError) as error:
             raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from None
         try:
-            _wait_for_lock(descriptor, waits)
+            _wait_for_lock(descriptor, on_wait)
             if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
                 yield
                 return
@@ -135,26 +141,26 @@ def _locked(path: Path, waits: Waits | None) -> Iterator[None]:
             os.close(descriptor)
 
 
-def _wait_for_lock(descriptor: int, waits: Waits | None) -> None:
+def _wait_for_lock(descriptor: int, on_wait: WaitCallback | None) -> None:
     if fcntl is None:
         return
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        if waits is not None:
-            waits()
+        if on_wait is not None:
+            on_wait()
         fcntl.flock(descriptor, fcntl.LOCK_EX)
     except OSError:  # a file system without locks
         return
 
 
-def _check(file_before: Path, digest: str, log: Path) -> None:
+def _check_restored_map(previous_file: Path, digest: str, log: Path) -> None:
     """Hold that an undone map is the one that it should be, row by row."""
-    with closing(MapFile(file_before)) as file:
+    with closing(MapFile(previous_file)) as file:
         rows = (
             digest
             if file.version == 1
-            else digest_of({table: file.checksums(table) for table in TABLES})
+            else compute_map_digest({table: file.checksums(table) for table in TABLES})
         )
         if not digest == rows == file.digest:
             raise MapError(

@@ -10,11 +10,11 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Float32, Int8
 
+from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
-from topoloc.features.kinds import find_kind
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.sums import LandmarkSums
+from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.retrieval.coarse import CoarseModel
 
 
@@ -45,9 +45,10 @@ class TopoNode:
     `features.points_img` are pixels of `camera` (of a stereo pair: the rectified left one); row k
     of `points_cam` (metres, the node's camera frame) is the position of feature k, with covariance
     ``L @ L.T`` for the lower triangular L in row k of `point_sqrt_covs` (xx, yx, yy, zx, zy, zz;
-    metres). `template_jpeg` is the node's picture, encoded, possibly smaller than `camera`. `sums`
-    are what each session knows of the points, where that was kept. `stored_descriptors` are the
-    descriptors as the file has them, so that a node that was read is written as it was.
+    metres). `template_jpeg` is the node's picture, encoded, possibly smaller than `camera`.
+    `session_statistics` are what each session knows of the points, where that was kept.
+    `stored_descriptors` are the descriptors as the file has them, so that a node that was read is
+    written as it was.
     """
 
     summary: NodeSummary
@@ -56,7 +57,7 @@ class TopoNode:
     points_cam: Float32[np.ndarray, "n 3"]
     point_sqrt_covs: Float32[np.ndarray, "n 6"]
     template_jpeg: bytes
-    sums: Iterable[LandmarkSums] = ()
+    session_statistics: Iterable[LandmarkStatistics] = ()
     stored_descriptors: Int8[np.ndarray, "n d"] | None = None
 
 
@@ -80,8 +81,8 @@ class PlaceImage:
 
 @no_type_check  # at run time: it would read from the file to look at entries' types
 @dataclass(frozen=True, eq=False)
-class SideNodes:
-    """Nodes seen once more by cameras turned to the left and to the right (`side_nodes.py`).
+class VirtualNodes:
+    """Nodes seen once more by cameras turned to the left and to the right (`virtual_nodes.py`).
 
     They are described by features of one `kind`. `summaries[i]` and `nodes[i]` describe side node
     i: session, name and time are those of the node `of_node` whose picture it comes from, the pose
@@ -95,9 +96,9 @@ class SideNodes:
     coarse_models: Mapping[str, CoarseModel]
     kind: str
 
-    def is_asked_by(self, kind: str) -> bool:
+    def is_used_with(self, kind: str) -> bool:
         """Are they asked together with the nodes' points of this kind of features?"""
-        return self.kind in (kind, find_kind(kind).kind_of_sides)
+        return self.kind in (kind, find_feature_type(kind).virtual_view_type)
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,7 @@ class Repetitions:
 
 
 @dataclass(frozen=True)
-class SharedErrors:
+class CorrelatedErrors:
     """rho, the share of a match's variance that the map's points have in common, as
     `map_facts/correlated_errors.py` measured it.
 

@@ -29,11 +29,11 @@ AXES = {
 _LEVEL_SIGMA, _CAMERA_SIGMA = math.radians(2.0), math.radians(10.0)
 """How far up is from where it should be: of worlds with z up, which somebody levelled, and of those
 of a camera held by hand."""
-_MIN_LEVEL = math.sin(math.radians(10.0))
+_MIN_HORIZONTAL_NORM = math.sin(math.radians(10.0))
 _MAX_HEIGHT = (
     100_000.0  # metres above the ellipsoid, or below it; a map of what lies there is a mistake
 )
-_LEAST_SIGMA = 0.01  # metres; nobody measures better
+_MIN_SIGMA = 0.01  # metres; nobody measures better
 _MAX_ROTATION_SIGMA = math.radians(5.0)
 _MAX_RESIDUAL_SHARE = 0.25
 _MAX_SCALE = 1.05
@@ -43,7 +43,7 @@ _GATE = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Up:
+class UpDirection:
     """The direction of the world that is up, and how far (radians, standard deviation) that may be
     from the truth."""
 
@@ -56,16 +56,18 @@ class Up:
 
 
 @dataclass(frozen=True, eq=False)
-class WorldFit:
-    """`residuals_m[k]` is what the fit leaves of point k; those that are not `used` are off by more
-    than the others allow for."""
+class GeoreferenceFit:
+    """`residuals_m[k]` is what the fit leaves of point k; those that are not `is_inlier` are off by
+    more than the others allow for."""
 
     georeference: Georeference
     residuals_m: Float[np.ndarray, " n"]
-    used: Bool[np.ndarray, " n"]
+    is_inlier: Bool[np.ndarray, " n"]
 
 
-def find_up(world_from_cams: Sequence[Rigid3], axis: str | None = None) -> Up:
+def estimate_up_direction(
+    world_from_cams: Sequence[Rigid3], axis: str | None = None
+) -> UpDirection:
     """The axis of the world that is nearest to the mapping cameras' mean up, or the one that is
     named.
 
@@ -77,11 +79,11 @@ def find_up(world_from_cams: Sequence[Rigid3], axis: str | None = None) -> Up:
         axis = max(AXES, key=lambda name: float(AXES[name] @ mean))
     if axis not in AXES:
         raise GeoreferenceError(f"up is one of {', '.join(AXES)}, not {axis!r}")
-    return Up(axis, _LEVEL_SIGMA if axis == "z" else _CAMERA_SIGMA)
+    return UpDirection(axis, _LEVEL_SIGMA if axis == "z" else _CAMERA_SIGMA)
 
 
-def georeference_by_view(
-    world_from_cam: Rigid3, origin: GeoPoint, heading_deg: float, up: Up
+def georeference_from_heading(
+    world_from_cam: Rigid3, origin: GeoPoint, heading_deg: float, up: UpDirection
 ) -> Georeference:
     """The picture `world_from_cam` was taken at `origin`, looking to `heading_deg` (degrees
     clockwise from true north).
@@ -93,7 +95,7 @@ def georeference_by_view(
     _check_heights([origin])
     view = world_from_cam.rotation[:, 2]
     level = view - (view @ up.world) * up.world
-    if np.linalg.norm(level) < _MIN_LEVEL:
+    if np.linalg.norm(level) < _MIN_HORIZONTAL_NORM:
         raise GeoreferenceError(
             f"the first picture looks up or down (up is {up.axis}), so it has no heading; known"
             " points do: --points"
@@ -116,8 +118,8 @@ def fit_georeference(
     points_world: Float[np.ndarray, "n 3"],
     places: Sequence[GeoPoint],
     source: str,
-    up: Up | None = None,
-) -> WorldFit:
+    up: UpDirection | None = None,
+) -> GeoreferenceFit:
     """The rigid transform that brings points of the world (metres) to their places on earth; its
     origin is the first place.
 
@@ -140,26 +142,26 @@ def fit_georeference(
         raise GeoreferenceError(
             "the places are more than 1000 km apart: latitude first, then longitude, degrees"
         )
-    pairs = _Pairs(points_world, points_enu, up)
+    pairs = _PointPairs(points_world, points_enu, up)
     weights = np.ones(len(points_world)) if len(points_world) <= 4 else _robust_weights(pairs)
-    used = weights > 0.0
-    sigma = _sigma_of(pairs, pairs.aligned(weights), weights)
-    enu_from_world = pairs.aligned(weights, sigma)
+    is_inlier = weights > 0.0
+    sigma = _estimate_sigma(pairs, pairs.align(weights), weights)
+    enu_from_world = pairs.align(weights, sigma)
     residuals = pairs.residuals(enu_from_world)
-    _check(pairs, enu_from_world, weights, sigma)
-    rms = float(np.sqrt(np.mean(residuals[used] ** 2)))
-    return WorldFit(Georeference(origin, enu_from_world, source, rms), residuals, used)
+    _check_fit(pairs, enu_from_world, weights, sigma)
+    rms = float(np.sqrt(np.mean(residuals[is_inlier] ** 2)))
+    return GeoreferenceFit(Georeference(origin, enu_from_world, source, rms), residuals, is_inlier)
 
 
 @dataclass(frozen=True, eq=False)
-class _Pairs:
+class _PointPairs:
     """Points in the world and east-north-up (metres), and what is known of up."""
 
     world: Float[np.ndarray, "n 3"]
     enu: Float[np.ndarray, "n 3"]
-    up: Up | None
+    up: UpDirection | None
 
-    def aligned(self, weights: Float[np.ndarray, " n"], sigma: float = 1.0) -> Rigid3:
+    def align(self, weights: Float[np.ndarray, " n"], sigma: float = 1.0) -> Rigid3:
         """enu_from_world by weighted least squares; `sigma` (metres) says how much the points count
         beside up."""
         share = weights / weights.sum()
@@ -176,35 +178,37 @@ class _Pairs:
         return np.linalg.norm(enu_from_world.apply(self.world) - self.enu, axis=1)
 
 
-def _robust_weights(pairs: _Pairs) -> Float[np.ndarray, " n"]:
+def _robust_weights(pairs: _PointPairs) -> Float[np.ndarray, " n"]:
     """Cauchy's weights, 0 for points off by more than `_GATE` standard deviations."""
     rng, num_points = np.random.default_rng(0), len(pairs.world)
-    best, least = Rigid3.identity(), math.inf
+    best, min_median = Rigid3.identity(), math.inf
     for _ in range(_NUM_SAMPLES):
         weights = np.zeros(num_points)
         weights[rng.choice(num_points, 3, replace=False)] = 1.0
-        sample = pairs.aligned(weights)
+        sample = pairs.align(weights)
         median = float(np.median(pairs.residuals(sample)))
-        best, least = (sample, median) if median < least else (best, least)
+        best, min_median = (sample, median) if median < min_median else (best, min_median)
     weights, enu_from_world, sigma = (
         np.ones(num_points),
         best,
-        max(least / _MEDIAN_NORM, _LEAST_SIGMA),
+        max(min_median / _MEDIAN_NORM, _MIN_SIGMA),
     )
     for _ in range(_NUM_STEPS):
         scaled = pairs.residuals(enu_from_world) / (math.sqrt(3.0) * sigma)
         weights = np.where(scaled < _GATE, 1.0 / (1.0 + (scaled / 2.385) ** 2), 0.0)
-        enu_from_world = pairs.aligned(weights, sigma)
-        sigma = _sigma_of(pairs, enu_from_world, weights)
+        enu_from_world = pairs.align(weights, sigma)
+        sigma = _estimate_sigma(pairs, enu_from_world, weights)
     return weights
 
 
-def _sigma_of(pairs: _Pairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n"]) -> float:
+def _estimate_sigma(
+    pairs: _PointPairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n"]
+) -> float:
     """Standard deviation of one coordinate of the points that are used, metres; of six numbers that
     were fitted nothing is learned."""
-    used = weights > 0.0
-    squares = float(np.sum(pairs.residuals(enu_from_world)[used] ** 2))
-    return max(math.sqrt(squares / max(3 * int(used.sum()) - 6, 1)), _LEAST_SIGMA)
+    is_inlier = weights > 0.0
+    squares = float(np.sum(pairs.residuals(enu_from_world)[is_inlier] ** 2))
+    return max(math.sqrt(squares / max(3 * int(is_inlier.sum()) - 6, 1)), _MIN_SIGMA)
 
 
 def _check_heights(places: Sequence[GeoPoint]) -> None:
@@ -213,23 +217,24 @@ def _check_heights(places: Sequence[GeoPoint]) -> None:
             raise GeoreferenceError(f"a height of {place.h:g} m above the ellipsoid")
 
 
-def _check(
-    pairs: _Pairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n"], sigma: float
+def _check_fit(
+    pairs: _PointPairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n"], sigma: float
 ) -> None:
     """Hold that the points say where the map lies. Raises GeoreferenceError."""
-    used = weights > 0.0
-    offsets = pairs.world[used] - pairs.world[used].mean(axis=0)
+    is_inlier = weights > 0.0
+    offsets = pairs.world[is_inlier] - pairs.world[is_inlier].mean(axis=0)
     extent, left = (
         float(np.linalg.norm(offsets, axis=1).max()),
         f"residuals of {math.sqrt(3.0) * sigma:.2f} m",
     )
-    if 2 * int(used.sum()) < len(used):
+    if 2 * int(is_inlier.sum()) < len(is_inlier):
         raise GeoreferenceError(
-            f"only {int(used.sum())} of {len(used)} points agree with each other: these are not the"
-            " map's places"
+            f"only {int(is_inlier.sum())} of {len(is_inlier)} points agree with each other: these"
+            " are not the map's places"
         )
     _check_scale(
-        offsets, (pairs.enu[used] - pairs.enu[used].mean(axis=0)) @ enu_from_world.rotation
+        offsets,
+        (pairs.enu[is_inlier] - pairs.enu[is_inlier].mean(axis=0)) @ enu_from_world.rotation,
     )
     information = np.sum(offsets**2) * np.eye(3) - offsets.T @ offsets
     information = information / sigma**2

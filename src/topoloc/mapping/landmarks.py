@@ -4,7 +4,7 @@ One stereo pair or depth image measures a point once, over a short baseline. The
 the node see it from elsewhere, at poses that are known; triangulating from all of them, with the
 first measurement as the prior, shrinks the long axis of its uncertainty, and shows up points that
 are not where they seemed (mismatched, or moving). What each session contributed to that is kept as
-sums (`sums.py`).
+sums (`landmark_statistics.py`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_kernels import add_observations
-from topoloc.mapping.sums import LandmarkSums
+from topoloc.mapping.landmark_statistics import LandmarkStatistics
 
 _CAUCHY_SCALE = 2.385  # of a residual in standard deviations
 
@@ -67,13 +67,13 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class RefinedPoints:
-    """`agrees` is False for points that their observations contradict; `num_observations` counts
-    images besides the node's own."""
+    """`is_consistent` is False for points that their observations contradict; `num_observations`
+    counts images besides the node's own."""
 
     points_cam: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
     num_observations: Int[np.ndarray, " n"]
-    agrees: Bool[np.ndarray, " n"]
+    is_consistent: Bool[np.ndarray, " n"]
 
 
 def observe_points(
@@ -128,29 +128,31 @@ def refine_points(
     for seen in observations:
         num_observations[seen.rows] += 1
     rms = np.sqrt(squares / np.maximum(2 * num_observations, 1))
-    agrees = (rms < config.max_disagreement) & np.isfinite(points).all(axis=1) & (points[:, 2] > 0)
-    return RefinedPoints(points, np.linalg.inv(information), num_observations, agrees)
+    is_consistent = (
+        (rms < config.max_disagreement) & np.isfinite(points).all(axis=1) & (points[:, 2] > 0)
+    )
+    return RefinedPoints(points, np.linalg.inv(information), num_observations, is_consistent)
 
 
-def session_sums(
+def compute_session_statistics(
     refined: Float[np.ndarray, "n 3"],
     points_cam: Float[np.ndarray, "n 3"],
     covariances: Float[np.ndarray, "n 3 3"],
     observations: list[Observations],
     kept: Int[np.ndarray, " k"],
-    own_session: int,
-) -> list[LandmarkSums]:
+    node_session_id: int,
+) -> list[LandmarkStatistics]:
     """What each session contributed to the `refined` positions of the points `kept`, whose rows are
     counted anew.
 
     Args:
-        points_cam, covariances: the first measurement, which belongs to the session `own_session`;
-            its image saw every point.
+        points_cam, covariances: the first measurement, which belongs to the session
+            `node_session_id`; its image saw every point.
     """
-    prior, sums = np.linalg.inv(covariances), []
-    for session_id in sorted({own_session, *(seen.session_id for seen in observations)}):
+    prior, statistics = np.linalg.inv(covariances), []
+    for session_id in sorted({node_session_id, *(seen.session_id for seen in observations)}):
         is_own, of_session = (
-            session_id == own_session,
+            session_id == node_session_id,
             [seen for seen in observations if seen.session_id == session_id],
         )
         information, pulls, _ = _normal_equations(
@@ -163,8 +165,8 @@ def session_sums(
         rows = np.flatnonzero(expected[kept] > 0)
         known = kept[rows]
         if len(rows):
-            sums.append(
-                LandmarkSums.of(
+            statistics.append(
+                LandmarkStatistics.of(
                     session_id,
                     rows,
                     information[known],
@@ -173,12 +175,12 @@ def session_sums(
                     num_seen[known],
                 )
             )
-    return sums
+    return statistics
 
 
-def counted_again(
+def count_session_observations(
     num_points: int, observations: list[Observations], session_id: int
-) -> LandmarkSums | None:
+) -> LandmarkStatistics | None:
     """How often a later session's pictures should have shown a node's points, and did; None where
     they should have shown none.
 
@@ -193,7 +195,7 @@ def counted_again(
     if len(rows) == 0:
         return None
     nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
-    return LandmarkSums.of(session_id, rows, *nothing, expected[rows], num_seen[rows])
+    return LandmarkStatistics.of(session_id, rows, *nothing, expected[rows], num_seen[rows])
 
 
 def _in_view(

@@ -15,24 +15,29 @@ from typing import TypeVar
 import cv2
 
 from topoloc.errors import TrajectoryError
-from topoloc.features.bands import in_order
 from topoloc.features.extraction import extract_features
 from topoloc.features.features import Features
+from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.sessions import Light, light_of
+from topoloc.mapping.sessions import Illumination, measure_illumination
 from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, locate_points
-from topoloc.points.motion_points import OtherPicture, choose_pictures, locate_by_motion, usual_step
+from topoloc.points.motion_triangulation import (
+    SourceImage,
+    compute_median_step,
+    select_source_images,
+    triangulate_from_motion,
+)
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
-from topoloc.recordings.frame_view import FrameView, frame_view
-from topoloc.recordings.pictures import jpeg_of
-from topoloc.recordings.recording import has_scale, left_frame
+from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
+from topoloc.recordings.image_io import encode_jpeg
+from topoloc.recordings.recording import has_scale, read_left_frame
 
 R = TypeVar("R")
 
-PLACE_QUALITY = 60  # of the place images' JPEG
-_KEPT_IMAGES = (
+PLACE_JPEG_QUALITY = 60  # of the place images' JPEG
+_MAX_CACHED_IMAGES = (
     48  # single pictures locate the points of several nodes; their features are found once
 )
 
@@ -55,10 +60,10 @@ class MappingFrame:
     def read_left(self) -> StereoFrame:
         """As `read`, but for the right or depth picture: whoever only describes the frame needs
         none."""
-        return left_frame(self.sequence, self.index)
+        return read_left_frame(self.sequence, self.index)
 
-    def view(self, with_depth: bool = True) -> FrameView:
-        return view_of(self.read(), with_depth)
+    def view(self, with_depth: bool = True) -> PreparedFrame:
+        return prepare_view(self.read(), with_depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +75,20 @@ class MappingImage:
     world_from_cam: Rigid3
     features: dict[str, Features]
     place_jpeg: bytes
-    light: Light
+    light: Illumination
 
 
-def view_of(frame: StereoFrame, with_depth: bool = True) -> FrameView:
+def prepare_view(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
     """A frame that was read, made ready for measuring; a single picture has no depth in any
     case."""
-    return frame_view(frame, with_depth and not _is_single(frame))
+    return prepare_frame(frame, with_depth and not _is_monocular(frame))
 
 
-def _is_single(frame: StereoFrame) -> bool:
+def _is_monocular(frame: StereoFrame) -> bool:
     return frame.right is None and frame.depth is None
 
 
-def posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame]:
+def select_posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame]:
     """The frames of a recording that have a pose.
 
     Raises:
@@ -108,22 +113,26 @@ def posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame
     return frames
 
 
-def mapping_image(frame: MappingFrame, view: FrameView, config: MapConfig) -> MappingImage:
+def extract_mapping_image(
+    frame: MappingFrame, view: PreparedFrame, config: MapConfig
+) -> MappingImage:
     """A frame that has been read, described by all kinds of features."""
-    jpeg = small_jpeg(view.picture, config.place_side_px, PLACE_QUALITY)
+    jpeg = encode_thumbnail(view.picture, config.place_side_px, PLACE_JPEG_QUALITY)
     world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     features = {
-        kind: extract_features(view.grey, config.features_of(kind)) for kind in config.kinds
+        kind: extract_features(view.grey, config.feature_config_for(kind)) for kind in config.kinds
     }
-    return MappingImage(view.camera, world_from_view, features, jpeg, light_of(view.picture))
+    return MappingImage(
+        view.camera, world_from_view, features, jpeg, measure_illumination(view.picture)
+    )
 
 
-def small_jpeg(picture: Image, side_px: int, quality: int) -> bytes:
+def encode_thumbnail(picture: Image, side_px: int, quality: int) -> bytes:
     """The picture as JPEG, its shorter side at most `side_px`."""
     scale = side_px / min(picture.shape[:2])
     if scale < 1.0:
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return jpeg_of(picture, quality)
+    return encode_jpeg(picture, quality)
 
 
 class PointLocator:
@@ -136,12 +145,12 @@ class PointLocator:
         for frame in frames:
             self._sessions.setdefault(frame.session_id, []).append(frame)
         self._steps = {
-            number: usual_step([frame.world_from_cam for frame in of_it])
+            number: compute_median_step([frame.world_from_cam for frame in of_it])
             for number, of_it in self._sessions.items()
         }
-        self._images: OrderedDict[int, MappingImage] = OrderedDict()
+        self._image_cache: OrderedDict[int, MappingImage] = OrderedDict()
 
-    def for_each(
+    def map_frames(
         self, work: Callable[[tuple[MappingFrame, StereoFrame]], R], frames: Sequence[MappingFrame]
     ) -> Iterator[R]:
         """What work(frame, as read) gives, in their order; several frames at a time, but for single
@@ -149,22 +158,24 @@ class PointLocator:
         for _, of_session in groupby(frames, lambda frame: frame.session_id):
             read = ((frame, frame.read()) for frame in of_session)
             first = next(read)
-            yield from (map if _is_single(first[1]) else in_order)(work, chain([first], read))
+            yield from (map if _is_monocular(first[1]) else parallel_map)(
+                work, chain([first], read)
+            )
 
-    def image(self, frame: MappingFrame, view: FrameView) -> MappingImage:
+    def image(self, frame: MappingFrame, view: PreparedFrame) -> MappingImage:
         """The frame described, from memory where that is possible."""
-        if id(frame) not in self._images:
-            image = mapping_image(frame, view, self._config)
+        if id(frame) not in self._image_cache:
+            image = extract_mapping_image(frame, view, self._config)
             if view.right_grey is not None or view.depth is not None:
                 return image
-            self._images[id(frame)] = image
-            if len(self._images) > _KEPT_IMAGES:
-                self._images.popitem(last=False)
-        self._images.move_to_end(id(frame))
-        return self._images[id(frame)]
+            self._image_cache[id(frame)] = image
+            if len(self._image_cache) > _MAX_CACHED_IMAGES:
+                self._image_cache.popitem(last=False)
+        self._image_cache.move_to_end(id(frame))
+        return self._image_cache[id(frame)]
 
     def locate(
-        self, frame: MappingFrame, view: FrameView, image: MappingImage
+        self, frame: MappingFrame, view: PreparedFrame, image: MappingImage
     ) -> tuple[dict[str, MetricPoints], list[MappingFrame]]:
         """The positions of a frame's features, by their kinds, and the other frames that these
         stand on."""
@@ -175,7 +186,7 @@ class PointLocator:
             }, []
         frames = self._sessions[frame.session_id]
         poses = [other.world_from_cam for other in frames]
-        chosen = choose_pictures(
+        chosen = select_source_images(
             poses, frames.index(frame), self._steps[frame.session_id], self._config.motion
         )
         others = [frames[k] for k in chosen]
@@ -183,16 +194,18 @@ class PointLocator:
         points = {}
         for kind, features in image.features.items():
             sigmas = keypoint_sigmas(features, self._config.points)
-            pictures = [self._other(of_other, kind, image) for of_other in images]
+            source_images = [self._make_source_image(of_other, kind, image) for of_other in images]
             relative = self._config.points.max_relative_sigma
-            points[kind] = locate_by_motion(
-                features, sigmas, image.camera, pictures, relative, self._config.motion
+            points[kind] = triangulate_from_motion(
+                features, sigmas, image.camera, source_images, relative, self._config.motion
             )
         return points, others
 
-    def _other(self, other: MappingImage, kind: str, image: MappingImage) -> OtherPicture:
+    def _make_source_image(
+        self, other: MappingImage, kind: str, image: MappingImage
+    ) -> SourceImage:
         sigmas = keypoint_sigmas(other.features[kind], self._config.points)
-        return OtherPicture(
+        return SourceImage(
             other.features[kind],
             sigmas,
             other.camera,

@@ -78,7 +78,9 @@ def node_distances(
     return d_translation + lambda_rot * d_rot
 
 
-def place_nodes(world_from_cams: list[Rigid3], config: NodeConfig) -> Int[np.ndarray, " nodes"]:
+def select_node_frames(
+    world_from_cams: list[Rigid3], config: NodeConfig
+) -> Int[np.ndarray, " nodes"]:
     """Walk along the trajectory and place a node wherever Eq. 1 holds: the frames that become
     nodes.
 
@@ -108,7 +110,7 @@ def place_nodes(world_from_cams: list[Rigid3], config: NodeConfig) -> Int[np.nda
     return np.array(frame_idx)
 
 
-class NearestNodes:
+class NearestNodeSearch:
     """The nodes nearest to a camera by Eq. 1, of which few are turned towards it: no node is nearer
     than the metres to it."""
 
@@ -118,22 +120,22 @@ class NearestNodes:
     def rows(self, world_from_cam: Rigid3, count: int) -> Int[np.ndarray, " nodes"]:
         """Up to `count` nodes, the nearest first; of equal ones the first."""
         metres = np.linalg.norm(self._poses.centres - world_from_cam.translation, axis=1)
-        num_looked_at = 8 * count
+        num_checked = 8 * count
         while True:
-            is_all = num_looked_at >= len(metres)
+            is_all = num_checked >= len(metres)
             rows = (
                 np.arange(len(metres))
                 if is_all
-                else np.sort(np.argpartition(metres, num_looked_at)[:num_looked_at])
+                else np.sort(np.argpartition(metres, num_checked)[:num_checked])
             )
             distances = node_distances(world_from_cam, self._poses.rows(rows), self._lambda_rot)
             order = np.argsort(distances, kind="stable")[:count]
             if is_all or distances[order[-1]] < metres[rows].max():
                 return rows[order]
-            num_looked_at *= 4
+            num_checked *= 4
 
 
-def digest_of_nodes(summaries: Sequence[NodeSummary], method: bytes) -> str:
+def compute_nodes_digest(summaries: Sequence[NodeSummary], method: bytes) -> str:
     """A short name for what follows from the nodes, by their poses and numbers of points, and from
     how it was found (`method`)."""
     digest = hashlib.sha256(method)

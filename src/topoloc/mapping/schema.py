@@ -10,7 +10,7 @@ from typing import Any
 
 APPLICATION_ID = 0x544F504F  # "TOPO", in the database's header
 SCHEMA_VERSION = 3
-SIDE = "side_"
+VIRTUAL_PREFIX = "side_"
 
 Columns = dict[str, str]
 _CHECKSUM = "checksum BLOB NOT NULL"
@@ -99,7 +99,7 @@ _CONSTRAINTS = {
     "edges": "PRIMARY KEY (source_id, target_id)",
 }
 # In whose order rows are written, read and digested.
-ORDER = {table: next(iter(columns)) for table, columns in TABLES.items()} | {
+SORT_COLUMNS = {table: next(iter(columns)) for table, columns in TABLES.items()} | {
     "node_points": "node_id, kind",
     "side_node_points": "node_id, kind",
     "landmark_sums": "node_id, kind, session_id",
@@ -123,7 +123,7 @@ SCHEMA_1 = {
     node_id INTEGER NOT NULL REFERENCES nodes, world_from_cam BLOB NOT NULL, jpeg BLOB NOT NULL)"""  # noqa: E501
     ),
 }
-for _prefix in ("", SIDE):
+for _prefix in ("", VIRTUAL_PREFIX):
     SCHEMA_1[f"{_prefix}nodes"] = (
         f"CREATE TABLE {_prefix}nodes (node_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name"
         " TEXT NOT NULL, t_ns INTEGER NOT NULL,\n    camera_id INTEGER NOT NULL REFERENCES"
@@ -140,7 +140,7 @@ for _prefix in ("", SIDE):
     )
 
 
-def creation_of(table: str) -> str:
+def create_table_statement(table: str) -> str:
     """The statement that makes a table, to the letter: a file with other tables than these is not
     read."""
     declared = [f"{name} {declaration}" for name, declaration in TABLES[table].items()]
@@ -148,7 +148,7 @@ def creation_of(table: str) -> str:
     return f"CREATE TABLE {table} ({', '.join([*declared, _CHECKSUM, *constraint])})"
 
 
-def checksum_of(table: str, row: Sequence[Any]) -> bytes:
+def compute_checksum(table: str, row: Sequence[Any]) -> bytes:
     """8 bytes (BLAKE2b) that change with the table's name and every bit of its row, columns in the
     order of `TABLES`."""
     digest = blake2b(table.encode(), digest_size=8)
@@ -165,7 +165,7 @@ def checksum_of(table: str, row: Sequence[Any]) -> bytes:
 # node's node from recording and
 # picture; there are no checksums, no counts
 # and no landmark sums.
-_ALWAYS = """
+_COMMON_VIEWS = """
 CREATE TEMP TABLE sessions (session_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, json TEXT NOT NULL, checksum BLOB);
 INSERT INTO sessions (session_id, name, json)
     SELECT row_number() OVER (ORDER BY first) - 1, name, '{}' FROM (
@@ -186,27 +186,31 @@ CREATE TEMP VIEW repetitions AS SELECT 0 AS node_id, 0 AS num_moves, x'' AS move
 """  # noqa: E501
 # Of nodes and of side nodes. Every map of schema 1 has one kind of features, named in its
 # configuration.
-_POINTS_OF = """
+_POINT_VIEWS = """
 CREATE TEMP VIEW {0}node_points AS SELECT node_id, k.kind AS kind, num_points, descriptor_size, points_img, shapes, descriptors, points_cam,
     sqrt_covs, NULL AS checksum FROM main.{0}node_points JOIN main.{0}nodes USING (node_id) JOIN kinds AS k;
 CREATE TEMP VIEW {0}coarse_models AS SELECT name, settings, arrays, NULL AS checksum FROM main.{0}coarse_models;
 """  # noqa: E501
-_KINDS = """
+_FEATURE_TYPE_TABLE = """
 CREATE TEMP TABLE kinds (kind TEXT);
 INSERT INTO kinds SELECT json_extract(value, '$.features.kind') FROM main.map WHERE key = 'config' AND json_valid(value);
 """  # noqa: E501
-_SIDES = """
+_VIRTUAL_NODE_VIEWS = """
 CREATE TEMP TABLE pictures (recording TEXT, name TEXT, node_id INTEGER, PRIMARY KEY (recording, name));
 INSERT OR REPLACE INTO pictures SELECT recording, name, node_id FROM main.nodes ORDER BY node_id;
 CREATE TEMP VIEW side_nodes AS SELECT s.node_id AS node_id, p.node_id AS of_node, s.name AS name, t_ns, camera_id, world_from_cam,
     num_points, NULL AS checksum FROM main.side_nodes AS s LEFT JOIN pictures AS p ON p.recording = s.recording AND p.name = s.name;
 """  # noqa: E501
-_NO_SIDES = """
+_EMPTY_VIRTUAL_NODE_VIEW = """
 CREATE TEMP VIEW side_nodes AS SELECT 0 AS node_id, 0 AS of_node, '' AS name, 0 AS t_ns, 0 AS camera_id, x'' AS world_from_cam,
     0 AS num_points, NULL AS checksum WHERE 0;
 """  # noqa: E501
 
-SHOW_AS_SCHEMA_2 = {
-    False: _KINDS + _ALWAYS + _POINTS_OF.format("") + _NO_SIDES,
-    True: _KINDS + _ALWAYS + _POINTS_OF.format("") + _SIDES + _POINTS_OF.format("side_"),
+SCHEMA_2_VIEWS = {
+    False: _FEATURE_TYPE_TABLE + _COMMON_VIEWS + _POINT_VIEWS.format("") + _EMPTY_VIRTUAL_NODE_VIEW,
+    True: _FEATURE_TYPE_TABLE
+    + _COMMON_VIEWS
+    + _POINT_VIEWS.format("")
+    + _VIRTUAL_NODE_VIEWS
+    + _POINT_VIEWS.format("side_"),
 }

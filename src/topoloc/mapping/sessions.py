@@ -20,7 +20,7 @@ _YEAR_2000_NS = 946_684_800 * 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Light:
+class Illumination:
     """The light of a session as its pictures show it, means over them; grey levels are 0 to 1.
 
     `level` is the mean grey level, `contrast` the standard deviation of the grey levels within a
@@ -54,17 +54,17 @@ class Session:
     start_ns: int | None = None
     end_ns: int | None = None
     camera: Camera | None = None
-    light: Light | None = None
+    light: Illumination | None = None
     light_name: str | None = None
 
     @property
     def start_date(self) -> str | None:
         """ISO date and time (UTC); None where the recording's clock tells none."""
-        return _date_of(self.start_ns)
+        return _format_date(self.start_ns)
 
     @property
     def end_date(self) -> str | None:
-        return _date_of(self.end_ns)
+        return _format_date(self.end_ns)
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ def today() -> str:
     return now.date().isoformat()
 
 
-def path_of(sequence: StereoSequence) -> str | None:
+def find_source_path(sequence: StereoSequence) -> str | None:
     """The folder or file that a sequence was opened from, where it has one."""
     while isinstance(sequence, SequenceView):
         sequence = sequence.base
     return str(sequence.root) if isinstance(sequence, Recording) else None
 
 
-def poses_source_of(sequence: StereoSequence) -> str:
+def find_pose_source(sequence: StereoSequence) -> str:
     """`truth` where the poses are those that the recording came with, else `given`."""
     if isinstance(sequence, SequenceView):
         before = sequence.base.poses
@@ -102,11 +102,11 @@ def poses_source_of(sequence: StereoSequence) -> str:
             pose is before[index]
             for index, pose in zip(sequence.indices, sequence.poses, strict=True)
         )
-        return poses_source_of(sequence.base) if is_same else "given"
+        return find_pose_source(sequence.base) if is_same else "given"
     return "truth" if isinstance(sequence, Recording) else "given"
 
 
-def light_of(image: Image) -> Light:
+def measure_illumination(image: Image) -> Illumination:
     """The light in one picture (uint8), of every fourth pixel each way."""
     sample = image[::4, ::4].astype(np.float64) / 255.0
     grey = sample if sample.ndim == 2 else sample @ np.array([0.299, 0.587, 0.114])
@@ -114,12 +114,12 @@ def light_of(image: Image) -> Light:
         (1.0, 1.0, 1.0) if sample.ndim == 2 else sample.reshape(-1, 3).mean(axis=0) + 1e-3
     )
     dark, bright = float((grey < 1 / 16).mean()), float((grey > 15 / 16).mean())
-    return Light(
+    return Illumination(
         float(grey.mean()), float(grey.std()), dark, bright, float(red / green), float(blue / green)
     )
 
 
-def mean_light(lights: Sequence[Light]) -> Light | None:
+def average_illumination(lights: Sequence[Illumination]) -> Illumination | None:
     """The mean of many, rounded to what is worth reading."""
     if not lights:
         return None
@@ -129,16 +129,16 @@ def mean_light(lights: Sequence[Light]) -> Light | None:
             for light in lights
         ]
     )
-    return Light(*(round(float(value), 4) for value in rows.mean(axis=0)))
+    return Illumination(*(round(float(value), 4) for value in rows.mean(axis=0)))
 
 
-def sessions_named(names: Sequence[str]) -> list[Session]:
+def sessions_from_names(names: Sequence[str]) -> list[Session]:
     """A session for each distinct name, in the order of their first mention: all that an older map
     knows of them."""
     return [Session(number, name) for number, name in enumerate(dict.fromkeys(names))]
 
 
-def _date_of(t_ns: int | None) -> str | None:
+def _format_date(t_ns: int | None) -> str | None:
     if t_ns is None or t_ns < _YEAR_2000_NS:
         return None
     try:

@@ -1,7 +1,7 @@
 """The topo-metric map of the paper (section III-A): nodes with features and their 3-D positions,
 edges, place images.
 
-`build.py` makes it, `writing.py` writes and `reading.py` reads it, `localization` asks it.
+`build.py` makes it, `map_writing.py` writes and `map_reading.py` reads it, `localization` asks it.
 
 Everything in a map has an id that never changes and is never used again. Whoever computes works on
 rows, which the open map derives: row i is `summaries[i]` and `nodes[i]`, and `row_of` leads there
@@ -19,36 +19,41 @@ from typing import Any, no_type_check
 
 import numpy as np
 
-from topoloc.errors import FeatureKindError, MapError
+from topoloc.errors import FeatureTypeError, MapError
 from topoloc.mapping.contents import MapContents
 from topoloc.mapping.entries import (
+    CorrelatedErrors,
     Edge,
     NodeSummary,
     PlaceImage,
     Repetitions,
-    SharedErrors,
-    SideNodes,
     TopoNode,
+    VirtualNodes,
 )
-from topoloc.mapping.file import MapFile
-from topoloc.mapping.reading import open_map
-from topoloc.mapping.session_light import light_of_nodes
+from topoloc.mapping.map_file import MapFile
+from topoloc.mapping.map_reading import open_map
+from topoloc.mapping.map_writing import save_map
+from topoloc.mapping.session_illumination import find_node_illumination_groups
 from topoloc.mapping.sessions import Edit, Session
-from topoloc.mapping.writing import save_map
-from topoloc.retrieval.coarse import ByVectors, CoarseLocalizer, CoarseModel, open_coarse
+from topoloc.retrieval.coarse import (
+    CoarseLocalizer,
+    CoarseModel,
+    DescriptorLocalizer,
+    open_coarse_localizer,
+)
 
 __all__ = [
+    "CorrelatedErrors",
     "Edge",
     "Edit",
     "NodeSummary",
     "PlaceImage",
     "Repetitions",
     "Session",
-    "SharedErrors",
-    "SideNodes",
     "TopoMetricMap",
     "TopoNode",
-    "open_coarse_of",
+    "VirtualNodes",
+    "open_map_coarse_localizer",
 ]
 
 
@@ -70,7 +75,7 @@ class TopoMetricMap(MapContents):
     def _rows(self) -> dict[int, int]:
         return {summary.node_id: row for row, summary in enumerate(self.summaries)}
 
-    def by_kind(self, kind: str) -> TopoMetricMap:
+    def with_feature_type(self, kind: str) -> TopoMetricMap:
         """The map as if it were made of this one of its kinds of features alone, its walls too;
         itself by its first kind.
 
@@ -80,15 +85,17 @@ class TopoMetricMap(MapContents):
         if kind == self.kind:
             return self
         if kind not in self.other_kinds:
-            raise FeatureKindError(
+            raise FeatureTypeError(
                 f"the map holds no features {kind} (it holds: {', '.join(self.kinds)})"
             )
         return replace(
             self,
             nodes=self.other_kinds[kind],
-            config=replace(self.config, features=self.config.features_of(kind), other_kinds=()),
+            config=replace(
+                self.config, features=self.config.feature_config_for(kind), other_kinds=()
+            ),
             shared_errors=self.other_shared_errors.get(kind),
-            sides=self.sides if self.sides is not None and self.sides.is_asked_by(kind) else None,
+            sides=self.sides if self.sides is not None and self.sides.is_used_with(kind) else None,
             other_kinds={},
             other_shared_errors={},
         )
@@ -100,7 +107,7 @@ class TopoMetricMap(MapContents):
     @staticmethod
     def load(path: str | Path) -> TopoMetricMap:
         """Open a map file; nodes are read when asked for. Raises MapError, MapVersionError."""
-        return _opened(open_map(Path(path)))
+        return _wrap_contents(open_map(Path(path)))
 
     def close(self) -> None:
         """Let go of the file, where the map was loaded; what is asked of it afterwards is a
@@ -128,22 +135,22 @@ class TopoMetricMap(MapContents):
     def __reduce__(self) -> Any:
         if self.file is None:
             return super().__reduce__()
-        return _load_same, (str(self.file.path.absolute()), self.file.digest)
+        return _reload_map, (str(self.file.path.absolute()), self.file.digest)
 
 
-def _load_same(path: str, digest: str) -> TopoMetricMap:
+def _reload_map(path: str, digest: str) -> TopoMetricMap:
     """The map that was pickled. Raises MapError where another one is in its place by now."""
-    return _opened(open_map(Path(path), digest))
+    return _wrap_contents(open_map(Path(path), digest))
 
 
-def _opened(read: tuple[MapContents, MapFile]) -> TopoMetricMap:
+def _wrap_contents(read: tuple[MapContents, MapFile]) -> TopoMetricMap:
     contents, file = read
     topomap = TopoMetricMap(**vars(contents))
     topomap.__dict__["_opened"] = file  # no field: a changed copy is not that of the file
     return topomap
 
 
-def open_coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
+def open_map_coarse_localizer(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
     """A map's coarse localizer, which names nodes by their rows. In `surf-vlad` what sets lights
     apart counts for less, where the map's sessions were taken in several. Raises MapError where the
     map has none of this name, or it is damaged."""
@@ -152,23 +159,27 @@ def open_coarse_of(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
     if name not in topomap.coarse_models:
         available = ", ".join(name for name in topomap.coarse_models if "@" not in name) or "none"
         raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
-    coarse = open_coarse(
-        in_rows(topomap.coarse_models[name], [summary.node_id for summary in topomap.summaries])
+    coarse = open_coarse_localizer(
+        node_ids_to_rows(
+            topomap.coarse_models[name], [summary.node_id for summary in topomap.summaries]
+        )
     )
     lights = (
-        light_of_nodes(topomap.summaries, topomap.sessions) if len(topomap.sessions) > 1 else None
+        find_node_illumination_groups(topomap.summaries, topomap.sessions)
+        if len(topomap.sessions) > 1
+        else None
     )
     return (
-        coarse.with_less_between(lights)
-        if isinstance(coarse, ByVectors) and lights is not None and lights.any()
+        coarse.suppress_group_differences(lights)
+        if isinstance(coarse, DescriptorLocalizer) and lights is not None and lights.any()
         else coarse
     )
 
 
-def in_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
+def node_ids_to_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
     """A stored model, which names nodes by their `ids`, as one that names them by their rows; what
     it knows of others is left out."""
-    known = model.arrays.get("node_ids", _outputs_of(model))
+    known = model.arrays.get("node_ids", _output_node_ids(model))
     if known is None or known.ndim != 1 or known.dtype.kind not in "iu":
         return model  # it says itself what is wrong with it
     if list(ids) == list(range(len(ids))) and (
@@ -190,7 +201,7 @@ def in_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
     return replace(model, arrays={**model.arrays, **per_vector, "node_ids": of_known[kept]})
 
 
-def _outputs_of(model: CoarseModel) -> np.ndarray | None:
+def _output_node_ids(model: CoarseModel) -> np.ndarray | None:
     """Of a model with an output for each node there was when it was made, in the order of their
     ids."""
     num_nodes = model.settings.get("num_nodes")

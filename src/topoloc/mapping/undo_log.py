@@ -17,25 +17,33 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError
-from topoloc.mapping.file import MapFile, check_header
-from topoloc.mapping.schema import ORDER, SCHEMA_VERSION, TABLES, checksum_of, creation_of
-from topoloc.mapping.writing import copy_in_order
-from topoloc.recordings.atomic import remove_leftovers, replaced_file, scratch_file
+from topoloc.mapping.map_file import MapFile, check_header
+from topoloc.mapping.map_writing import copy_sorted_tables
+from topoloc.mapping.schema import (
+    SCHEMA_VERSION,
+    SORT_COLUMNS,
+    TABLES,
+    compute_checksum,
+    create_table_statement,
+)
+from topoloc.recordings.atomic import atomic_write, remove_stale_files, temporary_file
 
 _APPLICATION_ID = 0x544F5055  # "TOPU"
-_WIDTH = 1 + max(len(columns) for columns in TABLES.values())  # with the checksum
-_ENTRIES = (
+_MAX_COLUMNS = 1 + max(len(columns) for columns in TABLES.values())  # with the checksum
+_CREATE_ENTRIES = (
     "CREATE TABLE entries (depth INTEGER PRIMARY KEY, before TEXT NOT NULL, after TEXT NOT NULL,"
     " whole BLOB)"
 )
-_ROWS = "CREATE TABLE old_rows (depth INTEGER, of_table TEXT, is_kept INTEGER, {})".format(
-    ", ".join(f"v{k}" for k in range(_WIDTH))
+_CREATE_OLD_ROWS = (
+    "CREATE TABLE old_rows (depth INTEGER, of_table TEXT, is_kept INTEGER, {})".format(
+        ", ".join(f"v{k}" for k in range(_MAX_COLUMNS))
+    )
 )
 _MAX_BYTES = 4_000_000_000
 
 
 @dataclass(frozen=True)
-class Entry:
+class UndoEntry:
     """One edit that can be taken back: from the file of digest `after` to that of `before`."""
 
     depth: int
@@ -43,22 +51,22 @@ class Entry:
     after: str
 
 
-def path_of_log(path: Path) -> Path:
+def undo_log_path(path: Path) -> Path:
     """The undo file of a map."""
     return path.with_name(f"{path.name}.undo")
 
 
-def entries_for(log_path: Path, digest: str) -> list[Entry]:
+def find_undo_entries(log_path: Path, digest: str) -> list[UndoEntry]:
     """The entries of an undo file that lead back from the map file of this digest, the last edit's
     first. Raises MapError."""
-    with closing(_opened(log_path)) as log:
+    with closing(_open_log(log_path)) as log:
         rows = [
-            Entry(*row)
+            UndoEntry(*row)
             for row in log.execute(
                 "SELECT depth, before, after FROM entries ORDER BY depth DESC"
             ).fetchall()
         ]
-    found = list[Entry]()
+    found = list[UndoEntry]()
     for entry in rows:
         if entry.after == digest:
             found.append(entry)
@@ -66,17 +74,20 @@ def entries_for(log_path: Path, digest: str) -> list[Entry]:
     return found
 
 
-def add_entry(path: Path, changed: Path) -> None:
+def add_undo_entry(path: Path, changed: Path) -> None:
     """What leads back from the file `changed` to that at `path`. Entries that lead elsewhere are
     dropped. Raises MapError, OSError."""
-    before, after = (_digest_of(one) for one in (path, changed))
-    depth = max((entry.depth for entry in entries_for(path_of_log(path), before)), default=0) + 1
-    with _rewritten(path) as log:
-        _drop(log, depth)
+    before, after = (_read_digest(one) for one in (path, changed))
+    depth = (
+        max((entry.depth for entry in find_undo_entries(undo_log_path(path), before)), default=0)
+        + 1
+    )
+    with _rewrite_log(path) as log:
+        _delete_entries(log, depth)
         log.execute("INSERT INTO entries VALUES (?, ?, ?, NULL)", (depth, before, after))
         if check_header(path) == SCHEMA_VERSION:
-            _keep_rows(log, depth, path, changed)
-        if not _leads_back(
+            _store_changed_rows(log, depth, path, changed)
+        if not _restores_previous(
             log, depth, path, changed
         ):  # an older file, or one that another version of SQLite laid out
             log.execute("DELETE FROM old_rows WHERE depth = ?", (depth,))
@@ -86,33 +97,33 @@ def add_entry(path: Path, changed: Path) -> None:
             )
 
 
-def drop_entries(path: Path, depth: int) -> None:
+def drop_undo_entries(path: Path, depth: int) -> None:
     """Drop the entries from `depth` on; an undo file without any is removed. Raises MapError,
     OSError."""
     if depth <= 1:
-        path_of_log(path).unlink(missing_ok=True)
+        undo_log_path(path).unlink(missing_ok=True)
         return
-    with _rewritten(path) as log:
-        _drop(log, depth)
+    with _rewrite_log(path) as log:
+        _delete_entries(log, depth)
 
 
-def write_before(path: Path, entry: Entry, target: Path) -> None:
+def write_previous_map(path: Path, entry: UndoEntry, target: Path) -> None:
     """The map file as it was before an edit, from the one at `path`, which is that after it. Raises
     MapError where the log is damaged."""
     try:
-        with closing(_opened(path_of_log(path))) as log:
-            _write_before(log, entry.depth, path, target)
+        with closing(_open_log(undo_log_path(path))) as log:
+            _write_previous(log, entry.depth, path, target)
     except (sqlite3.Error, zlib.error) as error:
-        raise MapError(f"{path_of_log(path)} is damaged: {error}") from error
+        raise MapError(f"{undo_log_path(path)} is damaged: {error}") from error
 
 
-def _opened(file: Path) -> sqlite3.Connection:
+def _open_log(file: Path) -> sqlite3.Connection:
     """An undo file, or an empty one in memory where there is none."""
-    remove_leftovers(file)
+    remove_stale_files(file)
     if not file.exists():
         log = sqlite3.connect(":memory:", isolation_level=None)
-        log.execute(_ENTRIES)
-        log.execute(_ROWS)
+        log.execute(_CREATE_ENTRIES)
+        log.execute(_CREATE_OLD_ROWS)
         return log
     try:
         log = sqlite3.connect(
@@ -121,7 +132,7 @@ def _opened(file: Path) -> sqlite3.Connection:
         with closing(log.execute("SELECT sql FROM sqlite_master LIMIT 10")) as tables:
             found = {sql for (sql,) in tables}
         if (
-            found == {_ENTRIES, _ROWS}
+            found == {_CREATE_ENTRIES, _CREATE_OLD_ROWS}
             and log.execute("PRAGMA application_id").fetchone()[0] == _APPLICATION_ID
         ):
             return log
@@ -135,11 +146,11 @@ def _opened(file: Path) -> sqlite3.Connection:
 
 
 @contextmanager
-def _rewritten(path: Path) -> Iterator[sqlite3.Connection]:
+def _rewrite_log(path: Path) -> Iterator[sqlite3.Connection]:
     """The undo file of a map, copied to be changed, and put in its place at the end."""
     with (
-        replaced_file(path_of_log(path)) as temporary,
-        closing(_opened(path_of_log(path))) as before,
+        atomic_write(undo_log_path(path)) as temporary,
+        closing(_open_log(undo_log_path(path))) as before,
         closing(sqlite3.connect(temporary, isolation_level=None)) as log,
     ):
         before.backup(log)
@@ -153,24 +164,24 @@ def _rewritten(path: Path) -> Iterator[sqlite3.Connection]:
         log.execute("VACUUM")
 
 
-def _drop(log: sqlite3.Connection, depth: int) -> None:
+def _delete_entries(log: sqlite3.Connection, depth: int) -> None:
     for table in ("entries", "old_rows"):
         log.execute(f"DELETE FROM {table} WHERE depth >= ?", (depth,))
 
 
-def _keep_rows(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -> None:
+def _store_changed_rows(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -> None:
     """All rows of the old file that are not in the new one, and the keys of all of the new that are
     not in the old."""
     for name, of in (("old", path), ("new", changed)):
         log.execute(f"ATTACH ? AS {name}", (str(of),))
     log.execute("BEGIN")
     for table, columns in TABLES.items():
-        keys = ORDER[table]
+        keys = SORT_COLUMNS[table]
         for is_kept, values, of, other in (
             (1, [*columns, "checksum"], "old", "new"),
             (0, keys.split(", "), "new", "old"),
         ):
-            selected = ", ".join([*values, *["NULL"] * (_WIDTH - len(values))])
+            selected = ", ".join([*values, *["NULL"] * (_MAX_COLUMNS - len(values))])
             differing = (
                 f"SELECT {keys}, checksum FROM {of}.{table} EXCEPT SELECT {keys}, checksum FROM"
                 f" {other}.{table}"
@@ -185,16 +196,16 @@ def _keep_rows(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -
         log.execute(f"DETACH {name}")
 
 
-def _leads_back(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -> bool:
+def _restores_previous(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -> bool:
     """Whether what is kept makes the file at `path` of the changed one, to the byte."""
     if check_header(path) != SCHEMA_VERSION:
         return False
-    with scratch_file(path_of_log(path)) as tried:
-        _write_before(log, depth, changed, tried)
+    with temporary_file(undo_log_path(path)) as tried:
+        _write_previous(log, depth, changed, tried)
         return tried.read_bytes() == path.read_bytes()
 
 
-def _write_before(log: sqlite3.Connection, depth: int, path: Path, target: Path) -> None:
+def _write_previous(log: sqlite3.Connection, depth: int, path: Path, target: Path) -> None:
     (whole,) = log.execute("SELECT whole FROM entries WHERE depth = ?", (depth,)).fetchone()
     if whole is not None:
         target.write_bytes(zlib.decompressobj().decompress(whole, _MAX_BYTES))
@@ -204,26 +215,31 @@ def _write_before(log: sqlite3.Connection, depth: int, path: Path, target: Path)
         database.execute("ATTACH ? AS now", (str(path),))
         database.execute("BEGIN")
         for table, columns in TABLES.items():
-            _restore(
-                database, table, [*columns, "checksum"], lambda *asked: _rows_of(log, depth, *asked)
+            _restore_table(
+                database,
+                table,
+                [*columns, "checksum"],
+                lambda *asked: _select_old_rows(log, depth, *asked),
             )
         database.execute("COMMIT")
         database.execute("DETACH now")
-        copy_in_order(database, target)
+        copy_sorted_tables(database, target)
 
 
-def _restore(database: sqlite3.Connection, table: str, columns: list[str], rows_of: Any) -> None:
+def _restore_table(
+    database: sqlite3.Connection, table: str, columns: list[str], rows_of: Any
+) -> None:
     """A table as it was before: without what was added or changed since, with what is kept of
     then."""
-    keys = ORDER[table].split(", ")
+    keys = SORT_COLUMNS[table].split(", ")
     at = [columns.index(key) for key in keys]
     kept, added = rows_of(table, 1, len(columns)), rows_of(table, 0, len(keys))
-    if any(checksum_of(table, values) != checksum for *values, checksum in kept):
+    if any(compute_checksum(table, values) != checksum for *values, checksum in kept):
         raise MapError(
             f"the undo file of the map is damaged: a row of {table} is not as it was; the map stays"
             " as it is"
         )
-    database.execute(creation_of(table))
+    database.execute(create_table_statement(table))
     database.execute(
         f"CREATE TEMP TABLE gone_{table} ({', '.join(keys)}, PRIMARY KEY ({', '.join(keys)}))"
     )
@@ -234,7 +250,7 @@ def _restore(database: sqlite3.Connection, table: str, columns: list[str], rows_
     database.executemany(f"INSERT INTO main.{table} VALUES ({', '.join('?' * len(columns))})", kept)
 
 
-def _rows_of(
+def _select_old_rows(
     log: sqlite3.Connection, depth: int, table: str, is_kept: int, width: int
 ) -> list[tuple[Any, ...]]:
     columns = ", ".join(f"v{k}" for k in range(width))
@@ -244,6 +260,6 @@ def _rows_of(
     ).fetchall()
 
 
-def _digest_of(path: Path) -> str:
+def _read_digest(path: Path) -> str:
     with closing(MapFile(path)) as file:
         return file.digest

@@ -1,5 +1,5 @@
-"""What a map file says, held against what can be: shapes, types, bounds. What is not is a `Damage`,
-before any kernel sees it."""
+"""What a map file says, held against what can be: shapes, types, bounds. What is not is a
+`CorruptDataError`, before any kernel sees it."""
 
 from __future__ import annotations
 
@@ -19,40 +19,45 @@ from topoloc.geometry.rigid import Rigid3
 
 MAX_POINTS = 100_000
 MAX_SIDE_PX = 32_768
-_FAR = 1e7  # metres and pixels; nothing that was measured is farther
+_MAX_MAGNITUDE = 1e7  # metres and pixels; nothing that was measured is farther
 
 
-class Damage(Exception):
+class CorruptDataError(Exception):
     """Something in a map file that no map can hold; the text says what."""
 
 
-def array_from(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """An array of exactly this shape; finite and within ± `_FAR`, where it is of floating point."""
+def array_from_bytes(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """An array of exactly this shape; finite and within ± `_MAX_MAGNITUDE`, where it is of floating
+    point."""
     if len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
-        raise Damage(f"{what}: {len(data)} bytes are not {' x '.join(map(str, shape))} {dtype}")
+        raise CorruptDataError(
+            f"{what}: {len(data)} bytes are not {' x '.join(map(str, shape))} {dtype}"
+        )
     array = np.frombuffer(data, dtype).reshape(shape)
     if (
-        array.dtype.kind == "f" and array.size and not (float(np.abs(array).max()) <= _FAR)
+        array.dtype.kind == "f"
+        and array.size
+        and not (float(np.abs(array).max()) <= _MAX_MAGNITUDE)
     ):  # NaN compares as false
-        raise Damage(f"{what}: a number that is not finite or beyond {_FAR:g}")
+        raise CorruptDataError(f"{what}: a number that is not finite or beyond {_MAX_MAGNITUDE:g}")
     return array
 
 
-def pose_from(data: bytes) -> Rigid3:
+def pose_from_bytes(data: bytes) -> Rigid3:
     """A rigid transform: 3x4 float64, the left 3x3 a rotation."""
-    matrix = array_from(data, "<f8", (3, 4), "a pose")
+    matrix = array_from_bytes(data, "<f8", (3, 4), "a pose")
     rotation = matrix[:, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0.0:
-        raise Damage("a pose whose rotation is none")
+        raise CorruptDataError("a pose whose rotation is none")
     return Rigid3(rotation.copy(), matrix[:, 3].copy())
 
 
-def camera_from(text: str) -> Camera:
+def camera_from_text(text: str) -> Camera:
     """A camera of a size that pictures have. Raises CalibrationError, Damage."""
-    camera = Camera.from_json(json_of(text))
+    camera = Camera.from_json(parse_json(text))
     if (
         max(camera.width, camera.height) > MAX_SIDE_PX
-        or max(map(abs, camera.params)) > _FAR
+        or max(map(abs, camera.params)) > _MAX_MAGNITUDE
         or min(camera.fx, camera.fy) < 1.0
     ):
         raise CalibrationError(
@@ -61,59 +66,61 @@ def camera_from(text: str) -> Camera:
     return camera
 
 
-def json_of(text: str) -> Any:
+def parse_json(text: str) -> Any:
     """The value of a JSON text."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise Damage(f"no JSON that can be read ({' '.join(str(error).split())[:100]})") from error
+        raise CorruptDataError(
+            f"no JSON that can be read ({' '.join(str(error).split())[:100]})"
+        ) from error
 
 
-def count_within(value: int, least: int, most: int, what: str) -> int:
+def check_count(value: int, least: int, most: int, what: str) -> int:
     if not least <= value <= most:
-        raise Damage(f"{what}: {value} is not within {least} and {most}")
+        raise CorruptDataError(f"{what}: {value} is not within {least} and {most}")
     return value
 
 
-def counts_from(text: str | None, tables: Iterable[str]) -> dict[str, int]:
+def parse_counts(text: str | None, tables: Iterable[str]) -> dict[str, int]:
     """Rows of each table, from the JSON that a map keeps."""
-    counts = json_of(text) if text is not None else None
+    counts = parse_json(text) if text is not None else None
     if (
         not isinstance(counts, dict)
         or set(counts) != set(tables) - {"map"}
         or not all(type(n) is int and n >= 0 for n in counts.values())
     ):
-        raise Damage("the numbers of rows are missing")
+        raise CorruptDataError("the numbers of rows are missing")
     return counts
 
 
-def unpacked(data: bytes, num_bytes: int, what: str) -> bytes:
+def decompress_bytes(data: bytes, num_bytes: int, what: str) -> bytes:
     """What zlib packed, which must be of this length."""
     unpacker = zlib.decompressobj()
     try:
         found = unpacker.decompress(data, num_bytes + 1)
     except zlib.error as error:
-        raise Damage(f"{what}: {error}") from error
+        raise CorruptDataError(f"{what}: {error}") from error
     if len(found) != num_bytes or not unpacker.eof:
-        raise Damage(f"{what}: not {num_bytes} bytes")
+        raise CorruptDataError(f"{what}: not {num_bytes} bytes")
     return found
 
 
-def arrays_from(data: bytes, what: str) -> dict[str, np.ndarray]:
+def arrays_from_npz(data: bytes, what: str) -> dict[str, np.ndarray]:
     """The arrays of a NumPy `.npz` as we write it: stored, not compressed, so that they are no
     larger than their bytes; no objects."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
             if len(members) > 2000 or sum(member.file_size for member in members) > len(data):
-                raise Damage(f"{what}: larger than it can be")
+                raise CorruptDataError(f"{what}: larger than it can be")
             if any(
                 member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1
                 for member in members
             ):
-                raise Damage(f"{what}: of a compression that no map has")
+                raise CorruptDataError(f"{what}: of a compression that no map has")
             return {
-                member.filename.removesuffix(".npy"): _array_of(archive.read(member), what)
+                member.filename.removesuffix(".npy"): _array_from_npy(archive.read(member), what)
                 for member in members
             }
     except (
@@ -125,10 +132,10 @@ def arrays_from(data: bytes, what: str) -> dict[str, np.ndarray]:
         LookupError,
         OverflowError,
     ) as error:
-        raise Damage(f"{what}: {' '.join(str(error).split())[:100]}") from error
+        raise CorruptDataError(f"{what}: {' '.join(str(error).split())[:100]}") from error
 
 
-def _array_of(data: bytes, what: str) -> np.ndarray:
+def _array_from_npy(data: bytes, what: str) -> np.ndarray:
     """One `.npy`, whose header must agree with its length before anything is made of it."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
@@ -137,7 +144,7 @@ def _array_of(data: bytes, what: str) -> np.ndarray:
         (2, 0): np.lib.format.read_array_header_2_0,
     }.get(version)
     if read_header is None:
-        raise Damage(f"{what}: an array of an unknown version")
+        raise CorruptDataError(f"{what}: an array of an unknown version")
     try:
         shape, is_fortran, dtype = read_header(stream, max_header_size=2000)
     except (
@@ -146,7 +153,7 @@ def _array_of(data: bytes, what: str) -> np.ndarray:
         RecursionError,
         MemoryError,
     ) as error:  # of Python's own parser, on what is no header
-        raise Damage(f"{what}: an array without a header") from error
+        raise CorruptDataError(f"{what}: an array without a header") from error
     left = len(data) - stream.tell()
     if (
         dtype.kind not in "fiub"
@@ -155,6 +162,6 @@ def _array_of(data: bytes, what: str) -> np.ndarray:
         or math.prod(shape) * dtype.itemsize != left
         or min(shape, default=0) < 0
     ):
-        raise Damage(f"{what}: an array of {left} bytes that says {dtype} {shape}")
+        raise CorruptDataError(f"{what}: an array of {left} bytes that says {dtype} {shape}")
     flat = np.frombuffer(data, dtype, offset=stream.tell())
     return flat.reshape(shape[::-1]).T.copy("F") if is_fortran else flat.reshape(shape).copy()

@@ -14,16 +14,16 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from topoloc.bounds import Above, Between
-from topoloc.features.bands import run_in_bands
+from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.stereo import depth_sigmas
 from topoloc.points.epipolar_kernels import match_in_ranges
 from topoloc.points.metric_points import smooth_depth
 from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.frame_view import FrameView, frame_view
+from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 
-_BASELINE_OF_DEPTH = 0.08
-_MIN_SIGMA_OF_DEPTH_PX = 0.03
+_DEPTH_BASELINE = 0.08
+_MIN_DEPTH_SIGMA_PX = 0.03
 
 
 @dataclass(frozen=True)
@@ -75,15 +75,15 @@ class MeasuredView:
     """A view of a frame with what measuring in it needs: `left` and `right` are its pictures as
     floats."""
 
-    view: FrameView
+    view: PreparedFrame
     stereo: StereoCamera
     left: Float32[np.ndarray, "h w"]
     right: Float32[np.ndarray, "h w"] | None
 
 
 def measured_view(frame: StereoFrame) -> MeasuredView:
-    """Raises CalibrationError, RecordingError as `frame_view`."""
-    view = frame_view(frame)
+    """Raises CalibrationError, RecordingError as `prepare_frame`."""
+    view = prepare_frame(frame)
     left = view.grey.astype(np.float32)
     if view.right_grey is not None and view.rig is not None:
         return MeasuredView(
@@ -93,7 +93,7 @@ def measured_view(frame: StereoFrame) -> MeasuredView:
             view.right_grey.astype(np.float32),
         )
     return MeasuredView(
-        view, StereoCamera(view.camera, view.camera.fx * _BASELINE_OF_DEPTH), left, None
+        view, StereoCamera(view.camera, view.camera.fx * _DEPTH_BASELINE), left, None
     )
 
 
@@ -110,35 +110,40 @@ def measure_disparities(
     found.
     """
     if measured.right is None:
-        return _from_depth(measured, points_img, config)
+        return _disparities_from_depth(measured, points_img, config)
     rig = measured.view.rig
     assert rig is not None
     at_infinity = rig.left.cx - rig.right.cx
     largest = int(measured.view.camera.width * config.max_share_of_width)
     known = np.isfinite(guesses_px)
-    lows = (
+    min_disparities = (
         np.where(known, np.floor(np.nan_to_num(guesses_px) + at_infinity) - config.search_px, 0.0)
         .clip(0, largest)
         .astype(np.int64)
     )
-    nums = np.where(known, 2 * config.search_px + 2, largest + 1)
+    range_lengths = np.where(known, 2 * config.search_px + 2, largest + 1)
     disparities, sigmas = (
         np.empty(len(points_img), np.float32),
         np.empty(len(points_img), np.float32),
     )
     # The long searches are shared out evenly.
-    order = np.argsort(nums, kind="stable")
+    order = np.argsort(range_lengths, kind="stable")
     order = np.concatenate([order[0::2], order[1::2]])
-    points, lows, nums = points_img[order], lows[order], nums[order]
+    points, min_disparities, range_lengths = (
+        points_img[order],
+        min_disparities[order],
+        range_lengths[order],
+    )
 
     def run(first: int, last: int) -> None:
         part = slice(first, last)
         match_in_ranges(
-            measured.left, measured.right, points[part], lows[part], nums[part], config.half_px,
+            measured.left, measured.right, points[part],
+            min_disparities[part], range_lengths[part], config.half_px,
             config.min_correlation, config.max_second_correlation, disparities[part], sigmas[part],
         )  # fmt: skip
 
-    run_in_bands(run, len(points))
+    parallel_for_rows(run, len(points))
     found, found_sigmas = np.full(len(points), np.nan), np.full(len(points), np.nan)
     found[order] = disparities.astype(np.float64) - at_infinity
     found_sigmas[order] = np.hypot(sigmas.astype(np.float64), config.min_sigma_px)
@@ -146,10 +151,10 @@ def measure_disparities(
     return np.where(good, found, np.nan), np.where(good, found_sigmas, np.nan)
 
 
-def _from_depth(
+def _disparities_from_depth(
     measured: MeasuredView, points_img: Float32[np.ndarray, "n 2"], config: DisparityConfig
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     assert measured.view.depth is not None
     depth = smooth_depth(measured.view.depth, points_img, config.max_depth_step)
     sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth)
-    return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_SIGMA_OF_DEPTH_PX)
+    return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_DEPTH_SIGMA_PX)

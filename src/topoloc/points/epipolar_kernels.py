@@ -166,7 +166,7 @@ def _match_point(
     x,
     y,
     half,
-    low,
+    min_disparity,
     num_disparities,
     min_score,
     max_ratio,
@@ -187,7 +187,9 @@ def _match_point(
         _normalized_patch(left, x, y, half, patch) < 2.0 * side
     ):  # standard deviation of less than two grey levels
         return nothing
-    _correlations(patch, half, right, x - low, y, -1, num_disparities, strip, sums, scores)
+    _correlations(
+        patch, half, right, x - min_disparity, y, -1, num_disparities, strip, sums, scores
+    )
     best = int(np.argmax(scores[:num_disparities]))
     if not scores[best] >= min_score:
         return nothing
@@ -197,26 +199,37 @@ def _match_point(
             second = scores[d]
     if second > max_ratio * scores[best]:
         return nothing
-    disparity, sigma = _refine_disparity(patch, half, right, x, y, np.float32(low + best), 8)
+    disparity, sigma = _refine_disparity(
+        patch, half, right, x, y, np.float32(min_disparity + best), 8
+    )
     xr = x - disparity
     if (
         not np.isfinite(sigma)
-        or abs(disparity - low - best) > 1.5
+        or abs(disparity - min_disparity - best) > 1.5
         or xr < half
         or xr >= width - half - 1
     ):
         return nothing
     # found back within a pixel? a point seen by one camera only is not
     _normalized_patch(right, xr, y, half, back)
-    _correlations(back, half, left, xr + low, y, 1, num_disparities, strip, sums, scores)
-    if abs(low + int(np.argmax(scores[:num_disparities])) - disparity) > 1.0:
+    _correlations(back, half, left, xr + min_disparity, y, 1, num_disparities, strip, sums, scores)
+    if abs(min_disparity + int(np.argmax(scores[:num_disparities])) - disparity) > 1.0:
         return nothing
     return disparity, sigma
 
 
 @kernel(**_OPTIONS)
 def match_in_ranges(
-    left, right, points, lows, nums, half, min_score, max_ratio, disparities, sigmas
+    left,
+    right,
+    points,
+    min_disparities,
+    range_lengths,
+    half,
+    min_score,
+    max_ratio,
+    disparities,
+    sigmas,
 ):
     """Disparity of each point (x, y) of `left` in `right` (float32 pictures of one size) with its
     standard deviation; fills the last two.
@@ -229,7 +242,7 @@ def match_in_ranges(
     side = 2 * half + 1
     most = 1
     for n in range(len(points)):
-        most = max(most, nums[n])
+        most = max(most, range_lengths[n])
     patch, back = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
     strip, sums, scores = (
         np.empty((side, most + side), np.float32),
@@ -243,8 +256,8 @@ def match_in_ranges(
             points[n, 0],
             points[n, 1],
             half,
-            lows[n],
-            nums[n],
+            min_disparities[n],
+            range_lengths[n],
             min_score,
             max_ratio,
             patch,

@@ -30,7 +30,7 @@ from topoloc.geometry.stereo import (
     ray_covariances,
 )
 from topoloc.points.epipolar_kernels import match_in_ranges
-from topoloc.recordings.frame_view import FrameView
+from topoloc.recordings.frame_preparation import PreparedFrame
 
 # SURF and SIFT describe a neighbourhood of 20 s and 12 sigma; both report sizes of about 7.5 scales
 # across.
@@ -68,13 +68,15 @@ class MetricPoints:
     valid: Bool[np.ndarray, " n"]
 
 
-def locate_points(features: Features, view: FrameView, config: MetricPointsConfig) -> MetricPoints:
+def locate_points(
+    features: Features, view: PreparedFrame, config: MetricPointsConfig
+) -> MetricPoints:
     """The 3-D positions (camera frame of the view) of `features`, which were found in
     `view.grey`."""
     if view.right_grey is not None and view.rig is not None:
-        points_cam, sigma_z = _from_stereo(features, view, config)
+        points_cam, sigma_z = _points_from_stereo(features, view, config)
     elif view.depth is not None:
-        points_cam, sigma_z = _from_depth(features, view, config)
+        points_cam, sigma_z = _points_from_depth(features, view, config)
     else:
         raise RecordingError("3-D positions need a stereo pair or a depth image")
     with np.errstate(invalid="ignore"):
@@ -97,8 +99,8 @@ def keypoint_sigmas(features: Features, config: MetricPointsConfig) -> Float[np.
     )
 
 
-def _from_stereo(
-    features: Features, view: FrameView, config: MetricPointsConfig
+def _points_from_stereo(
+    features: Features, view: PreparedFrame, config: MetricPointsConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.right_grey is not None
     assert view.rig is not None
@@ -118,8 +120,8 @@ def _from_stereo(
     return points_cam, depth_sigmas_of_disparity(points_cam[:, 2], sigma, view.rig)
 
 
-def _from_depth(
-    features: Features, view: FrameView, config: MetricPointsConfig
+def _points_from_depth(
+    features: Features, view: PreparedFrame, config: MetricPointsConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.depth is not None
     depth = smooth_depth(view.depth, features.points_img, config.max_depth_step)

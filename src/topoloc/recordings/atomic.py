@@ -35,28 +35,28 @@ def write_text(path: Path, text: str) -> None:
 def write_bytes(path: Path, data: bytes) -> None:
     """Write the whole file. Raises TopolocError where it cannot be written."""
     try:
-        with replaced_file(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_bytes(data)
     except OSError as error:
         raise TopolocError(f"cannot write {path}: {error.strerror}") from error
 
 
 @contextmanager
-def replaced_file(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """An empty file beside `path` to write to; it is renamed over `path` when all went well, and
     removed when not.
 
     Raises:
         OSError: the folder or the file cannot be written.
     """
-    path = _target(path)
-    remove_leftovers(path)
-    temporary, lock = _own_file(path)
+    path = _resolve_link(path)
+    remove_stale_files(path)
+    temporary, lock = _create_locked_file(path)
     try:
         yield temporary
-        _sync(temporary)
+        _fsync(temporary)
         os.replace(temporary, path)
-        _sync(path.parent)
+        _fsync(path.parent)
     finally:
         with suppress(
             OSError
@@ -66,7 +66,7 @@ def replaced_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def scratch_file(path: Path) -> Iterator[Path]:
+def temporary_file(path: Path) -> Iterator[Path]:
     """An empty file beside `path` that is removed afterwards; those of writers that were killed are
     removed by the next one.
 
@@ -75,9 +75,9 @@ def scratch_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be written.
     """
-    target = _target(path)
-    remove_leftovers(target)
-    temporary, lock = _own_file(target)
+    target = _resolve_link(path)
+    remove_stale_files(target)
+    temporary, lock = _create_locked_file(target)
     try:
         yield temporary
     finally:
@@ -87,12 +87,12 @@ def scratch_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def scratch_folder(prefix: str) -> Iterator[Path]:
+def temporary_folder(prefix: str) -> Iterator[Path]:
     """A new folder among this machine's temporary files, its name beginning so, that is removed
     afterwards; those of owners that were killed go, too. Raises OSError where none can be made."""
     for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
-        _remove_unowned(left)
-    folder, lock = _own_folder(prefix)
+        _remove_unlocked(left)
+    folder, lock = _create_locked_folder(prefix)
     try:
         yield folder
     finally:
@@ -108,19 +108,19 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
     Raises:
         TopolocError: it holds others, or cannot be written.
     """
-    path = _target(path)
-    temporary = path.with_name(f"{_prefix(path)}{secrets.token_hex(8)}.folder")
+    path = _resolve_link(path)
+    temporary = path.with_name(f"{_temporary_prefix(path)}{secrets.token_hex(8)}.folder")
     before = temporary.with_suffix(".before")
     try:
         _check_replaceable(path, files)
         for name, data in files.items():
             (temporary / name).parent.mkdir(parents=True, exist_ok=True)
             (temporary / name).write_bytes(data)
-            _sync(temporary / name)
+            _fsync(temporary / name)
         if path.is_dir():
             os.rename(path, before)
         os.rename(temporary, path)
-        _sync(path.parent)
+        _fsync(path.parent)
     except OSError as error:
         if before.is_dir() and not path.exists():
             os.rename(before, path)
@@ -145,23 +145,23 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
         raise TopolocError(f"cannot write {path}: this folder holds other things, such as {other}")
 
 
-def _target(path: Path) -> Path:
+def _resolve_link(path: Path) -> Path:
     """Where a symbolic link leads: that file is replaced, not the link."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
-def remove_leftovers(path: Path) -> None:
+def remove_stale_files(path: Path) -> None:
     """Remove what writers of `path` left beside it that were killed; what a living process writes
     stays."""
-    path = _target(path)
-    prefix = _prefix(path)
+    path = _resolve_link(path)
+    prefix = _temporary_prefix(path)
     try:
         names = [entry.name for entry in os.scandir(path.parent) if entry.name.startswith(prefix)]
     except OSError:  # no such folder: whoever writes there will say so
         return
     parts = {name for name in names if name.endswith(".part")}
     for name in parts:
-        _remove_unowned(path.parent / name)
+        _remove_unlocked(path.parent / name)
     for name in names:  # of SQLite, beside a temporary file that is gone
         owner = name.removesuffix("-journal")
         if owner != name and owner.endswith(".part") and not (path.parent / owner).exists():
@@ -169,7 +169,7 @@ def remove_leftovers(path: Path) -> None:
                 (path.parent / name).unlink()
 
 
-def remove_all_leftovers(folder: Path) -> None:
+def remove_all_stale_files(folder: Path) -> None:
     """Remove what killed writers of whatever file left in a folder; what a living process writes
     stays."""
     try:
@@ -181,10 +181,10 @@ def remove_all_leftovers(folder: Path) -> None:
     except OSError:
         return
     for name in names:
-        _remove_unowned(folder / name)
+        _remove_unlocked(folder / name)
 
 
-def _prefix(path: Path) -> str:
+def _temporary_prefix(path: Path) -> str:
     """What the names of all temporary files of `path` begin with; short enough for any file
     system."""
     name = (
@@ -195,20 +195,20 @@ def _prefix(path: Path) -> str:
     return f".{name}."
 
 
-def _own_file(path: Path) -> tuple[Path, int]:
+def _create_locked_file(path: Path) -> tuple[Path, int]:
     """A new empty file beside `path`, and its descriptor, which holds its lock."""
     while True:
-        temporary = path.with_name(f"{_prefix(path)}{secrets.token_hex(8)}.part")
+        temporary = path.with_name(f"{_temporary_prefix(path)}{secrets.token_hex(8)}.part")
         descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         # between these two lines another writer may have taken it for a leftover
-        if _lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
+        if _try_lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
             return temporary, descriptor
         os.close(descriptor)
         with suppress(OSError):
             temporary.unlink()
 
 
-def _own_folder(prefix: str) -> tuple[Path, int]:
+def _create_locked_folder(prefix: str) -> tuple[Path, int]:
     """A new folder, and its descriptor, which holds its lock."""
     while True:
         folder = Path(tempfile.mkdtemp(prefix=prefix))
@@ -216,12 +216,12 @@ def _own_folder(prefix: str) -> tuple[Path, int]:
             descriptor = os.open(folder, os.O_RDONLY)
         except FileNotFoundError:  # another one took it for a leftover
             continue
-        if _lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
+        if _try_lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
             return folder, descriptor
         os.close(descriptor)
 
 
-def _remove_unowned(temporary: Path) -> None:
+def _remove_unlocked(temporary: Path) -> None:
     """A file, or a folder with all that is in it, unless a writer holds its lock."""
     is_folder = temporary.is_dir()
     try:
@@ -229,7 +229,7 @@ def _remove_unowned(temporary: Path) -> None:
     except OSError:  # removed by another writer, or not ours to remove
         return
     try:
-        if not _lock(descriptor):
+        if not _try_lock(descriptor):
             return
         if is_folder:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -240,7 +240,7 @@ def _remove_unowned(temporary: Path) -> None:
         os.close(descriptor)
 
 
-def _lock(descriptor: int) -> bool | None:
+def _try_lock(descriptor: int) -> bool | None:
     """Take the lock of an open file; False where another has it, None where there are no locks."""
     if fcntl is None:
         return None
@@ -253,7 +253,7 @@ def _lock(descriptor: int) -> bool | None:
     return True
 
 
-def _sync(path: Path) -> None:
+def _fsync(path: Path) -> None:
     """Hold until a file, or the names in a folder, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:

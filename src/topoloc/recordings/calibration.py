@@ -16,21 +16,21 @@ from pathlib import Path
 from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
-from topoloc.recordings.camera_json import FILE_NAME, CameraFile, read_camera_json
+from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration, read_camera_json
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.pictures import image_size
+from topoloc.recordings.image_io import image_size
 from topoloc.recordings.recording import Recording
 from topoloc.recordings.stereo_yaml import YAML_SUFFIXES, is_calibration, read_calibration_yaml
 from topoloc.recordings.video import Video
 
-CalibrationOfSize = Callable[[int, int], CameraFile]
+CalibrationForSize = Callable[[int, int], CameraCalibration]
 """The calibration of pictures of this width and height (pixels). Raises CalibrationError."""
 # Principal points of lenses lie within a few percent of the centre; further off they are those of
 # another size or of a part of a picture.
-_SIZE_TOLERANCE, _SAME_SCALE = 0.12, 0.08
+_SIZE_TOLERANCE, _SCALE_TOLERANCE = 0.12, 0.08
 
 
-def calibration_of(text: str | Path) -> CalibrationOfSize:
+def parse_calibration(text: str | Path) -> CalibrationForSize:
     """A calibration by its file, or by four numbers ``fx,fy,cx,cy``.
 
     Raises:
@@ -38,15 +38,15 @@ def calibration_of(text: str | Path) -> CalibrationOfSize:
     """
     path = Path(text)
     if "," in str(text) and not path.exists():
-        return calibration_of_numbers(str(text))
+        return parse_intrinsics(str(text))
     if path.suffix.lower() in YAML_SUFFIXES:
         read_calibration_yaml(path, 1000, 1000)  # complains before the first picture is read
         return lambda width, height: read_calibration_yaml(path, width, height)
-    camera_file = read_camera_json(path)
-    return lambda width, height: camera_file
+    camera_calibration = read_camera_json(path)
+    return lambda width, height: camera_calibration
 
 
-def calibration_of_numbers(text: str) -> CalibrationOfSize:
+def parse_intrinsics(text: str) -> CalibrationForSize:
     """The pinhole camera of four numbers ``fx,fy,cx,cy`` (pixels). Raises CalibrationError."""
     try:
         fx, fy, cx, cy = map(float, text.split(","))
@@ -55,10 +55,12 @@ def calibration_of_numbers(text: str) -> CalibrationOfSize:
             f"{text[:80]}: neither a file nor four numbers fx,fy,cx,cy"
         ) from None
     Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
-    return lambda width, height: CameraFile(camera_of_numbers(fx, fy, cx, cy, width, height))
+    return lambda width, height: CameraCalibration(
+        camera_from_intrinsics(fx, fy, cx, cy, width, height)
+    )
 
 
-def camera_of_numbers(
+def camera_from_intrinsics(
     fx: float, fy: float, cx: float, cy: float, width: int, height: int
 ) -> Camera:
     """The pinhole camera of four numbers (pixels).
@@ -75,14 +77,16 @@ def camera_of_numbers(
             f"this one has {width}x{height}",
         )
         own = "a camera.json says for which size it is, where this is meant"
-        if _near(2.0 * cx + 1.0, height, _SIZE_TOLERANCE) and _near(
+        if _is_close(2.0 * cx + 1.0, height, _SIZE_TOLERANCE) and _is_close(
             2.0 * cy + 1.0, width, _SIZE_TOLERANCE
         ):
             raise CalibrationError(
                 f"{numbers} are those of a picture turned by 90 degrees, of about {height}x{width};"
                 f" {picture} ({own})"
             )
-        if _near(across, down, _SAME_SCALE) or not (0.0 < cx < width and 0.0 < cy < height):
+        if _is_close(across, down, _SCALE_TOLERANCE) or not (
+            0.0 < cx < width and 0.0 < cy < height
+        ):
             about = f"about {2.0 * cx + 1.0:.0f}x{2.0 * cy + 1.0:.0f} pixels"
             raise CalibrationError(
                 f"{numbers} are those of a picture of {about}; {picture} ({own})"
@@ -90,7 +94,7 @@ def camera_of_numbers(
     return camera
 
 
-def find_calibration(folder: Path) -> CalibrationOfSize | None:
+def find_calibration(folder: Path) -> CalibrationForSize | None:
     """The calibration that lies in a recording's folder: camera.json, else the only YAML file that
     holds one.
 
@@ -98,7 +102,7 @@ def find_calibration(folder: Path) -> CalibrationOfSize | None:
         CalibrationError: it is not usable, or there are several.
     """
     if (folder / FILE_NAME).is_file():
-        return calibration_of(folder / FILE_NAME)
+        return parse_calibration(folder / FILE_NAME)
     found = [
         path
         for path in sorted(folder.iterdir())
@@ -109,14 +113,14 @@ def find_calibration(folder: Path) -> CalibrationOfSize | None:
             f"{folder}: several calibrations ({', '.join(path.name for path in found)}); name one"
             " with --camera"
         )
-    return calibration_of(found[0]) if found else None
+    return parse_calibration(found[0]) if found else None
 
 
-def completed(given: CalibrationOfSize, folder: Path) -> CalibrationOfSize:
+def complete_calibration(given: CalibrationForSize, folder: Path) -> CalibrationForSize:
     """A calibration from outside; what it does not say of a rectified pair's baseline and of depth
     is as in the recording's folder."""
 
-    def of_size(width: int, height: int) -> CameraFile:
+    def for_size(width: int, height: int) -> CameraCalibration:
         calibration = given(width, height)
         with suppress(CalibrationError):
             if own := find_calibration(folder):
@@ -129,15 +133,15 @@ def completed(given: CalibrationOfSize, folder: Path) -> CalibrationOfSize:
                 rig = calibration.rig or (
                     StereoRig.rectified(calibration.camera, pair.baseline) if pair else None
                 )
-                return CameraFile(
+                return CameraCalibration(
                     calibration.camera, rig, calibration.depth_factor or of_folder.depth_factor
                 )
         return calibration
 
-    return of_size
+    return for_size
 
 
-def recalibrated(sequence: StereoSequence, calibration: CalibrationOfSize) -> StereoSequence:
+def with_calibration(sequence: StereoSequence, calibration: CalibrationForSize) -> StereoSequence:
     """A recording that brings a calibration of its own, with another one in its place.
 
     A single camera takes the place of both of a rectified pair, and of that of registered depth.
@@ -160,7 +164,7 @@ def recalibrated(sequence: StereoSequence, calibration: CalibrationOfSize) -> St
             f"{sequence.name}: a recording of this kind keeps its own calibration; --camera does"
             " not go with it"
         )
-    given = calibration(*size_of_first([sequence.root / name for name in sequence.names]))
+    given = calibration(*first_image_size([sequence.root / name for name in sequence.names]))
     right, depth = sequence.right, sequence.depth
     if right is not None:
         if given.rig is None and not right.rig.is_rectified:
@@ -180,14 +184,14 @@ def recalibrated(sequence: StereoSequence, calibration: CalibrationOfSize) -> St
     return replace(sequence, camera=given.camera, cameras=None, right=right, depth=depth)
 
 
-def size_of_first(pictures: Sequence[Path]) -> tuple[int, int]:
+def first_image_size(images: Sequence[Path]) -> tuple[int, int]:
     """Width and height of the first picture that can be read; (0, 0) where none can, which is said
     when they are asked for."""
-    for path in pictures:
+    for path in images:
         with suppress(UnreadableImageError):
             return image_size(path)
     return 0, 0
 
 
-def _near(one: float, other: float | int, tolerance: float) -> bool:
+def _is_close(one: float, other: float | int, tolerance: float) -> bool:
     return abs(one - other) <= tolerance * other

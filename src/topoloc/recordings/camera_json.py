@@ -16,7 +16,7 @@ FILE_NAME = "camera.json"
 
 
 @dataclass(frozen=True)
-class CameraFile:
+class CameraCalibration:
     """A camera; of a stereo pair the left one, with its `rig`. `depth_factor` is that of depth
     pictures: file units a metre."""
 
@@ -25,7 +25,7 @@ class CameraFile:
     depth_factor: float | None = None
 
 
-def read_camera_json(path: Path) -> CameraFile:
+def read_camera_json(path: Path) -> CameraCalibration:
     """Read a camera.json: one camera, with a "baseline" (metres) where it is the left one of a
     rectified pair; or two of any calibration, "left" and "right", with "right_from_left" (4x4,
     metres).
@@ -37,12 +37,12 @@ def read_camera_json(path: Path) -> CameraFile:
     if not isinstance(data, dict):
         raise CalibrationError(f"{path}: not a JSON object")
     try:
-        depth_factor = _positive(data, "depth_factor")
+        depth_factor = _positive_number(data, "depth_factor")
         if "left" in data or "right" in data:
-            rig = _two_cameras(data)
-            return CameraFile(rig.left, rig, depth_factor)
-        camera, baseline = Camera.from_json(data), _positive(data, "baseline")
-        return CameraFile(
+            rig = _stereo_rig(data)
+            return CameraCalibration(rig.left, rig, depth_factor)
+        camera, baseline = Camera.from_json(data), _positive_number(data, "baseline")
+        return CameraCalibration(
             camera,
             None if baseline is None else StereoRig.rectified(camera, baseline),
             depth_factor,
@@ -51,7 +51,7 @@ def read_camera_json(path: Path) -> CameraFile:
         raise CalibrationError(f"{path}: {error}") from None
 
 
-def _two_cameras(data: dict[str, Any]) -> StereoRig:
+def _stereo_rig(data: dict[str, Any]) -> StereoRig:
     for key in ("left", "right", "right_from_left"):
         if key not in data:
             raise CalibrationError(
@@ -59,17 +59,19 @@ def _two_cameras(data: dict[str, Any]) -> StereoRig:
                 " metres)"
             )
     right_from_left = json_rigid(data["right_from_left"], "right_from_left", CalibrationError)
-    return StereoRig(_named(data, "left"), _named(data, "right"), right_from_left)
+    return StereoRig(
+        _camera_from_key(data, "left"), _camera_from_key(data, "right"), right_from_left
+    )
 
 
-def _named(data: dict[str, Any], key: str) -> Camera:
+def _camera_from_key(data: dict[str, Any], key: str) -> Camera:
     try:
         return Camera.from_json(data[key])
     except CalibrationError as error:
         raise CalibrationError(f"{key}: {error}") from None
 
 
-def _positive(data: dict[str, Any], key: str) -> float | None:
+def _positive_number(data: dict[str, Any], key: str) -> float | None:
     if data.get(key) is None:
         return None
     try:

@@ -17,14 +17,14 @@ from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import SequenceFormat
-from topoloc.recordings.recording import Recording, RightPictures
+from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.recording import Recording, RightImages
 from topoloc.recordings.stereo_yaml import kalibr_camera
-from topoloc.recordings.text_rows import read_file_list
-from topoloc.recordings.trajectory import poses_at, read_asl_poses
-from topoloc.recordings.yaml_numbers import needed_numbers, read_yaml
+from topoloc.recordings.text_files import read_file_list
+from topoloc.recordings.trajectory import interpolate_poses, read_asl_poses
+from topoloc.recordings.yaml_numbers import read_yaml, require_numbers
 
-LOOKS_FOR = "mav0/ with cam0/data.csv, or cam0/data.csv"
+EXPECTED_FILES = "mav0/ with cam0/data.csv, or cam0/data.csv"
 MAX_TRUTH_GAP = 0.05
 _TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0")
 
@@ -37,7 +37,7 @@ class Sensor:
     body_from_cam: Rigid3
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this folder is a mav0, or has one."""
     return any((path / below / "cam0" / "data.csv").is_file() for below in ("mav0", ""))
 
@@ -56,7 +56,7 @@ def open_euroc(path: Path) -> Recording:
         None,
     )
     if mav is None:
-        raise RecordingError(f"{path}: not an EuRoC recording, which has {LOOKS_FOR}")
+        raise RecordingError(f"{path}: not an EuRoC recording, which has {EXPECTED_FILES}")
     left = _read_csv(mav / "cam0" / "data.csv")
     sensor = read_sensor(mav / "cam0" / "sensor.yaml")
     t_ns, right = sorted(left), None
@@ -69,12 +69,12 @@ def open_euroc(path: Path) -> Recording:
                 f"{mav}: none of the {len(left)} pictures of cam0 has a partner of its time among"
                 f" {len(right_by_time)} of cam1"
             )
-        right = RightPictures(
-            [right_by_time[time] for time in t_ns], _rig(mav, sensor, right_sensor)
-        )
+        right = RightImages([right_by_time[time] for time in t_ns], _rig(mav, sensor, right_sensor))
     names = [left[time].relative_to(path).as_posix() for time in t_ns]
     name = mav.resolve().parent.name if mav.resolve().name == "mav0" else path.resolve().name
-    return Recording(name, path, names, t_ns, _truth(mav, t_ns, sensor), sensor.camera, right)
+    return Recording(
+        name, path, names, t_ns, _read_ground_truth(mav, t_ns, sensor), sensor.camera, right
+    )
 
 
 def read_sensor(path: Path) -> Sensor:
@@ -88,7 +88,7 @@ def read_sensor(path: Path) -> Sensor:
     try:
         return Sensor(
             camera,
-            Rigid3.from_matrix(np.array(needed_numbers(path, text, 16, "T_BS")).reshape(4, 4)),
+            Rigid3.from_matrix(np.array(require_numbers(path, text, 16, "T_BS")).reshape(4, 4)),
         )
     except TrajectoryError as error:
         raise CalibrationError(f"{path}: {error}") from None
@@ -111,14 +111,14 @@ def _read_csv(path: Path) -> dict[int, Path]:
     return {time: path.parent / "data" / name for time, name in zip(t_ns, names, strict=True)}
 
 
-def _truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:
+def _read_ground_truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:
     path = next(
         (mav / name / "data.csv" for name in _TRUTH_FOLDERS if (mav / name / "data.csv").is_file()),
         None,
     )
     if path is None:
         return [None] * len(t_ns)
-    poses = poses_at(read_asl_poses(path), t_ns, MAX_TRUTH_GAP)
+    poses = interpolate_poses(read_asl_poses(path), t_ns, MAX_TRUTH_GAP)
     if all(world_from_body is None for world_from_body in poses):
         raise TrajectoryError(f"{path}: none of the {len(t_ns)} frames has a pose")
     return [
@@ -127,4 +127,4 @@ def _truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:
     ]
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_euroc)
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_euroc)

@@ -14,39 +14,39 @@ from pathlib import Path
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import (
-    CalibrationOfSize,
-    calibration_of,
-    completed,
+    CalibrationForSize,
+    complete_calibration,
     find_calibration,
-    size_of_first,
+    first_image_size,
+    parse_calibration,
 )
-from topoloc.recordings.camera_json import FILE_NAME, CameraFile
-from topoloc.recordings.format import SequenceFormat
-from topoloc.recordings.pictures import PICTURE_SUFFIXES
+from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration
+from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.image_io import IMAGE_SUFFIXES
 from topoloc.recordings.recording import (
-    DepthPictures,
+    DepthImages,
     Recording,
-    RightPictures,
+    RightImages,
     check_pairs,
-    list_pictures,
+    list_images,
 )
-from topoloc.recordings.trajectory import read_times, read_truth
+from topoloc.recordings.trajectory import read_ground_truth, read_times
 
-LOOKS_FOR = "pictures, or left/ and right/, or rgb/ and depth/ with camera.json"
+EXPECTED_FILES = "pictures, or left/ and right/, or rgb/ and depth/ with camera.json"
 _STEREO = (("left", "right"), ("image_0", "image_1"), ("cam0", "cam1"))
 _RGBD = (("rgb", "depth"), ("color", "depth"))
 _MONO = ("rgb", "color", "left", "image_0", "cam0", "images")
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this is a picture, or a folder with pictures in it or in one of the known folders
     below it."""
     if path.is_file():
-        return path.suffix.lower() in PICTURE_SUFFIXES
-    return any(_has_pictures(folder) for folder in (path, *(path / name for name in _MONO)))
+        return path.suffix.lower() in IMAGE_SUFFIXES
+    return any(_has_images(folder) for folder in (path, *(path / name for name in _MONO)))
 
 
-def open_folder(path: Path, calibration: CalibrationOfSize | None = None) -> Recording:
+def open_folder(path: Path, calibration: CalibrationForSize | None = None) -> Recording:
     """Open a folder of pictures, or a single picture as a recording of one frame. Without a
     calibration the camera is unknown.
 
@@ -60,78 +60,80 @@ def open_folder(path: Path, calibration: CalibrationOfSize | None = None) -> Rec
     """
     if path.is_file():
         beside = path.parent / FILE_NAME
-        calibration = calibration or (calibration_of(beside) if beside.is_file() else None)
-        camera = calibration(*size_of_first([path])).camera if calibration else None
+        calibration = calibration or (parse_calibration(beside) if beside.is_file() else None)
+        camera = calibration(*first_image_size([path])).camera if calibration else None
         return Recording(path.name, path.parent, [path.name], [0], [None], camera)
-    calibration = completed(calibration, path) if calibration else find_calibration(path)
+    calibration = complete_calibration(calibration, path) if calibration else find_calibration(path)
     for left, right in _STEREO:
         if (path / left).is_dir() and (path / right).is_dir():
             return _open_stereo(path, left, right, calibration)
     for colour, depth in _RGBD:
         if (path / colour).is_dir() and (path / depth).is_dir():
             return _open_rgbd(path, colour, depth, calibration)
-    folder = next((path / name for name in ("", *_MONO) if _has_pictures(path / name)), None)
+    folder = next((path / name for name in ("", *_MONO) if _has_images(path / name)), None)
     if folder is None:
         raise RecordingError(f"{path}: no pictures in this folder")
-    pictures = list_pictures(folder)
-    return _recording(path, pictures, _sized(calibration, pictures))
+    images = list_images(folder)
+    return _make_recording(path, images, _calibration_for_images(calibration, images))
 
 
 def _open_stereo(
-    path: Path, left: str, right: str, calibration: CalibrationOfSize | None
+    path: Path, left: str, right: str, calibration: CalibrationForSize | None
 ) -> Recording:
-    left_paths, right_paths = list_pictures(path / left), list_pictures(path / right)
-    camera_file = _sized(calibration, left_paths)
-    if camera_file is None or camera_file.rig is None:
+    left_paths, right_paths = list_images(path / left), list_images(path / right)
+    camera_calibration = _calibration_for_images(calibration, left_paths)
+    if camera_calibration is None or camera_calibration.rig is None:
         raise CalibrationError(
             f"{path / FILE_NAME}: a stereo pair ({left}/, {right}/) needs this file, with a"
             ' "baseline" in metres or two cameras, or the YAML of OpenCV or Kalibr'
         )
     check_pairs(left_paths, right_paths)
-    return _recording(
-        path, left_paths, camera_file, right=RightPictures(right_paths, camera_file.rig)
+    return _make_recording(
+        path, left_paths, camera_calibration, right=RightImages(right_paths, camera_calibration.rig)
     )
 
 
 def _open_rgbd(
-    path: Path, colour: str, depth: str, calibration: CalibrationOfSize | None
+    path: Path, colour: str, depth: str, calibration: CalibrationForSize | None
 ) -> Recording:
-    colour_paths, depth_paths = list_pictures(path / colour), list_pictures(path / depth)
-    camera_file = _sized(calibration, colour_paths)
-    if camera_file is None or camera_file.depth_factor is None:
+    colour_paths, depth_paths = list_images(path / colour), list_images(path / depth)
+    camera_calibration = _calibration_for_images(calibration, colour_paths)
+    if camera_calibration is None or camera_calibration.depth_factor is None:
         raise CalibrationError(
             f"{path / FILE_NAME}: RGB-D ({colour}/, {depth}/) needs this file, with a"
             ' "depth_factor" in units a metre'
         )
     check_pairs(colour_paths, depth_paths)
-    pictures = DepthPictures(
-        depth_paths, camera_file.depth_factor, camera_file.camera, Rigid3.identity()
+    images = DepthImages(
+        depth_paths, camera_calibration.depth_factor, camera_calibration.camera, Rigid3.identity()
     )
-    return _recording(path, colour_paths, camera_file, depth=pictures)
+    return _make_recording(path, colour_paths, camera_calibration, depth=images)
 
 
-def _recording(
+def _make_recording(
     path: Path,
-    pictures: list[Path],
-    camera_file: CameraFile | None,
-    right: RightPictures | None = None,
-    depth: DepthPictures | None = None,
+    images: list[Path],
+    camera_calibration: CameraCalibration | None,
+    right: RightImages | None = None,
+    depth: DepthImages | None = None,
 ) -> Recording:
-    t_ns = read_times(path / "times.txt", len(pictures))
-    poses = read_truth(path / "truth.tum", [path / "poses.txt"], t_ns)
-    names = [file.relative_to(path).as_posix() for file in pictures]
-    camera = camera_file.camera if camera_file else None
+    t_ns = read_times(path / "times.txt", len(images))
+    poses = read_ground_truth(path / "truth.tum", [path / "poses.txt"], t_ns)
+    names = [file.relative_to(path).as_posix() for file in images]
+    camera = camera_calibration.camera if camera_calibration else None
     return Recording(path.resolve().name, path, names, t_ns, poses, camera, right, depth)
 
 
-def _sized(calibration: CalibrationOfSize | None, pictures: list[Path]) -> CameraFile | None:
-    return None if calibration is None else calibration(*size_of_first(pictures))
+def _calibration_for_images(
+    calibration: CalibrationForSize | None, images: list[Path]
+) -> CameraCalibration | None:
+    return None if calibration is None else calibration(*first_image_size(images))
 
 
-def _has_pictures(folder: Path) -> bool:
+def _has_images(folder: Path) -> bool:
     return folder.is_dir() and any(
-        path.suffix.lower() in PICTURE_SUFFIXES for path in folder.iterdir()
+        path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir()
     )
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_folder, ("calibration",))
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_folder, ("calibration",))

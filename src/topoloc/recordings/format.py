@@ -10,13 +10,13 @@ from topoloc.recordings.frame import StereoSequence
 
 
 @dataclass(frozen=True)
-class SequenceFormat:
+class RecordingFormat:
     """A recording format: the function that recognises it and the function that opens it."""
 
-    looks_for: str
-    recognises: Callable[[Path], bool]
+    expected_files: str
+    can_open: Callable[[Path], bool]
     open: Callable[..., StereoSequence]
-    takes: tuple[str, ...] = ()
+    open_options: tuple[str, ...] = ()
     """Keywords that `open` accepts: the `topics` of a bag, the folder of a model's `images`, a
     `calibration` if the format may have none (otherwise `open_sequence` replaces the format's own
     calibration), or the file of a calibration as it is (`calibration_file`)."""

@@ -33,7 +33,8 @@ class StereoFrame:
 
     Either `right` and `rig` are there (stereo), or `depth` (RGB-D), or neither (a plain picture).
     `world_from_cam` is the truth or an attached trajectory: the pose of the camera of `image`.
-    `noted_focal` (pixels) is what the picture's file says of a camera that is not known otherwise.
+    `exif_focal_px` (pixels) is what the picture's file says of a camera that is not known
+    otherwise.
     """
 
     name: str
@@ -44,7 +45,7 @@ class StereoFrame:
     rig: StereoRig | None = None
     depth: DepthImage | None = None
     world_from_cam: Rigid3 | None = None
-    noted_focal: float | None = None
+    exif_focal_px: float | None = None
 
 
 @runtime_checkable

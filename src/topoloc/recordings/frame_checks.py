@@ -17,20 +17,20 @@ import numpy as np
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.depth_pictures import implausible_depth
+from topoloc.recordings.depth_images import find_depth_problem
 from topoloc.recordings.frame import DepthImage, StereoFrame
 
 _MIN_SPAN_NS = 1_000_000
-_MEANT = "pictures are uint8, grey (height, width) or RGB (height, width, 3)"
+_EXPECTED_IMAGE = "pictures are uint8, grey (height, width) or RGB (height, width, 3)"
 
 
-def picture_problem(image: Any) -> str | None:
+def find_image_problem(image: Any) -> str | None:
     """What keeps an array from being a picture; None where it is one."""
     if not isinstance(image, np.ndarray):
-        return f"a picture is a NumPy array, not {type(image).__name__}; {_MEANT}"
+        return f"a picture is a NumPy array, not {type(image).__name__}; {_EXPECTED_IMAGE}"
     shape = "x".join(map(str, image.shape))
     if image.dtype == np.uint16:
-        return f"a picture of 16 bits; {_MEANT}: (image >> 8).astype(np.uint8)"
+        return f"a picture of 16 bits; {_EXPECTED_IMAGE}: (image >> 8).astype(np.uint8)"
     if image.dtype.kind == "f":
         is_unit = image.size > 0 and float(np.nanmax(image)) <= 1.0
         mend = (
@@ -38,25 +38,29 @@ def picture_problem(image: Any) -> str | None:
             if is_unit
             else "image.round().clip(0, 255).astype(np.uint8)"
         )
-        return f"a picture of type {image.dtype}; {_MEANT}: {mend}"
+        return f"a picture of type {image.dtype}; {_EXPECTED_IMAGE}: {mend}"
     if image.dtype != np.uint8:
-        return f"a picture of type {image.dtype}; {_MEANT}"
+        return f"a picture of type {image.dtype}; {_EXPECTED_IMAGE}"
     if 0 in image.shape:
         return f"an empty picture, {shape}"
     if image.ndim == 3 and image.shape[2] == 4:
-        return f"a picture with four channels ({shape}); {_MEANT}: image[:, :, :3]"
+        return f"a picture with four channels ({shape}); {_EXPECTED_IMAGE}: image[:, :, :3]"
     if image.ndim == 3 and image.shape[0] in (1, 3) and image.shape[2] not in (1, 3):
-        return f"a picture with its channels first ({shape}); {_MEANT}: image.transpose(1, 2, 0)"
+        return (
+            f"a picture with its channels first ({shape}); {_EXPECTED_IMAGE}: image.transpose(1,"
+            " 2, 0)"
+        )
     if image.ndim == 3 and image.shape[2] == 1:
         return (
-            f"a picture of one channel with an axis of its own ({shape}); {_MEANT}: image[:, :, 0]"
+            f"a picture of one channel with an axis of its own ({shape}); {_EXPECTED_IMAGE}:"
+            " image[:, :, 0]"
         )
     if image.ndim != 2 and (image.ndim != 3 or image.shape[2] != 3):
-        return f"an array of shape {shape} is no picture; {_MEANT}"
+        return f"an array of shape {shape} is no picture; {_EXPECTED_IMAGE}"
     return None
 
 
-def time_problem(t_ns: Any) -> str | None:
+def find_time_problem(t_ns: Any) -> str | None:
     """What keeps a value from being a time in integer nanoseconds."""
     if isinstance(t_ns, bool | np.bool_) or not isinstance(t_ns, int | np.integer):
         return (
@@ -66,7 +70,7 @@ def time_problem(t_ns: Any) -> str | None:
     return None
 
 
-def times_problem(t_ns: Sequence[int]) -> str | None:
+def find_times_problem(t_ns: Sequence[int]) -> str | None:
     """What keeps the times of a recording, one by one good, from being those of frames one after
     another."""
     for before, after in pairwise(t_ns):
@@ -80,12 +84,12 @@ def times_problem(t_ns: Sequence[int]) -> str | None:
     return None
 
 
-def frame_problem(frame: StereoFrame) -> str | None:
+def find_frame_problem(frame: StereoFrame) -> str | None:
     """What is wrong with a frame in memory, one line; None where all fits together."""
     problem = (
-        picture_problem(frame.image)
-        or time_problem(frame.t_ns)
-        or _size_problem("the picture", frame.image, frame.camera)
+        find_image_problem(frame.image)
+        or find_time_problem(frame.t_ns)
+        or _find_size_problem("the picture", frame.image, frame.camera)
     )
     if (
         problem is None
@@ -98,12 +102,12 @@ def frame_problem(frame: StereoFrame) -> str | None:
         )
     return (
         problem
-        or _stereo_problem(frame.camera, frame.image, frame.right, frame.rig)
-        or _depth_problem(frame.depth)
+        or _find_stereo_problem(frame.camera, frame.image, frame.right, frame.rig)
+        or _find_depth_problem(frame.depth)
     )
 
 
-def _stereo_problem(
+def _find_stereo_problem(
     camera: Camera | None, image: np.ndarray, right: Any, rig: StereoRig | None
 ) -> str | None:
     if right is None and rig is None:
@@ -114,13 +118,13 @@ def _stereo_problem(
         )
     if camera != rig.left:
         return "`camera` is that of the left picture, rig.left, and here is another one"
-    problem = picture_problem(right) or _size_problem("the right picture", right, rig.right)
+    problem = find_image_problem(right) or _find_size_problem("the right picture", right, rig.right)
     if problem is None and right.shape[:2] != image.shape[:2]:
         problem = "the left and right picture differ in size"
     return problem
 
 
-def _depth_problem(depth: Any) -> str | None:
+def _find_depth_problem(depth: Any) -> str | None:
     if depth is None:
         return None
     if not isinstance(depth, DepthImage):
@@ -134,10 +138,10 @@ def _depth_problem(depth: Any) -> str | None:
         )
         meant = "depth is float32 (height, width) in metres, NaN where unknown"
         return f"{meant}, not {what}; of millimetres: depth.astype(np.float32) / 1000"
-    return _size_problem("the depth image", array, depth.camera) or implausible_depth(array)
+    return _find_size_problem("the depth image", array, depth.camera) or find_depth_problem(array)
 
 
-def _size_problem(what: str, image: np.ndarray, camera: Camera | None) -> str | None:
+def _find_size_problem(what: str, image: np.ndarray, camera: Camera | None) -> str | None:
     if camera is None or image.shape[:2] == (camera.height, camera.width):
         return None
     return f"{what} is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}"

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from topoloc.errors import TopolocError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.text_rows import read_text
+from topoloc.recordings.text_files import read_text
 
 
 def read_json(path: Path, error: type[TopolocError], missing: str = "no such file") -> Any:
@@ -64,7 +64,7 @@ def json_rigid(value: Any, where: str, error: type[TopolocError]) -> Rigid3:
         raise error(f"{where}: {failure}") from None
 
 
-def name_below(name: Any, where: str, error: type[TopolocError]) -> str:
+def parse_relative_path(name: Any, where: str, error: type[TopolocError]) -> str:
     """A file name that stays below its folder. Raises `error`, which says `where`."""
     path = PurePath(name) if isinstance(name, str) else None
     if (

@@ -16,17 +16,17 @@ from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import SequenceFormat
-from topoloc.recordings.pictures import image_size
-from topoloc.recordings.recording import Recording, RightPictures, check_pairs, list_pictures
-from topoloc.recordings.text_rows import read_text
-from topoloc.recordings.trajectory import read_times, read_truth
+from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.image_io import image_size
+from topoloc.recordings.recording import Recording, RightImages, check_pairs, list_images
+from topoloc.recordings.text_files import read_text
+from topoloc.recordings.trajectory import read_ground_truth, read_times
 
-LOOKS_FOR = "image_0/ and image_1/ (or image_2/ and image_3/) with calib.txt"
+EXPECTED_FILES = "image_0/ and image_1/ (or image_2/ and image_3/) with calib.txt"
 _PAIRS = ((0, 1), (2, 3))
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this folder has KITTI's picture folders; with a camera.json instead of a calib.txt it
     is a plain folder."""
     has_pictures = any((path / f"image_{left}").is_dir() for left, _ in _PAIRS)
@@ -44,19 +44,19 @@ def open_kitti(path: Path) -> Recording:
     """
     pair = next((pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir()), None)
     if pair is None:
-        raise RecordingError(f"{path}: not a KITTI folder, which has {LOOKS_FOR}")
-    left = list_pictures(path / f"image_{pair[0]}")
+        raise RecordingError(f"{path}: not a KITTI folder, which has {EXPECTED_FILES}")
+    left = list_images(path / f"image_{pair[0]}")
     projections = read_calib(path / "calib.txt")
     size = image_size(left[0])
     camera = _camera(path, projections, pair[0], size)
     right = None
     if (path / f"image_{pair[1]}").is_dir():
-        right_paths = list_pictures(path / f"image_{pair[1]}")
+        right_paths = list_images(path / f"image_{pair[1]}")
         check_pairs(left, right_paths)
-        right = RightPictures(right_paths, _rig(path, projections, pair, size))
+        right = RightImages(right_paths, _rig(path, projections, pair, size))
     t_ns = read_times(path / "times.txt", len(left))
     cam0_from_cam = Rigid3(np.eye(3), -_cam_from_cam0(projections[f"P{pair[0]}"]))
-    poses = _truth(path, t_ns, cam0_from_cam)
+    poses = _read_ground_truth(path, t_ns, cam0_from_cam)
     names = [f"{file.parent.name}/{file.name}" for file in left]
     return Recording(path.resolve().name, path, names, t_ns, poses, camera, right)
 
@@ -125,14 +125,14 @@ def _cam_from_cam0(projection: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3
     return np.linalg.solve(projection[:, :3], projection[:, 3])
 
 
-def _truth(path: Path, t_ns: list[int], cam0_from_cam: Rigid3) -> list[Rigid3 | None]:
+def _read_ground_truth(path: Path, t_ns: list[int], cam0_from_cam: Rigid3) -> list[Rigid3 | None]:
     absolute = path.resolve()
     rows = [path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"]
-    poses = read_truth(path / "truth.tum", rows, t_ns)
+    poses = read_ground_truth(path / "truth.tum", rows, t_ns)
     if (path / "truth.tum").is_file():
         return poses
     # KITTI's rows are the poses of camera 0 whichever pair is used.
     return [pose @ cam0_from_cam if pose is not None else None for pose in poses]
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_kitti)
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_kitti)

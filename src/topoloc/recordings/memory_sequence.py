@@ -9,7 +9,7 @@ from dataclasses import replace
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.frame_checks import frame_problem, times_problem
+from topoloc.recordings.frame_checks import find_frame_problem, find_times_problem
 
 
 class MemorySequence:
@@ -34,7 +34,7 @@ class MemorySequence:
                 raise RecordingError(
                     f"{name}, frame {number}: a StereoFrame is expected, not {type(frame).__name__}"
                 )
-            problem = frame_problem(frame)
+            problem = find_frame_problem(frame)
             if (
                 problem is None
                 and frame.camera is None
@@ -47,7 +47,7 @@ class MemorySequence:
             if problem is not None:
                 raise RecordingError(f"{name}, frame {number} ({frame.name}): {problem}")
         self._frames = [replace(frame, t_ns=int(frame.t_ns)) for frame in self._frames]
-        if problem := times_problem(self.t_ns):
+        if problem := find_times_problem(self.t_ns):
             raise RecordingError(f"{name}: {problem}")
 
     @property

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.recordings import video
-from topoloc.recordings.calibration import calibration_of, recalibrated
-from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.calibration import parse_calibration, with_calibration
+from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.recording import parse_selection, sequence_subset
 
@@ -35,7 +35,7 @@ FORMATS = {
 
 
 @cache
-def load_format(name: str) -> SequenceFormat:
+def load_format(name: str) -> RecordingFormat:
     """Return the format of a name of `FORMATS`."""
     module, _, attribute = FORMATS[name].partition(":")
     return getattr(importlib.import_module(module), attribute)
@@ -69,9 +69,9 @@ def open_sequence(
         TrajectoryError: the recording's truth is malformed or fits no frame.
     """
     folder, selection = split_selection(str(path))
-    is_side_by_side = format is None and str(camera).endswith(".conf") and video.recognises(folder)
+    is_side_by_side = format is None and str(camera).endswith(".conf") and video.can_open(folder)
     name = "zed" if is_side_by_side else find_format(path, format)
-    sequence = _open_whole(
+    sequence = _open_recording(
         folder, name, camera, {"images": images and Path(images), "topics": topics}
     )
     if selection is None:
@@ -82,22 +82,22 @@ def open_sequence(
     return sequence_subset(sequence, indices)
 
 
-def _open_whole(
+def _open_recording(
     folder: Path, name: str, camera: str | Path | None, options: Mapping[str, object]
 ) -> StereoSequence:
-    of, given = (
+    recording_format, given = (
         load_format(name),
         {key: value for key, value in options.items() if value is not None},
     )
-    if unused := [key for key in given if key not in of.takes]:
+    if unused := [key for key in given if key not in recording_format.open_options]:
         raise RecordingError(f"{folder}: a recording of format {name} takes no {unused[0]}")
     if camera is None:
-        return of.open(folder, **given)
-    if "calibration_file" in of.takes:
-        return of.open(folder, calibration=camera, **given)
-    if "calibration" in of.takes:
-        return of.open(folder, calibration=calibration_of(camera), **given)
-    return recalibrated(of.open(folder, **given), calibration_of(camera))
+        return recording_format.open(folder, **given)
+    if "calibration_file" in recording_format.open_options:
+        return recording_format.open(folder, calibration=camera, **given)
+    if "calibration" in recording_format.open_options:
+        return recording_format.open(folder, calibration=parse_calibration(camera), **given)
+    return with_calibration(recording_format.open(folder, **given), parse_calibration(camera))
 
 
 def find_format(path: str | Path, format: str | None = None) -> str:
@@ -113,7 +113,7 @@ def find_format(path: str | Path, format: str | None = None) -> str:
     folder, _ = split_selection(str(path))
     if not os.path.exists(folder):  # no error of a name that is too long
         raise RecordingError(f"{folder}: no such file or folder")
-    return format or _recognise(folder)
+    return format or _detect_format(folder)
 
 
 def split_selection(path: str) -> tuple[Path, str | None]:
@@ -125,11 +125,11 @@ def split_selection(path: str) -> tuple[Path, str | None]:
     return Path(folder), selection
 
 
-def _recognise(path: Path) -> str:
+def _detect_format(path: Path) -> str:
     for name in FORMATS:
-        if load_format(name).recognises(path):
+        if load_format(name).can_open(path):
             return name
     if path.is_dir() and not any(path.iterdir()):
         raise UnknownFormatError(f"{path}: no known recording: the folder is empty")
-    looked_for = "; ".join(f"{name}: {load_format(name).looks_for}" for name in FORMATS)
+    looked_for = "; ".join(f"{name}: {load_format(name).expected_files}" for name in FORMATS)
     raise UnknownFormatError(f"{path}: no known recording. Looked for {looked_for}")

@@ -15,9 +15,9 @@ from topoloc.errors import RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.depth_pictures import read_depth_picture, resized_depth
+from topoloc.recordings.depth_images import read_depth_image, resize_depth
 from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
-from topoloc.recordings.pictures import PICTURE_SUFFIXES, exif_focal_length, read_image
+from topoloc.recordings.image_io import IMAGE_SUFFIXES, exif_focal_length, read_image
 
 # Recordings without times are taken to be of this rate.
 DEFAULT_RATE_HZ = 10
@@ -29,7 +29,7 @@ _INDEX = re.compile(r"-?\d{1,18}")
 
 
 @dataclass(frozen=True, eq=False)
-class RightPictures:
+class RightImages:
     """The right picture of each frame, and the rig."""
 
     paths: list[Path]
@@ -37,7 +37,7 @@ class RightPictures:
 
 
 @dataclass(frozen=True, eq=False)
-class DepthPictures:
+class DepthImages:
     """The depth picture of each frame: its scale (file units a metre), its camera, and where that
     camera sits.
 
@@ -65,15 +65,15 @@ class Recording:
     t_ns: list[int]
     poses: list[Rigid3 | None]
     camera: Camera | None
-    right: RightPictures | None = None
-    depth: DepthPictures | None = None
+    right: RightImages | None = None
+    depth: DepthImages | None = None
     cameras: list[Camera] | None = None
     has_scale: bool = True
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def single(self) -> Recording:
+    def monocular(self) -> Recording:
         """The same recording without its right and depth pictures."""
         return replace(self, right=None, depth=None)
 
@@ -84,21 +84,23 @@ class Recording:
             IndexError: no such frame.
             UnreadableImageError: a picture is missing, broken, or of another size than its camera.
         """
-        frame = self.left_frame(index)
+        frame = self.read_left_frame(index)
         if self.right is not None:
-            return replace(frame, right=_read_as(self.right.paths[index], self.right.rig.right))
+            return replace(
+                frame, right=_read_checked_image(self.right.paths[index], self.right.rig.right)
+            )
         if self.depth is not None:
             return replace(frame, depth=_depth_image(self.depth, index, frame.camera))
         return frame
 
-    def left_frame(self, index: int) -> StereoFrame:
+    def read_left_frame(self, index: int) -> StereoFrame:
         """Read one frame but for its right or depth picture. Raises as the whole frame does."""
         path = self.root / self.names[index]
         camera, rig = (
             self.camera if self.cameras is None else self.cameras[index],
             None if self.right is None else self.right.rig,
         )
-        image = _read_as(path, camera)
+        image = _read_checked_image(path, camera)
         focal = exif_focal_length(path, image.shape[1], image.shape[0]) if camera is None else None
         return StereoFrame(
             self.names[index],
@@ -107,24 +109,24 @@ class Recording:
             camera,
             rig=rig,
             world_from_cam=self.poses[index],
-            noted_focal=focal,
+            exif_focal_px=focal,
         )
 
 
 @runtime_checkable
-class _Paired(Protocol):
+class _SupportsMonocular(Protocol):
     """A sequence that may have right or depth pictures."""
 
-    def single(self) -> StereoSequence:
+    def monocular(self) -> StereoSequence:
         """The same recording without them."""
         ...
 
 
 @runtime_checkable
-class _PartlyRead(Protocol):
+class _SupportsLeftFrame(Protocol):
     """A sequence whose right and depth pictures are files of their own."""
 
-    def left_frame(self, index: int) -> StereoFrame:
+    def read_left_frame(self, index: int) -> StereoFrame:
         """A frame without them, which are not read."""
         ...
 
@@ -177,7 +179,7 @@ def has_scale(sequence: StereoSequence) -> bool:
     return not isinstance(sequence, Recording) or sequence.has_scale
 
 
-def scaled(sequence: StereoSequence, metres: float) -> StereoSequence:
+def scale_poses(sequence: StereoSequence, metres: float) -> StereoSequence:
     """The same recording with poses of which a unit is so many metres."""
     poses = [
         None if pose is None else Rigid3(pose.rotation, metres * pose.translation)
@@ -186,29 +188,34 @@ def scaled(sequence: StereoSequence, metres: float) -> StereoSequence:
     return SequenceView(sequence, list(range(len(sequence))), poses)
 
 
-def single_pictures(sequence: StereoSequence) -> StereoSequence:
+def as_monocular(sequence: StereoSequence) -> StereoSequence:
     """The same recording without its right and depth pictures, which are then not read either."""
     if isinstance(sequence, SequenceView):
-        return replace(sequence, base=single_pictures(sequence.base))
-    return sequence.single() if isinstance(sequence, _Paired) else sequence
+        return replace(sequence, base=as_monocular(sequence.base))
+    return sequence.monocular() if isinstance(sequence, _SupportsMonocular) else sequence
 
 
-def left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
+def read_left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
     """A frame of which only the left (or colour) picture is asked: right and depth pictures are not
     read, where that is possible. A pair's rig is there, for it says how the left picture is
     rectified. Raises as the sequence does."""
     if type(sequence) is SequenceView:  # one that reads otherwise is asked itself
         return replace(
-            left_frame(sequence.base, sequence.indices[index]), world_from_cam=sequence.poses[index]
+            read_left_frame(sequence.base, sequence.indices[index]),
+            world_from_cam=sequence.poses[index],
         )
-    return sequence.left_frame(index) if isinstance(sequence, _PartlyRead) else sequence[index]
+    return (
+        sequence.read_left_frame(index)
+        if isinstance(sequence, _SupportsLeftFrame)
+        else sequence[index]
+    )
 
 
-def notes_of(sequence: StereoSequence) -> list[str]:
+def recording_notes(sequence: StereoSequence) -> list[str]:
     """What a user should know of a recording that could be opened all the same: what was cut off,
     what was guessed."""
     return (
-        notes_of(sequence.base)
+        recording_notes(sequence.base)
         if isinstance(sequence, SequenceView)
         else list(getattr(sequence, "notes", ()))
     )
@@ -258,7 +265,7 @@ def parse_selection(text: str, num_frames: int) -> list[int]:
     return sorted(chosen)
 
 
-def list_pictures(folder: Path, suffix: str = "") -> list[Path]:
+def list_images(folder: Path, suffix: str = "") -> list[Path]:
     """The picture files of a folder in natural order (2 before 10), those only whose name ends in
     `suffix` if given.
 
@@ -269,7 +276,7 @@ def list_pictures(folder: Path, suffix: str = "") -> list[Path]:
         paths = [
             path
             for path in folder.iterdir()
-            if path.suffix.lower() in PICTURE_SUFFIXES and path.stem.endswith(suffix)
+            if path.suffix.lower() in IMAGE_SUFFIXES and path.stem.endswith(suffix)
         ]
     except OSError as error:
         raise RecordingError(f"{folder}: {error.strerror}") from None
@@ -309,7 +316,7 @@ def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
             )
 
 
-def nearest_rows(times: np.ndarray, others: np.ndarray) -> list[int]:
+def find_nearest_idx(times: np.ndarray, others: np.ndarray) -> list[int]:
     """The row of the nearest of `others` (increasing) for each time."""
     after = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
     before = after - 1
@@ -319,23 +326,23 @@ def nearest_rows(times: np.ndarray, others: np.ndarray) -> list[int]:
     ]
 
 
-def times_by_rate(num_frames: int, rate_hz: int = DEFAULT_RATE_HZ) -> list[int]:
+def times_from_rate(num_frames: int, rate_hz: int = DEFAULT_RATE_HZ) -> list[int]:
     """Times in nanoseconds of frames at a steady rate from 0."""
     return [index * 1_000_000_000 // rate_hz for index in range(num_frames)]
 
 
-def _depth_image(depth: DepthPictures, index: int, camera: Camera | None) -> DepthImage:
+def _depth_image(depth: DepthImages, index: int, camera: Camera | None) -> DepthImage:
     """The depth of a frame whose own picture is seen by `camera`."""
     path = depth.paths[index]
-    metres = read_depth_picture(path, depth.units_per_metre)
+    metres = read_depth_image(path, depth.units_per_metre)
     if depth.camera is not None:
         _check_size(path, metres.shape, depth.camera)
         return DepthImage(metres, depth.camera, depth.cam_from_depth)
     assert camera is not None, "depth that is the picture's own is of a picture with a camera"
-    return DepthImage(resized_depth(path, metres, camera), camera, depth.cam_from_depth)
+    return DepthImage(resize_depth(path, metres, camera), camera, depth.cam_from_depth)
 
 
-def _read_as(path: Path, camera: Camera | None) -> Image:
+def _read_checked_image(path: Path, camera: Camera | None) -> Image:
     image = read_image(path)
     if camera is not None:
         _check_size(path, image.shape, camera)

@@ -35,7 +35,7 @@ def back_project(depth, normalized, rotation, translation, points):
 
 
 @kernel(error_model="numpy", inline="always")
-def _keep(x, y, depth, registered):
+def _update_z_buffer_pixel(x, y, depth, registered):
     height, width = registered.shape
     if x >= -0.5 and y >= -0.5 and x < width - 0.5 and y < height - 0.5:
         row, column = int(np.rint(y)), int(np.rint(x))
@@ -45,10 +45,10 @@ def _keep(x, y, depth, registered):
 
 
 @kernel(error_model="numpy")
-def register_without_lens(depth, normalized, rotation, translation, focal, centre, registered):
+def register_undistorted(depth, normalized, rotation, translation, focal, centre, registered):
     """`back_project`, the pixels of a camera without distortion (focal lengths and principal point,
-    x and y) and `keep_nearest` in one pass, without the points in between; the same numbers to the
-    bit."""
+    x and y) and `update_z_buffer` in one pass, without the points in between; the same numbers to
+    the bit."""
     height, width = depth.shape
     for row in range(height):
         for column in range(width):
@@ -60,14 +60,14 @@ def register_without_lens(depth, normalized, rotation, translation, focal, centr
             py = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
             pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
             if pz > 1e-9:
-                _keep(
+                _update_z_buffer_pixel(
                     px / pz * focal[0] + centre[0], py / pz * focal[1] + centre[1], pz, registered
                 )
 
 
 @kernel(error_model="numpy")
-def keep_nearest(pixels, points, registered):
+def update_z_buffer(pixels, points, registered):
     """Write each point's z into `registered` at its rounded pixel (NaN: none), where nothing nearer
     is."""
     for i in range(len(pixels)):
-        _keep(pixels[i, 0], pixels[i, 1], points[i, 2], registered)
+        _update_z_buffer_pixel(pixels[i, 0], pixels[i, 1], points[i, 2], registered)

@@ -16,10 +16,10 @@ import numpy as np
 from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.recordings.format import SequenceFormat
-from topoloc.recordings.recording import DepthPictures, Recording, list_pictures
+from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.recording import DepthImages, Recording, list_images
 
-LOOKS_FOR = "frame-*.color.png or .jpg with .pose.txt, or one seq-* folder of these"
+EXPECTED_FILES = "frame-*.color.png or .jpg with .pose.txt, or one seq-* folder of these"
 DEPTH_CAMERA = Camera.pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
 COLOUR_CAMERA = Camera.pinhole(640, 480, 525.0, 525.0, 320.0, 240.0)
 COLOUR_FROM_DEPTH = Rigid3(
@@ -29,7 +29,7 @@ UNITS_PER_METRE = 1000.0
 RATE_HZ = 30
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this folder is a run of 7-Scenes, or a scene with runs in it."""
     return path.is_dir() and (
         _is_run(path) or any(_is_run(folder) for folder in path.glob("seq-*"))
@@ -45,19 +45,19 @@ def open_seven_scenes(path: Path) -> Recording:
         TrajectoryError: a .pose.txt is no pose.
     """
     run = _find_run(path)
-    colour = list_pictures(run, ".color")
+    colour = list_images(run, ".color")
     stems = [file.name.partition(".color")[0] for file in colour]
     files = {file.name for file in run.iterdir()}
-    with_depth = [stem for stem in stems if f"{stem}.depth.png" in files]
-    if with_depth and len(with_depth) != len(stems):
+    stems_with_depth = [stem for stem in stems if f"{stem}.depth.png" in files]
+    if stems_with_depth and len(stems_with_depth) != len(stems):
         raise RecordingError(
-            f"{run}: {len(stems)} colour pictures but {len(with_depth)} with depth; every picture"
-            " needs its partner"
+            f"{run}: {len(stems)} colour pictures but {len(stems_with_depth)} with depth; every"
+            " picture needs its partner"
         )
     depth = None
-    if with_depth:
+    if stems_with_depth:
         depth_paths = [run / f"{stem}.depth.png" for stem in stems]
-        depth = DepthPictures(depth_paths, UNITS_PER_METRE, DEPTH_CAMERA, COLOUR_FROM_DEPTH)
+        depth = DepthImages(depth_paths, UNITS_PER_METRE, DEPTH_CAMERA, COLOUR_FROM_DEPTH)
     depth_from_colour = COLOUR_FROM_DEPTH.inverse()
     poses = [
         (
@@ -83,7 +83,7 @@ def _find_run(path: Path) -> Path:
         return path
     runs = sorted(folder for folder in path.glob("seq-*") if _is_run(folder))
     if not runs:
-        raise RecordingError(f"{path}: not a run of 7-Scenes, which has {LOOKS_FOR}")
+        raise RecordingError(f"{path}: not a run of 7-Scenes, which has {EXPECTED_FILES}")
     if len(runs) > 1:
         raise RecordingError(
             f"{path}: {len(runs)} runs here, name one: {', '.join(run.name for run in runs)}"
@@ -110,4 +110,4 @@ def _read_pose(path: Path) -> Rigid3:
         raise TrajectoryError(f"{path}: {error}") from None
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_seven_scenes)
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_seven_scenes)

@@ -18,8 +18,8 @@ from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.camera_json import CameraFile
-from topoloc.recordings.yaml_numbers import needed_numbers, read_yaml, yaml_numbers, yaml_word
+from topoloc.recordings.camera_json import CameraCalibration
+from topoloc.recordings.yaml_numbers import read_yaml, require_numbers, yaml_numbers, yaml_word
 
 YAML_SUFFIXES = frozenset({".yaml", ".yml"})
 _MAX_BASELINE = 5.0  # metres; a wider rig is taken for one in millimetres
@@ -33,7 +33,7 @@ _DISTORTIONS = {
 _FISHEYE_WORDS = ("equidistant", "fisheye", "KANNALA_BRANDT")
 # The names that programs give to matrix and distortion of the left, the right, and of an only
 # camera.
-_LEFT = (
+_LEFT_KEYS = (
     (
         "M1",
         "K1",
@@ -53,11 +53,11 @@ _LEFT = (
         "D_left",
     ),
 )
-_RIGHT = (
-    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT[0]),
-    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT[1]),
+_RIGHT_KEYS = (
+    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT_KEYS[0]),
+    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT_KEYS[1]),
 )
-_ONLY = (
+_MONO_KEYS = (
     ("camera_matrix", "cameraMatrix", "K"),
     ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D"),
 )
@@ -69,10 +69,12 @@ def is_calibration(path: Path) -> bool:
         text = read_yaml(path)
     except CalibrationError:
         return False
-    return _is_kalibr(text) or any(yaml_numbers(text, *names[0]) for names in (_LEFT, _ONLY))
+    return _is_kalibr(text) or any(
+        yaml_numbers(text, *names[0]) for names in (_LEFT_KEYS, _MONO_KEYS)
+    )
 
 
-def read_calibration_yaml(path: Path, width: int, height: int) -> CameraFile:
+def read_calibration_yaml(path: Path, width: int, height: int) -> CameraCalibration:
     """The calibration of pictures of this size (pixels), which counts where the file names none.
 
     Raises:
@@ -81,20 +83,22 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraFile:
     """
     text = read_yaml(path)
     if _is_kalibr(text):
-        return _kalibr(path, text)
-    size = _size(text) or (float(width), float(height))
-    if not yaml_numbers(text, *_LEFT[0]):
-        return CameraFile(_opencv_camera(path, text, _ONLY, size))
-    left, right = (_opencv_camera(path, text, names, size) for names in (_LEFT, _RIGHT))
+        return _read_kalibr(path, text)
+    size = _image_size(text) or (float(width), float(height))
+    if not yaml_numbers(text, *_LEFT_KEYS[0]):
+        return CameraCalibration(_opencv_camera(path, text, _MONO_KEYS, size))
+    left, right = (_opencv_camera(path, text, names, size) for names in (_LEFT_KEYS, _RIGHT_KEYS))
     beside = path.with_name("extrinsics.yml")
     motion = read_yaml(beside) if not yaml_numbers(text, "R") and beside.is_file() else text
     rotation = np.array(
-        needed_numbers(path, motion, 9, "R", "rotation_matrix", "R_right_left")
+        require_numbers(path, motion, 9, "R", "rotation_matrix", "R_right_left")
     ).reshape(3, 3)
     translation = np.array(
-        needed_numbers(path, motion, 3, "T", "translation_vector", "T_right_left")
+        require_numbers(path, motion, 3, "T", "translation_vector", "T_right_left")
     )
-    return CameraFile(left, rig=_rig(path, left, right, np.column_stack([rotation, translation])))
+    return CameraCalibration(
+        left, rig=_rig(path, left, right, np.column_stack([rotation, translation]))
+    )
 
 
 def kalibr_camera(path: Path, section: str) -> Camera:
@@ -107,10 +111,10 @@ def kalibr_camera(path: Path, section: str) -> Camera:
             " pinhole"
         )
     model, count = _DISTORTIONS[distortion]
-    width, height = needed_numbers(path, section, 2, "resolution")
-    params = needed_numbers(path, section, 4, "intrinsics")
+    width, height = require_numbers(path, section, 2, "resolution")
+    params = require_numbers(path, section, 4, "intrinsics")
     if count:
-        params += needed_numbers(
+        params += require_numbers(
             path, section, count, "distortion_coefficients", "distortion_coeffs"
         )
     return _camera(path, model, (width, height), params)
@@ -120,15 +124,15 @@ def _is_kalibr(text: str) -> bool:
     return re.search(r"^cam0:", text, re.MULTILINE) is not None
 
 
-def _kalibr(path: Path, text: str) -> CameraFile:
+def _read_kalibr(path: Path, text: str) -> CameraCalibration:
     parts = re.split(r"^cam(\d+):", text, flags=re.MULTILINE)
     sections = dict(zip(parts[1::2], parts[2::2], strict=True))
     left = kalibr_camera(path, sections["0"])
     if "1" not in sections:
-        return CameraFile(left)
+        return CameraCalibration(left)
     right = kalibr_camera(path, sections["1"])
-    motion = np.array(needed_numbers(path, sections["1"], 16, "T_cn_cnm1")).reshape(4, 4)
-    return CameraFile(left, rig=_rig(path, left, right, motion[:3]))
+    motion = np.array(require_numbers(path, sections["1"], 16, "T_cn_cnm1")).reshape(4, 4)
+    return CameraCalibration(left, rig=_rig(path, left, right, motion[:3]))
 
 
 def _opencv_camera(
@@ -136,7 +140,7 @@ def _opencv_camera(
 ) -> Camera:
     """The camera whose matrix and distortion have one of these names."""
     matrix, distortion = names
-    fx, skew, cx, _, fy, cy, *_ = needed_numbers(path, text, 9, *matrix)
+    fx, skew, cx, _, fy, cy, *_ = require_numbers(path, text, 9, *matrix)
     if abs(skew) > 1e-6 * abs(fx):
         raise CalibrationError(
             f"{path}: {matrix[0]} has a skew of {skew:g}, which no model here knows"
@@ -162,7 +166,7 @@ def _camera(path: Path, model: str, size: tuple[float, float], params: list[floa
         raise CalibrationError(f"{path}: {error}") from None
 
 
-def _size(text: str) -> tuple[float, float] | None:
+def _image_size(text: str) -> tuple[float, float] | None:
     """Width and height, where the file names them."""
     pair = yaml_numbers(text, "image_size", "imageSize", "size", "resolution")
     if len(pair) >= 2:

@@ -17,24 +17,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.errors import RecordingError, TrajectoryError
-from topoloc.geometry.lazy_poses import LazyPoses, pose_of_quaternion, poses_of_matrices
-from topoloc.geometry.pose_conventions import PoseReading
+from topoloc.geometry.lazy_poses import LazyPoses, pose_from_quaternion, poses_from_matrices
+from topoloc.geometry.pose_conventions import PoseConventions
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.atomic import write_text
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.recording import SequenceView, times_by_rate
-from topoloc.recordings.text_rows import (
-    NANOSECONDS,
+from topoloc.recordings.recording import SequenceView, times_from_rate
+from topoloc.recordings.text_files import (
+    NANOSECONDS_PER_SECOND,
     parse_times,
-    plain_times,
-    read_plain_table,
+    parse_uniform_times,
+    read_numeric_table,
     read_rows,
 )
 
 # Times written with few decimals still mean the frame they were made from.
-_SAME_TIME_NS = 1_000_000
+_TIME_TOLERANCE_NS = 1_000_000
 _ROTATION_TOLERANCE = 1e-2
-_SAME_SPAN = 0.8  # of the time that the frames take, for two clocks to tell of the same
+_MIN_OVERLAP_SHARE = 0.8  # of the time that the frames take, for two clocks to tell of the same
 TUM_HEADER = "# t tx ty tz qx qy qz qw (s, m; world_from_cam)"
 _Rows = Sequence[tuple[int, list[str]]]
 
@@ -59,24 +59,24 @@ def read_trajectory(path: Path) -> Trajectory:
         TrajectoryError: missing, empty, a wrong number of columns, NaN, no rotation, or times that
             do not increase; with the line.
     """
-    return _plain_trajectory(path) or _trajectory_of_rows(path)
+    return _read_numeric_trajectory(path) or _trajectory_from_rows(path)
 
 
-def _plain_trajectory(path: Path) -> Trajectory | None:
+def _read_numeric_trajectory(path: Path) -> Trajectory | None:
     """A file of numbers alone, all of them good, read at once; None of any other, which is then
     read line by line."""
-    table = read_plain_table(path, TrajectoryError)
+    table = read_numeric_table(path, TrajectoryError)
     if table is None or table.numbers.shape[1] not in (8, 12):
         return None
     if table.numbers.shape[1] == 12:
-        poses, is_rotation = poses_of_matrices(table.numbers, _ROTATION_TOLERANCE)
+        poses, is_rotation = poses_from_matrices(table.numbers, _ROTATION_TOLERANCE)
         return Trajectory(poses) if is_rotation.all() else None
-    t_ns, rows = plain_times(table.lines), table.numbers[:, 1:]
-    is_good = t_ns is not None and _are_of_unit_length(rows[:, 3:]).all()
-    return Trajectory(LazyPoses(rows, pose_of_quaternion), t_ns) if is_good else None
+    t_ns, rows = parse_uniform_times(table.lines), table.numbers[:, 1:]
+    is_good = t_ns is not None and _is_unit_quaternion(rows[:, 3:]).all()
+    return Trajectory(LazyPoses(rows, pose_from_quaternion), t_ns) if is_good else None
 
 
-def _trajectory_of_rows(path: Path) -> Trajectory:
+def _trajectory_from_rows(path: Path) -> Trajectory:
     rows = read_rows(path, TrajectoryError)
     num_columns = len(rows[0][1])
     if num_columns not in (8, 12):
@@ -89,8 +89,10 @@ def _trajectory_of_rows(path: Path) -> Trajectory:
                 f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}"
             )
     if num_columns == 12:
-        poses, is_rotation = poses_of_matrices(_numbers(path, rows, range(12)), _ROTATION_TOLERANCE)
-        _check(is_rotation, "not a rotation", path, rows)
+        poses, is_rotation = poses_from_matrices(
+            _parse_numbers(path, rows, range(12)), _ROTATION_TOLERANCE
+        )
+        _check_rows(is_rotation, "not a rotation", path, rows)
         return Trajectory(poses)
     return _timed_trajectory(path, rows, range(1, 8))
 
@@ -98,9 +100,9 @@ def _trajectory_of_rows(path: Path) -> Trajectory:
 def _timed_trajectory(path: Path, rows: _Rows, columns: Iterable[int]) -> Trajectory:
     """Of rows that begin with a time, and whose other columns are, in this order, x, y, z (metres)
     and a quaternion (x, y, z, w)."""
-    t_ns, numbers = parse_times(rows, path, TrajectoryError), _numbers(path, rows, columns)
-    _check(_are_of_unit_length(numbers[:, 3:]), "not a rotation", path, rows)
-    return Trajectory(LazyPoses(numbers, pose_of_quaternion), t_ns)
+    t_ns, numbers = parse_times(rows, path, TrajectoryError), _parse_numbers(path, rows, columns)
+    _check_rows(_is_unit_quaternion(numbers[:, 3:]), "not a rotation", path, rows)
+    return Trajectory(LazyPoses(numbers, pose_from_quaternion), t_ns)
 
 
 def read_asl_poses(path: Path) -> Trajectory:
@@ -157,7 +159,7 @@ def kitti_text(trajectory: Trajectory) -> str:
     return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
 
 
-def poses_at(
+def interpolate_poses(
     trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2
 ) -> list[Rigid3 | None]:
     """The pose at each time: interpolated where its neighbours are at most `max_gap` seconds apart,
@@ -169,12 +171,19 @@ def poses_at(
     if trajectory.t_ns is None:
         raise TrajectoryError("these poses have no times, they go with frames row by row")
     return [
-        _pose_at(trajectory.t_ns, trajectory.world_from_cam, time, round(max_gap * NANOSECONDS))
+        _interpolate_pose(
+            trajectory.t_ns,
+            trajectory.world_from_cam,
+            time,
+            round(max_gap * NANOSECONDS_PER_SECOND),
+        )
         for time in t_ns
     ]
 
 
-def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list[Rigid3 | None]:
+def match_frame_poses(
+    trajectory: Trajectory, t_ns: Sequence[int], path: Path
+) -> list[Rigid3 | None]:
     """The pose of each frame: by time, or by row where the trajectory has no times.
 
     Raises:
@@ -185,7 +194,7 @@ def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list
         if len(trajectory) != len(t_ns):
             raise TrajectoryError(f"{path}: {len(trajectory)} poses for {len(t_ns)} frames")
         return list(trajectory.world_from_cam)
-    poses = poses_at(trajectory, t_ns)
+    poses = interpolate_poses(trajectory, t_ns)
     if t_ns and all(pose is None for pose in poses):
         span = f"{trajectory.t_ns[0] / 1e9:.3f} to {trajectory.t_ns[-1] / 1e9:.3f} s"
         frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
@@ -197,7 +206,7 @@ def frame_poses(trajectory: Trajectory, t_ns: Sequence[int], path: Path) -> list
 
 
 def with_trajectory(
-    sequence: StereoSequence, path: Path, reading: PoseReading | None = None
+    sequence: StereoSequence, path: Path, conventions: PoseConventions | None = None
 ) -> StereoSequence:
     """The same recording with the poses of a trajectory file: TUM by time, KITTI rows frame by
     frame.
@@ -207,26 +216,26 @@ def with_trajectory(
     Raises:
         TrajectoryError: the file is malformed, or fits no frame.
     """
-    trajectory, reading = read_trajectory(path), reading or PoseReading()
+    trajectory, conventions = read_trajectory(path), conventions or PoseConventions()
     if (
         trajectory.t_ns is None
         and isinstance(sequence, SequenceView)
         and len(trajectory) == len(sequence.base) != len(sequence)
     ):
-        rows = frame_poses(trajectory, sequence.base.t_ns, path)
+        rows = match_frame_poses(trajectory, sequence.base.t_ns, path)
         poses = [rows[index] for index in sequence.indices]
     else:
-        poses = frame_poses(_on_the_frames_clock(trajectory, reading), sequence.t_ns, path)
-    return _with_poses(sequence, [pose and reading.mend(pose) for pose in poses])
+        poses = match_frame_poses(_to_frame_clock(trajectory, conventions), sequence.t_ns, path)
+    return _with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
 
 
-def as_read(sequence: StereoSequence, reading: PoseReading) -> StereoSequence:
+def with_pose_conventions(sequence: StereoSequence, conventions: PoseConventions) -> StereoSequence:
     """The same recording, its own poses read so.
 
     Raises:
         TrajectoryError: no frame has a pose then.
     """
-    if reading == PoseReading():
+    if conventions == PoseConventions():
         return sequence
     posed = [
         (pose, t_ns)
@@ -234,26 +243,27 @@ def as_read(sequence: StereoSequence, reading: PoseReading) -> StereoSequence:
         if pose is not None
     ]
     poses = sequence.poses
-    if posed and (reading.shift_s or reading.clock != 1.0):
+    if posed and (conventions.shift_s or conventions.time_scale != 1.0):
         trajectory = Trajectory([pose for pose, _ in posed], [t_ns for _, t_ns in posed])
-        poses = frame_poses(
-            _on_the_frames_clock(trajectory, reading), sequence.t_ns, Path(sequence.name)
+        poses = match_frame_poses(
+            _to_frame_clock(trajectory, conventions), sequence.t_ns, Path(sequence.name)
         )
-    return _with_poses(sequence, [pose and reading.mend(pose) for pose in poses])
+    return _with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
 
 
 def _with_poses(sequence: StereoSequence, poses: list[Rigid3 | None]) -> StereoSequence:
     return SequenceView(sequence, list(range(len(sequence))), poses)
 
 
-def _on_the_frames_clock(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
-    if trajectory.t_ns is None or (reading.clock == 1.0 and reading.shift_s == 0.0):
+def _to_frame_clock(trajectory: Trajectory, conventions: PoseConventions) -> Trajectory:
+    if trajectory.t_ns is None or (conventions.time_scale == 1.0 and conventions.shift_s == 0.0):
         return trajectory
-    shift_ns = round(reading.shift_s * NANOSECONDS)
+    shift_ns = round(conventions.shift_s * NANOSECONDS_PER_SECOND)
     return replace(
         trajectory,
         t_ns=[
-            (time if reading.clock == 1.0 else round(time * reading.clock)) - shift_ns
+            (time if conventions.time_scale == 1.0 else round(time * conventions.time_scale))
+            - shift_ns
             for time in trajectory.t_ns
         ],
     )
@@ -265,16 +275,16 @@ def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
         overlap = min(of_poses[-1] * factor, of_frames[-1]) - max(
             of_poses[0] * factor, of_frames[0]
         )
-        if overlap > _SAME_SPAN * (of_frames[-1] - of_frames[0]):
+        if overlap > _MIN_OVERLAP_SHARE * (of_frames[-1] - of_frames[0]):
             return f"; its times seem to be in another unit: --poses clock={factor:g}"
     lasts, frames_last = of_poses[-1] - of_poses[0], of_frames[-1] - of_frames[0]
-    if _SAME_SPAN * frames_last < lasts < frames_last / _SAME_SPAN:
-        shift = (of_poses[0] - of_frames[0]) / NANOSECONDS
+    if _MIN_OVERLAP_SHARE * frames_last < lasts < frames_last / _MIN_OVERLAP_SHARE:
+        shift = (of_poses[0] - of_frames[0]) / NANOSECONDS_PER_SECOND
         return f"; if both began at the same moment: --poses shift={shift:.9g}"
     return ""
 
 
-def read_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
+def read_ground_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
     """The pose of each frame from the first of these files that is there: TUM by time, KITTI rows
     one a frame.
 
@@ -283,7 +293,7 @@ def read_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid
     """
     for path in (tum, *kitti_rows):
         if path.is_file():
-            return frame_poses(read_trajectory(path), t_ns, path)
+            return match_frame_poses(read_trajectory(path), t_ns, path)
     return [None] * len(t_ns)
 
 
@@ -294,14 +304,14 @@ def read_times(path: Path, num_frames: int) -> list[int]:
         RecordingError: malformed, not increasing, or their number is not that of the frames.
     """
     if not path.is_file():
-        return times_by_rate(num_frames)
+        return times_from_rate(num_frames)
     t_ns = parse_times(read_rows(path, RecordingError), path, RecordingError)
     if len(t_ns) != num_frames:
         raise RecordingError(f"{path}: {len(t_ns)} times for {num_frames} pictures")
     return t_ns
 
 
-def _pose_at(
+def _interpolate_pose(
     times: list[int], poses: Sequence[Rigid3], time: int, max_gap_ns: int
 ) -> Rigid3 | None:
     after = bisect.bisect_left(times, time)
@@ -314,12 +324,12 @@ def _pose_at(
     nearest = min(neighbours, key=lambda index: abs(times[index] - time), default=None)
     return (
         poses[nearest]
-        if nearest is not None and abs(times[nearest] - time) <= _SAME_TIME_NS
+        if nearest is not None and abs(times[nearest] - time) <= _TIME_TOLERANCE_NS
         else None
     )
 
 
-def _numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarray, "n c"]:
+def _parse_numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarray, "n c"]:
     """These columns of the rows."""
     wanted = list(columns)
     try:
@@ -329,20 +339,20 @@ def _numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarra
     except ValueError:
         for line, tokens in rows:
             for column in wanted:
-                _number(path, line, tokens[column])
+                _parse_number(path, line, tokens[column])
         raise
-    _check(np.asarray(np.isfinite(numbers).all(axis=1)), "NaN or infinite numbers", path, rows)
+    _check_rows(np.asarray(np.isfinite(numbers).all(axis=1)), "NaN or infinite numbers", path, rows)
     return numbers
 
 
-def _number(path: Path, line: int, token: str) -> float:
+def _parse_number(path: Path, line: int, token: str) -> float:
     try:
         return float(token)
     except ValueError:
         raise TrajectoryError(f"{path}, line {line}: {token[:40]!r} is not a number") from None
 
 
-def _are_of_unit_length(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
+def _is_unit_quaternion(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
     """But for rounding."""
     with np.errstate(over="ignore", invalid="ignore"):
         return (
@@ -351,7 +361,7 @@ def _are_of_unit_length(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarra
         )
 
 
-def _check(is_good: Bool[np.ndarray, " n"], fault: str, path: Path, rows: _Rows) -> None:
+def _check_rows(is_good: Bool[np.ndarray, " n"], fault: str, path: Path, rows: _Rows) -> None:
     if not is_good.all():
         line, tokens = rows[int(np.argmin(is_good))]
         raise TrajectoryError(f"{path}, line {line}: {fault} in {' '.join(tokens)[:120]}")

@@ -15,14 +15,14 @@ import numpy as np
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.calibration import CalibrationOfSize, size_of_first
-from topoloc.recordings.camera_json import FILE_NAME, CameraFile, read_camera_json
-from topoloc.recordings.format import SequenceFormat
-from topoloc.recordings.recording import DepthPictures, Recording, nearest_rows
-from topoloc.recordings.text_rows import read_file_list
-from topoloc.recordings.trajectory import read_truth
+from topoloc.recordings.calibration import CalibrationForSize, first_image_size
+from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration, read_camera_json
+from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.recording import DepthImages, Recording, find_nearest_idx
+from topoloc.recordings.text_files import read_file_list
+from topoloc.recordings.trajectory import read_ground_truth
 
-LOOKS_FOR = "rgb.txt and depth.txt"
+EXPECTED_FILES = "rgb.txt and depth.txt"
 DEPTH_FACTOR = 5000.0
 MAX_DEPTH_DELAY = 0.02
 _FREIBURG = {
@@ -42,12 +42,12 @@ _FREIBURG = {
 }
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether the two lists are there."""
     return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
 
 
-def open_tum(path: Path, calibration: CalibrationOfSize | None = None) -> Recording:
+def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recording:
     """Open a recording; a colour picture without depth within 20 ms is left out.
 
     Args:
@@ -59,13 +59,13 @@ def open_tum(path: Path, calibration: CalibrationOfSize | None = None) -> Record
         TrajectoryError: the truth is malformed or fits no frame.
     """
     colour_times, colour = read_file_list(path / "rgb.txt", RecordingError)
-    camera_file = (
-        calibration(*size_of_first([path / name for name in colour]))
+    camera_calibration = (
+        calibration(*first_image_size([path / name for name in colour]))
         if calibration
         else _calibration(path)
     )
     depth_times, depth = read_file_list(path / "depth.txt", RecordingError)
-    nearest = nearest_rows(np.array(colour_times), np.array(depth_times))
+    nearest = find_nearest_idx(np.array(colour_times), np.array(depth_times))
     kept = [
         row
         for row, other in enumerate(nearest)
@@ -77,11 +77,11 @@ def open_tum(path: Path, calibration: CalibrationOfSize | None = None) -> Record
             " within 20 ms"
         )
     t_ns = [colour_times[row] for row in kept]
-    poses = read_truth(path / "groundtruth.txt", [], t_ns)
-    pictures = DepthPictures(
+    poses = read_ground_truth(path / "groundtruth.txt", [], t_ns)
+    images = DepthImages(
         [path / depth[nearest[row]] for row in kept],
-        camera_file.depth_factor or DEPTH_FACTOR,
-        camera_file.camera,
+        camera_calibration.depth_factor or DEPTH_FACTOR,
+        camera_calibration.camera,
         Rigid3.identity(),
     )
     return Recording(
@@ -90,12 +90,12 @@ def open_tum(path: Path, calibration: CalibrationOfSize | None = None) -> Record
         [colour[row] for row in kept],
         t_ns,
         poses,
-        camera_file.camera,
-        depth=pictures,
+        camera_calibration.camera,
+        depth=images,
     )
 
 
-def _calibration(path: Path) -> CameraFile:
+def _calibration(path: Path) -> CameraCalibration:
     if (path / FILE_NAME).is_file():
         return read_camera_json(path / FILE_NAME)
     number = re.search(r"freiburg([123])", path.resolve().name)
@@ -104,7 +104,7 @@ def _calibration(path: Path) -> CameraFile:
             f"{path / FILE_NAME}: no calibration here, and the folder's name does not say"
             " freiburg1, 2 or 3"
         )
-    return CameraFile(_FREIBURG[number[1]])
+    return CameraCalibration(_FREIBURG[number[1]])
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_tum, ("calibration",))
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_tum, ("calibration",))

@@ -21,9 +21,9 @@ from topoloc.errors import CalibrationError, RecordingError, UnreadableImageErro
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
-from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.frame import Image, StereoFrame
-from topoloc.recordings.trajectory import read_truth
+from topoloc.recordings.trajectory import read_ground_truth
 
 # FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once
 # a process, at its first use.
@@ -31,10 +31,10 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
 _LOG_LEVEL_LOCK = threading.Lock()
-LOOKS_FOR = "a video file (.mp4, .mov, .avi, .mkv, .webm)"
+EXPECTED_FILES = "a video file (.mp4, .mov, .avi, .mkv, .webm)"
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this is a video file, by its name."""
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
@@ -86,7 +86,7 @@ class Video:
     def _decode(self, index: int) -> Image:
         reader = self._reader
         if reader is None or reader.next_idx > index:
-            reader = self._reader = _Reader(_open(self.path))
+            reader = self._reader = _Reader(_open_capture(self.path))
         while reader.next_idx <= index:
             grabbed = reader.capture.grab()
             reader.next_idx += 1
@@ -114,7 +114,7 @@ def open_video(path: Path) -> Video:
         CalibrationError: camera.json is not usable, or is of another size than the frames.
         TrajectoryError: the truth is malformed or fits no frame.
     """
-    video = uncalibrated_video(path)
+    video = open_uncalibrated_video(path)
     if not (path.parent / FILE_NAME).is_file():
         return video
     camera, (width, height) = read_camera_json(path.parent / FILE_NAME).camera, video.size
@@ -126,28 +126,28 @@ def open_video(path: Path) -> Video:
     return replace(video, camera=camera)
 
 
-def uncalibrated_video(path: Path) -> Video:
+def open_uncalibrated_video(path: Path) -> Video:
     """The video as it is, whatever calibration lies beside it. Raises as `open_video`."""
-    size, rate = frame_size(path)
-    t_ns = _times(path, rate)
-    poses = read_truth(path.with_suffix(".tum"), [], t_ns)
+    size, rate = read_frame_size(path)
+    t_ns = _read_times(path, rate)
+    poses = read_ground_truth(path.with_suffix(".tum"), [], t_ns)
     return Video(
         path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, None, size
     )
 
 
-def frame_size(path: Path) -> tuple[tuple[int, int], float]:
+def read_frame_size(path: Path) -> tuple[tuple[int, int], float]:
     """Width and height of the first frame, in pixels, and the rate that the container names. Raises
     RecordingError."""
-    capture = _open(path)
+    capture = _open_capture(path)
     decoded, first = capture.read()
     if not decoded or first is None:
         raise RecordingError(f"{path}: no frame of this video can be decoded")
     return (first.shape[1], first.shape[0]), capture.get(cv2.CAP_PROP_FPS)
 
 
-def _open(path: Path) -> cv2.VideoCapture:
-    with opencv_silent():
+def _open_capture(path: Path) -> cv2.VideoCapture:
+    with silence_opencv():
         capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise RecordingError(f"{path}: not a video, damaged, or of a codec that OpenCV cannot read")
@@ -155,9 +155,9 @@ def _open(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def _times(path: Path, rate: float) -> list[int]:
+def _read_times(path: Path, rate: float) -> list[int]:
     """The time of each frame; by the rate where the container gives none."""
-    capture = _open(path)
+    capture = _open_capture(path)
     t_ns = []
     while capture.grab():
         t_ns.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
@@ -175,7 +175,7 @@ def _times(path: Path, rate: float) -> list[int]:
 
 
 @contextmanager
-def opencv_silent() -> Iterator[None]:
+def silence_opencv() -> Iterator[None]:
     """No OpenCV messages on stderr beside the error that says it."""
     logging: Any = getattr(
         cv2.utils, "logging", cv2
@@ -189,4 +189,4 @@ def opencv_silent() -> Iterator[None]:
             logging.setLogLevel(level)
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_video)
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_video)

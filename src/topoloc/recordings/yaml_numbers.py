@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from topoloc.errors import CalibrationError
-from topoloc.recordings.text_rows import read_text
+from topoloc.recordings.text_files import read_text
 
 _MAX_CHARS = 1_000_000
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -48,7 +48,7 @@ def yaml_numbers(text: str, *keys: str) -> list[float]:
     return []
 
 
-def needed_numbers(path: Path, text: str, count: int, *keys: str) -> list[float]:
+def require_numbers(path: Path, text: str, count: int, *keys: str) -> list[float]:
     """The first `count` numbers after one of these keys. Raises CalibrationError, which names the
     file."""
     numbers = yaml_numbers(text, *keys)

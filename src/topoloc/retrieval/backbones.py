@@ -95,12 +95,12 @@ def has_wide_classifier(name: BackboneName) -> bool:
     return name in _VGG_LAYERS
 
 
-def normalize_pictures(pictures: Tensor) -> Tensor:
+def normalize_images(rgb_images: Tensor) -> Tensor:
     """RGB bytes (n, h, w, 3) as the networks take them: float32 (n, 3, h, w), channels last in
     memory."""
-    mean = torch.tensor(IMAGENET_MEAN, device=pictures.device) * 255.0
-    deviation = torch.tensor(IMAGENET_DEVIATION, device=pictures.device) * 255.0
-    return ((pictures - mean) / deviation).permute(0, 3, 1, 2)
+    mean = torch.tensor(IMAGENET_MEAN, device=rgb_images.device) * 255.0
+    deviation = torch.tensor(IMAGENET_DEVIATION, device=rgb_images.device) * 255.0
+    return ((rgb_images - mean) / deviation).permute(0, 3, 1, 2)
 
 
 class _Fire(nn.Module):

@@ -16,15 +16,15 @@ from jaxtyping import Float32, Int, Int8
 
 from topoloc.errors import MapError
 from topoloc.retrieval.coarse import CoarseModel, model_array
-from topoloc.retrieval.place_kernels import multiply_shifted
+from topoloc.retrieval.descriptor_kernels import max_shifted_products
 
 DIMENSION = 32
 """Numbers of a cell after PCA, at most."""
-_SOFTENING = (
+_VARIANCE_REGULARIZATION = (
     0.1  # so many times the mean variance is added to each axis's: the weakest axes are noise
 )
 _MAX_SHIFT = 1  # columns
-_LARGEST = 1e6  # no network's level comes near it
+_MAX_VALUE = 1e6  # no network's level comes near it
 _SCALE = np.float32(127.0)  # of the numbers of a cell, which are kept as signed bytes
 
 
@@ -59,14 +59,15 @@ class CellGrid:
             mean, centred = np.zeros_like(mean), by_column.reshape(-1, channels)
         variances, axes = np.linalg.eigh(centred.T.astype(np.float64) @ centred / len(centred))
         variances, axes = variances[::-1][:dimension], axes[:, ::-1][:, :dimension]
-        softened = np.sqrt(
-            np.maximum(variances, 0.0) / max(float(variances.mean()), 1e-12) + _SOFTENING
+        regularized = np.sqrt(
+            np.maximum(variances, 0.0) / max(float(variances.mean()), 1e-12)
+            + _VARIANCE_REGULARIZATION
         )
         # as the map file keeps it, so that a map says the same before and after
-        projection = (axes / softened).T.astype(np.float16).astype(np.float32)
+        projection = (axes / regularized).T.astype(np.float16).astype(np.float32)
         vectors = np.concatenate(
             [
-                _described(part, mean, projection)
+                _normalize_cells(part, mean, projection)
                 for part in np.array_split(by_column, -(-len(cells) // 256))
             ]
         )
@@ -75,7 +76,7 @@ class CellGrid:
     def with_cells(self, cells: Float32[np.ndarray, "n rows columns c"]) -> CellGrid:
         """With the cells of further mapping images, less the same mean and by the same
         projection."""
-        added = _described(
+        added = _normalize_cells(
             np.ascontiguousarray(cells.transpose(0, 2, 1, 3)), self._mean, self._projection
         )
         return CellGrid(
@@ -84,7 +85,7 @@ class CellGrid:
             np.concatenate([self._stored, np.rint(_SCALE * added).astype(np.int8)]),
         )
 
-    def likeness(
+    def compute_similarity(
         self, cells: Float32[np.ndarray, "rows columns c"], images: Int[np.ndarray, " k"]
     ) -> Float32[np.ndarray, " k"]:
         """The mean cosine between the cells of a picture and those of each of these mapping images,
@@ -98,10 +99,10 @@ class CellGrid:
         if by_column.shape[1:] != self._mean.shape:
             raise MapError("the map's cells are not of the form that its features have")
         vector, products = (
-            _described(by_column, self._mean, self._projection)[0],
+            _normalize_cells(by_column, self._mean, self._projection)[0],
             np.empty(len(images), np.float32),
         )
-        multiply_shifted(
+        max_shifted_products(
             self._vectors,
             images,
             vector,
@@ -131,9 +132,9 @@ class CellGrid:
         projection = model_array(model, "cell_projection", "f", (None, mean.shape[2])).astype(
             np.float32
         )
-        if not max(float(np.abs(mean).max()), float(np.abs(projection).max())) < _LARGEST:
+        if not max(float(np.abs(mean).max()), float(np.abs(projection).max())) < _MAX_VALUE:
             raise MapError(
-                f"the map's coarse localizer {model.name!r} is damaged: cells beyond {_LARGEST:g}"
+                f"the map's coarse localizer {model.name!r} is damaged: cells beyond {_MAX_VALUE:g}"
             )
         vectors = model_array(
             model,
@@ -144,7 +145,7 @@ class CellGrid:
         return CellGrid(mean, projection, vectors.astype(np.int8))
 
 
-def _described(
+def _normalize_cells(
     cells: Float32[np.ndarray, "n columns rows c"],
     mean: Float32[np.ndarray, "columns rows c"],
     projection: Float32[np.ndarray, "d c"],

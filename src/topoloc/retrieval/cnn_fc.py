@@ -16,10 +16,10 @@ from torch import Tensor, nn
 from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.retrieval.backbones import Backbone, has_wide_classifier
-from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, setting
-from topoloc.retrieval.inference import Predictor, from_arrays
-from topoloc.retrieval.network_config import BackboneName, ClassifierNetwork
-from topoloc.retrieval.network_pictures import PictureShape, network_pictures
+from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, read_setting
+from topoloc.retrieval.inference import Predictor, load_network_weights
+from topoloc.retrieval.network_config import BackboneName, ClassifierNetworkConfig
+from topoloc.retrieval.network_images import ImageShape, prepare_network_images
 
 NAME = "cnn-fc"
 MAX_OUTPUTS = 100_000
@@ -35,7 +35,9 @@ class NodeClassifier(nn.Module):
         super().__init__()
         wide = has_wide_classifier(backbone)
         self.backbone = Backbone(backbone, num_outputs=num_nodes if wide else None)
-        self.head = nn.Identity() if wide else _cell_head(self.backbone.num_channels, num_nodes)
+        self.head = (
+            nn.Identity() if wide else _grid_pooling_head(self.backbone.num_channels, num_nodes)
+        )
 
     def forward(self, images: Tensor, first: int = 0) -> Tensor:
         """As that of `Backbone`."""
@@ -50,11 +52,11 @@ class CnnFc:
     """
 
     def __init__(self, model: CoarseModel) -> None:
-        self._picture = setting(model, "config", ClassifierNetwork).picture
-        self._shape = PictureShape(*setting(model, "picture_shape", tuple[int, int]))
+        self._input_config = read_setting(model, "config", ClassifierNetworkConfig).picture
+        self._shape = ImageShape(*read_setting(model, "picture_shape", tuple[int, int]))
         self._temperature, num_outputs = (
-            setting(model, "temperature", float),
-            setting(model, "num_nodes", int),
+            read_setting(model, "temperature", float),
+            read_setting(model, "num_nodes", int),
         )
         if not 0 < num_outputs <= MAX_OUTPUTS or self._temperature <= 0.0:
             raise MapError(
@@ -63,8 +65,8 @@ class CnnFc:
             )
         try:
             self._predict = Predictor(
-                from_arrays(
-                    NodeClassifier(setting(model, "backbone", BackboneName), num_outputs),
+                load_network_weights(
+                    NodeClassifier(read_setting(model, "backbone", BackboneName), num_outputs),
                     model.arrays,
                 )
             )
@@ -99,9 +101,9 @@ class CnnFc:
 
     def probabilities(self, images: Sequence[Image]) -> Float32[np.ndarray, "n nodes"]:
         """Of each node, for each image."""
-        outputs = self._predict(network_pictures(images, self._shape, self._picture)) / np.float32(
-            self._temperature
-        )
+        outputs = self._predict(
+            prepare_network_images(images, self._shape, self._input_config)
+        ) / np.float32(self._temperature)
         powers = np.exp(outputs - outputs.max(axis=1, keepdims=True))
         return powers / powers.sum(axis=1, keepdims=True)
 
@@ -109,7 +111,7 @@ class CnnFc:
 open_model = CnnFc
 
 
-def _cell_head(num_channels: int, num_nodes: int) -> nn.Sequential:
+def _grid_pooling_head(num_channels: int, num_nodes: int) -> nn.Sequential:
     squeeze = [
         nn.Conv2d(num_channels, _SQUEEZED, 1),
         nn.ReLU(True),

@@ -11,9 +11,9 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from topoloc.retrieval.backbones import Backbone
-from topoloc.retrieval.coarse import CoarseModel, setting
-from topoloc.retrieval.network_config import BackboneName, PooledNetwork
-from topoloc.retrieval.vector_search import VectorSearch
+from topoloc.retrieval.coarse import CoarseModel, read_setting
+from topoloc.retrieval.network_config import BackboneName, PooledNetworkConfig
+from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
 
 # Deeper layers know more of things and less of places: the fifth and sixth of SqueezeNet's fire
 # modules rank nodes best.
@@ -45,15 +45,17 @@ class PooledFeatures(nn.Module):
         return nn.functional.normalize(pooled.flatten(1))
 
 
-def open_model(model: CoarseModel) -> VectorSearch:
+def open_model(model: CoarseModel) -> NetworkDescriptorLocalizer:
     """The localizer of a stored model. Raises MapError, ConfigError."""
-    config = setting(model, "config", PooledNetwork)
-    return VectorSearch(
-        model, network_of(setting(model, "backbone", BackboneName), config), config.picture
+    config = read_setting(model, "config", PooledNetworkConfig)
+    return NetworkDescriptorLocalizer(
+        model,
+        create_pooled_network(read_setting(model, "backbone", BackboneName), config),
+        config.picture,
     )
 
 
-def network_of(backbone: BackboneName, config: PooledNetwork) -> PooledFeatures:
+def create_pooled_network(backbone: BackboneName, config: PooledNetworkConfig) -> PooledFeatures:
     """The network with random weights."""
     depth = config.depth if config.depth is not None else DEPTHS[backbone]
     return PooledFeatures(backbone, depth, config.grid_rows, config.grid_columns, config.power)

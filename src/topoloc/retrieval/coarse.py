@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from topoloc.bounds import value_from
+from topoloc.bounds import parse_value
 from topoloc.errors import ConfigError, MapError, MissingExtraError
 from topoloc.features.features import Features
 
@@ -90,26 +90,28 @@ class CoarseLocalizer(Protocol):
 
 
 @runtime_checkable
-class ByVectors(CoarseLocalizer, Protocol):
+class DescriptorLocalizer(CoarseLocalizer, Protocol):
     """One that compares vectors of pictures."""
 
-    def with_less_between(self, group_of_node: Int[np.ndarray, " nodes"]) -> CoarseLocalizer:
+    def suppress_group_differences(
+        self, group_of_node: Int[np.ndarray, " nodes"]
+    ) -> CoarseLocalizer:
         """The same with less of what sets groups of nodes, by their rows, apart on the whole."""
         ...
 
 
 @runtime_checkable
-class GrowsByPictures(CoarseLocalizer, Protocol):
+class ExtendableLocalizer(CoarseLocalizer, Protocol):
     """One that learns a picture by its vector alone."""
 
-    def with_pictures(
-        self, pictures: Sequence[Image], node_ids: Int[np.ndarray, " n"]
+    def extend_with_images(
+        self, images: Sequence[Image], node_ids: Int[np.ndarray, " n"]
     ) -> CoarseModel:
         """The stored model with these pictures, each of the node with this id."""
         ...
 
 
-def open_coarse(model: CoarseModel) -> CoarseLocalizer:
+def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
     """The localizer of a stored model.
 
     Raises:
@@ -134,7 +136,7 @@ def open_coarse(model: CoarseModel) -> CoarseLocalizer:
         raise MapError(f"the map's coarse localizer {model.name!r} is damaged: {error}") from error
 
 
-def setting(model: CoarseModel, name: str, of: Any) -> Any:
+def read_setting(model: CoarseModel, name: str, of: Any) -> Any:
     """A setting of a stored model, of this type, without the keys of other versions. Raises
     ConfigError."""
-    return value_from(of, model.settings.get(name), name, is_strict=False)
+    return parse_value(of, model.settings.get(name), name, is_strict=False)

@@ -92,9 +92,9 @@ class _Block(nn.Module):
         self.expand = None if expansion == 1 else nn.Conv2d(num_inputs, width, 1)
         self.depthwise = SameConv(width, width, kernel, stride=stride, groups=width)
         self.project = nn.Conv2d(width, num_outputs, 1)
-        self.out_channels, self._adds = num_outputs, stride == 1 and num_inputs == num_outputs
+        self.out_channels, self._has_skip = num_outputs, stride == 1 and num_inputs == num_outputs
 
     def forward(self, maps: Tensor) -> Tensor:
         spread = maps if self.expand is None else relu6(self.expand(maps))
         drawn = self.project(relu6(self.depthwise(spread)))
-        return maps + drawn if self._adds else drawn
+        return maps + drawn if self._has_skip else drawn

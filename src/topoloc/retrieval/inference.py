@@ -19,8 +19,8 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 
 from topoloc.compiled import num_threads
-from topoloc.retrieval.backbones import normalize_pictures
-from topoloc.retrieval.network_pictures import RgbPictures
+from topoloc.retrieval.backbones import normalize_images
+from topoloc.retrieval.network_images import RgbImages
 
 BATCH_SIZE = 16
 
@@ -42,36 +42,38 @@ class Predictor:
 
     def __init__(self, network: nn.Module) -> None:
         self._dtype = torch.bfloat16 if has_bfloat16() else torch.float32
-        self._network = in_channels_last(network.eval().requires_grad_(False).to(self._dtype))
+        self._network = to_channels_last(network.eval().requires_grad_(False).to(self._dtype))
         self._frozen: dict[tuple[int, ...], torch.jit.ScriptModule] = {}
-        self._freezing = threading.Lock()
+        self._freeze_lock = threading.Lock()
 
-    def __call__(self, pictures: RgbPictures) -> Float32[np.ndarray, "n d"]:
+    def __call__(self, rgb_images: RgbImages) -> Float32[np.ndarray, "n d"]:
         """One row of outputs for each picture, whatever their number."""
         rows = []
         with torch.inference_mode():
-            for start in range(0, len(pictures), BATCH_SIZE):
-                images = normalize_pictures(
-                    torch.from_numpy(pictures[start : start + BATCH_SIZE])
+            for start in range(0, len(rgb_images), BATCH_SIZE):
+                images = normalize_images(
+                    torch.from_numpy(rgb_images[start : start + BATCH_SIZE])
                 ).to(self._dtype)
-                outputs = self._single(images) if len(images) == 1 else self._network(images)
+                outputs = (
+                    self._predict_single(images) if len(images) == 1 else self._network(images)
+                )
                 rows.append(outputs.float().numpy())
         return np.concatenate(rows)
 
-    def _single(self, image: Tensor) -> Tensor:
+    def _predict_single(self, image: Tensor) -> Tensor:
         """One picture through the frozen network, which is made at the first call: in small
         networks calls cost as much as arithmetic."""
         shape = tuple(image.shape)
         # By default one: the last digits follow from the number, and on a busy machine several wait
         # for one another many times as long.
         with threads(num_threads(1)):
-            with self._freezing:
+            with self._freeze_lock:
                 if shape not in self._frozen:
                     self._frozen[shape] = _freeze(self._network, image)
             return self._frozen[shape](image)
 
 
-class _Threads:
+class _ThreadLimit:
     """`with threads(number)`: this many threads for PyTorch's operations; afterwards as many as
     before.
 
@@ -81,31 +83,31 @@ class _Threads:
     """
 
     def __init__(self) -> None:
-        self._lock, self._here = threading.Lock(), threading.local()
-        self._num_users, self._own = 0, 0
+        self._lock, self._thread_local = threading.Lock(), threading.local()
+        self._num_users, self._process_threads = 0, 0
 
     @contextmanager
     def __call__(self, number: int) -> Iterator[None]:
-        outer: int | None = getattr(self._here, "number", None)
+        outer: int | None = getattr(self._thread_local, "number", None)
         with self._lock:
             # always asked: it makes a new thread take the process's number, which would else happen
             # later
             own = torch.get_num_threads()
             if self._num_users == 0:
-                self._own = own
+                self._process_threads = own
             self._num_users += 1
             torch.set_num_threads(number)
-        self._here.number = number
+        self._thread_local.number = number
         try:
             yield
         finally:
-            self._here.number = outer
+            self._thread_local.number = outer
             with self._lock:
                 self._num_users -= 1
-                torch.set_num_threads(self._own if outer is None else outer)
+                torch.set_num_threads(self._process_threads if outer is None else outer)
 
 
-threads = _Threads()
+threads = _ThreadLimit()
 
 
 def _freeze(network: nn.Module, image: Tensor) -> torch.jit.ScriptModule:
@@ -118,7 +120,7 @@ def _freeze(network: nn.Module, image: Tensor) -> torch.jit.ScriptModule:
     return frozen
 
 
-def in_channels_last(network: nn.Module) -> nn.Module:
+def to_channels_last(network: nn.Module) -> nn.Module:
     """The same network with its convolutions' weights laid out as they are fastest: channels
     last."""
     for value in network.state_dict(keep_vars=True).values():
@@ -127,7 +129,7 @@ def in_channels_last(network: nn.Module) -> nn.Module:
     return network
 
 
-def from_arrays(network: nn.Module, arrays: Mapping[str, np.ndarray]) -> nn.Module:
+def load_network_weights(network: nn.Module, arrays: Mapping[str, np.ndarray]) -> nn.Module:
     """Puts the weights that a map keeps, half floats under names that begin with ``network.``, into
     `network`.
 

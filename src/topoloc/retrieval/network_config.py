@@ -12,7 +12,7 @@ BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "efficientnet_lite0", 
 
 
 @dataclass(frozen=True)
-class PictureConfig:
+class NetworkInputConfig:
     """How a picture is brought to the network: cut to the mapping pictures' shape, reduced, and
     stretched to one size."""
 
@@ -23,17 +23,17 @@ class PictureConfig:
 
 
 @dataclass(frozen=True)
-class ClassifierNetwork:
+class ClassifierNetworkConfig:
     """The network of cnn-fc."""
 
-    picture: PictureConfig = field(default_factory=PictureConfig)
+    picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
 
 
 @dataclass(frozen=True)
-class PooledNetwork:
+class PooledNetworkConfig:
     """The network of cnn-nn: features of a pretrained one, pooled."""
 
-    picture: PictureConfig = field(default_factory=PictureConfig)
+    picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
     depth: Annotated[int | None, Between(1, 100)] = None
     """Layers of the backbone's `features` that are used (None: what measured best for each
     backbone)."""
@@ -51,7 +51,7 @@ class PooledNetwork:
 class VladNetworkConfig:
     """The network of vlad-nn: NetVLAD of a network's features."""
 
-    picture: PictureConfig = field(default_factory=PictureConfig)
+    picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
     depth: Annotated[int | None, Between(1, 100)] = None
     """Layers of the backbone's `features` that are used (None: what measured best for each
     backbone)."""

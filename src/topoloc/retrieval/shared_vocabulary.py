@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from topoloc.features.features import Features
-from topoloc.retrieval.neighbours import Whitening
-from topoloc.retrieval.vlad import VladConfig, placed, vlad
+from topoloc.retrieval.descriptor_index import Whitening
+from topoloc.retrieval.vlad import VladConfig, append_positions, vlad
 
 _FOLDER = "vocabularies"
 
@@ -50,14 +50,18 @@ class SharedVocabulary:
         parts = (self.words, self.whitening.mean, self.whitening.projection)
         return blake2b(b"".join(part.tobytes() for part in parts), digest_size=6).hexdigest()
 
-    def raw_vector(self, features: Features, width: int, height: int) -> Float32[np.ndarray, " kd"]:
+    def raw_descriptor(
+        self, features: Features, width: int, height: int
+    ) -> Float32[np.ndarray, " kd"]:
         """VLAD of the features of a picture of that size (pixels), before whitening."""
-        return vlad(placed(features, width, height, self.config), self.words)
+        return vlad(append_positions(features, width, height, self.config), self.words)
 
-    def vector(self, features: Features, width: int, height: int) -> Float32[np.ndarray, " p"]:
+    def global_descriptor(
+        self, features: Features, width: int, height: int
+    ) -> Float32[np.ndarray, " p"]:
         """The place vector of a picture of that size (pixels): of unit length, the inner product of
         two is their likeness."""
-        return self.whitening.apply(self.raw_vector(features, width, height)[None])[0]
+        return self.whitening.apply(self.raw_descriptor(features, width, height)[None])[0]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """What the file keeps, half floats."""

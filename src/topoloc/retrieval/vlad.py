@@ -18,19 +18,19 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float32, Int
 
-from topoloc.bounds import AtLeast, Between, settings_from
+from topoloc.bounds import AtLeast, Between, parse_settings
 from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.retrieval.cell_grid import CellGrid
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array
-from topoloc.retrieval.neighbours import PlaceIndex, learn_whitening, visual_words
-from topoloc.retrieval.place_kernels import add_residuals, multiply_rows
+from topoloc.retrieval.descriptor_index import DescriptorIndex, learn_visual_words, learn_whitening
+from topoloc.retrieval.descriptor_kernels import add_residuals, multiply_rows
 
 _BLOCK = 1024  # vectors whitened at a time
-_LEAST_OF_GROUP = 8  # images whose mean vector says something of them all
+_MIN_GROUP_SIZE = 8  # images whose mean vector says something of them all
 # of what sets groups apart; all of it costs more where every group covers the whole place
 # (docs/journal.md)
-_LEFT_OUT = 0.5
+_SUPPRESSED_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class SurfVlad:
         self._grid = grid
         self._words, self._mean, self._projection, self._vectors = words, mean, projection, vectors
         self._node_ids, self._config = node_ids, config
-        self._index = PlaceIndex(vectors, node_ids)
+        self._index = DescriptorIndex(vectors, node_ids)
 
     @staticmethod
     def fit(
@@ -78,8 +78,9 @@ class SurfVlad:
         config: VladConfig,
         cells: Sequence[Float32[np.ndarray, "rows columns c"] | None] = (),
     ) -> SurfVlad:
-        """From the vocabulary (`learn_words`), the `vlad` of each mapping image's `placed`
-        features, the node it belongs to and its cells, where the kind of features has them."""
+        """From the vocabulary (`learn_words`), the `vlad` of each mapping image's
+        `append_positions` features, the node it belongs to and its cells, where the kind of
+        features has them."""
         whitening, known = (
             learn_whitening(vlads, config.dimension),
             [one for one in cells if one is not None],
@@ -97,19 +98,21 @@ class SurfVlad:
         """See `CoarseLocalizer.rank`; of the picture itself only the size is looked at. Features
         without cells are ranked by VLAD alone."""
         height, width = image.shape[:2]
-        vector = self._vector(features, width, height)
+        vector = self._global_descriptor(features, width, height)
         if self._grid is None or features.cells is None:
             return self._index.rank_nodes(vector, num_candidates)
         images, similarities = self._index.nearest(vector)
         return self._index.rank_images(
             images,
-            0.5 * (similarities + self._grid.likeness(features.cells, images)),
+            0.5 * (similarities + self._grid.compute_similarity(features.cells, images)),
             num_candidates,
         )
 
-    def _vector(self, features: Features, width: int, height: int) -> Float32[np.ndarray, " p"]:
+    def _global_descriptor(
+        self, features: Features, width: int, height: int
+    ) -> Float32[np.ndarray, " p"]:
         vector = np.empty(len(self._projection), np.float32)
-        descriptors = placed(features, width, height, self._config)
+        descriptors = append_positions(features, width, height, self._config)
         if descriptors.shape[1] != self._words.shape[1]:
             raise MapError(
                 f"the map's coarse localizer {self.name!r} is damaged: its words are not those of"
@@ -119,8 +122,10 @@ class SurfVlad:
         vector /= max(float(np.linalg.norm(vector)), 1e-6)
         return vector
 
-    def with_images(
-        self, pictures: Sequence[tuple[Features, int, int]], node_ids: Int[np.ndarray, " m"]
+    def extend_with_features(
+        self,
+        images_with_features: Sequence[tuple[Features, int, int]],
+        node_ids: Int[np.ndarray, " m"],
     ) -> SurfVlad:
         """With further mapping images, by the vocabulary and the whitening that are there.
 
@@ -129,11 +134,15 @@ class SurfVlad:
                 these must, too.
             node_ids: the node that each belongs to.
         """
-        vectors = np.stack([self._vector(*picture) for picture in pictures])
-        cells = [features.cells for features, _, _ in pictures if features.cells is not None]
+        vectors = np.stack(
+            [self._global_descriptor(*image_features) for image_features in images_with_features]
+        )
+        cells = [
+            features.cells for features, _, _ in images_with_features if features.cells is not None
+        ]
         grid = (
             self._grid.with_cells(np.stack(cells))
-            if self._grid is not None and len(cells) == len(pictures)
+            if self._grid is not None and len(cells) == len(images_with_features)
             else None
         )
         all_ids = np.concatenate([self._node_ids, node_ids.astype(self._node_ids.dtype)])
@@ -147,7 +156,7 @@ class SurfVlad:
             grid,
         )
 
-    def with_less_between(self, group_of_node: Int[np.ndarray, " nodes"]) -> SurfVlad:
+    def suppress_group_differences(self, group_of_node: Int[np.ndarray, " nodes"]) -> SurfVlad:
         """The same with less of what sets groups of nodes apart on the whole, such as the light in
         which they were taken: all vectors are halved along the directions between the mean vectors
         of the groups' images.
@@ -162,16 +171,16 @@ class SurfVlad:
         numbers, counts = np.unique(groups, return_counts=True)
         means = [
             self._vectors[groups == number].mean(axis=0)
-            for number in numbers[counts >= _LEAST_OF_GROUP]
+            for number in numbers[counts >= _MIN_GROUP_SIZE]
         ]
         if len(means) < 2:
             return self
         _, lengths, axes = np.linalg.svd(np.stack(means[1:]) - means[0], full_matrices=False)
         axes = axes[lengths > 1e-4].astype(np.float32)
         projection = np.ascontiguousarray(
-            self._projection - _LEFT_OUT * axes.T @ (axes @ self._projection)
+            self._projection - _SUPPRESSED_SHARE * axes.T @ (axes @ self._projection)
         )
-        vectors = self._vectors - _LEFT_OUT * (self._vectors @ axes.T) @ axes
+        vectors = self._vectors - _SUPPRESSED_SHARE * (self._vectors @ axes.T) @ axes
         vectors = np.ascontiguousarray(
             vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6)
         )
@@ -201,7 +210,7 @@ class SurfVlad:
     def from_model(model: CoarseModel) -> SurfVlad:
         """The inverse of `to_model`. Raises MapError where the arrays do not belong together, for
         kernels trust them, and ConfigError."""
-        config = settings_from(VladConfig, {"position_weight": 0.0, **model.settings}, "settings")
+        config = parse_settings(VladConfig, {"position_weight": 0.0, **model.settings}, "settings")
         words = model_array(model, "words", "f", (None, None)).astype(np.float32, copy=False)
         projection = model_array(model, "projection", "f", (None, words.size)).astype(np.float32)
         mean = model_array(model, "mean", "f", (words.size,)).astype(np.float32, copy=False)
@@ -221,7 +230,7 @@ class SurfVlad:
 open_model = SurfVlad.from_model
 
 
-def placed(
+def append_positions(
     features: Features, width: int, height: int, config: VladConfig
 ) -> Float32[np.ndarray, "n d"]:
     """Descriptors with their places in a picture of that size behind them; as they are where places
@@ -251,10 +260,10 @@ def learn_words(
 ) -> Float32[np.ndarray, "k d"]:
     """The visual words: k-means centres of the map's descriptors, fewer where there are few of
     them."""
-    return learn_words_of([len(descriptors)], lambda _: descriptors, config)
+    return learn_words_from_parts([len(descriptors)], lambda _: descriptors, config)
 
 
-def learn_words_of(
+def learn_words_from_parts(
     num_rows: Sequence[int], part: Callable[[int], Float32[np.ndarray, "_ d"]], config: VladConfig
 ) -> Float32[np.ndarray, "k d"]:
     """As `learn_words` of many parts one after the other, of which one at a time is in memory.
@@ -277,4 +286,4 @@ def learn_words_of(
         for k, rows in enumerate(of_parts)
         if len(rows) or k == 0
     ]
-    return visual_words(np.concatenate(rows), config.num_words, config.seed)
+    return learn_visual_words(np.concatenate(rows), config.num_words, config.seed)

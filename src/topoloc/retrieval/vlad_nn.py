@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from topoloc.retrieval.backbones import Backbone
-from topoloc.retrieval.coarse import CoarseModel, setting
+from topoloc.retrieval.coarse import CoarseModel, read_setting
 from topoloc.retrieval.network_config import BackboneName, VladNetworkConfig
-from topoloc.retrieval.vector_search import VectorSearch
+from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
 
 # NetVLAD takes VGG's last convolution before its rectifier and pooling, as the public checkpoints
 # do.
@@ -61,14 +61,14 @@ class VladNetwork(nn.Module):
         return self.pool(self.backbone(images))
 
 
-def open_model(model: CoarseModel) -> VectorSearch:
+def open_model(model: CoarseModel) -> NetworkDescriptorLocalizer:
     """The localizer of a stored model. Raises MapError, ConfigError."""
-    config = setting(model, "config", VladNetworkConfig)
+    config = read_setting(model, "config", VladNetworkConfig)
     backbone, num_clusters = (
-        setting(model, "backbone", BackboneName),
-        setting(model, "num_clusters", int),
+        read_setting(model, "backbone", BackboneName),
+        read_setting(model, "num_clusters", int),
     )
     depth = config.depth if config.depth is not None else DEPTHS[backbone]
-    return VectorSearch(
+    return NetworkDescriptorLocalizer(
         model, VladNetwork(backbone, depth, min(num_clusters, 4096)), config.picture
     )

@@ -11,7 +11,7 @@ _OPTIONS = {"error_model": "numpy"}
 
 
 @kernel(**_OPTIONS)
-def place_of_block(starts, rows, row, column):
+def find_block_idx(starts, rows, row, column):
     """Where block (row, column) lies, row not above column; it must be there."""
     low, high = starts[column], starts[column + 1]
     while high - low > 1:

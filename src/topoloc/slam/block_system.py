@@ -16,7 +16,7 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.slam.block_kernels import factor_blocks, place_of_block, solve_factored
+from topoloc.slam.block_kernels import factor_blocks, find_block_idx, solve_factored
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,27 +27,27 @@ class BlockPattern:
     Rows and columns are in the order of elimination; `ranks[i]` is the place of unknown i in it.
     """
 
-    ranks: Int[np.ndarray, " n"]
+    elimination_idx: Int[np.ndarray, " n"]
     starts: Int[np.ndarray, " n1"]
     rows: Int[np.ndarray, " b"]
 
     @staticmethod
-    def of(num: int, pairs: Iterable[tuple[int, int]]) -> BlockPattern:
+    def from_pairs(num: int, pairs: Iterable[tuple[int, int]]) -> BlockPattern:
         """That of so many unknowns, these pairs of which are tied together."""
         tied: list[set[int]] = [set() for _ in range(num)]
         for a, b in pairs:
             if a != b:
                 tied[a].add(b)
                 tied[b].add(a)
-        ranks = np.full(num, -1)
+        elimination_idx = np.full(num, -1)
         columns: list[set[int]] = []
         waiting = [(len(others), i) for i, others in enumerate(tied)]
         heapify(waiting)
         while waiting:
             degree, i = heappop(waiting)
-            if ranks[i] >= 0 or degree != len(tied[i]):
+            if elimination_idx[i] >= 0 or degree != len(tied[i]):
                 continue
-            ranks[i] = len(columns)
+            elimination_idx[i] = len(columns)
             columns.append(tied[i])
             for other in tied[i]:
                 tied[other] |= tied[i]
@@ -55,10 +55,11 @@ class BlockPattern:
                 heappush(waiting, (len(tied[other]), other))
         starts = np.cumsum([0, *(1 + len(column) for column in columns)])
         rows = [
-            np.sort(ranks[[*column]]) if column else np.zeros(0, np.int64) for column in columns
+            np.sort(elimination_idx[[*column]]) if column else np.zeros(0, np.int64)
+            for column in columns
         ]
         return BlockPattern(
-            ranks,
+            elimination_idx,
             starts,
             np.concatenate([np.r_[p, r] for p, r in enumerate(rows)])
             if rows
@@ -74,20 +75,24 @@ class BlockPattern:
         """Where the diagonal's blocks lie, in the order of elimination."""
         return self.starts[:-1]
 
-    def place(self, i: int, j: int) -> tuple[int, bool]:
+    def block_idx(self, i: int, j: int) -> tuple[int, bool]:
         """Where the block of unknowns i and j lies, which must be tied, and whether i is its column
         (its row in the upper half)."""
-        low, high = sorted((int(self.ranks[i]), int(self.ranks[j])))
-        return int(place_of_block(self.starts, self.rows, high, low)), bool(low == self.ranks[i])
+        low, high = sorted((int(self.elimination_idx[i]), int(self.elimination_idx[j])))
+        return int(find_block_idx(self.starts, self.rows, high, low)), bool(
+            low == self.elimination_idx[i]
+        )
 
 
 def solve_blocks(
-    pattern: BlockPattern, blocks: Float[np.ndarray, "b 6 6"], rights: Float[np.ndarray, "k n 6"]
+    pattern: BlockPattern,
+    blocks: Float[np.ndarray, "b 6 6"],
+    right_hand_sides: Float[np.ndarray, "k n 6"],
 ) -> Float[np.ndarray, "k n 6"]:
     """x with ``H x = right`` for each right-hand side, all in the order of elimination; `blocks`,
     H's lower half, become its factor."""
     factor_blocks(pattern.starts, pattern.rows, blocks)
-    solved = np.array(rights)
+    solved = np.array(right_hand_sides)
     for right in solved:
         solve_factored(pattern.starts, pattern.rows, blocks, right)
     return solved

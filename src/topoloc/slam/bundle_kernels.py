@@ -11,44 +11,44 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.compiled import kernel
-from topoloc.slam.block_kernels import place_of_block
+from topoloc.slam.block_kernels import find_block_idx
 
 _OPTIONS = {"error_model": "numpy"}
 _MIN_DEPTH = 0.02
 # What an observation costs whose point is behind the camera: as much as one that is off by a
 # hundred sigma.
-_BEHIND = 1e4
+_BEHIND_CAMERA_COST = 1e4
 
 
 @kernel(**_OPTIONS)
-def _residual(rotation, translation, camera, point, measured, weights, residual, seen):
+def _residual(rotation, translation, camera, point, measured, weights, residual, point_cam):
     """Whitened (measured - predicted), and the point in the camera's frame; returns its square,
     negative behind the camera."""
     for axis in range(3):
-        seen[axis] = (
+        point_cam[axis] = (
             rotation[axis, 0] * point[0]
             + rotation[axis, 1] * point[1]
             + rotation[axis, 2] * point[2]
             + translation[axis]
         )
-    if seen[2] < _MIN_DEPTH:
+    if point_cam[2] < _MIN_DEPTH:
         return -1.0
-    inverse = 1.0 / seen[2]
-    residual[0] = weights[0] * (measured[0] - camera[0] * seen[0] * inverse - camera[2])
-    residual[1] = weights[1] * (measured[1] - camera[1] * seen[1] * inverse - camera[3])
+    inverse = 1.0 / point_cam[2]
+    residual[0] = weights[0] * (measured[0] - camera[0] * point_cam[0] * inverse - camera[2])
+    residual[1] = weights[1] * (measured[1] - camera[1] * point_cam[1] * inverse - camera[3])
     residual[2] = weights[2] * (measured[2] - camera[4] * inverse - camera[5])
     return residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2
 
 
 @kernel(**_OPTIONS)
 def squared_residuals(
-    rotations, translations, cameras, points, frames, rows, measured, weights, squares
+    rotations, translations, cameras, points, keyframe_idx, rows, measured, weights, squares
 ):
     """Fill the squared whitened residual of each observation (frame and point rows given); infinite
     behind the camera."""
-    residual, seen = np.empty(3), np.empty(3)
-    for k in range(len(frames)):
-        f = frames[k]
+    residual, point_cam = np.empty(3), np.empty(3)
+    for k in range(len(keyframe_idx)):
+        f = keyframe_idx[k]
         square = _residual(
             rotations[f],
             translations[f],
@@ -57,7 +57,7 @@ def squared_residuals(
             measured[k],
             weights[k],
             residual,
-            seen,
+            point_cam,
         )
         squares[k] = square if square >= 0.0 else np.inf
 
@@ -67,29 +67,29 @@ def robust_cost(squares, scale_squared):
     """Cauchy's loss, summed."""
     total = 0.0
     for k in range(len(squares)):
-        total += scale_squared * np.log1p(min(squares[k], _BEHIND) / scale_squared)
+        total += scale_squared * np.log1p(min(squares[k], _BEHIND_CAMERA_COST) / scale_squared)
     return total
 
 
 @kernel(**_OPTIONS)
-def _jacobians(rotation, camera, seen, weights, by_pose, by_point):
+def _jacobians(rotation, camera, point_cam, weights, jacobian_pose, jacobian_point):
     """Derivatives of the whitened prediction by the pose's xi and by the point."""
-    inverse = 1.0 / seen[2]
-    by_seen = np.zeros((3, 3))
-    by_seen[0, 0] = weights[0] * camera[0] * inverse
-    by_seen[0, 2] = -weights[0] * camera[0] * seen[0] * inverse * inverse
-    by_seen[1, 1] = weights[1] * camera[1] * inverse
-    by_seen[1, 2] = -weights[1] * camera[1] * seen[1] * inverse * inverse
-    by_seen[2, 2] = -weights[2] * camera[4] * inverse * inverse
+    inverse = 1.0 / point_cam[2]
+    jacobian_cam = np.zeros((3, 3))
+    jacobian_cam[0, 0] = weights[0] * camera[0] * inverse
+    jacobian_cam[0, 2] = -weights[0] * camera[0] * point_cam[0] * inverse * inverse
+    jacobian_cam[1, 1] = weights[1] * camera[1] * inverse
+    jacobian_cam[1, 2] = -weights[1] * camera[1] * point_cam[1] * inverse * inverse
+    jacobian_cam[2, 2] = -weights[2] * camera[4] * inverse * inverse
     for r in range(3):
-        a, b, c = by_seen[r, 0], by_seen[r, 1], by_seen[r, 2]
-        by_pose[r, 0], by_pose[r, 1], by_pose[r, 2] = a, b, c
+        a, b, c = jacobian_cam[r, 0], jacobian_cam[r, 1], jacobian_cam[r, 2]
+        jacobian_pose[r, 0], jacobian_pose[r, 1], jacobian_pose[r, 2] = a, b, c
         # d(omega x seen) = -[seen]x d(omega)
-        by_pose[r, 3] = -b * seen[2] + c * seen[1]
-        by_pose[r, 4] = a * seen[2] - c * seen[0]
-        by_pose[r, 5] = -a * seen[1] + b * seen[0]
+        jacobian_pose[r, 3] = -b * point_cam[2] + c * point_cam[1]
+        jacobian_pose[r, 4] = a * point_cam[2] - c * point_cam[0]
+        jacobian_pose[r, 5] = -a * point_cam[1] + b * point_cam[0]
         for axis in range(3):
-            by_point[r, axis] = (
+            jacobian_point[r, axis] = (
                 a * rotation[0, axis] + b * rotation[1, axis] + c * rotation[2, axis]
             )
 
@@ -111,48 +111,48 @@ def _invert_symmetric(m, inverse):
 
 
 @kernel(**_OPTIONS)
-def count_ties(starts, frames, slots):
-    """How many pairs of free key frames `tied_frames` says, repetitions included."""
+def count_covisible_pairs(starts, keyframe_idx, slots):
+    """How many pairs of free key frames `find_covisible_pairs` says, repetitions included."""
     total = 0
     for n in range(len(starts) - 1):
         free = 0
         for k in range(starts[n], starts[n + 1]):
-            free += slots[frames[k]] >= 0
+            free += slots[keyframe_idx[k]] >= 0
         total += free * (free - 1) // 2
     return total
 
 
 @kernel(**_OPTIONS)
-def tied_frames(starts, frames, slots, num_free, keys):
+def find_covisible_pairs(starts, keyframe_idx, slots, num_free, keys):
     """Into `keys`, i * num_free + j for all slots i and j that see a point in common, as often as
     they do."""
     at = 0
     for n in range(len(starts) - 1):
         for k in range(starts[n], starts[n + 1]):
             for other in range(starts[n], k):
-                i, j = slots[frames[k]], slots[frames[other]]
+                i, j = slots[keyframe_idx[k]], slots[keyframe_idx[other]]
                 if i >= 0 and j >= 0:
                     keys[at] = max(i, j) * num_free + min(i, j)
                     at += 1
 
 
 @kernel(**_OPTIONS)
-def _look_at_point(
-    point, rotations, translations, cameras, slots, column, frames, measured, weights, scale_squared, damping, is_adding,  # noqa: E501
+def _linearize_point(
+    point, rotations, translations, cameras, slots, column, keyframe_idx, measured, weights, scale_squared, damping, is_accumulating,  # noqa: E501
     pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,
 ):  # fmt: skip
-    """What the observations of one point say of it, and where `is_adding` what they say of the
-    poses and the bias that see it.
+    """What the observations of one point say of it, and where `is_accumulating` what they say of
+    the poses and the bias that see it.
 
     Filled: `couplings` (k, 6, 3) with the poses, the `inverse` (3, 3) of the point's own block, its
     `gradient` and `bias_coupling` (3,).
     """
-    residual, seen = np.empty(3), np.empty(3)
-    by_pose, by_point, block = np.empty((3, 6)), np.empty((3, 3)), np.zeros((3, 3))
+    residual, point_cam = np.empty(3), np.empty(3)
+    jacobian_pose, jacobian_point, block = np.empty((3, 6)), np.empty((3, 3)), np.zeros((3, 3))
     gradient[:] = 0.0
     bias_coupling[:] = 0.0
-    for k in range(len(frames)):
-        f = frames[k]
+    for k in range(len(keyframe_idx)):
+        f = keyframe_idx[k]
         couplings[k] = 0.0
         square = _residual(
             rotations[f],
@@ -162,29 +162,29 @@ def _look_at_point(
             measured[k],
             weights[k],
             residual,
-            seen,
+            point_cam,
         )
         if square < 0.0:
             continue
         robust = 1.0 / (1.0 + square / scale_squared)
-        _jacobians(rotations[f], cameras[f], seen, weights[k], by_pose, by_point)
+        _jacobians(rotations[f], cameras[f], point_cam, weights[k], jacobian_pose, jacobian_point)
         for r in range(3):
             for s in range(3):
-                gradient[r] += robust * by_point[s, r] * residual[s]
+                gradient[r] += robust * jacobian_point[s, r] * residual[s]
                 for q in range(3):
-                    block[r, s] += robust * by_point[q, r] * by_point[q, s]
+                    block[r, s] += robust * jacobian_point[q, r] * jacobian_point[q, s]
         slot = slots[f]
         if column >= 0:
             for r in range(3):
-                bias_coupling[r] += robust * weights[k, 2] * by_point[2, r]
+                bias_coupling[r] += robust * weights[k, 2] * jacobian_point[2, r]
         if slot >= 0:
             for r in range(6):
                 for q in range(3):
                     for s in range(3):
-                        couplings[k, r, s] += robust * by_pose[q, r] * by_point[q, s]
-        if is_adding:
+                        couplings[k, r, s] += robust * jacobian_pose[q, r] * jacobian_point[q, s]
+        if is_accumulating:
             _add_observation(
-                slot, column, robust, weights[k, 2], residual, by_pose, pattern_starts, blocks, vector, border, corner  # noqa: E501
+                slot, column, robust, weights[k, 2], residual, jacobian_pose, pattern_starts, blocks, vector, border, corner  # noqa: E501
             )  # fmt: skip
     for r in range(3):
         block[r, r] += damping * block[r, r] + 1e-9
@@ -198,7 +198,7 @@ def _add_observation(
     robust,
     disparity_weight,
     residual,
-    by_pose,
+    jacobian_pose,
     pattern_starts,
     blocks,
     vector,
@@ -215,16 +215,16 @@ def _add_observation(
     block = blocks[pattern_starts[slot]]
     for r in range(6):
         if column >= 0:
-            border[column, slot, r] += robust * disparity_weight * by_pose[2, r]
+            border[column, slot, r] += robust * disparity_weight * jacobian_pose[2, r]
         for q in range(3):
-            vector[slot, r] += robust * by_pose[q, r] * residual[q]
+            vector[slot, r] += robust * jacobian_pose[q, r] * residual[q]
             for s in range(6):
-                block[r, s] += robust * by_pose[q, r] * by_pose[q, s]
+                block[r, s] += robust * jacobian_pose[q, r] * jacobian_pose[q, s]
 
 
 @kernel(**_OPTIONS)
-def _subtract_point(
-    slots, column, frames, couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows, blocks, vector, border, corner  # noqa: E501
+def _eliminate_point(
+    slots, column, keyframe_idx, couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows, blocks, vector, border, corner  # noqa: E501
 ):  # fmt: skip
     """Take a point out of the system: what the poses and the bias that it ties together still know
     without it."""
@@ -232,8 +232,8 @@ def _subtract_point(
     if column >= 0:
         corner[column, 0] -= bias_coupling @ (inverse @ bias_coupling)
         corner[column, 1] -= bias_coupling @ step
-    for k in range(len(frames)):
-        i = slots[frames[k]]
+    for k in range(len(keyframe_idx)):
+        i = slots[keyframe_idx[k]]
         if i < 0:
             continue
         coupling = couplings[k]
@@ -253,12 +253,12 @@ def _subtract_point(
                     + product[r, 1] * bias_coupling[1]
                     + product[r, 2] * bias_coupling[2]
                 )
-        for other in range(len(frames)):
-            j = slots[frames[other]]
+        for other in range(len(keyframe_idx)):
+            j = slots[keyframe_idx[other]]
             if j < 0 or j > i:
                 continue
             block, coupled = (
-                blocks[place_of_block(pattern_starts, pattern_rows, i, j)],
+                blocks[find_block_idx(pattern_starts, pattern_rows, i, j)],
                 couplings[other],
             )
             for r in range(6):
@@ -272,7 +272,7 @@ def _subtract_point(
 
 @kernel(**_OPTIONS)
 def eliminate_points(
-    rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,  # noqa: E501
+    rotations, translations, cameras, slots, columns, points, starts, keyframe_idx, measured, weights, scale_squared, damping,  # noqa: E501
     pattern_starts, pattern_rows, blocks, vector, border, corner,
 ):  # fmt: skip
     """Add to the reduced system of the free poses and biases what the observations of some points
@@ -292,20 +292,20 @@ def eliminate_points(
     inverse, gradient, bias_coupling = np.empty((3, 3)), np.empty(3), np.empty(3)
     for n in range(len(points)):
         first, last = starts[n], starts[n + 1]
-        column = columns[frames[first]] if last > first else -1
-        _look_at_point(
-            points[n], rotations, translations, cameras, slots, column, frames[first:last], measured[first:last], weights[first:last],  # noqa: E501
+        column = columns[keyframe_idx[first]] if last > first else -1
+        _linearize_point(
+            points[n], rotations, translations, cameras, slots, column, keyframe_idx[first:last], measured[first:last], weights[first:last],  # noqa: E501
             scale_squared, damping, True, pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,  # noqa: E501
         )  # fmt: skip
-        _subtract_point(
-            slots, column, frames[first:last], couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows,  # noqa: E501
+        _eliminate_point(
+            slots, column, keyframe_idx[first:last], couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows,  # noqa: E501
             blocks, vector, border, corner,
         )  # fmt: skip
 
 
 @kernel(**_OPTIONS)
-def move_points(
-    rotations, translations, cameras, slots, columns, points, starts, frames, measured, weights, scale_squared, damping,  # noqa: E501
+def update_points(
+    rotations, translations, cameras, slots, columns, points, starts, keyframe_idx, measured, weights, scale_squared, damping,  # noqa: E501
     pattern_starts, blocks, border, corner, steps, bias_steps, moved,
 ):  # fmt: skip
     """The points after the `steps` (k, 6) of poses and those of biases, into `moved`; all else as
@@ -317,16 +317,16 @@ def move_points(
     inverse, rest, bias_coupling = np.empty((3, 3)), np.empty(3), np.empty(3)
     for n in range(len(points)):
         first, last = starts[n], starts[n + 1]
-        column = columns[frames[first]] if last > first else -1
-        _look_at_point(
-            points[n], rotations, translations, cameras, slots, column, frames[first:last], measured[first:last], weights[first:last],  # noqa: E501
+        column = columns[keyframe_idx[first]] if last > first else -1
+        _linearize_point(
+            points[n], rotations, translations, cameras, slots, column, keyframe_idx[first:last], measured[first:last], weights[first:last],  # noqa: E501
             scale_squared, damping, False, pattern_starts, blocks, steps, border, corner, couplings, inverse, rest, bias_coupling,  # noqa: E501
         )  # fmt: skip
         if column >= 0:
             for s in range(3):
                 rest[s] -= bias_coupling[s] * bias_steps[column]
         for k in range(first, last):
-            slot = slots[frames[k]]
+            slot = slots[keyframe_idx[k]]
             if slot < 0:
                 continue
             for s in range(3):

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.points.disparity import DisparityConfig, MeasuredView, measure_disparities
-from topoloc.points.tracking import TrackingConfig, align_with_reference, follow
+from topoloc.points.point_tracking import TrackingConfig, align_with_reference, track_points
 from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.keyframes import KeyFrame, Landmarks
 
@@ -41,7 +41,7 @@ class InputChecks:
     def __init__(self, recording: str, config: InputCheckConfig) -> None:
         self._recording, self._config = recording, config
         self._vertical_px: list[float] = []
-        self._has_begun = False
+        self._has_started = False
         self.right_residuals_px: list[Float[np.ndarray, " n"]] = []
         """Per key frame: distance between where landmarks are in the right picture and where they
         should be."""
@@ -65,16 +65,18 @@ class InputChecks:
         Raises:
             RecordingError: they have, but only with left and right swapped.
         """
-        num_found = _num_with_disparity(measured, corners, config)
-        if measured.right is None or self._has_begun:
+        num_found = _count_disparities(measured, corners, config)
+        if measured.right is None or self._has_started:
             return num_found >= self._config.min_start_points
         # What the right camera sees to the right of the left one moves to the left where both
         # pictures are mirrored.
-        mirrored = replace(measured, left=_mirrored(measured.left), right=_mirrored(measured.right))
+        mirrored = replace(
+            measured, left=_mirror_image(measured.left), right=_mirror_image(measured.right)
+        )
         mirrored_corners = (np.array([measured.left.shape[1] - 1, 0]) + corners * [-1, 1]).astype(
             np.float32
         )
-        if _num_with_disparity(mirrored, mirrored_corners, config) > max(
+        if _count_disparities(mirrored, mirrored_corners, config) > max(
             self._config.min_start_points, 2 * num_found
         ):
             raise RecordingError(
@@ -83,18 +85,18 @@ class InputChecks:
             )
         if num_found < self._config.min_start_points:
             assert measured.view.right_grey is not None
-            coarse, _ = follow(
+            coarse, _ = track_points(
                 measured.view.grey,
                 measured.view.right_grey,
                 corners,
                 corners,
                 self._config.tracking,
             )
-            self._seek_in_right(measured, corners, coarse)
-        self._has_begun = num_found >= self._config.min_start_points
-        return self._has_begun
+            self._match_in_right_image(measured, corners, coarse)
+        self._has_started = num_found >= self._config.min_start_points
+        return self._has_started
 
-    def look_at_keyframe(
+    def check_keyframe(
         self, keyframe: KeyFrame, landmarks: Landmarks, measured: MeasuredView
     ) -> None:
         """Seek landmarks of a new key frame in the right picture, and compare with where they
@@ -109,7 +111,7 @@ class InputChecks:
         at_infinity = measured.view.rig.left.cx - measured.view.rig.right.cx
         to_right = np.column_stack([-seen.measured[rows, 2] - at_infinity, np.zeros(len(rows))])
         points = seen.measured[rows, :2]
-        found = self._seek_in_right(
+        found = self._match_in_right_image(
             measured, points.astype(np.float32), (points + to_right).astype(np.float32)
         )
         expected = keyframe.stereo.project(
@@ -120,7 +122,7 @@ class InputChecks:
         )
         self.right_residuals_px.append(np.linalg.norm(found - expected_right, axis=1))
 
-    def verdict(self) -> None:
+    def check_stereo_pairs(self) -> None:
         """Raises RecordingError where left and right pictures were no pairs: at other moments, or
         not rectified as calibrated."""
         if len(self._vertical_px) < self._config.min_keyframes:
@@ -133,7 +135,7 @@ class InputChecks:
                 " calibrated wrongly?"
             )
 
-    def _seek_in_right(
+    def _match_in_right_image(
         self,
         measured: MeasuredView,
         points: Float32[np.ndarray, "n 2"],
@@ -150,17 +152,17 @@ class InputChecks:
             np.ones(len(points), np.float32),
             self._config.tracking,
         )
-        places = np.where(found.is_alike[:, None], found.points_img, np.nan).astype(np.float64)
-        if np.count_nonzero(found.is_alike) >= max(10, len(points) // 3):
+        places = np.where(found.is_matched[:, None], found.points_img, np.nan).astype(np.float64)
+        if np.count_nonzero(found.is_matched) >= max(10, len(points) // 3):
             self._vertical_px.append(float(np.nanmedian(np.abs(places[:, 1] - points[:, 1]))))
         return places
 
 
-def _mirrored(picture: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    return np.ascontiguousarray(picture[:, ::-1])
+def _mirror_image(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    return np.ascontiguousarray(image[:, ::-1])
 
 
-def _num_with_disparity(
+def _count_disparities(
     measured: MeasuredView, corners: Float32[np.ndarray, "n 2"], config: DisparityConfig
 ) -> int:
     return int(

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from topoloc.disk_list import DiskList
 from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import StereoCamera
 from topoloc.points.metric_points import MetricPoints
-from topoloc.shelf import Shelf
 
 
 @dataclass(eq=False)
@@ -81,7 +81,7 @@ class Observations:
 
 
 @dataclass(frozen=True, eq=False)
-class PlaceView:
+class PlaceFeatures:
     """How a key frame looks: local features, and their metric points in the key frame's camera."""
 
     features: Features
@@ -103,7 +103,7 @@ class KeyFrame:
     map is optimised.
 
     `motion` is None for the first of a sub-map. How it looks lies on a shelf that it shares with
-    others (`places`), at `place_row`.
+    others (`places`), at `place_idx`.
     """
 
     recording: int
@@ -115,26 +115,26 @@ class KeyFrame:
     observations: Observations
     bias: DisparityBias
     motion: Motion | None = None
-    places: Shelf[PlaceView] = field(default_factory=lambda: Shelf[PlaceView]())
-    place_row: int | None = None
-    coming_place: Future[PlaceView] | None = None
+    places: DiskList[PlaceFeatures] = field(default_factory=lambda: DiskList[PlaceFeatures]())
+    place_idx: int | None = None
+    pending_place: Future[PlaceFeatures] | None = None
 
     @property
     def has_place(self) -> bool:
         """Whether it is known how it looks, or will be."""
-        return self.place_row is not None or self.coming_place is not None
+        return self.place_idx is not None or self.pending_place is not None
 
     @property
-    def place(self) -> PlaceView | None:
+    def place(self) -> PlaceFeatures | None:
         """How it looks, where that is known; waits for what a thread still looks at
-        (`coming_place`)."""
-        if self.coming_place is not None:
-            self.place, self.coming_place = self.coming_place.result(), None
-        return None if self.place_row is None else self.places[self.place_row]
+        (`pending_place`)."""
+        if self.pending_place is not None:
+            self.place, self.pending_place = self.pending_place.result(), None
+        return None if self.place_idx is None else self.places[self.place_idx]
 
     @place.setter
-    def place(self, view: PlaceView) -> None:
-        self.place_row = len(self.places)
+    def place(self, view: PlaceFeatures) -> None:
+        self.place_idx = len(self.places)
         self.places.append(view)
 
 

@@ -16,15 +16,15 @@ from typing import Annotated
 import numpy as np
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.features.bands import in_order
+from topoloc.disk_list import DiskList
 from topoloc.features.features import Features
+from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
-from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words_of, vlad
-from topoloc.shelf import Shelf
+from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words_from_parts, vlad
 from topoloc.slam.keyframes import KeyFrame
 from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_places
 
-_VLAD_BYTES = 4_000_000  # in memory: each is looked at once or twice, in their order
+_MAX_VLAD_BYTES = 4_000_000  # in memory: each is looked at once or twice, in their order
 
 
 @dataclass(frozen=True)
@@ -76,38 +76,38 @@ def find_links(
     places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
     if len(places) < 2:
         return []
-    proposals = _propose(keyframes, places, config)
+    proposals = _propose_pairs(keyframes, places, config)
     links = []
     for done, link in enumerate(
-        in_order(lambda pair: _match(pair[1], pair[0], keyframes, config), proposals)
+        parallel_map(lambda pair: _match_keyframes(pair[1], pair[0], keyframes, config), proposals)
     ):
         if link is not None:
             links.append(link)
         progress("loops", done + 1, len(proposals))
     rank = {keyframe: place for place, keyframe in enumerate(places)}
-    plausible = [link for link in links if _within_drift(link, keyframes, config)]
+    plausible = [link for link in links if _is_within_drift(link, keyframes, config)]
     clear = [
         link
         for link in plausible
-        if not any(_contradicts(other, link, keyframes, config) for other in plausible)
+        if not any(_is_contradicting(other, link, keyframes, config) for other in plausible)
     ]
     supported = [
         link
         for link in clear
-        if any(_supports(other, link, keyframes, rank, config) for other in clear)
+        if any(_is_supporting(other, link, keyframes, rank, config) for other in clear)
     ]
-    are_rivalled = in_order(lambda link: _is_rivalled(link, keyframes, places, config), supported)
+    are_rivalled = parallel_map(lambda link: _has_rival(link, keyframes, places, config), supported)
     sure = [
         link for link, is_rivalled in zip(supported, are_rivalled, strict=True) if not is_rivalled
     ]
     return [
         link
         for link in sure
-        if any(_supports(other, link, keyframes, rank, config) for other in sure)
+        if any(_is_supporting(other, link, keyframes, rank, config) for other in sure)
     ]
 
 
-def _propose(
+def _propose_pairs(
     keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig
 ) -> list[tuple[int, int]]:
     """(target, source) of pairs that look alike, source the earlier one."""
@@ -117,7 +117,9 @@ def _propose(
     )  # itself and its neighbours may come first
     for number, ranked in enumerate(rank_places([keyframes[i] for i in places], config.vlad, num)):
         others = (
-            other for other in ranked if _may_be_loop(keyframes, places, other, number, config)
+            other
+            for other in ranked
+            if _is_loop_candidate(keyframes, places, other, number, config)
         )
         for _, other in zip(range(config.num_candidates), others, strict=False):
             pairs.add((places[max(number, other)], places[min(number, other)]))
@@ -139,9 +141,9 @@ def rank_places(
     num_features = [len(features(row)) for row in range(len(keyframes))]
     if sum(num_features) == 0:
         return
-    words = learn_words_of(num_features, lambda row: features(row).descriptors, config)
-    vlads = Shelf(
-        (vlad(features(row).descriptors, words) for row in range(len(keyframes))), _VLAD_BYTES
+    words = learn_words_from_parts(num_features, lambda row: features(row).descriptors, config)
+    vlads = DiskList(
+        (vlad(features(row).descriptors, words) for row in range(len(keyframes))), _MAX_VLAD_BYTES
     )
     localizer, blank = (
         SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config),
@@ -153,19 +155,19 @@ def rank_places(
         ]
 
 
-def _may_be_loop(
+def _is_loop_candidate(
     keyframes: Sequence[KeyFrame], places: list[int], a: int, b: int, config: LoopConfig
 ) -> bool:
     same = keyframes[places[a]].submap == keyframes[places[b]].submap
     return a != b and (not same or abs(a - b) >= config.min_places_between)
 
 
-def _within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
+def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
     source, target = keyframes[link.source], keyframes[link.target]
     if source.submap != target.submap:
-        return source.recording != target.recording or is_within_reach(link, keyframes, config)
-    way = _way(keyframes, link.source, link.target)
-    drift = _difference(
+        return source.recording != target.recording or is_reachable(link, keyframes, config)
+    way = _path_length(keyframes, link.source, link.target)
+    drift = _pose_difference(
         link.match.target_from_source, target.cam_from_world @ source.cam_from_world.inverse()
     )
     return bool(
@@ -173,7 +175,7 @@ def _within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig)
     )
 
 
-def is_within_reach(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
+def is_reachable(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
     """Whether the camera can have come from the end of the earlier sub-map to the beginning of the
     later one, as the link has it."""
     source, target, target_from_source = (
@@ -188,11 +190,11 @@ def is_within_reach(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfi
     start_in_target = target.cam_from_world @ after[0].cam_from_world.inverse()
     start_in_source = target_from_source.inverse() @ start_in_target
     seconds = 1e-9 * (after[0].t_ns - before[-1].t_ns)
-    reach = 0.5 + config.max_speedup * max(_fastest(before), _fastest(after)) * seconds
+    reach = 0.5 + config.max_speedup * max(_max_speed(before), _max_speed(after)) * seconds
     return bool(np.linalg.norm(end_in_source.translation - start_in_source.translation) < reach)
 
 
-def _fastest(submap: Sequence[KeyFrame]) -> float:
+def _max_speed(submap: Sequence[KeyFrame]) -> float:
     """Metres a second."""
     positions = np.array([k.cam_from_world.inverse().translation for k in submap])
     seconds = 1e-9 * np.diff([k.t_ns for k in submap])
@@ -204,7 +206,7 @@ def _fastest(submap: Sequence[KeyFrame]) -> float:
     )
 
 
-def _way(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
+def _path_length(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
     """Metres between two key frames of the same sub-map, along the way."""
     submap, (first, last) = keyframes[first].submap, sorted((first, last))
     between = [
@@ -215,7 +217,7 @@ def _way(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
     return float(np.linalg.norm(np.diff(between, axis=0), axis=1).sum())
 
 
-def _contradicts(
+def _is_contradicting(
     other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig
 ) -> bool:
     """Whether one of the link's ends is linked nearly as well with another place, and cannot be at
@@ -227,11 +229,11 @@ def _contradicts(
     ends = (
         (link.source, other.source) if other.target == link.target else (link.target, other.target)
     )
-    drift = config.max_drift * _way(keyframes, min(ends), max(ends))
-    return _agreement(other, link, keyframes, config, drift) is False
+    drift = config.max_drift * _path_length(keyframes, min(ends), max(ends))
+    return _are_consistent(other, link, keyframes, config, drift) is False
 
 
-def _is_rivalled(
+def _has_rival(
     link: Link, keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig
 ) -> bool:
     """Whether the target looks as if it were near a neighbour of the source, somewhere else."""
@@ -243,17 +245,17 @@ def _is_rivalled(
         if i not in (link.source, link.target)
         and keyframes[i].submap == keyframes[link.source].submap
     ):
-        match = _match(source, link.target, keyframes, config)
+        match = _match_keyframes(source, link.target, keyframes, config)
         if (
             match is not None
-            and _within_drift(match, keyframes, config)
-            and _contradicts(match, link, keyframes, config)
+            and _is_within_drift(match, keyframes, config)
+            and _is_contradicting(match, link, keyframes, config)
         ):
             return True
     return False
 
 
-def _match(
+def _match_keyframes(
     source: int, target: int, keyframes: Sequence[KeyFrame], config: LoopConfig
 ) -> Link | None:
     a, b = keyframes[source].place, keyframes[target].place
@@ -263,7 +265,7 @@ def _match(
     return None if match is None else Link(source, target, match)
 
 
-def _supports(
+def _is_supporting(
     other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int], config: LoopConfig
 ) -> bool:
     """Whether a link of other key frames nearby says the same."""
@@ -275,10 +277,10 @@ def _supports(
         or abs(rank[other.source] - rank[link.source]) > near
     ):
         return False
-    return _agreement(other, link, keyframes, config) is True
+    return _are_consistent(other, link, keyframes, config) is True
 
 
-def _agreement(
+def _are_consistent(
     other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig, drift: float = 0.0
 ) -> bool | None:
     """Whether going from source to target by the one link and back by the other ends where it
@@ -300,13 +302,13 @@ def _agreement(
         + np.linalg.norm(targets.translation)
         + np.linalg.norm(expected.translation)
     )
-    metres, radians = _difference(link.match.target_from_source, expected)
+    metres, radians = _pose_difference(link.match.target_from_source, expected)
     return bool(
         metres < config.max_disagreement * (1.0 + way) + drift
         and radians < np.deg2rad(config.max_disagreement_deg)
     )
 
 
-def _difference(a: Rigid3, b: Rigid3) -> tuple[float, float]:
+def _pose_difference(a: Rigid3, b: Rigid3) -> tuple[float, float]:
     """Metres and radians."""
     return float(np.linalg.norm(a.translation - b.translation)), (a @ b.inverse()).angle()

@@ -9,19 +9,19 @@ from typing import Annotated
 import numpy as np
 
 from topoloc.bounds import AtLeast, Between
-from topoloc.features.bands import in_order
 from topoloc.features.extraction import extract_features
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.kinds import FeatureConfig
 from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.parallel import parallel_map
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.metric_points import MetricPoints, MetricPointsConfig, locate_points
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.frame_view import frame_view
-from topoloc.recordings.recording import left_frame
+from topoloc.recordings.frame_preparation import prepare_frame
+from topoloc.recordings.recording import read_left_frame
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ class MeasuredStep:
 
 
 def measure_steps(
-    sequence: StereoSequence, usable: list[int], config: MeasuredStepsConfig
+    sequence: StereoSequence, usable_idx: list[int], config: MeasuredStepsConfig
 ) -> list[MeasuredStep]:
-    """Steps spread over the frames `usable` (their rows, increasing), by the left pictures and the
-    depth of each step's first frame; of a single camera by its pictures alone.
+    """Steps spread over the frames `usable_idx` (their rows, increasing), by the left pictures and
+    the depth of each step's first frame; of a single camera by its pictures alone.
 
     A step that cannot be measured, as too little is recognised, is left out. All steps over one gap
     are sought before those over the next, so that the recording is read in its order.
@@ -65,16 +65,18 @@ def measure_steps(
     Raises:
         RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
     """
-    starts = np.unique(np.linspace(0, len(usable) - 1, config.num_steps).astype(int)).tolist()
-    firsts: dict[int, _Seen] = {}
+    starts = np.unique(np.linspace(0, len(usable_idx) - 1, config.num_steps).astype(int)).tolist()
+    firsts: dict[int, _ViewFeatures] = {}
     steps: dict[int, MeasuredStep] = {}
 
     def measure(
         pair: tuple[int, int, StereoFrame | None, StereoFrame],
-    ) -> tuple[int, _Seen, MeasuredStep | None]:
+    ) -> tuple[int, _ViewFeatures, MeasuredStep | None]:
         start, other, frame, other_frame = pair
-        first = firsts[start] if frame is None else _seen(frame, config, is_first=True)
-        motion = _motion(first, last := _seen(other_frame, config, is_first=False), config)
+        first = firsts[start] if frame is None else _extract_view(frame, config, is_first=True)
+        motion = _estimate_motion(
+            first, last := _extract_view(other_frame, config, is_first=False), config
+        )
         if motion is None:
             return start, first, None
         first_from_last = first.view_from_cam.inverse() @ motion[0].inverse() @ last.view_from_cam
@@ -82,8 +84,8 @@ def measure_steps(
             start,
             first,
             MeasuredStep(
-                usable[start],
-                usable[other],
+                usable_idx[start],
+                usable_idx[other],
                 first_from_last,
                 motion[1],
                 has_scale=first.points is not None,
@@ -92,16 +94,21 @@ def measure_steps(
 
     for gap in config.gaps:  # backwards where the recording ends
         pairs = (
-            (start, start + gap if start + gap < len(usable) else start - gap)
+            (start, start + gap if start + gap < len(usable_idx) else start - gap)
             for start in starts
             if start not in steps
         )
         pairs = [pair for pair in pairs if pair[1] >= 0]
         read = (
-            (a, b, None if a in firsts else sequence[usable[a]], left_frame(sequence, usable[b]))
+            (
+                a,
+                b,
+                None if a in firsts else sequence[usable_idx[a]],
+                read_left_frame(sequence, usable_idx[b]),
+            )
             for a, b in pairs
         )
-        for start, first, step in in_order(measure, read):
+        for start, first, step in parallel_map(measure, read):
             firsts[start] = first
             if step is not None:
                 steps[start] = step
@@ -109,26 +116,28 @@ def measure_steps(
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _ViewFeatures:
     camera: Camera
     view_from_cam: Rigid3
     features: Features
     points: MetricPoints | None
 
 
-def _seen(frame: StereoFrame, config: MeasuredStepsConfig, is_first: bool) -> _Seen:
+def _extract_view(frame: StereoFrame, config: MeasuredStepsConfig, is_first: bool) -> _ViewFeatures:
     has_depth = is_first and (frame.right is not None or frame.depth is not None)
-    view = frame_view(frame, with_depth=has_depth)
+    view = prepare_frame(frame, with_depth=has_depth)
     features = extract_features(view.grey, config.features)
     if not has_depth:
-        return _Seen(view.camera, view.view_from_cam, features, None)
+        return _ViewFeatures(view.camera, view.view_from_cam, features, None)
     located = locate_points(features, view, config.points)
     rows = np.flatnonzero(located.valid)
     points = MetricPoints(located.points_cam[rows], located.covariances[rows], located.valid[rows])
-    return _Seen(view.camera, view.view_from_cam, features.select(rows), points)
+    return _ViewFeatures(view.camera, view.view_from_cam, features.select(rows), points)
 
 
-def _motion(first: _Seen, last: _Seen, config: MeasuredStepsConfig) -> tuple[Rigid3, float] | None:
+def _estimate_motion(
+    first: _ViewFeatures, last: _ViewFeatures, config: MeasuredStepsConfig
+) -> tuple[Rigid3, float] | None:
     """last_from_first of the views, and the median depth of what it stands on; of a single camera
     0, and the way has the length 1."""
     matches = match_features(

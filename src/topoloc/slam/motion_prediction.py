@@ -62,7 +62,7 @@ class Prediction:
         )
 
 
-def expected_one(
+def select_expected_pose(
     prediction: Prediction | None, poses: Sequence[Rigid3], config: PredictionConfig
 ) -> Rigid3 | None:
     """Which of several cam_from_world the motion singles out: near the prediction, and all others
@@ -84,23 +84,23 @@ class MotionHistory:
 
     def __init__(self, config: PredictionConfig) -> None:
         self._config = config
-        self._squares: deque[tuple[float, float]] = deque(maxlen=config.remembered)
+        self._squared_accelerations: deque[tuple[float, float]] = deque(maxlen=config.remembered)
         self._intervals: deque[float] = deque(maxlen=config.remembered)
         self._velocity: np.ndarray | None = None  # twist, left of cam_from_world, a second
         self._t_ns: int | None = None
         self._cam_from_world: Rigid3 | None = None
 
-    def remember(self, t_ns: int, cam_from_world: Rigid3, moved: Rigid3 | None = None) -> None:
-        """A frame was at `cam_from_world`; `moved` is its motion since the frame before, None where
-        that is not known."""
-        if moved is not None and self._t_ns is not None and t_ns > self._t_ns:
+    def add_pose(self, t_ns: int, cam_from_world: Rigid3, motion: Rigid3 | None = None) -> None:
+        """A frame was at `cam_from_world`; `motion` is its motion since the frame before, None
+        where that is not known."""
+        if motion is not None and self._t_ns is not None and t_ns > self._t_ns:
             interval = 1e-9 * (t_ns - self._t_ns)
-            velocity = moved.log() / interval
+            velocity = motion.log() / interval
             if self._velocity is not None:
                 change = (velocity - self._velocity) * interval
                 between = 0.5 * (interval + self._intervals[-1])
                 rates = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
-                self._squares.append(
+                self._squared_accelerations.append(
                     (
                         float(rates[0] / (interval * between)) ** 2,
                         float(rates[1] / (interval * between)) ** 2,
@@ -110,11 +110,11 @@ class MotionHistory:
             self._intervals.append(interval)
         self._t_ns, self._cam_from_world = t_ns, cam_from_world
 
-    def move(self, cam_from_world: Rigid3) -> None:
+    def update_last_pose(self, cam_from_world: Rigid3) -> None:
         """The last frame's pose has been adjusted."""
         self._cam_from_world = cam_from_world
 
-    def stop(self) -> None:
+    def reset(self) -> None:
         """The camera was lost, and its motion with it."""
         self._velocity, self._t_ns, self._cam_from_world = None, None, None
 
@@ -129,12 +129,12 @@ class MotionHistory:
         step = self._velocity * min(time, config.max_intervals * last)
         way, turn = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:]))
         is_gap = time > config.gap * float(np.median(self._intervals))
-        moved = Rigid3.exp(step)
-        if len(self._squares) < config.min_remembered:
-            return Prediction(moved @ self._cam_from_world, moved, np.inf, np.inf, is_gap)
+        motion = Rigid3.exp(step)
+        if len(self._squared_accelerations) < config.min_remembered:
+            return Prediction(motion @ self._cam_from_world, motion, np.inf, np.inf, is_gap)
         growth = 0.5 * time * (time + last)
-        acceleration, turning = np.sqrt(np.mean(np.array(self._squares), axis=0))
+        acceleration, turning = np.sqrt(np.mean(np.array(self._squared_accelerations), axis=0))
         share = config.way_share if is_gap else config.stop_share
         sigma = max(float(acceleration) * growth, share * way, 1e-3)
         sigma_rad = max(float(turning) * growth, share * turn, 1e-3)
-        return Prediction(moved @ self._cam_from_world, moved, sigma, sigma_rad, is_gap)
+        return Prediction(motion @ self._cam_from_world, motion, sigma, sigma_rad, is_gap)

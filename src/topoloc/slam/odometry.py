@@ -15,13 +15,13 @@ from itertools import islice
 
 import numpy as np
 
-from topoloc.compiled import be_one_of_several
+from topoloc.compiled import mark_worker_thread
+from topoloc.disk_list import DiskList
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import MeasuredView, measure_disparities, measured_view
-from topoloc.points.tracking import find_corners
+from topoloc.points.point_tracking import find_corners
 from topoloc.recordings.frame import StereoFrame
-from topoloc.shelf import Shelf
-from topoloc.slam.bundle import adjust_bundle
+from topoloc.slam.bundle_adjustment import adjust_bundle
 from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import (
     DisparityBias,
@@ -30,15 +30,15 @@ from topoloc.slam.keyframes import (
     Landmarks,
     Motion,
     Observations,
-    PlaceView,
+    PlaceFeatures,
 )
-from topoloc.slam.motion_prediction import MotionHistory, expected_one
-from topoloc.slam.place_matching import match_places, place_view
-from topoloc.slam.steps import LastFrame, OdometryConfig, Step, StepSeeker, Tracks
+from topoloc.slam.motion_prediction import MotionHistory, select_expected_pose
+from topoloc.slam.place_matching import extract_place_features, match_places
+from topoloc.slam.step_estimation import LastFrame, OdometryConfig, Step, StepEstimator, Tracks
 
 # of places in memory, about 80: the last few are asked, and comparing two takes ten times as long
 # as reading
-_PLACE_BYTES = 16_000_000
+_MAX_PLACE_BYTES = 16_000_000
 
 
 class Odometry:
@@ -55,51 +55,53 @@ class Odometry:
     ):
         self._recording, self._keyframes, self._landmarks = recording, keyframes, landmarks
         self._checks, self._config = checks, config
-        self._last: LastFrame | None = None
+        self._last_frame: LastFrame | None = None
         self._reference: KeyFrame | None = None
-        self._reference_picture: np.ndarray = np.zeros((0, 0), np.float32)
-        self._tracks = Tracks.of(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
-        self._chain: list[KeyFrame] = []  # the key frames since tracking began or began again
+        self._reference_image: np.ndarray = np.zeros((0, 0), np.float32)
+        self._tracks = Tracks.from_points(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+        self._recent_keyframes: list[
+            KeyFrame
+        ] = []  # the key frames since tracking began or began again
         self._num_lost = 0
-        self._missed: list[
+        self._lost_frames: list[
             tuple[int, StereoFrame]
         ] = []  # the frames since the camera was lost that may begin a sub-map
         self._history = MotionHistory(config.prediction)
-        self._repeats: list[Rigid3] = []  # of the last frame before the camera was lost
+        self._repeated_motions: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
-        self._places = Shelf[PlaceView](max_bytes=_PLACE_BYTES)
-        self._looking = ThreadPoolExecutor(1, initializer=be_one_of_several)
-        self._looked_at: KeyFrame | None = None
+        self._place_features = DiskList[PlaceFeatures](max_bytes=_MAX_PLACE_BYTES)
+        self._place_executor = ThreadPoolExecutor(1, initializer=mark_worker_thread)
+        self._pending_keyframe: KeyFrame | None = None
 
     def process(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
     ) -> list[FramePose]:
         """Where this frame is, and those before it whose place is known only now; nothing where
         that is not known. `measured` is `measured_view(frame)`."""
-        self._expect_bias(measured)
-        pose = self._follow(frame_idx, frame, measured)
-        return [pose] if pose is not None else self._lost(frame_idx, frame, measured)
+        self._enable_bias_estimation(measured)
+        pose = self._track_frame(frame_idx, frame, measured)
+        return [pose] if pose is not None else self._handle_lost_frame(frame_idx, frame, measured)
 
     def finish(self) -> list[FramePose]:
         """The recording is at its end: the frames that were sought in vain until then."""
-        poses = self._begin_again() if len(self._missed) > 1 else []
-        self._looking.shutdown()
+        poses = self._restart_submap() if len(self._lost_frames) > 1 else []
+        self._place_executor.shutdown()
         return poses
 
-    def _expect_bias(self, measured: MeasuredView) -> None:
+    def _enable_bias_estimation(self, measured: MeasuredView) -> None:
         if measured.right is not None:
             self._bias.information = 1.0 / self._config.sigma_bias_px**2
 
-    def _follow(
+    def _track_frame(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
     ) -> FramePose | None:
         """Where the frame is, by its step from the last one."""
-        step = self._track(frame, measured)
+        step = self._estimate_step(frame, measured)
         if step is None:
             return None
-        self._num_lost, self._missed = 0, []
+        self._num_lost, self._lost_frames = 0, []
         self._tracks = step.tracks
-        self._remember(frame, measured, step.cam_from_world)
+        self._update_last_frame(frame, measured, step.cam_from_world)
         assert self._reference is not None
         cam_from_keyframe = step.cam_from_world @ self._reference.cam_from_world.inverse()
         if self._is_keyframe_due(measured):
@@ -113,22 +115,24 @@ class Odometry:
             cam_from_keyframe = Rigid3.identity()
         return FramePose(frame_idx, self._reference, cam_from_keyframe, measured.view.view_from_cam)
 
-    def _track(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
+    def _estimate_step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
         """The step from the last frame to this one; None where there is none, or the motion does
         not tell which."""
         prediction = self._history.predict(frame.t_ns)
-        if self._last is None or self._reference is None or prediction is None:
+        if self._last_frame is None or self._reference is None or prediction is None:
             return None
-        seeker = StepSeeker(
-            self._last,
+        step_estimator = StepEstimator(
+            self._last_frame,
             self._reference,
-            self._reference_picture,
+            self._reference_image,
             self._tracks,
             self._landmarks,
             measured,
             self._config,
         )
-        step = seeker.seek(prediction.cam_from_world) or seeker.seek(self._last.cam_from_world)
+        step = step_estimator.estimate_step(
+            prediction.cam_from_world
+        ) or step_estimator.estimate_step(self._last_frame.cam_from_world)
         trusted = self._config.prediction
         is_expected = (
             step is not None and prediction.distance(step.cam_from_world) < trusted.max_sigmas
@@ -136,29 +140,39 @@ class Odometry:
         if is_expected and not prediction.is_gap:
             return step
         if self._num_lost == 0:
-            self._repeats = seeker.repeats(prediction)
+            self._repeated_motions = step_estimator.find_repeated_motions(prediction)
         if step is None or (
-            prediction.is_gap and not is_expected and step.share < self._config.min_gap_share
+            prediction.is_gap and not is_expected and step.inlier_ratio < self._config.min_gap_share
         ):
             return None
-        expected = expected_one(prediction, self._with_repeats(step.cam_from_world), trusted)
-        if expected is not None and not seeker.is_same(expected, step.cam_from_world):
-            step = seeker.seek(expected)
-        if expected is None or step is None or not seeker.is_same(expected, step.cam_from_world):
+        expected = select_expected_pose(
+            prediction, self._collect_repeated_poses(step.cam_from_world), trusted
+        )
+        if expected is not None and not step_estimator.is_close(expected, step.cam_from_world):
+            step = step_estimator.estimate_step(expected)
+        if (
+            expected is None
+            or step is None
+            or not step_estimator.is_close(expected, step.cam_from_world)
+        ):
             self._reference = None  # nor is it worth while to seek the camera in the last places
             return None
         return step
 
-    def _with_repeats(self, cam_from_world: Rigid3) -> list[Rigid3]:
+    def _collect_repeated_poses(self, cam_from_world: Rigid3) -> list[Rigid3]:
         """All that the camera may be at where it looks as if it were there."""
-        return [cam_from_world, *(repeat @ cam_from_world for repeat in self._repeats)]
+        return [cam_from_world, *(repeat @ cam_from_world for repeat in self._repeated_motions)]
 
-    def _remember(self, frame: StereoFrame, measured: MeasuredView, cam_from_world: Rigid3) -> None:
+    def _update_last_frame(
+        self, frame: StereoFrame, measured: MeasuredView, cam_from_world: Rigid3
+    ) -> None:
         moved = (
-            cam_from_world @ self._last.cam_from_world.inverse() if self._last is not None else None
+            cam_from_world @ self._last_frame.cam_from_world.inverse()
+            if self._last_frame is not None
+            else None
         )
-        self._history.remember(frame.t_ns, cam_from_world, moved)
-        self._last = LastFrame(measured, cam_from_world)
+        self._history.add_pose(frame.t_ns, cam_from_world, moved)
+        self._last_frame = LastFrame(measured, cam_from_world)
 
     def _is_keyframe_due(self, measured: MeasuredView) -> bool:
         assert self._reference is not None
@@ -208,20 +222,20 @@ class Odometry:
             submap,
             measured.stereo,
             cam_from_world,
-            self._observations(ids, values[rows], sigmas[rows]),
+            self._make_observations(ids, values[rows], sigmas[rows]),
             self._bias,
             motion,
-            self._places,
+            self._place_features,
         )
         self._keyframes.append(keyframe)
-        self._chain.append(keyframe)
+        self._recent_keyframes.append(keyframe)
         self._adjust_window()
-        self._follow_from(keyframe, measured)
-        self._checks.look_at_keyframe(keyframe, self._landmarks, measured)
+        self._set_reference_keyframe(keyframe, measured)
+        self._checks.check_keyframe(keyframe, self._landmarks, measured)
         if self._is_new_place(keyframe):
-            self._look(keyframe, measured)
+            self._submit_place_extraction(keyframe, measured)
 
-    def _observations(
+    def _make_observations(
         self, ids: np.ndarray, values: np.ndarray, sigmas: np.ndarray
     ) -> Observations:
         weights = np.full((len(ids), 3), 1.0 / self._config.sigma_px)
@@ -233,19 +247,19 @@ class Odometry:
 
     def _adjust_window(self) -> None:
         config = self._config
-        free = self._chain[-config.window :]
-        held = self._chain[: -config.window][-config.held :]
+        free = self._recent_keyframes[-config.window :]
+        held = self._recent_keyframes[: -config.window][-config.held :]
         adjust_bundle(free, held, self._landmarks, config.bundle)
-        del self._chain[: -(config.window + config.held)]
+        del self._recent_keyframes[: -(config.window + config.held)]
 
-    def _follow_from(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
+    def _set_reference_keyframe(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
         seen = keyframe.observations
         points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
-        self._tracks = Tracks.of(seen.landmark_ids[seen.active], points)
-        self._reference, self._reference_picture = keyframe, measured.left
-        if self._last is not None:
-            self._last.cam_from_world = keyframe.cam_from_world
-            self._history.move(keyframe.cam_from_world)
+        self._tracks = Tracks.from_points(seen.landmark_ids[seen.active], points)
+        self._reference, self._reference_image = keyframe, measured.left
+        if self._last_frame is not None:
+            self._last_frame.cam_from_world = keyframe.cam_from_world
+            self._history.update_last_pose(keyframe.cam_from_world)
 
     def _is_new_place(self, keyframe: KeyFrame) -> bool:
         last = self._last_places(1)
@@ -259,13 +273,15 @@ class Odometry:
         far = np.linalg.norm(motion.translation) > self._config.place_distance * np.median(depth)
         return bool(far or motion.angle() > np.deg2rad(self._config.place_angle_deg))
 
-    def _look(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
+    def _submit_place_extraction(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
         """How a key frame looks is found while the next frames are followed; of one at a time, so
         that few pictures are held."""
-        if self._looked_at is not None:
-            assert self._looked_at.place is not None  # waits
-        keyframe.coming_place = self._looking.submit(place_view, measured.view, self._config.places)
-        self._looked_at = keyframe
+        if self._pending_keyframe is not None:
+            assert self._pending_keyframe.place is not None  # waits
+        keyframe.pending_place = self._place_executor.submit(
+            extract_place_features, measured.view, self._config.places
+        )
+        self._pending_keyframe = keyframe
 
     def _last_places(self, num: int) -> list[KeyFrame]:
         """The last key frames of this sub-map whose looks are known, newest first."""
@@ -278,24 +294,26 @@ class Odometry:
         )
         return list(islice((keyframe for keyframe in candidates if keyframe.has_place), num))
 
-    def _lost(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> list[FramePose]:
+    def _handle_lost_frame(
+        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
+    ) -> list[FramePose]:
         """Seek the camera in the last places; after a while begin again."""
         self._num_lost += 1
-        self._missed.append((frame_idx, frame))
+        self._lost_frames.append((frame_idx, frame))
         if self._num_lost > self._config.max_lost_tracked:
-            self._last = None
+            self._last_frame = None
         if self._reference is not None and self._num_lost <= self._config.max_lost_frames:
             found = self._relocalize(frame, measured)
             if found is not None:
-                return [self._start(frame_idx, frame, measured, *found)]
+                return [self._start_tracking(frame_idx, frame, measured, *found)]
             if self._reference is not None:
                 return []
-        return self._begin_again()
+        return self._restart_submap()
 
-    def _begin_again(self) -> list[FramePose]:
+    def _restart_submap(self) -> list[FramePose]:
         """A sub-map of the frames that were sought in vain, from the first on which all others
         follow."""
-        missed, self._missed, self._reference = self._missed, [], None
+        missed, self._lost_frames, self._reference = self._lost_frames, [], None
         num_keyframes, num_landmarks, num_lost = (
             len(self._keyframes),
             self._landmarks.num,
@@ -304,20 +322,20 @@ class Odometry:
         poses: list[FramePose] = []
         for frame_idx, frame in missed:
             measured = measured_view(frame)
-            pose = self._follow(frame_idx, frame, measured) if poses else None
+            pose = self._track_frame(frame_idx, frame, measured) if poses else None
             if pose is None:  # what came before it leads nowhere
                 poses, self._reference = [], None
                 del self._keyframes[num_keyframes:]
                 self._landmarks.num = num_landmarks
                 corners = find_corners(measured.view.grey, np.zeros((0, 2)), self._config.tracking)
                 if self._checks.can_start(frame, measured, corners, self._config.disparity):
-                    pose = self._start(frame_idx, frame, measured, Rigid3.identity(), None)
+                    pose = self._start_tracking(frame_idx, frame, measured, Rigid3.identity(), None)
             if pose is not None:
                 poses.append(pose)
         self._num_lost = 0 if poses else num_lost
         return poses
 
-    def _start(
+    def _start_tracking(
         self,
         frame_idx: int,
         frame: StereoFrame,
@@ -326,12 +344,12 @@ class Odometry:
         motion: Motion | None,
     ) -> FramePose:
         """Tracking begins with this frame, as a key frame."""
-        self._last, self._chain = None, []
-        self._history.stop()
+        self._last_frame, self._recent_keyframes = None, []
+        self._history.reset()
         self._tracks = self._tracks.select(np.zeros(0, np.int64))
         self._add_keyframe(frame, frame_idx, cam_from_world, measured, motion)
-        self._remember(frame, measured, cam_from_world)
-        self._num_lost, self._missed = 0, []
+        self._update_last_frame(frame, measured, cam_from_world)
+        self._num_lost, self._lost_frames = 0, []
         assert self._reference is not None
         return FramePose(frame_idx, self._reference, Rigid3.identity(), measured.view.view_from_cam)
 
@@ -340,7 +358,7 @@ class Odometry:
     ) -> tuple[Rigid3, Motion] | None:
         """Where the camera is by one of the last places; where the wall repeats itself and the
         motion does not tell, the search ends."""
-        here = place_view(measured.view, self._config.places)
+        here = extract_place_features(measured.view, self._config.places)
         prediction = self._history.predict(frame.t_ns)
         for keyframe in self._last_places(self._config.places_asked):
             place = keyframe.place
@@ -349,8 +367,8 @@ class Odometry:
             if match is None:
                 continue
             cam_from_world = match.target_from_source @ keyframe.cam_from_world
-            expected = expected_one(
-                prediction, self._with_repeats(cam_from_world), self._config.prediction
+            expected = select_expected_pose(
+                prediction, self._collect_repeated_poses(cam_from_world), self._config.prediction
             )
             if expected is cam_from_world:
                 return cam_from_world, Motion(keyframe, match.covariance)

@@ -11,16 +11,16 @@ from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.extraction import extract_features
-from topoloc.features.kinds import FeatureConfig, find_kind
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import StereoCamera
 from topoloc.points.metric_points import MetricPointsConfig, locate_points
-from topoloc.recordings.frame_view import FrameView
-from topoloc.slam.keyframes import PlaceView
+from topoloc.recordings.frame_preparation import PreparedFrame
+from topoloc.slam.keyframes import PlaceFeatures
 
-_ELSEWHERE = 0.05  # of the picture's width, so that a feature is not itself at another scale
+_MIN_SEPARATION = 0.05  # of the picture's width, so that a feature is not itself at another scale
 
 
 @dataclass(frozen=True)
@@ -54,20 +54,20 @@ class PlaceMatch:
     target_rows: Int[np.ndarray, " n"]
 
 
-def place_view(view: FrameView, config: PlaceMatchingConfig) -> PlaceView:
+def extract_place_features(view: PreparedFrame, config: PlaceMatchingConfig) -> PlaceFeatures:
     """The local features of a view, and where they are."""
     features = extract_features(view.grey, config.features)
-    return PlaceView(features, locate_points(features, view, config.points))
+    return PlaceFeatures(features, locate_points(features, view, config.points))
 
 
 def match_places(
-    source: PlaceView, target: PlaceView, stereo: StereoCamera, config: PlaceMatchingConfig
+    source: PlaceFeatures, target: PlaceFeatures, stereo: StereoCamera, config: PlaceMatchingConfig
 ) -> PlaceMatch | None:
     """Where `source` was taken, seen from `target` (whose camera is `stereo`), or None where they
     do not agree on it."""
     rows, matching = (
         np.flatnonzero(source.points.valid),
-        config.matching.resolved(find_kind(config.features.kind).ratio),
+        config.matching.resolved(find_feature_type(config.features.kind).ratio),
     )
     matches = match_features(
         target.features.descriptors, source.features.descriptors[rows], matching
@@ -95,7 +95,9 @@ def match_places(
     )
 
 
-def num_repeated(view: PlaceView, stereo: StereoCamera, config: PlaceMatchingConfig) -> int:
+def count_repeated_features(
+    view: PlaceFeatures, stereo: StereoCamera, config: PlaceMatchingConfig
+) -> int:
     """How many of a view's features look like others of the same picture, all as from one other
     place: a wall of equal panels.
 
@@ -105,7 +107,7 @@ def num_repeated(view: PlaceView, stereo: StereoCamera, config: PlaceMatchingCon
     points_img, descriptors = view.features.points_img.astype(np.float64), view.features.descriptors
     apart = np.linalg.norm(points_img[:, None] - points_img, axis=2)
     likeness = np.where(
-        apart < _ELSEWHERE * stereo.camera.width, -np.inf, descriptors @ descriptors.T
+        apart < _MIN_SEPARATION * stereo.camera.width, -np.inf, descriptors @ descriptors.T
     )
     if len(descriptors) < config.min_inliers:
         return 0

@@ -25,82 +25,84 @@ from topoloc.geometry.pose_conventions import (
     DIRECTIONS,
     ROTATIONS,
     UNITS,
-    Mend,
-    meaning,
-    mended,
+    PoseConversion,
+    describe_conventions,
+    undo_pose_conventions,
 )
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.trajectory import Trajectory, poses_at
+from topoloc.recordings.trajectory import Trajectory, interpolate_poses
 from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
 
-_MIN_TELLING = 5
-_MIN_BELIEVED, _MIN_NAMED = (
+_MIN_INFORMATIVE_STEPS = 5
+_MIN_ACCEPTED_RATIO, _MIN_CONVENTION_RATIO = (
     0.5,
     0.7,
 )  # of the telling steps, that agree with poses that are believed, with a convention that is named
-_MIN_TURN, _TURN, _WAY, _SHARE = (
+_MIN_ROTATION, _ROTATION_TOLERANCE, _TRANSLATION_TOLERANCE, _RELATIVE_TOLERANCE = (
     math.radians(5.0),
     math.radians(1.5),
     0.02,
     0.15,
 )  # rad, rad, m, share of the step
-_DEPTH_SHARE = 0.01  # of the depth of what is seen, by which a measured way may be wrong
-_MIN_WAY = 3.0  # times the tolerance
+_DEPTH_TOLERANCE = 0.01  # of the depth of what is seen, by which a measured way may be wrong
+_MIN_TRANSLATION_RATIO = 3.0  # times the tolerance
 _UNIT_TOLERANCE = 0.15
-_DIRECTION = math.radians(12.0)  # of a way whose length is unknown
-_FARTHEST = 1e12  # no place in any unit; squares of much more are no numbers
+_DIRECTION_TOLERANCE = math.radians(12.0)  # of a way whose length is unknown
+_MAX_COORDINATE = 1e12  # no place in any unit; squares of much more are no numbers
 _MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = (
     0.02,
     3.0,
     60,
     1.0,
 )  # shifts tried to each side
-_NOTED_MISS, _FAR_BETTER = 0.3, 0.4
-_MOUNTING_ROUNDS, _LEAST_TURN = 5, 0.05
-_BODY_COUNTS = 4.0  # conventions: a mounting has six numbers to fit by
+_SUSPICIOUS_ERROR, _MAX_ERROR_RATIO = 0.3, 0.4
+_NUM_MOUNTING_ITERATIONS, _MIN_SINGULAR_RATIO = 5, 0.05
+_BODY_COMPLEXITY = 4.0  # conventions: a mounting has six numbers to fit by
 
 _Poses = Sequence[Rigid3 | None]
 
 
 @dataclass(frozen=True)
-class PoseVerdict:
-    """`num_telling` steps are long enough to tell, `num_agreeing` of them agree with the poses as
-    they are. `conventions`, as `--poses` takes them, make most of them agree; empty where the poses
-    are believed, or nothing known makes them fit."""
+class PoseCheckResult:
+    """`num_informative` steps are long enough to tell, `num_consistent` of them agree with the
+    poses as they are. `conventions`, as `--poses` takes them, make most of them agree; empty where
+    the poses are believed, or nothing known makes them fit."""
 
-    num_telling: int
-    num_agreeing: int
+    num_informative: int
+    num_consistent: int
     conventions: tuple[str, ...] = ()
 
     @property
-    def is_believed(self) -> bool:
+    def is_accepted(self) -> bool:
         return not self.conventions and (
-            self.num_telling < _MIN_TELLING or self.num_agreeing >= _MIN_BELIEVED * self.num_telling
+            self.num_informative < _MIN_INFORMATIVE_STEPS
+            or self.num_consistent >= _MIN_ACCEPTED_RATIO * self.num_informative
         )
 
 
 @dataclass(frozen=True)
-class _Reading:
-    """A way to read the poses; `misses` are those of the steps, in units of what is tolerated."""
+class _PoseInterpretation:
+    """A way to read the poses; `normalized_errors` are those of the steps, in units of what is
+    tolerated."""
 
     conventions: tuple[str, ...]
-    misses: Float[np.ndarray, " n"]
+    normalized_errors: Float[np.ndarray, " n"]
 
     @property
-    def num_agreeing(self) -> int:
-        return int(np.count_nonzero(self.misses < 1.0))
+    def num_consistent(self) -> int:
+        return int(np.count_nonzero(self.normalized_errors < 1.0))
 
     @property
-    def rank(self) -> tuple[float, float]:
+    def sort_key(self) -> tuple[float, float]:
         """The plainer one is taken where two fit about as well."""
         complexity = sum(
-            _BODY_COUNTS if name.startswith("body") else 1.0 for name in self.conventions
+            _BODY_COMPLEXITY if name.startswith("body") else 1.0 for name in self.conventions
         )
-        return self.num_agreeing - 0.5 * complexity, -float(np.median(self.misses))
+        return self.num_consistent - 0.5 * complexity, -float(np.median(self.normalized_errors))
 
 
-def check_gaps(sequence: StereoSequence) -> None:
+def check_pose_coverage(sequence: StereoSequence) -> None:
     """Hold that at least half of the frames have a pose. Raises TrajectoryError."""
     num_posed = sum(pose is not None for pose in sequence.poses)
     if 0 < 2 * num_posed < len(sequence):
@@ -120,26 +122,26 @@ def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = N
         RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
     """
     posed = [k for k, pose in enumerate(sequence.poses) if pose is not None]
-    if len(posed) < _MIN_TELLING:
+    if len(posed) < _MIN_INFORMATIVE_STEPS:
         return
     if sequence[posed[0]].camera is None:
         return
-    verdict = judge_poses(
+    verdict = evaluate_poses(
         measure_steps(sequence, posed, config or MeasuredStepsConfig()),
         sequence.poses,
         sequence.t_ns,
     )
-    if verdict.is_believed:
+    if verdict.is_accepted:
         return
     differ = (
-        f"{verdict.num_telling - verdict.num_agreeing} of {verdict.num_telling} steps from picture"
-        " to picture are not the poses'"
+        f"{verdict.num_informative - verdict.num_consistent} of {verdict.num_informative} steps"
+        " from picture to picture are not the poses'"
     )
     if verdict.conventions:
         names = ",".join(verdict.conventions)
         raise TrajectoryError(
-            f"{sequence.name}: {differ}; they look like poses {meaning(verdict.conventions)}:"
-            f" --poses {names}"
+            f"{sequence.name}: {differ}; they look like poses"
+            f" {describe_conventions(verdict.conventions)}: --poses {names}"
         )
     raise TrajectoryError(
         f"{sequence.name}: {differ}, and no known convention explains it: of another recording, or"
@@ -147,68 +149,89 @@ def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = N
     )
 
 
-def judge_poses(steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]) -> PoseVerdict:
+def evaluate_poses(
+    steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]
+) -> PoseCheckResult:
     """Hold the poses (world_from_cam in metres, one a frame) against the measured steps."""
-    telling = [step for step in steps if _is_telling(step)]
-    telling = [
-        step for step in telling if poses[step.first] is not None and poses[step.last] is not None
+    informative_steps = [step for step in steps if _is_informative(step)]
+    informative_steps = [
+        step
+        for step in informative_steps
+        if poses[step.first] is not None and poses[step.last] is not None
     ]
-    if len(telling) < _MIN_TELLING:
-        return PoseVerdict(len(telling), len(telling))
-    if any(pose is not None and np.abs(pose.translation).max() > _FARTHEST for pose in poses):
-        return PoseVerdict(len(telling), 0)
-    as_is = _Reading((), _misses(telling, _steps_of(telling, poses)))
-    verdict = PoseVerdict(len(telling), as_is.num_agreeing)
-    if verdict.is_believed and not _is_noted(as_is):
+    if len(informative_steps) < _MIN_INFORMATIVE_STEPS:
+        return PoseCheckResult(len(informative_steps), len(informative_steps))
+    if any(pose is not None and np.abs(pose.translation).max() > _MAX_COORDINATE for pose in poses):
+        return PoseCheckResult(len(informative_steps), 0)
+    as_is = _PoseInterpretation(
+        (), _compute_step_errors(informative_steps, _steps_from_poses(informative_steps, poses))
+    )
+    verdict = PoseCheckResult(len(informative_steps), as_is.num_consistent)
+    if verdict.is_accepted and not _is_suspicious(as_is):
         return verdict
-    readings = [*_by_convention(telling, poses), *_best_shift(telling, poses, t_ns)]
+    readings = [
+        *_test_conventions(informative_steps, poses),
+        *_find_time_shift(informative_steps, poses, t_ns),
+    ]
     if (
-        verdict.is_believed
+        verdict.is_accepted
     ):  # of a way that is nearly straight and level, wrong poses may be nearly right
         better = [
             one
             for one in readings
-            if _is_far_better(one, as_is) and not any("scale" in name for name in one.conventions)
+            if _has_lower_error(one, as_is) and not any("scale" in name for name in one.conventions)
         ]
         return replace(
             verdict,
-            conventions=max(better, key=lambda reading: reading.rank).conventions if better else (),
+            conventions=(
+                max(better, key=lambda reading: reading.sort_key).conventions if better else ()
+            ),
         )
-    best = max([*readings, *_as_body(telling, poses)], key=lambda reading: reading.rank)
-    is_named = best.num_agreeing >= max(_MIN_NAMED * len(telling), as_is.num_agreeing + 1)
+    best = max(
+        [*readings, *_test_body_poses(informative_steps, poses)],
+        key=lambda reading: reading.sort_key,
+    )
+    is_named = best.num_consistent >= max(
+        _MIN_CONVENTION_RATIO * len(informative_steps), as_is.num_consistent + 1
+    )
     return replace(verdict, conventions=best.conventions if is_named else ())
 
 
-def _is_telling(step: MeasuredStep) -> bool:
+def _is_informative(step: MeasuredStep) -> bool:
     way = float(np.linalg.norm(step.first_from_last.translation))
     return (
         not step.has_scale
-        or way > _MIN_WAY * (_WAY + _DEPTH_SHARE * step.median_depth)
-        or step.first_from_last.angle() > _MIN_TURN
+        or way
+        > _MIN_TRANSLATION_RATIO * (_TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * step.median_depth)
+        or step.first_from_last.angle() > _MIN_ROTATION
     )
 
 
-def _steps_of(telling: Sequence[MeasuredStep], poses: _Poses) -> list[Rigid3]:
+def _steps_from_poses(informative_steps: Sequence[MeasuredStep], poses: _Poses) -> list[Rigid3]:
     """first_from_last as the poses have it."""
-    pairs = ((poses[step.first], poses[step.last]) for step in telling)
+    pairs = ((poses[step.first], poses[step.last]) for step in informative_steps)
     return [
         first.inverse() @ last for first, last in pairs if first is not None and last is not None
     ]
 
 
-def _misses(telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]) -> Float[np.ndarray, " n"]:
+def _compute_step_errors(
+    informative_steps: Sequence[MeasuredStep], steps: Sequence[Rigid3]
+) -> Float[np.ndarray, " n"]:
     """By how much each step is not the measured one: 1 is what is tolerated."""
-    misses = []
-    for measured, step in zip(telling, steps, strict=True):
+    normalized_errors = []
+    for measured, step in zip(informative_steps, steps, strict=True):
         apart, tolerated_turn = (
             step.inverse() @ measured.first_from_last,
-            _TURN + _SHARE * measured.first_from_last.angle(),
+            _ROTATION_TOLERANCE + _RELATIVE_TOLERANCE * measured.first_from_last.angle(),
         )
-        misses.append(max(_miss_of_way(measured, step), apart.angle() / tolerated_turn))
-    return np.array(misses)
+        normalized_errors.append(
+            max(_compute_translation_error(measured, step), apart.angle() / tolerated_turn)
+        )
+    return np.array(normalized_errors)
 
 
-def _miss_of_way(measured: MeasuredStep, step: Rigid3) -> float:
+def _compute_translation_error(measured: MeasuredStep, step: Rigid3) -> float:
     """By how much the way is another one, in units of what is tolerated; of a single camera by its
     direction alone."""
     ours, theirs = measured.first_from_last.translation, step.translation
@@ -217,45 +240,57 @@ def _miss_of_way(measured: MeasuredStep, step: Rigid3) -> float:
         return (
             2.0
             if length == 0.0
-            else float(np.arccos(np.clip(ours @ theirs / length, -1.0, 1.0))) / _DIRECTION
+            else float(np.arccos(np.clip(ours @ theirs / length, -1.0, 1.0))) / _DIRECTION_TOLERANCE
         )
-    tolerated = _WAY + _DEPTH_SHARE * measured.median_depth + _SHARE * float(np.linalg.norm(ours))
+    tolerated = (
+        _TRANSLATION_TOLERANCE
+        + _DEPTH_TOLERANCE * measured.median_depth
+        + _RELATIVE_TOLERANCE * float(np.linalg.norm(ours))
+    )
     # seen in the first camera; in the last one the difference is as long
     return float(np.linalg.norm(ours - theirs)) / tolerated
 
 
-def _by_convention(telling: Sequence[MeasuredStep], poses: _Poses) -> Iterator[_Reading]:
-    for conventions in _combined(ROTATIONS, DIRECTIONS, AXES):
-        steps = _steps_of(telling, _read(telling, poses, conventions))
-        unit, factor = _unit_of(telling, steps)
+def _test_conventions(
+    informative_steps: Sequence[MeasuredStep], poses: _Poses
+) -> Iterator[_PoseInterpretation]:
+    for conventions in _combine_conventions(ROTATIONS, DIRECTIONS, AXES):
+        steps = _steps_from_poses(
+            informative_steps, _apply_conventions(informative_steps, poses, conventions)
+        )
+        unit, factor = _estimate_unit(informative_steps, steps)
         steps = [Rigid3(step.rotation, factor * step.translation) for step in steps]
-        yield _Reading((*conventions, *unit), _misses(telling, steps))
+        yield _PoseInterpretation(
+            (*conventions, *unit), _compute_step_errors(informative_steps, steps)
+        )
 
 
-def _combined(*tables: dict[str, Mend]) -> list[tuple[str, ...]]:
+def _combine_conventions(*tables: dict[str, PoseConversion]) -> list[tuple[str, ...]]:
     """One or no convention of each table."""
     choices = [[(), *((name,) for name in table)] for table in tables]
     return [tuple(itertools.chain(*parts)) for parts in itertools.product(*choices)]
 
 
-def _read(
-    telling: Sequence[MeasuredStep], poses: _Poses, conventions: tuple[str, ...]
+def _apply_conventions(
+    informative_steps: Sequence[MeasuredStep], poses: _Poses, conventions: tuple[str, ...]
 ) -> list[Rigid3 | None]:
     """The poses that the steps need, with these conventions undone."""
-    needed = {step.first for step in telling} | {step.last for step in telling}
+    needed = {step.first for step in informative_steps} | {step.last for step in informative_steps}
     return [
-        mended(pose, conventions) if pose is not None and k in needed else None
+        undo_pose_conventions(pose, conventions) if pose is not None and k in needed else None
         for k, pose in enumerate(poses)
     ]
 
 
-def _unit_of(
-    telling: Sequence[MeasuredStep], steps: Sequence[Rigid3]
+def _estimate_unit(
+    informative_steps: Sequence[MeasuredStep], steps: Sequence[Rigid3]
 ) -> tuple[tuple[str, ...], float]:
     """The unit that gives the steps their measured lengths, as a convention, and its metres."""
-    if not all(step.has_scale for step in telling):
+    if not all(step.has_scale for step in informative_steps):
         return (), 1.0
-    measured = np.array([np.linalg.norm(step.first_from_last.translation) for step in telling])
+    measured = np.array(
+        [np.linalg.norm(step.first_from_last.translation) for step in informative_steps]
+    )
     lengths = np.array([np.linalg.norm(step.translation) for step in steps])
     long = lengths > 1e-9
     if not long.any() or not measured[long].any():
@@ -267,9 +302,9 @@ def _unit_of(
     return (f"scale={factor:.4g}",), factor
 
 
-def _best_shift(
-    telling: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]
-) -> list[_Reading]:
+def _find_time_shift(
+    informative_steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]
+) -> list[_PoseInterpretation]:
     """The poses at other times than those of the pictures, by the shift that fits best; none where
     the recording is too short for any."""
     posed = [k for k, pose in enumerate(poses) if pose is not None]
@@ -277,70 +312,82 @@ def _best_shift(
     largest = min(_MAX_SHIFT_S, 0.4e-9 * (t_ns[posed[-1]] - t_ns[posed[0]]))
     shifts = np.linspace(-largest, largest, 2 * _NUM_SHIFTS + 1)
     readings = (
-        _shifted(telling, trajectory, t_ns, float(seconds))
+        _test_time_shift(informative_steps, trajectory, t_ns, float(seconds))
         for seconds in shifts
         if abs(seconds) > _MIN_SHIFT_S
     )
     return sorted(
-        (one for one in readings if one is not None), key=lambda one: float(np.median(one.misses))
+        (one for one in readings if one is not None),
+        key=lambda one: float(np.median(one.normalized_errors)),
     )[:1]
 
 
-def _shifted(
-    telling: Sequence[MeasuredStep], trajectory: Trajectory, t_ns: Sequence[int], seconds: float
-) -> _Reading | None:
+def _test_time_shift(
+    informative_steps: Sequence[MeasuredStep],
+    trajectory: Trajectory,
+    t_ns: Sequence[int],
+    seconds: float,
+) -> _PoseInterpretation | None:
     """None where too few steps have poses then."""
-    misses = []
-    for step in telling:
+    normalized_errors = []
+    for step in informative_steps:
         times = [t_ns[k] + round(1e9 * seconds) for k in (step.first, step.last)]
-        first, last = poses_at(trajectory, times, _MAX_GAP_S)
+        first, last = interpolate_poses(trajectory, times, _MAX_GAP_S)
         if first is not None and last is not None:
-            misses.append(float(_misses([step], [first.inverse() @ last])[0]))
-    if len(misses) < max(_MIN_TELLING, len(telling) // 2):
+            normalized_errors.append(
+                float(_compute_step_errors([step], [first.inverse() @ last])[0])
+            )
+    if len(normalized_errors) < max(_MIN_INFORMATIVE_STEPS, len(informative_steps) // 2):
         return None
-    misses += [float(np.median(misses))] * (
-        len(telling) - len(misses)
+    normalized_errors += [float(np.median(normalized_errors))] * (
+        len(informative_steps) - len(normalized_errors)
     )  # those beyond an end are taken to be as the others
-    return _Reading((f"shift={seconds:.3g}",), np.array(misses))
+    return _PoseInterpretation((f"shift={seconds:.3g}",), np.array(normalized_errors))
 
 
-def _is_far_better(other: _Reading, as_is: _Reading) -> bool:
+def _has_lower_error(other: _PoseInterpretation, as_is: _PoseInterpretation) -> bool:
     """Does another reading explain most of what the steps miss by?"""
-    return _is_noted(as_is) and float(np.median(other.misses)) < _FAR_BETTER * float(
-        np.median(as_is.misses)
-    )
+    return _is_suspicious(as_is) and float(
+        np.median(other.normalized_errors)
+    ) < _MAX_ERROR_RATIO * float(np.median(as_is.normalized_errors))
 
 
-def _is_noted(as_is: _Reading) -> bool:
+def _is_suspicious(as_is: _PoseInterpretation) -> bool:
     """Do the steps miss by enough for another reading to be far better?"""
-    return float(np.median(as_is.misses)) > _NOTED_MISS
+    return float(np.median(as_is.normalized_errors)) > _SUSPICIOUS_ERROR
 
 
-def _as_body(telling: Sequence[MeasuredStep], poses: _Poses) -> Iterator[_Reading]:
+def _test_body_poses(
+    informative_steps: Sequence[MeasuredStep], poses: _Poses
+) -> Iterator[_PoseInterpretation]:
     """The poses as those of a body, by the mounting of the camera that fits best; none by steps
     that know no metre."""
-    if not all(step.has_scale for step in telling):
+    if not all(step.has_scale for step in informative_steps):
         return
-    for conventions in _combined(ROTATIONS, DIRECTIONS):
-        steps = _steps_of(telling, _read(telling, poses, conventions))
-        pairs = kept = list(zip(telling, steps, strict=True))
-        mounting, misses = Rigid3.identity(), np.zeros(len(pairs))
+    for conventions in _combine_conventions(ROTATIONS, DIRECTIONS):
+        steps = _steps_from_poses(
+            informative_steps, _apply_conventions(informative_steps, poses, conventions)
+        )
+        pairs = kept = list(zip(informative_steps, steps, strict=True))
+        mounting, normalized_errors = Rigid3.identity(), np.zeros(len(pairs))
         for _ in range(
-            _MOUNTING_ROUNDS
+            _NUM_MOUNTING_ITERATIONS
         ):  # what the first mountings leave far off may be measured wrongly
-            mounting = _mounting(kept)
-            misses = _misses(telling, [mounting.inverse() @ step @ mounting for step in steps])
+            mounting = _estimate_mounting(kept)
+            normalized_errors = _compute_step_errors(
+                informative_steps, [mounting.inverse() @ step @ mounting for step in steps]
+            )
             kept = [
                 pair
-                for pair, miss in zip(pairs, misses, strict=True)
-                if miss <= 1.5 * np.median(misses)
+                for pair, miss in zip(pairs, normalized_errors, strict=True)
+                if miss <= 1.5 * np.median(normalized_errors)
             ]
         w, x, y, z = mounting.quat_wxyz()
         numbers = ",".join(f"{number:.4g}" for number in (*mounting.translation, x, y, z, w))
-        yield _Reading((*conventions, f"body={numbers}"), misses)
+        yield _PoseInterpretation((*conventions, f"body={numbers}"), normalized_errors)
 
 
-def _mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
+def _estimate_mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
     """body_from_cam of least squares, by turns: its rotation by the steps' axes and ways, its
     translation by what is left of the ways.
 
@@ -351,14 +398,14 @@ def _mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
         (np.outer(step.log()[3:], measured.first_from_last.log()[3:]) for measured, step in pairs),
         np.zeros((3, 3)),
     )
-    for _ in range(_MOUNTING_ROUNDS):
-        correlation = of_axes / _TURN**2
+    for _ in range(_NUM_MOUNTING_ITERATIONS):
+        correlation = of_axes / _ROTATION_TOLERANCE**2
         for measured, step in pairs:
             way = step.translation - (translation - step.rotation @ translation)
             correlation = (
                 correlation
                 + np.outer(way, measured.first_from_last.translation)
-                / (_WAY + _DEPTH_SHARE * measured.median_depth) ** 2
+                / (_TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * measured.median_depth) ** 2
             )
         rotation = nearest_rotation(correlation)
         lefts = np.concatenate([step.rotation - np.eye(3) for _, step in pairs])
@@ -368,5 +415,5 @@ def _mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
                 for measured, step in pairs
             ]
         )
-        translation = np.linalg.lstsq(lefts, rights, rcond=_LEAST_TURN)[0]
+        translation = np.linalg.lstsq(lefts, rights, rcond=_MIN_SINGULAR_RATIO)[0]
     return Rigid3(rotation, translation)

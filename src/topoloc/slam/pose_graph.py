@@ -45,20 +45,20 @@ class Edge:
     is_loop: bool
 
 
-def optimise_graph(
+def optimize_pose_graph(
     cam_from_worlds: Sequence[Rigid3], edges: Sequence[Edge], config: PoseGraphConfig
 ) -> list[Rigid3]:
     """The poses, the first one unmoved."""
     poses = list(cam_from_worlds)
     informations = [np.linalg.inv(edge.covariance) for edge in edges]
-    pattern = BlockPattern.of(len(poses), [(edge.first, edge.second) for edge in edges])
-    places = [pattern.place(edge.first, edge.second) for edge in edges]
-    ranks = pattern.ranks
+    pattern = BlockPattern.from_pairs(len(poses), [(edge.first, edge.second) for edge in edges])
+    places = [pattern.block_idx(edge.first, edge.second) for edge in edges]
+    elimination_idx = pattern.elimination_idx
     for _ in range(config.max_steps):
         blocks, right = pattern.empty(), np.zeros((len(poses), 6))
         blocks[pattern.diagonal] = 1e-6 * np.eye(6)
-        blocks[pattern.diagonal[ranks[0]]] += 1e12 * np.eye(6)
-        for edge, information, (place, is_first_above) in zip(
+        blocks[pattern.diagonal[elimination_idx[0]]] += 1e12 * np.eye(6)
+        for edge, information, (block_idx, is_first_above) in zip(
             edges, informations, places, strict=True
         ):
             predicted = poses[edge.second] @ poses[edge.first].inverse()
@@ -69,19 +69,21 @@ def optimise_graph(
                 )
             adjoint = predicted.adjoint()
             weighted = adjoint.T @ information
-            blocks[pattern.diagonal[ranks[edge.second]]] += information
-            blocks[pattern.diagonal[ranks[edge.first]]] += weighted @ adjoint
-            blocks[place] -= weighted.T if is_first_above else weighted
-            right[ranks[edge.second]] -= information @ residual
-            right[ranks[edge.first]] += weighted @ residual
-        steps = solve_blocks(pattern, blocks, right[None])[0][ranks]
+            blocks[pattern.diagonal[elimination_idx[edge.second]]] += information
+            blocks[pattern.diagonal[elimination_idx[edge.first]]] += weighted @ adjoint
+            blocks[block_idx] -= weighted.T if is_first_above else weighted
+            right[elimination_idx[edge.second]] -= information @ residual
+            right[elimination_idx[edge.first]] += weighted @ residual
+        steps = solve_blocks(pattern, blocks, right[None])[0][elimination_idx]
         poses = [Rigid3.exp(step) @ pose for step, pose in zip(steps, poses, strict=True)]
         if np.abs(steps).max() < config.min_step:
             break
     return poses
 
 
-def residuals_in_sigma(poses: Sequence[Rigid3], edges: Sequence[Edge]) -> Float[np.ndarray, " e"]:
+def compute_normalized_residuals(
+    poses: Sequence[Rigid3], edges: Sequence[Edge]
+) -> Float[np.ndarray, " e"]:
     """Length of each edge's residual, in standard deviations."""
     lengths = np.empty(len(edges))
     for k, edge in enumerate(edges):

@@ -22,15 +22,20 @@ from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import MeasuredView, measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.frame_view import frame_view
+from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import SequenceView
-from topoloc.slam.global_map import GlobalMapConfig, adjust_all, close_loops, join_submaps
+from topoloc.slam.global_optimization import (
+    GlobalMapConfig,
+    adjust_global_bundle,
+    close_loops,
+    join_submaps,
+)
 from topoloc.slam.input_checks import InputCheckConfig, InputChecks
-from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceView
+from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceFeatures
 from topoloc.slam.loop_closure import Link, LoopConfig, find_links
 from topoloc.slam.odometry import Odometry
-from topoloc.slam.place_matching import place_view
-from topoloc.slam.steps import OdometryConfig
+from topoloc.slam.place_matching import extract_place_features
+from topoloc.slam.step_estimation import OdometryConfig
 from topoloc.slam.submap_joins import JoinConfig, find_joins, group_submaps
 
 Progress = Callable[[str, int, int], None]
@@ -98,21 +103,23 @@ def run_slam(
     for number, sequence in enumerate(sequences):
         checks = InputChecks(sequence.name, config.checks)
         odometry = Odometry(number, keyframes, landmarks, checks, config.odometry)
-        tracked.append(_track(sequence, odometry, checks, progress))
+        tracked.append(_track_recording(sequence, odometry, checks, progress))
         residuals += checks.right_residuals_px
     links = find_links(keyframes, config.loops, progress)
     links += find_joins(
         keyframes,
         links,
-        lambda keyframe: _looked_at(keyframe, sequences, config),
+        lambda keyframe: _read_place_features(keyframe, sequences, config),
         config.joins,
         config.loops,
     )
-    joined = join_submaps(keyframes, links, landmarks, _largest(keyframes, links, tracked[0]))
-    links = _optimise(keyframes, links, joined, landmarks, config, progress)
+    joined = join_submaps(
+        keyframes, links, landmarks, _find_largest_submap(keyframes, links, tracked[0])
+    )
+    links = _optimize_map(keyframes, links, joined, landmarks, config, progress)
     return SlamResult(
-        poses=_world_poses(tracked, joined),
-        apart=[_poses_apart(of_recording, joined) for of_recording in tracked],
+        poses=_to_world_poses(tracked, joined),
+        apart=[_collect_separate_poses(of_recording, joined) for of_recording in tracked],
         num_keyframes=len(keyframes),
         num_loops=len(links),
         num_submaps=len({keyframe.submap for keyframe in keyframes}),
@@ -123,7 +130,7 @@ def run_slam(
     )
 
 
-def posed_by_slam(
+def estimate_slam_poses(
     sequences: Sequence[StereoSequence],
     config: SlamConfig | None = None,
     progress: Progress | None = None,
@@ -133,10 +140,10 @@ def posed_by_slam(
     Raises:
         RecordingError: one of them shares no place with the others; and as `run_slam`.
     """
-    return with_slam_poses(sequences, run_slam(sequences, config, progress))
+    return apply_slam_poses(sequences, run_slam(sequences, config, progress))
 
 
-def with_slam_poses(
+def apply_slam_poses(
     sequences: Sequence[StereoSequence], result: SlamResult
 ) -> list[StereoSequence]:
     """The recordings with the poses that `run_slam` has found in them, and those of stretches that
@@ -157,17 +164,17 @@ def with_slam_poses(
     ]
 
 
-def _track(
+def _track_recording(
     sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress
 ) -> list[FramePose | None]:
     poses: list[FramePose | None] = [None] * len(sequence)
-    for i, (frame, measured) in enumerate(_read_ahead(sequence, checks)):
+    for i, (frame, measured) in enumerate(_prefetch_frames(sequence, checks)):
         for pose in odometry.process(i, frame, measured):
             poses[pose.frame_idx] = pose
         progress(f"tracking {sequence.name}", i + 1, len(sequence))
     for pose in odometry.finish():
         poses[pose.frame_idx] = pose
-    checks.verdict()
+    checks.check_stereo_pairs()
     if all(pose is None for pose in poses):
         raise RecordingError(
             f"{sequence.name}: none of the {len(poses)} frames could be tracked: too dark, without"
@@ -176,7 +183,7 @@ def _track(
     return poses
 
 
-def _read_ahead(
+def _prefetch_frames(
     sequence: StereoSequence, checks: InputChecks
 ) -> Iterator[tuple[StereoFrame, MeasuredView]]:
     """The frames, each read and made ready for measuring while the one before is being worked
@@ -196,7 +203,9 @@ def _read_ahead(
             yield ready
 
 
-def _largest(keyframes: list[KeyFrame], links: list[Link], tracked: list[FramePose | None]) -> int:
+def _find_largest_submap(
+    keyframes: list[KeyFrame], links: list[Link], tracked: list[FramePose | None]
+) -> int:
     """The first of the sub-maps that, joined, hold most frames of the first recording."""
     groups = group_submaps(keyframes, links)
     return Counter(
@@ -204,16 +213,16 @@ def _largest(keyframes: list[KeyFrame], links: list[Link], tracked: list[FramePo
     ).most_common(1)[0][0]
 
 
-def _looked_at(
+def _read_place_features(
     keyframe: KeyFrame, sequences: Sequence[StereoSequence], config: SlamConfig
-) -> PlaceView:
+) -> PlaceFeatures:
     """What a key frame looks like that was no place of its own: its picture is read once more."""
-    return place_view(
-        frame_view(sequences[keyframe.recording][keyframe.frame_idx]), config.odometry.places
+    return extract_place_features(
+        prepare_frame(sequences[keyframe.recording][keyframe.frame_idx]), config.odometry.places
     )
 
 
-def _optimise(
+def _optimize_map(
     keyframes: list[KeyFrame],
     links: list,
     joined: list[int],
@@ -233,12 +242,12 @@ def _optimise(
     progress("optimising", 0, 2)
     kept = close_loops(ours, of_joined, landmarks, config.globally)
     progress("optimising", 1, 2)
-    adjust_all(ours, kept, landmarks, config.globally)
+    adjust_global_bundle(ours, kept, landmarks, config.globally)
     progress("optimising", 2, 2)
     return kept
 
 
-def _world_poses(
+def _to_world_poses(
     tracked: list[list[FramePose | None]], joined: list[int]
 ) -> list[list[Rigid3 | None]]:
     """World_from_cam of every frame, the world being the camera of the first of them."""
@@ -250,7 +259,9 @@ def _world_poses(
     return [[world_from_any @ pose if pose is not None else None for pose in one] for one in poses]
 
 
-def _poses_apart(tracked: list[FramePose | None], joined: list[int]) -> list[list[Rigid3 | None]]:
+def _collect_separate_poses(
+    tracked: list[FramePose | None], joined: list[int]
+) -> list[list[Rigid3 | None]]:
     """Of each sub-map that is not among the joined ones, world_from_cam of its frames in its own
     world."""
     submaps = sorted({pose.keyframe.submap for pose in tracked if pose is not None} - set(joined))

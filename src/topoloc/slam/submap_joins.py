@@ -20,26 +20,26 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.geometry.rigid import Rigid3, covariance_of_inverse
+from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.transform_consensus import (
     ConsensusConfig,
     DriftConfig,
     TransformConsensus,
-    carried,
     diagonal_covariance,
     find_consensus,
+    propagate_estimate,
 )
-from topoloc.slam.keyframes import KeyFrame, PlaceView
-from topoloc.slam.loop_closure import Link, LoopConfig, is_within_reach, rank_places
-from topoloc.slam.place_matching import PlaceMatchingConfig, match_places, num_repeated
+from topoloc.slam.keyframes import KeyFrame, PlaceFeatures
+from topoloc.slam.loop_closure import Link, LoopConfig, is_reachable, rank_places
+from topoloc.slam.place_matching import PlaceMatchingConfig, count_repeated_features, match_places
 
-_MIN_LOOSE = 6  # matches that agree on a pose which is known already
-_MIN_TRACE = 1.0  # of a turn by 90 degrees: beyond it hardly anything is in both pictures
-_LOOKED_AT = (
+_MIN_LOOSE_INLIERS = 6  # matches that agree on a pose which is known already
+_MIN_ROTATION_TRACE = 1.0  # of a turn by 90 degrees: beyond it hardly anything is in both pictures
+_CANDIDATE_FACTOR = (
     10  # times as many pairs as are checked, the nearest, are asked how much they must see alike
 )
 
-Look = Callable[[KeyFrame], PlaceView]
+PlaceExtractor = Callable[[KeyFrame], PlaceFeatures]
 """What a key frame looks like, from its recording."""
 
 
@@ -87,7 +87,7 @@ class JoinConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class _Ends:
+class _KeyFramePair:
     """The two key frames that match best, of the earlier and of the later sub-map: what is said of
     the two is said at these."""
 
@@ -98,7 +98,7 @@ class _Ends:
 def find_joins(
     keyframes: Sequence[KeyFrame],
     links: Sequence[Link],
-    look: Look,
+    extract_place: PlaceExtractor,
     config: JoinConfig,
     loops: LoopConfig,
 ) -> list[Link]:
@@ -110,15 +110,15 @@ def find_joins(
         return []
     joins: list[Link] = []
     repeated: dict[int, int] = {}
-    for pairs in _look_alikes(keyframes, places, groups, config, loops).values():
-        found = _matched(pairs, keyframes, config, loops)
+    for pairs in _find_similar_places(keyframes, places, groups, config, loops).values():
+        found = _match_pairs(pairs, keyframes, config, loops)
         seeds = sorted(found, key=lambda link: -len(link.match.source_rows))[: config.num_seeds]
-        around = _around(seeds, keyframes, config) - set(pairs)
+        around = _find_neighbour_pairs(seeds, keyframes, config) - set(pairs)
         for i in sorted({i for pair in around for i in pair}):
             if not keyframes[i].has_place:
-                keyframes[i].place = look(keyframes[i])
-        found += _matched(sorted(around), keyframes, config, loops)
-        joins += _agreeing(
+                keyframes[i].place = extract_place(keyframes[i])
+        found += _match_pairs(sorted(around), keyframes, config, loops)
+        joins += _select_consistent(
             [link for link in found if _is_distinct(link, keyframes, repeated, config)],
             keyframes,
             config,
@@ -134,14 +134,14 @@ def _is_distinct(
     for end in (link.source, link.target):
         place = keyframes[end].place
         if end not in repeated and place is not None:
-            repeated[end] = num_repeated(place, keyframes[end].stereo, config.matching)
+            repeated[end] = count_repeated_features(place, keyframes[end].stereo, config.matching)
     rivals = max(repeated[link.source], repeated[link.target])
     return rivals < max(
         config.consensus.rival_share * len(link.match.source_rows), config.matching.min_inliers
     )
 
 
-def _agreeing(
+def _select_consistent(
     links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig
 ) -> list[Link]:
     """Those of the links between two sub-maps that say the same, where enough do and what they say
@@ -149,13 +149,13 @@ def _agreeing(
     if not links:
         return []
     best = max(links, key=lambda link: len(link.match.source_rows))
-    ends = _Ends(*(keyframes[i] for i in _in_order(best, keyframes)))
-    estimates, covariances = _estimates(links, keyframes, ends, config)
-    pictures = np.array([_in_order(link, keyframes) for link in links])
+    ends = _KeyFramePair(*(keyframes[i] for i in _order_ends(best, keyframes)))
+    estimates, covariances = _compute_estimates(links, keyframes, ends, config)
+    pictures = np.array([_order_ends(link, keyframes) for link in links])
     consensus = find_consensus(estimates, covariances, config.consensus, pictures)
-    if consensus is None or not _is_seen_again(consensus, keyframes, ends, config):
+    if consensus is None or not _is_join_verified(consensus, keyframes, ends, config):
         return []
-    return [link for link, agrees in zip(links, consensus.agrees, strict=True) if agrees]
+    return [link for link, is_inlier in zip(links, consensus.is_inlier, strict=True) if is_inlier]
 
 
 def group_submaps(keyframes: Sequence[KeyFrame], links: Sequence[Link]) -> dict[int, int]:
@@ -170,7 +170,7 @@ def group_submaps(keyframes: Sequence[KeyFrame], links: Sequence[Link]) -> dict[
     return groups
 
 
-def _look_alikes(
+def _find_similar_places(
     keyframes: Sequence[KeyFrame],
     places: list[int],
     groups: dict[int, int],
@@ -196,27 +196,28 @@ def _look_alikes(
     return {submaps: sorted(pairs[submaps]) for submaps in sorted(pairs)}
 
 
-def _around(
+def _find_neighbour_pairs(
     links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig
 ) -> set[tuple[int, int]]:
     """Pairs of key frames around those of the links: of the earlier sub-map, of the later."""
     pairs: set[tuple[int, int]] = set()
     for link in links:
         one, other = (
-            _neighbours(end, keyframes, config.neighbours) for end in _in_order(link, keyframes)
+            _find_neighbours(end, keyframes, config.neighbours)
+            for end in _order_ends(link, keyframes)
         )
         pairs |= set(product(one, other))
     return pairs
 
 
-def _neighbours(row: int, keyframes: Sequence[KeyFrame], num: int) -> list[int]:
+def _find_neighbours(row: int, keyframes: Sequence[KeyFrame], num: int) -> list[int]:
     """Rows of the key frames of one sub-map around one of them, itself among them."""
     own = [i for i, keyframe in enumerate(keyframes) if keyframe.submap == keyframes[row].submap]
     at = own.index(row)
     return own[max(at - num, 0) : at + num + 1]
 
 
-def _matched(
+def _match_pairs(
     pairs: Sequence[tuple[int, int]],
     keyframes: Sequence[KeyFrame],
     config: JoinConfig,
@@ -233,26 +234,26 @@ def _matched(
         )
         if match is not None:
             link = Link(source, target, match)
-            if keyframes[source].recording != keyframes[target].recording or is_within_reach(
+            if keyframes[source].recording != keyframes[target].recording or is_reachable(
                 link, keyframes, loops
             ):
                 links.append(link)
     return links
 
 
-def _in_order(link: Link, keyframes: Sequence[KeyFrame]) -> list[int]:
+def _order_ends(link: Link, keyframes: Sequence[KeyFrame]) -> list[int]:
     """Its end in the earlier sub-map, and that in the later."""
     return sorted((link.source, link.target), key=lambda i: keyframes[i].submap)
 
 
-def _estimates(
-    links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig
+def _compute_estimates(
+    links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _KeyFramePair, config: JoinConfig
 ) -> tuple[list[Rigid3], Float[np.ndarray, "n 6 6"]]:
     """first_from_second as each link says, and the covariances; the further along the sub-maps it
     is, the less exactly."""
     estimates, covariances, along = [], [], DriftConfig(config.drift, config.drift_deg)
     for link in links:
-        a, b = _in_order(link, keyframes)
+        a, b = _order_ends(link, keyframes)
         first_from_a = ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse()
         b_from_second = keyframes[b].cam_from_world @ ends.second.cam_from_world.inverse()
         a_from_b = link.match.target_from_source
@@ -260,8 +261,8 @@ def _estimates(
             config.sigma, config.sigma_deg
         )
         if link.source == a:
-            a_from_b, covariance = a_from_b.inverse(), covariance_of_inverse(a_from_b, covariance)
-        estimate, carried_covariance = carried(
+            a_from_b, covariance = a_from_b.inverse(), inverse_covariance(a_from_b, covariance)
+        estimate, carried_covariance = propagate_estimate(
             first_from_a, a_from_b, covariance, b_from_second, along
         )
         estimates.append(estimate)
@@ -269,24 +270,29 @@ def _estimates(
     return estimates, np.stack(covariances)
 
 
-def _is_seen_again(
-    consensus: TransformConsensus, keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig
+def _is_join_verified(
+    consensus: TransformConsensus,
+    keyframes: Sequence[KeyFrame],
+    ends: _KeyFramePair,
+    config: JoinConfig,
 ) -> bool:
     """Whether enough of what key frames of both sub-maps must see alike is matched, and not on one
     thing alone."""
-    loosely = replace(config.matching, min_inliers=_MIN_LOOSE, min_inlier_share=0.0)
+    loosely = replace(config.matching, min_inliers=_MIN_LOOSE_INLIERS, min_inlier_share=0.0)
     num_seen, num_found, num_covered = 0, 0, 0
-    for source, target, rows in _near_views(consensus.a_from_b, keyframes, ends, config):
+    for source, target, rows in _find_overlapping_views(
+        consensus.a_from_b, keyframes, ends, config
+    ):
         a, b = keyframes[source].place, keyframes[target].place
         assert a is not None
         assert b is not None
-        cells = _cells(a, keyframes[source], config)
+        cells = _compute_cells(a, keyframes[source], config)
         seen, found = (
             np.bincount(cells[rows], minlength=config.cells**2),
             np.zeros(config.cells**2, np.int64),
         )
         match = match_places(a, b, keyframes[target].stereo, loosely)
-        if match is not None and _is_as_joined(
+        if match is not None and _is_link_consistent(
             Link(source, target, match), consensus, keyframes, ends, config
         ):
             found = np.bincount(cells[np.intersect1d(match.source_rows, rows)], minlength=len(seen))
@@ -302,7 +308,9 @@ def _is_seen_again(
     return bool(num_seen >= config.min_seen_points and enough)
 
 
-def _cells(place: PlaceView, keyframe: KeyFrame, config: JoinConfig) -> Int[np.ndarray, " n"]:
+def _compute_cells(
+    place: PlaceFeatures, keyframe: KeyFrame, config: JoinConfig
+) -> Int[np.ndarray, " n"]:
     """In which cell of a grid over its picture each feature lies."""
     camera = keyframe.stereo.camera
     columns_rows = np.floor(
@@ -311,21 +319,24 @@ def _cells(place: PlaceView, keyframe: KeyFrame, config: JoinConfig) -> Int[np.n
     return np.clip(columns_rows, 0, config.cells - 1) @ [1, config.cells]
 
 
-def _is_as_joined(
+def _is_link_consistent(
     link: Link,
     consensus: TransformConsensus,
     keyframes: Sequence[KeyFrame],
-    ends: _Ends,
+    ends: _KeyFramePair,
     config: JoinConfig,
 ) -> bool:
-    estimates, covariances = _estimates([link], keyframes, ends, config)
+    estimates, covariances = _compute_estimates([link], keyframes, ends, config)
     residual = (estimates[0] @ consensus.a_from_b.inverse()).log()
     square = residual @ np.linalg.solve(covariances[0] + consensus.covariance, residual)
     return bool(square <= config.consensus.max_sigmas**2)
 
 
-def _near_views(
-    first_from_second: Rigid3, keyframes: Sequence[KeyFrame], ends: _Ends, config: JoinConfig
+def _find_overlapping_views(
+    first_from_second: Rigid3,
+    keyframes: Sequence[KeyFrame],
+    ends: _KeyFramePair,
+    config: JoinConfig,
 ) -> list[tuple[int, int, Int[np.ndarray, " n"]]]:
     """Source, target and the source's features that are seen alike, of the pairs of places that
     have most of these; both ways."""
@@ -352,19 +363,21 @@ def _near_views(
         ),
     )
     apart = np.linalg.norm(places[:, None] - other_places, axis=2)
-    nearest = np.argsort(np.where(turned > _MIN_TRACE, apart, np.inf), axis=None, kind="stable")[
-        : _LOOKED_AT * config.num_checked
-    ]
+    nearest = np.argsort(
+        np.where(turned > _MIN_ROTATION_TRACE, apart, np.inf), axis=None, kind="stable"
+    )[: _CANDIDATE_FACTOR * config.num_checked]
     views = []
     for a, b in np.column_stack(np.unravel_index(nearest, apart.shape)).tolist():
         b_from_a = first_from_others[b].inverse() @ first_from_ones[a]
         one, other = keyframes[ones[a]], keyframes[others[b]]
-        views += [(ones[a], others[b], _alike(one, other, b_from_a, config))]
-        views += [(others[b], ones[a], _alike(other, one, b_from_a.inverse(), config))]
+        views += [(ones[a], others[b], _find_covisible_features(one, other, b_from_a, config))]
+        views += [
+            (others[b], ones[a], _find_covisible_features(other, one, b_from_a.inverse(), config))
+        ]
     return sorted(views, key=lambda view: -len(view[2]))[: config.num_checked]
 
 
-def _alike(
+def _find_covisible_features(
     source: KeyFrame, target: KeyFrame, target_from_source: Rigid3, config: JoinConfig
 ) -> Int[np.ndarray, " n"]:
     """Which features of `source` lie within the picture of `target`, and are seen from about the

@@ -13,7 +13,7 @@ from topoloc.slam.keyframes import KeyFrame
 
 
 @dataclass(frozen=True, eq=False)
-class Triangulated:
+class TriangulatedPoints:
     """Of each point: where its rays come nearest to each other (world), how many there are, the
     widest angle between the first of them and another (radians), and the largest distance (pixels)
     from where a key frame sees it; infinite behind one. NaN where one ray is all."""
@@ -21,11 +21,11 @@ class Triangulated:
     points: Float[np.ndarray, "n 3"]
     num_rays: Int[np.ndarray, " n"]
     parallax: Float[np.ndarray, " n"]
-    worst_px: Float[np.ndarray, " n"]
+    max_reprojection_px: Float[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _RayObservations:
     """All observations of the points sought: row of the point, key frame, pixel, centre and unit
     direction of the ray in the world."""
 
@@ -36,28 +36,43 @@ class _Seen:
     directions: Float[np.ndarray, "m 3"]
 
 
-def triangulate(keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]) -> Triangulated:
+def triangulate_points(
+    keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]
+) -> TriangulatedPoints:
     """The points with these ids (in ascending order) by all that the key frames observe of them,
     active or not."""
-    seen, num = _gather(keyframes, ids), len(ids)
-    across = np.eye(3) - seen.directions[:, :, None] * seen.directions[:, None, :]
+    ray_observations, num = _collect_observations(keyframes, ids), len(ids)
+    across = (
+        np.eye(3)
+        - ray_observations.directions[:, :, None] * ray_observations.directions[:, None, :]
+    )
     normal, right = np.zeros((num, 3, 3)), np.zeros((num, 3))
-    np.add.at(normal, seen.rows, across)
-    np.add.at(right, seen.rows, np.einsum("mij,mj->mi", across, seen.centres))
-    num_rays = np.bincount(seen.rows, minlength=num)
+    np.add.at(normal, ray_observations.rows, across)
+    np.add.at(
+        right, ray_observations.rows, np.einsum("mij,mj->mi", across, ray_observations.centres)
+    )
+    num_rays = np.bincount(ray_observations.rows, minlength=num)
     solvable = (num_rays > 1) & (np.abs(np.linalg.det(normal)) > 1e-12)
     points = np.full((num, 3), np.nan)
     points[solvable] = np.linalg.solve(normal[solvable], right[solvable, :, None])[:, :, 0]
     first = np.zeros((num, 3))
-    first[seen.rows[::-1]] = seen.directions[::-1]
+    first[ray_observations.rows[::-1]] = ray_observations.directions[::-1]
     parallax, worst = np.zeros(num), np.where(solvable, 0.0, np.nan)
-    cosines = np.clip(np.sum(first[seen.rows] * seen.directions, axis=1), -1.0, 1.0)
-    np.maximum.at(parallax, seen.rows, np.arccos(cosines))
-    np.maximum.at(worst, seen.rows, _distances_px(keyframes, seen, points))
-    return Triangulated(points, num_rays, parallax, worst)
+    cosines = np.clip(
+        np.sum(first[ray_observations.rows] * ray_observations.directions, axis=1), -1.0, 1.0
+    )
+    np.maximum.at(parallax, ray_observations.rows, np.arccos(cosines))
+    np.maximum.at(
+        worst,
+        ray_observations.rows,
+        _compute_reprojection_errors(keyframes, ray_observations, points),
+    )
+    return TriangulatedPoints(points, num_rays, parallax, worst)
 
 
-def _gather(keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]) -> _Seen:
+def _collect_observations(
+    keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]
+) -> _RayObservations:
     parts: list[tuple[np.ndarray, ...]] = []
     for number, keyframe in enumerate(keyframes):
         observed = keyframe.observations
@@ -68,31 +83,33 @@ def _gather(keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]) -> _Seen:
         centres = np.tile(world_from_cam.translation, (len(chosen), 1))
         rows = np.searchsorted(ids, observed.landmark_ids[chosen])
         parts.append((rows, np.full(len(chosen), number), points_img, centres, directions))
-    return _Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return _RayObservations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _distances_px(
-    keyframes: Sequence[KeyFrame], seen: _Seen, points: Float[np.ndarray, "n 3"]
+def _compute_reprojection_errors(
+    keyframes: Sequence[KeyFrame],
+    ray_observations: _RayObservations,
+    points: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, " m"]:
-    distances = np.full(len(seen.rows), np.inf)
+    distances = np.full(len(ray_observations.rows), np.inf)
     for number, keyframe in enumerate(keyframes):
-        of_it = np.flatnonzero(seen.frames == number)
+        of_it = np.flatnonzero(ray_observations.frames == number)
         projected = keyframe.stereo.project(
-            keyframe.cam_from_world.apply(points[seen.rows[of_it]])
+            keyframe.cam_from_world.apply(points[ray_observations.rows[of_it]])
         )[:, :2]
         distances[of_it] = np.nan_to_num(
-            np.linalg.norm(projected - seen.points_img[of_it], axis=1), nan=np.inf
+            np.linalg.norm(projected - ray_observations.points_img[of_it], axis=1), nan=np.inf
         )
     return distances
 
 
-def is_clear(
-    found: Triangulated, min_rays: int, min_parallax: float, max_px: float
+def is_well_triangulated(
+    found: TriangulatedPoints, min_rays: int, min_parallax: float, max_px: float
 ) -> Bool[np.ndarray, " n"]:
     """Which points are known well enough to be believed."""
     with np.errstate(invalid="ignore"):
         return (
             (found.num_rays >= min_rays)
             & (found.parallax >= min_parallax)
-            & (found.worst_px <= max_px)
+            & (found.max_reprojection_px <= max_px)
         )

@@ -107,7 +107,7 @@ def predict_motion(
     return MotionState(t_ns, state.world_from_cam @ step, velocity, covariance)
 
 
-def surprise(
+def squared_mahalanobis(
     predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> float:
     """Squared Mahalanobis distance of a measured pose (its covariance of the right perturbation)

@@ -27,15 +27,15 @@ class PoseErrors:
     `depth` of the points, metres."""
 
     noise: Float[np.ndarray, "6 6"]
-    lasting: Float[np.ndarray, "6 6"]
+    correlated: Float[np.ndarray, "6 6"]
     depth: float
 
     @property
-    def whole(self) -> Float[np.ndarray, "6 6"]:
-        return self.noise + self.lasting
+    def total(self) -> Float[np.ndarray, "6 6"]:
+        return self.noise + self.correlated
 
 
-def errors_of(found: Localization, depth: float, floor_share: float) -> PoseErrors:
+def compute_pose_errors(found: Localization, depth: float, floor_share: float) -> PoseErrors:
     """The two parts, of points at this depth (metres); the noise is not below `noise_floor`."""
     noise = found.noise_share * found.camera_covariance
     return PoseErrors(
@@ -49,7 +49,7 @@ def noise_floor(depth: float, share: float) -> Float[np.ndarray, "6 6"]:
     return np.diag(np.repeat([(share * depth) ** 2, share**2], 3))
 
 
-def lasting_change(
+def compute_correlated_change(
     errors: PoseErrors, cam_from_before: Rigid3, reach: float
 ) -> Float[np.ndarray, "6 6"]:
     """The covariance by which the lasting part differs from that of another picture,
@@ -57,4 +57,4 @@ def lasting_change(
     moved = (
         float(np.linalg.norm(cam_from_before.translation)) / errors.depth + cam_from_before.angle()
     )
-    return 2.0 * (1.0 - np.exp(-moved / reach)) * errors.lasting
+    return 2.0 * (1.0 - np.exp(-moved / reach)) * errors.correlated

@@ -31,8 +31,8 @@ from topoloc.tracking.motion import (
     MotionConfig,
     MotionState,
     predict_motion,
+    squared_mahalanobis,
     start_motion,
-    surprise,
     update_motion,
 )
 
@@ -96,57 +96,58 @@ class _Hypothesis:
     picture at hand.
 
     `from_best` takes poses of the best hypothesis into those of this one, whatever the motion since
-    they were compared. `taken` is the number of the candidate that it took of this picture's, None
-    where none.
+    they were compared. `candidate_idx` is the number of the candidate that it took of this
+    picture's, None where none.
     """
 
     state: MotionState
     odom_from_cam: Rigid3 | None
-    now: MotionState
+    current: MotionState
     weight: float
     node_id: int
     from_best: Rigid3
-    taken: int | None
+    candidate_idx: int | None
 
 
 class PoseHypotheses:
     """The hypotheses, the heaviest first, and the weight of "elsewhere"; all weights sum to one.
 
-    `continues`: the heaviest one is the one that was so before this picture, or follows from it.
+    `is_track_continued`: the heaviest one is the one that was so before this picture, or follows
+    from it.
     """
 
     def __init__(self, config: HypothesesConfig) -> None:
         self.config = config
-        self.forget()
+        self.clear()
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Nothing is known."""
-        self._alive: list[_Hypothesis] = []
-        self._elsewhere, self.continues = 1.0, False
+        self._ranked: list[_Hypothesis] = []
+        self._null_weight, self.is_track_continued = 1.0, False
 
     @property
     def best(self) -> MotionState | None:
         """The heaviest hypothesis at the picture at hand; None where the camera is lost."""
-        return self._alive[0].now if self._alive else None
+        return self._ranked[0].current if self._ranked else None
 
     @property
-    def taken(self) -> int | None:
+    def candidate_idx(self) -> int | None:
         """The number of the candidate that the heaviest hypothesis took."""
-        return self._alive[0].taken if self._alive else None
+        return self._ranked[0].candidate_idx if self._ranked else None
 
     @property
-    def is_decided(self) -> bool:
+    def is_unambiguous(self) -> bool:
         """Whether one pose leads clearly, or there is none at all."""
-        return not self._alive or self.alternatives()[0].probability >= self.config.min_probability
+        return not self._ranked or self.alternatives()[0].probability >= self.config.min_probability
 
     def alternatives(self) -> tuple[Alternative, ...]:
         """The poses at the picture at hand, the likeliest first; hypotheses of one pose that differ
         in their velocity are one."""
         found: list[Alternative] = []
-        for one in self._alive:
-            pose = one.now.world_from_cam
+        for one in self._ranked:
+            pose = one.current.world_from_cam
             known = next(
-                (k for k, other in enumerate(found) if is_same_place(other.world_from_cam, pose)),
+                (k for k, other in enumerate(found) if is_same_pose(other.world_from_cam, pose)),
                 None,
             )
             if known is None:
@@ -159,14 +160,14 @@ class PoseHypotheses:
 
     def seconds_since(self, t_ns: int) -> float:
         """Seconds from the pose measured last to this time; infinite where there is none."""
-        return (t_ns - self._alive[0].state.t_ns) / 1e9 if self._alive else float("inf")
+        return (t_ns - self._ranked[0].state.t_ns) / 1e9 if self._ranked else float("inf")
 
     def predict(self, t_ns: int, odom_from_cam: Rigid3 | None = None) -> MotionState | None:
         """Where the best hypothesis has the camera at this time; those not measured for too long
         are given up."""
-        config, before, alive = self.config, self._alive, list[_Hypothesis]()
+        config, before, alive = self.config, self._ranked, list[_Hypothesis]()
         for one in before:
-            before_from_cam = _since(one.odom_from_cam, odom_from_cam)
+            before_from_cam = _relative_odometry(one.odom_from_cam, odom_from_cam)
             limit = (
                 config.max_predicted
                 if before_from_cam is None
@@ -176,32 +177,33 @@ class PoseHypotheses:
                 alive.append(
                     replace(
                         one,
-                        now=predict_motion(one.state, t_ns, config.motion, before_from_cam),
-                        taken=None,
+                        current=predict_motion(one.state, t_ns, config.motion, before_from_cam),
+                        candidate_idx=None,
                     )
                 )
-        self.continues = bool(alive) and alive[0].state is before[0].state
+        self.is_track_continued = bool(alive) and alive[0].state is before[0].state
         left = sum(one.weight for one in alive)
-        self._keep(
-            alive if self.continues or left > 0.5 else [], 1.0 - left
+        self._prune(
+            alive if self.is_track_continued or left > 0.5 else [], 1.0 - left
         )  # who was given up is elsewhere: what is left beside it is no belief
         return self.best
 
-    def follows(
+    def is_consistent(
         self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
     ) -> bool:
         """Whether this pose can follow from a prediction."""
         return (
-            self._slack_surprise(predicted, world_from_cam, covariance) <= self.config.max_surprise
+            self._compute_gated_distance(predicted, world_from_cam, covariance)
+            <= self.config.max_surprise
         )
 
-    def _slack_surprise(
+    def _compute_gated_distance(
         self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
     ) -> float:
         slack = (self.config.prediction_scale**2 - 1.0) * predicted.pose_covariance
-        return surprise(predicted, world_from_cam, covariance + slack)
+        return squared_mahalanobis(predicted, world_from_cam, covariance + slack)
 
-    def move(
+    def apply_motion(
         self,
         world_from_cam: Rigid3,
         covariance: Float[np.ndarray, "6 6"],
@@ -209,16 +211,18 @@ class PoseHypotheses:
     ) -> None:
         """Followed points show the best hypothesis at this pose, and so each other one where the
         same motion takes it."""
-        for k, one in enumerate(self._alive):
-            now = update_motion(one.now, one.from_best @ world_from_cam, covariance)
-            self._alive[k] = replace(one, state=now, now=now, odom_from_cam=odom_from_cam)
+        for k, one in enumerate(self._ranked):
+            current = update_motion(one.current, one.from_best @ world_from_cam, covariance)
+            self._ranked[k] = replace(
+                one, state=current, current=current, odom_from_cam=odom_from_cam
+            )
 
-    def weigh(
+    def update_weights(
         self,
         t_ns: int,
         candidates: Sequence[Candidate],
         odom_from_cam: Rigid3 | None = None,
-        share_new: float = 1.0,
+        new_evidence_ratio: float = 1.0,
     ) -> None:
         """What the picture's answer makes of the hypotheses, if this share of what it says is new.
 
@@ -226,9 +230,9 @@ class PoseHypotheses:
         little likelier.
         """
         if not candidates:
-            self._keep(
-                [replace(one, weight=self.config.refused * one.weight) for one in self._alive],
-                self._elsewhere,
+            self._prune(
+                [replace(one, weight=self.config.refused * one.weight) for one in self._ranked],
+                self._null_weight,
             )
             return
         before, miss = (
@@ -236,27 +240,31 @@ class PoseHypotheses:
             self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous,
         )
         none = max(miss, 1.0 - sum(one.probability for one in candidates))
-        new = self._agreed(candidates[0], odom_from_cam, share_new) if len(candidates) == 1 else []
-        for one in self._alive:
-            if new and self.follows(
-                one.now, candidates[0].world_from_cam, candidates[0].covariance
+        new = (
+            self._merge_consistent(candidates[0], odom_from_cam, new_evidence_ratio)
+            if len(candidates) == 1
+            else []
+        )
+        for one in self._ranked:
+            if new and self.is_consistent(
+                one.current, candidates[0].world_from_cam, candidates[0].covariance
             ):
                 continue  # it is that one
-            taking = [
-                self._taking(one, number, candidate, odom_from_cam)
+            updated = [
+                self._update_with_candidate(one, number, candidate, odom_from_cam)
                 for number, candidate in enumerate(candidates)
             ]
-            children = [child for child in taking if child is not None]
+            children = [child for child in updated if child is not None]
             children.append(replace(one, weight=one.weight * none))
             gain = sum(child.weight for child in children) / one.weight
             new += [
-                replace(child, weight=child.weight * gain ** (share_new - 1.0))
+                replace(child, weight=child.weight * gain ** (new_evidence_ratio - 1.0))
                 for child in children
             ]
         for number, candidate in enumerate(candidates):
-            weight = self._elsewhere * candidate.probability * share_new
+            weight = self._null_weight * candidate.probability * new_evidence_ratio
             heaviest = max(
-                (one for one in new if one.taken == number),
+                (one for one in new if one.candidate_idx == number),
                 key=lambda one: one.weight,
                 default=None,
             )
@@ -277,49 +285,55 @@ class PoseHypotheses:
                         number,
                     )
                 )
-        self._keep(_merged(new), self._elsewhere * none**share_new)
-        best = self._alive[0].now
-        self.continues = before is not None and self.follows(
+        self._prune(_merge_duplicates(new), self._null_weight * none**new_evidence_ratio)
+        best = self._ranked[0].current
+        self.is_track_continued = before is not None and self.is_consistent(
             before, best.world_from_cam, best.pose_covariance
         )
-        self._compare()
+        self._update_relative_poses()
 
-    def correct(self, state: MotionState, odom_from_cam: Rigid3 | None) -> None:
+    def set_best_state(self, state: MotionState, odom_from_cam: Rigid3 | None) -> None:
         """The heaviest hypothesis is in this state: its pose is known better than from the
         candidate that it took."""
-        self._alive[0] = replace(
-            self._alive[0], state=state, now=state, odom_from_cam=odom_from_cam
+        self._ranked[0] = replace(
+            self._ranked[0], state=state, current=state, odom_from_cam=odom_from_cam
         )
-        self._compare()
+        self._update_relative_poses()
 
-    def _agreed(
-        self, candidate: Candidate, odom_from_cam: Rigid3 | None, share_new: float
+    def _merge_consistent(
+        self, candidate: Candidate, odom_from_cam: Rigid3 | None, new_evidence_ratio: float
     ) -> list[_Hypothesis]:
         """The hypotheses that a sure pose follows from, as one: there they all are. The motion is
         that of the likeliest of them."""
         pose, covariance = candidate.world_from_cam, candidate.covariance
         weight, likeliest = 0.0, (-math.inf, None)
-        for one in self._alive:
-            if (taking := self._taking(one, 0, candidate, odom_from_cam)) is not None:
-                surprised = math.exp(-0.5 * self._slack_surprise(one.now, pose, covariance))
-                weight += one.weight * (candidate.probability * surprised) ** share_new
-                spread = float(np.linalg.slogdet(one.now.pose_covariance + covariance)[1])
-                density = math.log(one.weight) - 0.5 * (
-                    surprise(one.now, pose, covariance) + spread
+        for one in self._ranked:
+            if (
+                updated := self._update_with_candidate(one, 0, candidate, odom_from_cam)
+            ) is not None:
+                surprised = math.exp(
+                    -0.5 * self._compute_gated_distance(one.current, pose, covariance)
                 )
-                likeliest = max(likeliest, (density, taking), key=lambda pair: pair[0])
+                weight += one.weight * (candidate.probability * surprised) ** new_evidence_ratio
+                spread = float(np.linalg.slogdet(one.current.pose_covariance + covariance)[1])
+                density = math.log(one.weight) - 0.5 * (
+                    squared_mahalanobis(one.current, pose, covariance) + spread
+                )
+                likeliest = max(likeliest, (density, updated), key=lambda pair: pair[0])
         return [] if likeliest[1] is None else [replace(likeliest[1], weight=weight)]
 
-    def _taking(
+    def _update_with_candidate(
         self, one: _Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
     ) -> _Hypothesis | None:
         """The hypothesis that the picture was taken there, less likely the more that surprises;
         None where it does not follow."""
         pose, covariance = candidate.world_from_cam, candidate.covariance
-        if not self.follows(one.now, pose, covariance):
+        if not self.is_consistent(one.current, pose, covariance):
             return None
-        state = update_motion(one.now, pose, covariance)
-        likelihood = max(math.exp(-0.5 * surprise(one.now, pose, covariance)), 1e-100)
+        state = update_motion(one.current, pose, covariance)
+        likelihood = max(
+            math.exp(-0.5 * squared_mahalanobis(one.current, pose, covariance)), 1e-100
+        )
         return _Hypothesis(
             state,
             odom_from_cam,
@@ -330,35 +344,36 @@ class PoseHypotheses:
             number,
         )
 
-    def _keep(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:
+    def _prune(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:
         """The heaviest of these."""
         config = self.config
         whole = sum(one.weight for one in hypotheses) + elsewhere
         heaviest = sorted(hypotheses, key=lambda one: -one.weight)[: config.max_number]
         kept = [one for one in heaviest if one.weight >= config.min_weight * whole] or heaviest[:1]
-        self._elsewhere = max(elsewhere / whole, config.elsewhere) if kept else 1.0
-        share = (1.0 - self._elsewhere) / max(sum(one.weight for one in kept), 1e-300)
-        self._alive = [replace(one, weight=share * one.weight) for one in kept]
+        self._null_weight = max(elsewhere / whole, config.elsewhere) if kept else 1.0
+        share = (1.0 - self._null_weight) / max(sum(one.weight for one in kept), 1e-300)
+        self._ranked = [replace(one, weight=share * one.weight) for one in kept]
 
-    def _compare(self) -> None:
+    def _update_relative_poses(self) -> None:
         """From where the best hypothesis is to where each is."""
-        best_from_world = self._alive[0].now.world_from_cam.inverse()
-        self._alive = [
-            replace(one, from_best=one.now.world_from_cam @ best_from_world) for one in self._alive
+        best_from_world = self._ranked[0].current.world_from_cam.inverse()
+        self._ranked = [
+            replace(one, from_best=one.current.world_from_cam @ best_from_world)
+            for one in self._ranked
         ]
 
 
-def _merged(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
+def _merge_duplicates(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
     """Those that agree in pose and velocity become one, of what was measured now where there is a
     choice."""
     kept: list[_Hypothesis] = []
     least = 1e-4 * max(one.weight for one in hypotheses)
     for one in sorted(
         (one for one in hypotheses if one.weight > least),
-        key=lambda one: (one.taken is None, -one.weight),
+        key=lambda one: (one.candidate_idx is None, -one.weight),
     ):
         same = next(
-            (k for k, other in enumerate(kept) if _is_same_motion(one.now, other.now)), None
+            (k for k, other in enumerate(kept) if _is_same_motion(one.current, other.current)), None
         )
         if same is None:
             kept.append(one)
@@ -376,12 +391,14 @@ def _is_same_motion(a: MotionState, b: MotionState) -> bool:
     return float(error @ np.linalg.solve(a.covariance + b.covariance, error)) < 6.0
 
 
-def is_same_place(a: Rigid3, b: Rigid3) -> bool:
+def is_same_pose(a: Rigid3, b: Rigid3) -> bool:
     """As near as two right answers can be (`Localization.probability`)."""
     return translation_error(a, b) < 0.25 and (a.inverse() @ b).angle() < math.radians(5.0)
 
 
-def _since(odom_from_before: Rigid3 | None, odom_from_cam: Rigid3 | None) -> Rigid3 | None:
+def _relative_odometry(
+    odom_from_before: Rigid3 | None, odom_from_cam: Rigid3 | None
+) -> Rigid3 | None:
     """The motion that external odometry saw, where it was there both times."""
     if odom_from_before is None or odom_from_cam is None:
         return None

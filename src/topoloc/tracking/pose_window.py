@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from topoloc.bounds import Between
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimise_graph
+from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimize_pose_graph
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,6 @@ class PoseWindow:
             for k, entry in enumerate(self._entries, start=1)
             if k > 1
         ]
-        poses = optimise_graph([Rigid3.identity(), *self._smoothed], edges, self._config.graph)
+        poses = optimize_pose_graph([Rigid3.identity(), *self._smoothed], edges, self._config.graph)
         self._smoothed = deque(poses[1:], maxlen=self._config.size)
         return self._smoothed[-1], self._covariance

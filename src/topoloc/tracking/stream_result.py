@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import Localization, NotLocalized, pose_json
+from topoloc.localization.result import Localization, NotLocalized, pose_to_json
 
 State = Literal["localized", "tracked", "predicted", "ambiguous", "lost"]
 
@@ -39,7 +39,7 @@ class StreamedPose:
 
     def to_json(self, query: str) -> dict[str, Any]:
         """One line of the result file, see docs/cli.md."""
-        smoothed = None if self.smoothed is None else pose_json(self.smoothed)
+        smoothed = None if self.smoothed is None else pose_to_json(self.smoothed)
         covariance = None if self.smoothed_covariance is None else self.smoothed_covariance.tolist()
         streamed = {
             "t_ns": self.t_ns,

@@ -10,20 +10,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
-from topoloc.atlas.open_maps import OpenedMap
+from topoloc.atlas.map_cache import CachedMap
 from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
-from topoloc.localization.query import check_size
+from topoloc.localization.query import check_image_size
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.recordings.frame_checks import time_problem
+from topoloc.recordings.frame_checks import find_time_problem
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker, TrackerConfig
 
-_ASK_EVERY_NS = 1_000_000_000
+_QUERY_INTERVAL_NS = 1_000_000_000
 """The atlas is asked again where nothing was known for so long: a refusal costs as much as a dozen
 tracked pictures or more."""
-_KNOWN = ("localized", "tracked")
+_LOCALIZED_STATES = ("localized", "tracked")
 
 
 class TileTracker:
@@ -35,9 +35,9 @@ class TileTracker:
 
     def __init__(self, localizer: AtlasLocalizer, config: TrackerConfig | None = None) -> None:
         self.localizer, self.config = localizer, config or TrackerConfig()
-        self._tile: tuple[str, OpenedMap, Tracker] | None = None
+        self._tile: tuple[str, CachedMap, Tracker] | None = None
         self._t_ns: int | None = None
-        self._asked_ns = self._known_ns = -_ASK_EVERY_NS
+        self._last_query_ns = self._last_localized_ns = -_QUERY_INTERVAL_NS
 
     def process(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
         """Where was this picture, the next of the stream, taken?
@@ -50,41 +50,46 @@ class TileTracker:
             AtlasError: no tile can be read.
             StoreError: the object store does not answer.
         """
-        check_size(image, camera)
-        self._advance(t_ns)
+        check_image_size(image, camera)
+        self._check_time(t_ns)
         answer = (
-            None if self._tile is None else self._named(self._tile[2].process(image, camera, t_ns))
+            None
+            if self._tile is None
+            else self._add_tile(self._tile[2].process(image, camera, t_ns))
         )
-        if answer is not None and answer.state in _KNOWN:
-            self._known_ns = t_ns
+        if answer is not None and answer.state in _LOCALIZED_STATES:
+            self._last_localized_ns = t_ns
             return answer
-        if t_ns - max(self._known_ns, self._asked_ns) < _ASK_EVERY_NS and answer is not None:
+        if (
+            t_ns - max(self._last_localized_ns, self._last_query_ns) < _QUERY_INTERVAL_NS
+            and answer is not None
+        ):
             return answer
-        self._asked_ns = t_ns
+        self._last_query_ns = t_ns
         result = self.localizer.localize(image, camera, t_ns=t_ns)
         if not isinstance(result, Localization):
             return answer or StreamedPose(
                 t_ns, "ambiguous" if result.reason == "ambiguous" else "lost", result
             )
         assert result.provenance.tile is not None, "an atlas names the tile of its answer"
-        return self._begun(result.provenance.tile, image, camera, t_ns)
+        return self._start_tile(result.provenance.tile, image, camera, t_ns)
 
-    def miss(self, t_ns: int, result: NotLocalized) -> StreamedPose:
+    def process_missing(self, t_ns: int, result: NotLocalized) -> StreamedPose:
         """The answer to a picture that could not be read. Raises QueryError as of
-        `Tracker.miss`."""
-        self._advance(t_ns)
+        `Tracker.process_missing`."""
+        self._check_time(t_ns)
         if self._tile is None:
-            return StreamedPose(t_ns, "lost", self.localizer.completed(result, t_ns))
-        return self._named(self._tile[2].miss(t_ns, result))
+            return StreamedPose(t_ns, "lost", self.localizer.with_provenance(result, t_ns))
+        return self._add_tile(self._tile[2].process_missing(t_ns, result))
 
     def close(self) -> None:
         """Forget the stream; the tile that was followed may be closed."""
         if self._tile is not None:
-            self.localizer.give_back(self._tile[1])
+            self.localizer.release_map(self._tile[1])
         self._tile = None
 
-    def _advance(self, t_ns: int) -> None:
-        if problem := time_problem(t_ns):
+    def _check_time(self, t_ns: int) -> None:
+        if problem := find_time_problem(t_ns):
             raise QueryError(problem)
         if self._t_ns is not None and t_ns < self._t_ns:
             raise QueryError(
@@ -93,15 +98,15 @@ class TileTracker:
             )
         self._t_ns = t_ns
 
-    def _begun(self, tile_id: str, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
+    def _start_tile(self, tile_id: str, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
         """The stream followed anew, in this tile."""
         self.close()
-        opened = self.localizer.lend(tile_id)
+        opened = self.localizer.acquire_map(tile_id)
         self._tile = tile_id, opened, Tracker(opened.localizer, self.config)
-        answer = self._named(self._tile[2].process(image, camera, t_ns))
-        self._known_ns = t_ns
+        answer = self._add_tile(self._tile[2].process(image, camera, t_ns))
+        self._last_localized_ns = t_ns
         return answer
 
-    def _named(self, answer: StreamedPose) -> StreamedPose:
+    def _add_tile(self, answer: StreamedPose) -> StreamedPose:
         assert self._tile is not None
         return replace(answer, result=self.localizer.named(answer.result, self._tile[0]))

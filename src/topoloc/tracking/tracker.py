@@ -28,25 +28,30 @@ from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import StageClock, check_size
-from topoloc.localization.result import Localization, NotLocalized, at_time
-from topoloc.recordings.frame_checks import time_problem
-from topoloc.recordings.pictures import grey_image
+from topoloc.localization.query import StageClock, check_image_size
+from topoloc.localization.result import Localization, NotLocalized, with_time
+from topoloc.recordings.frame_checks import find_time_problem
+from topoloc.recordings.image_io import to_grey
 from topoloc.retrieval.coarse import Image
-from topoloc.tracking.following import Followed, FollowingConfig, PointFollower
 from topoloc.tracking.motion import MotionState, update_motion
-from topoloc.tracking.pose_errors import lasting_change, noise_floor
+from topoloc.tracking.point_tracker import PointTracker, PointTrackerConfig, TrackedMotion
+from topoloc.tracking.pose_errors import compute_correlated_change, noise_floor
 from topoloc.tracking.pose_hypotheses import HypothesesConfig, PoseHypotheses
 from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
+from topoloc.tracking.stream_localizer import (
+    ExpectedPose,
+    LocalizedPose,
+    StreamLocalizer,
+    reject_jump,
+)
 from topoloc.tracking.stream_result import StreamedPose
-from topoloc.tracking.stream_search import Expected, Found, StreamSearch, refused
 from topoloc.tracking.tracker_state import (
-    Reference,
-    StreamPicture,
-    doubt_of,
-    followed_covariance,
-    reduced,
-    smoothed_covariance,
+    ReferenceImage,
+    StreamFrame,
+    compute_direction_uncertainty,
+    compute_motion_covariance,
+    compute_smoothed_covariance,
+    downscale_image,
 )
 
 
@@ -61,7 +66,7 @@ class TrackerConfig:
     """mode "paper": metres from one pose to the next beyond which the new one is refused (the
     paper: 1 to 5, by the size of the place)."""
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
-    following: FollowingConfig = field(default_factory=FollowingConfig)
+    following: PointTrackerConfig = field(default_factory=PointTrackerConfig)
     window: PoseWindowConfig = field(default_factory=PoseWindowConfig)
     max_side_px: Annotated[int, Between(64, 16_384)] = 800
     """Points are followed in pictures reduced to this width or height."""
@@ -100,7 +105,9 @@ class Tracker:
             PoseHypotheses(self.config.hypotheses),
             PoseWindow(self.config.window),
         )
-        self._search = StreamSearch(localizer, self._hypotheses, self.config.floor_share)
+        self._stream_localizer = StreamLocalizer(
+            localizer, self._hypotheses, self.config.floor_share
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -108,9 +115,9 @@ class Tracker:
         self._t_ns: int | None = None
         self._image: np.ndarray | None = None
         self._answer: StreamedPose | None = None
-        self._reference: Reference | None = None
-        self._attempt_ns = 0
-        self._hypotheses.forget()
+        self._reference: ReferenceImage | None = None
+        self._last_attempt_ns = 0
+        self._hypotheses.clear()
         self._window.clear()
 
     def process(
@@ -128,23 +135,28 @@ class Tracker:
             QueryError: the clock goes backwards, stands still or is not in integer nanoseconds; the
                 image is no picture of 8 bits; the camera is of another image size.
         """
-        check_size(image, camera)
+        check_image_size(image, camera)
         is_same = self._image is not None and np.array_equal(self._image, image)
-        self._advance(t_ns, may_stand_still=is_same)
+        self._check_time(t_ns, is_repeat_allowed=is_same)
         if is_same and self._answer is not None:
             return replace(
-                self._answer, t_ns=t_ns, result=at_time(self._answer.result, t_ns), is_repeated=True
+                self._answer,
+                t_ns=t_ns,
+                result=with_time(self._answer.result, t_ns),
+                is_repeated=True,
             )
         self._image = image.copy()  # who reads a camera may read into the same memory again
         if self.config.mode == "paper":
-            answer = self._by_paper(image, camera, t_ns)
+            answer = self._process_paper_mode(image, camera, t_ns)
         else:
-            grey = reduced(grey_image(image), camera, self.config.max_side_px)
-            answer = self._by_motion(StreamPicture(image, camera, t_ns, odom_from_cam, *grey))
-        self._answer = self._completed(answer, camera)
+            grey = downscale_image(to_grey(image), camera, self.config.max_side_px)
+            answer = self._process_motion_mode(
+                StreamFrame(image, camera, t_ns, odom_from_cam, *grey)
+            )
+        self._answer = self._complete_result(answer, camera)
         return self._answer
 
-    def miss(
+    def process_missing(
         self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None
     ) -> StreamedPose:
         """The answer to a picture that could not be read: predicted, where the motion is known.
@@ -152,22 +164,26 @@ class Tracker:
         Raises:
             QueryError: the clock goes backwards or stands still.
         """
-        self._advance(t_ns)
+        self._check_time(t_ns)
         self._image = None
         if self.config.mode == "paper":
-            return self._completed(self._copied(result, t_ns))
+            return self._complete_result(self._copy_previous_pose(result, t_ns))
         self._hypotheses.predict(t_ns, odom_from_cam)
-        self._keep_reference()
-        return self._completed(self._decided(self._without_pose(result, t_ns)))
+        self._drop_stale_reference()
+        return self._complete_result(
+            self._mark_if_ambiguous(self._make_predicted_pose(result, t_ns))
+        )
 
-    def _completed(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
-        return replace(answer, result=self.localizer.completed(answer.result, camera, answer.t_ns))
+    def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
+        return replace(
+            answer, result=self.localizer.with_provenance(answer.result, camera, answer.t_ns)
+        )
 
-    def _advance(self, t_ns: int, may_stand_still: bool = False) -> None:
-        if problem := time_problem(t_ns):
+    def _check_time(self, t_ns: int, is_repeat_allowed: bool = False) -> None:
+        if problem := find_time_problem(t_ns):
             raise QueryError(problem)
         if self._t_ns is not None and (
-            t_ns < self._t_ns or (t_ns == self._t_ns and not may_stand_still)
+            t_ns < self._t_ns or (t_ns == self._t_ns and not is_repeat_allowed)
         ):
             what = "stands still" if t_ns == self._t_ns else "goes backwards"
             raise QueryError(
@@ -176,57 +192,61 @@ class Tracker:
             )
         self._t_ns = t_ns
 
-    def _by_paper(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
+    def _process_paper_mode(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
         """Section III-B: "when such a jump is found, we copy the previous pose from the
         trajectory"."""
         result = self.localizer.localize(image, camera)
         if not isinstance(result, Localization):
-            return self._copied(result, t_ns)
+            return self._copy_previous_pose(result, t_ns)
         previous = self._answer.smoothed if self._answer is not None else None
         if (
             previous is not None
             and np.linalg.norm(result.world_from_cam.translation - previous.translation)
             > self.config.max_jump
         ):
-            return self._copied(refused(result), t_ns)
+            return self._copy_previous_pose(reject_jump(result), t_ns)
         return StreamedPose(t_ns, "localized", result, result.world_from_cam, result.covariance)
 
-    def _copied(self, result: NotLocalized, t_ns: int) -> StreamedPose:
+    def _copy_previous_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
         previous = self._answer.smoothed if self._answer is not None else None
         return StreamedPose(t_ns, "lost" if previous is None else "predicted", result, previous)
 
-    def _by_motion(self, picture: StreamPicture) -> StreamedPose:
+    def _process_motion_mode(self, frame: StreamFrame) -> StreamedPose:
         clock = StageClock()
-        seconds = self._hypotheses.seconds_since(picture.t_ns)
-        predicted = self._hypotheses.predict(picture.t_ns, picture.odom_from_cam)
-        self._keep_reference()
+        seconds = self._hypotheses.seconds_since(frame.t_ns)
+        predicted = self._hypotheses.predict(frame.t_ns, frame.odom_from_cam)
+        self._drop_stale_reference()
         with clock.stage("tracking"):
-            followed = self._follow(picture, predicted)
-        if followed is not None:
-            self._hypotheses.move(
-                self._blended(followed, picture.t_ns).inverse(),
-                followed.covariance,
-                picture.odom_from_cam,
+            tracked_motion = self._track_points(frame, predicted)
+        if tracked_motion is not None:
+            self._hypotheses.apply_motion(
+                self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse(),
+                tracked_motion.covariance,
+                frame.odom_from_cam,
             )
-        if followed is None or self._is_due(followed, picture):
-            self._attempt_ns = picture.t_ns
-            found = self._search.find(picture, self._expected(predicted, followed))
-            self._keep_reference()
-            if isinstance(found, Found):
-                return self._decided(self._believe(picture, found, predicted, followed, seconds))
-            if followed is None or self._reference is None:
-                return self._decided(self._without_pose(found, picture.t_ns))
-        return self._decided(self._tracked(picture, followed, clock))
+        if tracked_motion is None or self._is_localization_due(tracked_motion, frame):
+            self._last_attempt_ns = frame.t_ns
+            found = self._stream_localizer.localize(
+                frame, self._predict_pose(predicted, tracked_motion)
+            )
+            self._drop_stale_reference()
+            if isinstance(found, LocalizedPose):
+                return self._mark_if_ambiguous(
+                    self._update_with_localization(frame, found, predicted, tracked_motion, seconds)
+                )
+            if tracked_motion is None or self._reference is None:
+                return self._mark_if_ambiguous(self._make_predicted_pose(found, frame.t_ns))
+        return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked_motion, clock))
 
-    def _keep_reference(self) -> None:
+    def _drop_stale_reference(self) -> None:
         """Only while its hypothesis is the heaviest."""
-        if not self._hypotheses.continues:
+        if not self._hypotheses.is_track_continued:
             self._reference = None
             self._window.clear()
 
-    def _decided(self, answer: StreamedPose) -> StreamedPose:
+    def _mark_if_ambiguous(self, answer: StreamedPose) -> StreamedPose:
         """The answer where one hypothesis leads; else that it may be any of them."""
-        if self._hypotheses.is_decided:
+        if self._hypotheses.is_unambiguous:
             return answer
         alternatives = self._hypotheses.alternatives()
         detail = (
@@ -246,106 +266,123 @@ class Tracker:
         )
         return StreamedPose(answer.t_ns, "ambiguous", result)
 
-    def _follow(self, picture: StreamPicture, predicted: MotionState | None) -> Followed | None:
+    def _track_points(
+        self, frame: StreamFrame, predicted: MotionState | None
+    ) -> TrackedMotion | None:
         """The points followed into this picture; None where they are lost or lead where the camera
         cannot be."""
         reference = self._reference
-        if (
-            reference is None
-            or predicted is None
-            or reference.follower.camera != picture.grey_camera
-        ):
+        if reference is None or predicted is None or reference.follower.camera != frame.grey_camera:
             return None
-        followed = reference.follower.follow(picture.grey, predicted.world_from_cam.inverse())
-        if followed is None:
+        tracked_motion = reference.follower.track_points(
+            frame.grey, predicted.world_from_cam.inverse()
+        )
+        if tracked_motion is None:
             return None
-        world_from_cam = self._blended(followed, picture.t_ns).inverse()
+        world_from_cam = self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse()
         floor = noise_floor(reference.errors.depth, self.config.floor_share)
         return (
-            followed
-            if self._hypotheses.follows(predicted, world_from_cam, followed.covariance + floor)
+            tracked_motion
+            if self._hypotheses.is_consistent(
+                predicted, world_from_cam, tracked_motion.covariance + floor
+            )
             else None
         )
 
-    def _is_due(self, followed: Followed, picture: StreamPicture) -> bool:
+    def _is_localization_due(self, tracked_motion: TrackedMotion, frame: StreamFrame) -> bool:
         """Whether it is time to localize in full."""
         config, reference = self.config, self._reference
         assert reference is not None
-        if not self._hypotheses.is_decided:
+        if not self._hypotheses.is_unambiguous:
             return True
-        if picture.t_ns - self._attempt_ns < config.retry_after * 1e9:
+        if frame.t_ns - self._last_attempt_ns < config.retry_after * 1e9:
             return False
-        is_old = picture.t_ns - reference.t_ns >= config.localize_every * 1e9
+        is_old = frame.t_ns - reference.t_ns >= config.localize_every * 1e9
         return (
             is_old
-            or followed.share_left < config.min_share_left
-            or followed.shift_px > config.max_shift * picture.grey_camera.width
+            or tracked_motion.tracked_ratio < config.min_share_left
+            or tracked_motion.shift_px > config.max_shift * frame.grey_camera.width
         )
 
-    def _expected(
-        self, predicted: MotionState | None, followed: Followed | None
-    ) -> Expected | None:
+    def _predict_pose(
+        self, predicted: MotionState | None, tracked_motion: TrackedMotion | None
+    ) -> ExpectedPose | None:
         """About where the picture was taken; a followed pose is wrong by its reference's errors and
         by wrong depths, too."""
         reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
         if reference is None or predicted is None:
             return None
-        if followed is None:
-            is_known = doubt_of(predicted, reference.errors.depth) <= self.config.max_doubt
-            return Expected(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
-        motion, scale = followed.cam_from_ref.adjoint(), self.config.hypotheses.prediction_scale**2
-        doubt = motion @ reference.errors.whole @ motion.T + scale * followed_covariance(
-            followed, self.config.followed_share
+        if tracked_motion is None:
+            is_known = (
+                compute_direction_uncertainty(predicted, reference.errors.depth)
+                <= self.config.max_doubt
+            )
+            return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
+        motion, scale = (
+            tracked_motion.cam_from_ref.adjoint(),
+            self.config.hypotheses.prediction_scale**2,
         )
-        near = (followed.cam_from_ref @ reference.cam_from_world).inverse()
-        return Expected(
-            near, doubt, is_alone, is_followed=True, is_from_walls=reference.found.is_from_walls
+        pose_covariance = (
+            motion @ reference.errors.total @ motion.T
+            + scale * compute_motion_covariance(tracked_motion, self.config.followed_share)
+        )
+        near = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
+        return ExpectedPose(
+            near,
+            pose_covariance,
+            is_alone,
+            is_tracked=True,
+            is_from_virtual_views=reference.found.is_from_virtual_views,
         )
 
-    def _believe(
+    def _update_with_localization(
         self,
-        picture: StreamPicture,
-        found: Found,
+        frame: StreamFrame,
+        found: LocalizedPose,
         predicted: MotionState | None,
-        followed: Followed | None,
+        tracked_motion: TrackedMotion | None,
         seconds: float,
     ) -> StreamedPose:
         """The answer that a full localization gives, `seconds` after the pose measured before."""
         cam_from_world, errors = found.result.world_from_cam.inverse(), found.errors
-        t_ns, offset = picture.t_ns, Rigid3.identity()
+        t_ns, offset = frame.t_ns, Rigid3.identity()
         if predicted is None or self._reference is None:
-            smoothed, doubt = self._window.add(
+            smoothed, pose_covariance = self._window.add(
                 cam_from_world, errors.noise, Rigid3.identity(), errors.noise
             )
         else:
-            motion, motion_covariance = self._motion(predicted, followed)
-            motion_covariance = motion_covariance + lasting_change(
+            motion, motion_covariance = self._compute_motion(predicted, tracked_motion)
+            motion_covariance = motion_covariance + compute_correlated_change(
                 errors, motion, self.config.reach
             )
-            before = self._blended(followed, t_ns) if followed is not None else None
-            if followed is None and np.trace(motion_covariance) >= np.trace(errors.noise):
+            before = (
+                self._compute_smoothed_pose(tracked_motion, t_ns)
+                if tracked_motion is not None
+                else None
+            )
+            if tracked_motion is None and np.trace(motion_covariance) >= np.trace(errors.noise):
                 self._window.clear()  # a guess from the poses before says nothing new of this one
-            smoothed, doubt = self._window.add(
+            smoothed, pose_covariance = self._window.add(
                 cam_from_world, errors.noise, motion, motion_covariance
             )
             if before is not None:
-                offset = self._faded(before @ smoothed.inverse(), seconds)
-            measured = errors.noise if followed is None else followed.covariance
-            self._hypotheses.correct(
+                offset = self._fade_offset(before @ smoothed.inverse(), seconds)
+            measured = errors.noise if tracked_motion is None else tracked_motion.covariance
+            self._hypotheses.set_best_state(
                 update_motion(predicted, (offset @ smoothed).inverse(), measured),
-                picture.odom_from_cam,
+                frame.odom_from_cam,
             )
-        points = found.seen.in_image(picture.grey_camera.width / picture.camera.width)
-        follower = PointFollower(
-            picture.grey, points, cam_from_world, picture.grey_camera, self.config.following
+        points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
+        follower = PointTracker(
+            frame.grey, points, cam_from_world, frame.grey_camera, self.config.following
         )
-        self._reference = Reference(
+        self._reference = ReferenceImage(
             t_ns,
             found.result,
             cam_from_world,
             errors,
             smoothed,
-            doubt + errors.lasting,
+            pose_covariance + errors.correlated,
             offset,
             follower,
         )
@@ -356,45 +393,49 @@ class Tracker:
             "localized",
             found.result,
             best.world_from_cam,
-            smoothed_covariance(self._reference),
+            compute_smoothed_covariance(self._reference),
         )
 
-    def _blended(self, followed: Followed, t_ns: int) -> Rigid3:
+    def _compute_smoothed_pose(self, tracked_motion: TrackedMotion, t_ns: int) -> Rigid3:
         """The smoothed cam_from_world of a followed picture."""
         reference = self._reference
         assert reference is not None
         return (
-            self._faded(reference.offset, (t_ns - reference.t_ns) / 1e9)
-            @ followed.cam_from_ref
+            self._fade_offset(reference.offset, (t_ns - reference.t_ns) / 1e9)
+            @ tracked_motion.cam_from_ref
             @ reference.smoothed
         )
 
-    def _faded(self, offset: Rigid3, seconds: float) -> Rigid3:
+    def _fade_offset(self, offset: Rigid3, seconds: float) -> Rigid3:
         return Rigid3.exp(np.exp(-seconds / self.config.blend_time) * offset.log())
 
-    def _motion(
-        self, predicted: MotionState, followed: Followed | None
+    def _compute_motion(
+        self, predicted: MotionState, tracked_motion: TrackedMotion | None
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """cam_from_before, from the picture localized last, with the covariance of its left
         perturbation."""
         assert self._reference is not None
-        if followed is not None:
-            return followed.cam_from_ref, followed_covariance(followed, self.config.followed_share)
+        if tracked_motion is not None:
+            return tracked_motion.cam_from_ref, compute_motion_covariance(
+                tracked_motion, self.config.followed_share
+            )
         return (
             predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(),
             predicted.pose_covariance,
         )
 
-    def _tracked(
-        self, picture: StreamPicture, followed: Followed, clock: StageClock
+    def _make_tracked_pose(
+        self, frame: StreamFrame, tracked_motion: TrackedMotion, clock: StageClock
     ) -> StreamedPose:
         reference, state = self._reference, self._hypotheses.best
         assert reference is not None
         assert state is not None
-        world_from_cam = (followed.cam_from_ref @ reference.cam_from_world).inverse()
-        adjoint, motion = world_from_cam.adjoint(), followed.cam_from_ref.adjoint()
+        world_from_cam = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
+        adjoint, motion = world_from_cam.adjoint(), tracked_motion.cam_from_ref.adjoint()
         covariance = (
-            adjoint @ (motion @ reference.errors.whole @ motion.T + followed.covariance) @ adjoint.T
+            adjoint
+            @ (motion @ reference.errors.total @ motion.T + tracked_motion.covariance)
+            @ adjoint.T
         )
         found = reference.found
         result = Localization(
@@ -403,20 +444,20 @@ class Tracker:
             probability=min(found.probability, self._hypotheses.alternatives()[0].probability),
             node_id=found.node_id,
             candidates=[],
-            num_matches=followed.num_found,
-            num_inliers=followed.num_agreeing,
+            num_matches=tracked_motion.num_tracked,
+            num_inliers=tracked_motion.num_inliers,
             times_ms=clock.times_ms(),
             provenance=found.provenance,
         )
         return StreamedPose(
-            picture.t_ns,
+            frame.t_ns,
             "tracked",
             result,
             state.world_from_cam,
-            smoothed_covariance(reference, state),
+            compute_smoothed_covariance(reference, state),
         )
 
-    def _without_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
+    def _make_predicted_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
         """Predicted for a while, then lost."""
         predicted = self._hypotheses.best
         if predicted is None:
@@ -426,5 +467,5 @@ class Tracker:
             "predicted",
             result,
             predicted.world_from_cam,
-            smoothed_covariance(self._reference, predicted),
+            compute_smoothed_covariance(self._reference, predicted),
         )

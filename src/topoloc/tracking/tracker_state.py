@@ -12,13 +12,13 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 from topoloc.retrieval.coarse import Image
-from topoloc.tracking.following import Followed, PointFollower
 from topoloc.tracking.motion import MotionState
+from topoloc.tracking.point_tracker import PointTracker, TrackedMotion
 from topoloc.tracking.pose_errors import PoseErrors
 
 
 @dataclass(frozen=True, eq=False)
-class StreamPicture:
+class StreamFrame:
     """The picture at hand, its time and external odometry; in grey, and reduced, with the camera of
     that."""
 
@@ -31,7 +31,7 @@ class StreamPicture:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceImage:
     """The picture that was localized last: its pose raw and smoothed, what these are wrong by, and
     its points.
 
@@ -46,27 +46,29 @@ class Reference:
     smoothed: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     offset: Rigid3
-    follower: PointFollower
+    follower: PointTracker
 
 
-def doubt_of(predicted: MotionState, depth: float) -> float:
+def compute_direction_uncertainty(predicted: MotionState, depth: float) -> float:
     """Three sigma (radians) of the direction in which points at this depth (metres) are seen."""
     sigmas = np.sqrt(np.diag(predicted.pose_covariance))
     return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
 
 
-def followed_covariance(followed: Followed, share: float) -> Float[np.ndarray, "6 6"]:
+def compute_motion_covariance(
+    tracked_motion: TrackedMotion, share: float
+) -> Float[np.ndarray, "6 6"]:
     """Of a followed motion: what the points say, and what wrong depths make of it, this share of
     the motion."""
     way, turn = (
-        float(np.linalg.norm(followed.cam_from_ref.translation)),
-        followed.cam_from_ref.angle(),
+        float(np.linalg.norm(tracked_motion.cam_from_ref.translation)),
+        tracked_motion.cam_from_ref.angle(),
     )
-    return followed.covariance + np.diag(np.repeat([way**2, turn**2], 3)) * share**2
+    return tracked_motion.covariance + np.diag(np.repeat([way**2, turn**2], 3)) * share**2
 
 
-def smoothed_covariance(
-    reference: Reference | None, since: MotionState | None = None
+def compute_smoothed_covariance(
+    reference: ReferenceImage | None, since: MotionState | None = None
 ) -> Float[np.ndarray, "6 6"]:
     """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and
     the motion since."""
@@ -80,7 +82,7 @@ def smoothed_covariance(
     return covariance + adjoint @ since.pose_covariance @ adjoint.T
 
 
-def reduced(
+def downscale_image(
     grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int
 ) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
     """The picture with its camera, smaller where a side is longer than `max_side_px`."""

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from topoloc.compiled import is_kept
+from topoloc.compiled import is_cached
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.features.surf_detector_kernels import integral_image
@@ -23,8 +23,8 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided_kernels import match_projections
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import build_map
-from topoloc.localization.walls.wall_poses import agreeing_pose
+from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.walls.upright_pose import estimate_upright_pose
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import DepthImage, StereoFrame
 from topoloc.slam.block_kernels import solve_factored
@@ -41,7 +41,7 @@ _WALL_Z, _WALL_SLOPE = 2.0, 0.4  # the wall: z = 2 m + 0.4 x
 def is_warm() -> bool:
     """Whether the machine code of what answers is kept: of kernels with which a search begins and
     ends, and of the last in streams."""
-    return all(map(is_kept, (integral_image, match_projections, solve_factored)))
+    return all(map(is_cached, (integral_image, match_projections, solve_factored)))
 
 
 def warm_up(progress: Progress | None = None) -> None:
@@ -54,9 +54,9 @@ def warm_up(progress: Progress | None = None) -> None:
     Args:
         progress: called with ("compiling", steps done, steps in all).
     """
-    wall = _texture(seed=0)
-    pictures = [_seen(wall, place)[0] for place in (0.0, 0.1, 0.2)]
-    lost = _seen(_texture(seed=1), 0.0)[0]
+    wall = _make_texture(seed=0)
+    pictures = [_render_wall(wall, place)[0] for place in (0.0, 0.1, 0.2)]
+    lost = _render_wall(_make_texture(seed=1), 0.0)[0]
     with tempfile.TemporaryDirectory() as folder:
         map_file = Path(folder) / "wall.topo"
 
@@ -64,27 +64,27 @@ def warm_up(progress: Progress | None = None) -> None:
             first, second = (extract_features(picture, FeatureConfig()) for picture in pictures[:2])
             match_features(first.descriptors, second.descriptors, MatchingConfig())
 
-        def ask(image: UInt8[np.ndarray, "h w"], camera: Camera | None) -> None:
+        def localize_image(image: UInt8[np.ndarray, "h w"], camera: Camera | None) -> None:
             Localizer(TopoMetricMap.load(map_file)).localize(image, camera)
 
-        def look_to_the_sides() -> None:
+        def estimate_virtual_pose() -> None:
             node = TopoMetricMap.load(map_file).nodes[0]
             points = node.points_cam.astype(np.float64)
-            agreeing_pose(points[:, :2] / points[:, 2:], points)
+            estimate_upright_pose(points[:, :2] / points[:, 2:], points)
 
-        def follow() -> None:
+        def track_stream() -> None:
             tracker = Tracker(Localizer(TopoMetricMap.load(map_file)))
             for number in range(4):
-                tracker.process(_seen(wall, 0.02 * number)[0], _CAMERA, 100_000_000 * number)
+                tracker.process(_render_wall(wall, 0.02 * number)[0], _CAMERA, 100_000_000 * number)
 
         steps: tuple[Callable[[], object], ...] = (
             features,
-            lambda: build_map(_Walk(wall)).save(map_file),
-            lambda: ask(pictures[1], _CAMERA),
-            lambda: ask(pictures[1], None),
-            lambda: ask(lost, _CAMERA),
-            look_to_the_sides,
-            follow,
+            lambda: build_map(_SyntheticRecording(wall)).save(map_file),
+            lambda: localize_image(pictures[1], _CAMERA),
+            lambda: localize_image(pictures[1], None),
+            lambda: localize_image(lost, _CAMERA),
+            estimate_virtual_pose,
+            track_stream,
         )
         for number, step in enumerate(steps):
             if progress:
@@ -94,23 +94,23 @@ def warm_up(progress: Progress | None = None) -> None:
             progress(STAGE, len(steps), len(steps))
 
 
-class _Walk:
+class _SyntheticRecording:
     """An RGB-D recording of two frames along the wall."""
 
     name = "wall"
 
     def __init__(self, wall: Float32[np.ndarray, "h w"]) -> None:
-        self._wall, self._places = wall, (0.0, 0.2)
+        self._wall, self._positions = wall, (0.0, 0.2)
         self.names, self.t_ns = ["first", "second"], [0, 100_000_000]
         self.poses: list[Rigid3 | None] = [
-            Rigid3(np.eye(3), np.array([place, 0.0, 0.0])) for place in self._places
+            Rigid3(np.eye(3), np.array([place, 0.0, 0.0])) for place in self._positions
         ]
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def __getitem__(self, index: int) -> StereoFrame:
-        image, depth = _seen(self._wall, self._places[index])
+        image, depth = _render_wall(self._wall, self._positions[index])
         registered = DepthImage(depth, _CAMERA, Rigid3.identity())
         return StereoFrame(
             self.names[index],
@@ -122,7 +122,7 @@ class _Walk:
         )
 
 
-def _texture(seed: int) -> Float32[np.ndarray, "h w"]:
+def _make_texture(seed: int) -> Float32[np.ndarray, "h w"]:
     """Noise of several sizes, of which no two places look alike."""
     rng = np.random.default_rng(seed)
     total = np.zeros((480, 640), np.float32)
@@ -132,7 +132,7 @@ def _texture(seed: int) -> Float32[np.ndarray, "h w"]:
     return np.clip(127.5 + 20.0 * total, 0.0, 255.0)
 
 
-def _seen(
+def _render_wall(
     wall: Float32[np.ndarray, "h w"], place: float
 ) -> tuple[UInt8[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """The wall's picture and depth (metres) from `place` metres along x."""

@@ -15,7 +15,7 @@ import pytest
 from built_room import unseen_views, write_pictures
 from tiny_world import write_stereo_recording
 from topoloc.apps.cli import demo, main
-from topoloc.demo.recordings import SHIPPED, missing_recordings
+from topoloc.demo.recordings import SHIPPED, find_missing_recordings
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.trajectory import read_trajectory
 
@@ -110,7 +110,7 @@ def test_without_matplotlib_all_but_the_report_is_done(
 
 @pytest.mark.slow  # the tests of quickstart and examples map and ask the same recordings
 @pytest.mark.skipif(
-    bool(missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
+    bool(find_missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
 )
 def test_the_recordings_brought_along_keep_the_promise(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

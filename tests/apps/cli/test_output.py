@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.apps.cli.output import check_outputs, print_facts, progress_bar, write_text
+from topoloc.apps.cli.output import check_outputs, print_fields, progress_bar, write_text
 from topoloc.errors import TopolocError
 
 
@@ -60,7 +60,7 @@ def test_one_path_is_not_two_outputs(tmp_path: Path):
 
 
 def test_facts_stand_in_columns(capsys: pytest.CaptureFixture[str]):
-    print_facts([("map", "a.topo"), ("nodes", "12")])
+    print_fields([("map", "a.topo"), ("nodes", "12")])
     assert capsys.readouterr().out == "map    a.topo\nnodes  12\n"
 
 

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from topoloc.apps.cli.recordings_table import recordings_table, state_text
-from topoloc.apps.cluster.tasks import Running
+from topoloc.apps.cli.recordings_table import format_state, recordings_table
+from topoloc.apps.cluster.tasks import JobProgress
 from topoloc.apps.cluster.tiles import Outcome
 
 BUILT = Outcome(
@@ -20,7 +20,7 @@ FAILED = Outcome("walks/yard", "yard", "failed", "walks/yard: no such file or fo
 def test_a_line_each_where_nobody_looks(capsys: pytest.CaptureFixture[str]):
     with recordings_table(["walks/hall", "walks/yard"]) as (show, is_live):
         assert not is_live
-        show(0, Running("nodes", 1, 5))
+        show(0, JobProgress("nodes", 1, 5))
         show(0, BUILT)
         show(1, FAILED)
     assert capsys.readouterr().err.splitlines() == [
@@ -38,7 +38,7 @@ def test_one_table_on_a_terminal(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("COLUMNS", "120")
     with recordings_table(["walks/hall", "walks/yard", "walks/late"]) as (show, is_live):
         assert is_live
-        show(0, Running("nodes", 1, 5))
+        show(0, JobProgress("nodes", 1, 5))
         show(1, FAILED)
         show(0, BUILT)
         shown = sys.stderr.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
@@ -51,5 +51,5 @@ def test_one_table_on_a_terminal(monkeypatch: pytest.MonkeyPatch):
 
 def test_where_a_recording_is():
     there = Outcome("walks/hall", "hall", "there")
-    said = [state_text(state) for state in (None, Running("images", 2, 7), BUILT, there)]
+    said = [format_state(state) for state in (None, JobProgress("images", 2, 7), BUILT, there)]
     assert said == ["waits", "images 2/7", "built", "there already"]

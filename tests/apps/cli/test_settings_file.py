@@ -22,7 +22,7 @@ from topoloc.apps.cli.settings_file import (
     read_settings,
     with_option,
 )
-from topoloc.bounds import Above, Between, check_bounds, settings_from
+from topoloc.bounds import Above, Between, check_bounds, parse_settings
 from topoloc.errors import ConfigError
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.mapping.build import BuildConfig
@@ -191,7 +191,7 @@ def _refusal(read: Callable[[], Any]) -> str | None:
 @given(data=st.data())
 def test_whatever_a_table_holds_it_is_read_or_refused_by_its_key(name: str, data: st.DataObject):
     before, table = config_class(name)(), data.draw(_trees(name))
-    said = _refusal(lambda: check_bounds(settings_from(type(before), table, name, before)))
+    said = _refusal(lambda: check_bounds(parse_settings(type(before), table, name, before)))
     assert said is None or said.startswith(name)
 
 

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from topoloc.apps.cli.recording_maps import MapMaking
+from topoloc.apps.cli.map_jobs import MapJob
 from topoloc.mapping.build import Progress
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -18,7 +18,7 @@ class LoggingMaker:
     """`seconds` pass after a map was begun for the first time, so that its worker can be killed in
     the middle."""
 
-    making: MapMaking
+    making: MapJob
     log: str
     name: str
     seconds: float = 0.0

@@ -36,7 +36,7 @@ class Noting:
         self._note("end")
         return f"done {self.number}"
 
-    def failed(self, reason: str) -> str:
+    def failure_outcome(self, reason: str) -> str:
         return f"failed {self.number}: {reason}"
 
     def _note(self, what: str) -> None:

@@ -14,7 +14,7 @@ from tiny_world import write_stereo_recording
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.atlas.editing import create_atlas, new_tiles, remove_tiles
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.open import open_sequence
 
@@ -95,7 +95,7 @@ def test_a_pair_whose_worker_ended_is_told(
 
     def half_lost(jobs: Any, address: str, *args: object) -> list[Any]:
         return [
-            job.failed("its worker ended: killed") if number else job.run(lambda *_: None)
+            job.failure_outcome("its worker ended: killed") if number else job.run(lambda *_: None)
             for number, job in enumerate(jobs)
         ]
 

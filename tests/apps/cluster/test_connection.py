@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.apps.cluster.connection import _own_token, _quiet, connected
+from topoloc.apps.cluster.connection import _create_token, _silence_stderr, connect_to_cluster
 from topoloc.errors import ClusterError, MissingExtraError
-from topoloc.recordings.atomic import scratch_folder
+from topoloc.recordings.atomic import temporary_folder
 
 Complaint = Callable[..., str]
 needs_ray = pytest.mark.usefixtures("ray")
@@ -55,7 +55,7 @@ def test_nobody_answers(
     monkeypatch.setattr("ray._private.utils.read_ray_address", lambda *_: None)
     with (
         pytest.raises(ClusterError, match="no Ray cluster runs on this machine"),
-        connected("auto"),
+        connect_to_cluster("auto"),
     ):
         pass
 
@@ -67,16 +67,16 @@ def test_without_ray_the_extra_is_named(
     assert "pip install 'topoloc[cluster]'" in complaint(
         "build", tiny_recording, tmp_path / "campus", "--ray", "auto"
     )
-    with pytest.raises(MissingExtraError, match="cluster"), connected("local"):
+    with pytest.raises(MissingExtraError, match="cluster"), connect_to_cluster("local"):
         pass
 
 
 def test_folders_of_killed_clusters_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     (tmp_path / "topoloc-ray-left" / "session").mkdir(parents=True)
-    with scratch_folder("topoloc-ray-") as one:
+    with temporary_folder("topoloc-ray-") as one:
         assert list(tmp_path.iterdir()) == [one]
-        with scratch_folder("topoloc-ray-") as two:
+        with temporary_folder("topoloc-ray-") as two:
             assert sorted(tmp_path.iterdir()) == sorted([one, two])
         assert list(tmp_path.iterdir()) == [one]
     assert list(tmp_path.iterdir()) == []
@@ -88,19 +88,19 @@ def test_a_cluster_of_our_own_has_a_token_of_its_own(monkeypatch: pytest.MonkeyP
         monkeypatch.delenv(name, raising=False)
     tokens = set()
     for _ in range(2):
-        with _own_token():
+        with _create_token():
             tokens.add(os.environ["RAY_AUTH_TOKEN"])
             os.environ["RAY_AUTH_MODE"] = "token"  # as Ray does
         assert not set(names) & set(os.environ)
     assert len(tokens) == 2
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    with _own_token():
+    with _create_token():
         assert "RAY_AUTH_TOKEN" not in os.environ
     assert os.environ["RAY_AUTH_MODE"] == "disabled"
 
 
 def test_what_is_written_past_python_is_not_seen(capfd: pytest.CaptureFixture[str]):
-    with _quiet():
+    with _silence_stderr():
         os.write(2, b"a warning of C++")
     os.write(2, b"ours")
     assert capfd.readouterr().err == "ours"

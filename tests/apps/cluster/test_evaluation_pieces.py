@@ -15,8 +15,8 @@ import pytest
 from dying_piece import DyingPiece
 
 from built_room import unseen_views, write_pictures
-from topoloc.apps.cli import main, recording_queries
-from topoloc.apps.cli.recording_queries import Piece, Queries, QueryRecording, SentMap
+from topoloc.apps.cli import main, remote_queries
+from topoloc.apps.cli.remote_queries import OpenQueries, Piece, QueryRecording, RemoteMap
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.errors import MapError, MissingExtraError, RecordingError, TrajectoryError
 from topoloc.evaluation.metrics import summarize
@@ -27,7 +27,7 @@ Complaint = Callable[..., str]
 
 
 @pytest.fixture
-def asked(room_map: Path, queries: Path, tmp_path: Path) -> Path:
+def queried_map(room_map: Path, queries: Path, tmp_path: Path) -> Path:
     """A folder with `room.topo`, `pictures` of the room and pictures of `elsewhere`, to be
     broken."""
     shutil.copy(room_map, tmp_path / "room.topo")
@@ -55,34 +55,47 @@ def _evaluated(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[Any, 
 
 
 def test_the_same_figures_whoever_dies(
-    cluster: Any, asked: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cluster: Any,
+    queried_map: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
     """Paths begin in the folder of the command; the pictures of a page are read where it is
     written."""
-    monkeypatch.setattr(recording_queries, "MAX_PICTURES", 2)
-    monkeypatch.setattr(recording_queries, "Piece", DyingPiece)
-    monkeypatch.chdir(asked)
+    monkeypatch.setattr(remote_queries, "MAX_IMAGES", 2)
+    monkeypatch.setattr(remote_queries, "Piece", DyingPiece)
+    monkeypatch.chdir(queried_map)
     args = ("room.topo", "pictures", "--elsewhere", "elsewhere")
     alone = _evaluated(capsys, *args)
     assert alone[0]["num_localized"] == len(unseen_views())
     assert alone[0]["num_elsewhere"] > 0
     assert _evaluated(capsys, *args, "--report", "page.html", "--ray", cluster.address) == alone
     assert (
-        len(list(asked.glob("*.begun-*")))
-        == len(list(asked.glob("pictures.begun-*"))) + len(list(asked.glob("elsewhere.begun-*")))
+        len(list(queried_map.glob("*.begun-*")))
+        == len(list(queried_map.glob("pictures.begun-*")))
+        + len(list(queried_map.glob("elsewhere.begun-*")))
         >= 3
     )
-    assert (asked / "page.html").read_text().count("<article>") > 0
+    assert (queried_map / "page.html").read_text().count("<article>") > 0
 
 
 def test_an_atlas_and_a_tile_that_cannot_be_read(
-    cluster: Any, asked: Path, walks: list[Path], capsys: pytest.CaptureFixture[str]
+    cluster: Any, queried_map: Path, walks: list[Path], capsys: pytest.CaptureFixture[str]
 ):
     """What is wrong with a tile is said once, however many pieces meet it."""
-    assert main(["build", str(walks[0]), str(asked / "other.topo")]) == 0
-    campus = asked / "campus"
-    create_atlas(str(campus), new_tiles([str(asked / "room.topo"), str(asked / "other.topo")]))
-    args = (campus, asked / "pictures", "--elsewhere", asked / "elsewhere", "--tile", "room")
+    assert main(["build", str(walks[0]), str(queried_map / "other.topo")]) == 0
+    campus = queried_map / "campus"
+    create_atlas(
+        str(campus), new_tiles([str(queried_map / "room.topo"), str(queried_map / "other.topo")])
+    )
+    args = (
+        campus,
+        queried_map / "pictures",
+        "--elsewhere",
+        queried_map / "elsewhere",
+        "--tile",
+        "room",
+    )
     assert _evaluated(capsys, *args, "--ray", cluster.address) == _evaluated(capsys, *args)
     (rotten,) = (campus / "tiles").glob("other-*.topo")
     rotten.write_bytes(b"rotten")
@@ -92,11 +105,20 @@ def test_an_atlas_and_a_tile_that_cannot_be_read(
     assert _evaluated(capsys, *args, "--ray", cluster.address) == alone
 
 
-def test_failures_are_those_of_the_plain_command(cluster: Any, asked: Path, complaint: Complaint):
-    (asked / "pictures" / "view01.png").write_bytes(b"no picture")
-    for args in ((asked / "pictures",), (asked / "nowhere",), (asked / "pictures" / "view00.png",)):
-        alone = complaint("evaluate", asked / "room.topo", *args)
-        assert complaint("evaluate", asked / "room.topo", *args, "--ray", cluster.address) == alone
+def test_failures_are_those_of_the_plain_command(
+    cluster: Any, queried_map: Path, complaint: Complaint
+):
+    (queried_map / "pictures" / "view01.png").write_bytes(b"no picture")
+    for args in (
+        (queried_map / "pictures",),
+        (queried_map / "nowhere",),
+        (queried_map / "pictures" / "view00.png",),
+    ):
+        alone = complaint("evaluate", queried_map / "room.topo", *args)
+        assert (
+            complaint("evaluate", queried_map / "room.topo", *args, "--ray", cluster.address)
+            == alone
+        )
 
 
 def test_against_itself_asks_no_cluster(room_map: Path, complaint: Complaint):
@@ -106,13 +128,13 @@ def test_against_itself_asks_no_cluster(room_map: Path, complaint: Complaint):
 
 
 @pytest.fixture
-def piece(asked: Path) -> Piece:
+def piece(queried_map: Path) -> Piece:
     """All pictures of the room, as they are sent to a machine."""
-    topomap = TopoMetricMap.load(asked / "room.topo")
-    recording = QueryRecording(str(asked / "pictures"), None, None, None, None)
-    queries = Queries(recording, recording.open(), "walk", None)
-    sent = SentMap.of(Localizer(topomap), LocalizerConfig(), None)
-    (piece,) = recording_queries._pieces(sent, queries)
+    topomap = TopoMetricMap.load(queried_map / "room.topo")
+    recording = QueryRecording(str(queried_map / "pictures"), None, None, None, None)
+    queries = OpenQueries(recording, recording.open(), "walk", None)
+    sent = RemoteMap.of(Localizer(topomap), LocalizerConfig(), None)
+    (piece,) = remote_queries._split_queries(sent, queries)
     return piece
 
 
@@ -130,26 +152,26 @@ def test_a_piece_travels_small_and_answers_as_here(piece: Piece, queries: Path):
     assert evaluation["median_translation_m"] < 0.01
 
 
-def test_another_map_in_its_place_is_not_asked(piece: Piece, asked: Path):
+def test_another_map_in_its_place_is_not_asked(piece: Piece, queried_map: Path):
     packed = pickle.dumps(piece)
-    with TopoMetricMap.load(asked / "room.topo") as topomap:
-        replace(topomap, length_m=3.0).save(asked / "new.topo")
-    os.replace(asked / "new.topo", asked / "room.topo")
+    with TopoMetricMap.load(queried_map / "room.topo") as topomap:
+        replace(topomap, length_m=3.0).save(queried_map / "new.topo")
+    os.replace(queried_map / "new.topo", queried_map / "room.topo")
     with pytest.raises(MapError, match="was replaced since"):
         pickle.loads(packed).run(_silent)
 
 
-def test_another_recording_in_its_place_is_not_asked(piece: Piece, asked: Path):
-    (asked / "pictures" / "view00.png").rename(asked / "pictures" / "a.png")
+def test_another_recording_in_its_place_is_not_asked(piece: Piece, queried_map: Path):
+    (queried_map / "pictures" / "view00.png").rename(queried_map / "pictures" / "a.png")
     with pytest.raises((RecordingError, TrajectoryError)):
         piece.run(_silent)
-    (asked / "pictures" / "a.png").unlink()
+    (queried_map / "pictures" / "a.png").unlink()
     with pytest.raises((RecordingError, TrajectoryError)):
         piece.run(_silent)
 
 
 def test_a_machine_without_the_same_features_does_not_answer(piece: Piece):
-    other = replace(piece, asked=replace(piece.asked, kinds=frozenset()))
+    other = replace(piece, queried_map=replace(piece.queried_map, kinds=frozenset()))
     with pytest.raises(
         MissingExtraError, match="has what features surf need, unlike the machine that asks"
     ):
@@ -158,10 +180,10 @@ def test_a_machine_without_the_same_features_does_not_answer(piece: Piece):
 
 @pytest.mark.parametrize("count", [1, 3, 4, 7])
 def test_pieces_are_of_about_one_size(piece: Piece, count: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(recording_queries, "MAX_PICTURES", 3)
-    queries = Queries(piece.recording, piece.recording.open(), "walk", None)
-    monkeypatch.setattr(Queries, "frames", property(lambda self: [k % 2 for k in range(count)]))
-    sizes = [len(one.frames) for one in recording_queries._pieces(piece.asked, queries)]
+    monkeypatch.setattr(remote_queries, "MAX_IMAGES", 3)
+    queries = OpenQueries(piece.recording, piece.recording.open(), "walk", None)
+    monkeypatch.setattr(OpenQueries, "frames", property(lambda self: [k % 2 for k in range(count)]))
+    sizes = [len(one.frames) for one in remote_queries._split_queries(piece.queried_map, queries)]
     assert sum(sizes) == count
     assert max(sizes) <= 3
     assert max(sizes) - min(sizes) <= 1

@@ -12,9 +12,9 @@ import pytest
 
 from tiny_world import path_pose
 from topoloc.apps.cli import main
+from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cli.output import UsageError
-from topoloc.apps.cli.recording_maps import MapMaking, PosesAsked
-from topoloc.apps.cli.recording_pieces import Split, pieces_of
+from topoloc.apps.cli.recording_pieces import SplitOptions, split_recording
 from topoloc.atlas.atlas import Atlas
 from topoloc.geometry.alignment import translation_error
 from topoloc.mapping.build import BuildConfig
@@ -30,8 +30,8 @@ def long_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
-def _making(recording: Path, *trajectory: str) -> MapMaking:
-    return MapMaking((str(recording),), PosesAsked(tuple(trajectory)), BuildConfig(), SlamConfig())
+def _making(recording: Path, *trajectory: str) -> MapJob:
+    return MapJob((str(recording),), PoseOptions(tuple(trajectory)), BuildConfig(), SlamConfig())
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def _making(recording: Path, *trajectory: str) -> MapMaking:
     [(10, 6, 3), (1000, 300, 30), (301, 300, 30), (300, 300, 30), (7, 300, 30), (999, 100, 50)],
 )
 def test_pieces_cover_all_frames_and_overlap(total: int, frames: int, shared: int):
-    ranges = Split(frames, shared).ranges(total)
+    ranges = SplitOptions(frames, shared).ranges(total)
     assert ranges[0][0] == 0
     assert ranges[-1][1] == total
     assert all(stop - start == min(frames, total) for start, stop in ranges)
@@ -48,38 +48,38 @@ def test_pieces_cover_all_frames_and_overlap(total: int, frames: int, shared: in
 
 
 def test_the_pieces_of_one_trajectory_are_one_world(long_walk: Path):
-    pieces = pieces_of(_making(long_walk), "walk", Split(6, 3))
-    assert [making.recordings[0].rpartition("@")[2] for making in pieces.makings] == [
+    pieces = split_recording(_making(long_walk), "walk", SplitOptions(6, 3))
+    assert [making.recordings[0].rpartition("@")[2] for making in pieces.piece_jobs] == [
         "0:6",
         "2:8",
         "4:10",
     ]
-    assert [making.asked.trajectory for making in pieces.makings] == [("truth",)] * 3
+    assert [making.asked.trajectory for making in pieces.piece_jobs] == [("truth",)] * 3
     assert pieces.world is not None
     assert pieces.world.startswith("walk-")
-    assert pieces_of(_making(long_walk, "slam"), "walk", Split(6, 3)).world is None
-    whole = pieces_of(_making(long_walk), "walk", Split(10, 3))
-    assert [making.recordings for making in whole.makings] == [(str(long_walk),)]
+    assert split_recording(_making(long_walk, "slam"), "walk", SplitOptions(6, 3)).world is None
+    whole = split_recording(_making(long_walk), "walk", SplitOptions(10, 3))
+    assert [making.recordings for making in whole.piece_jobs] == [(str(long_walk),)]
     assert whole.world is None
 
 
 def test_what_cannot_be_split_is_said(long_walk: Path, tmp_path: Path):
     with pytest.raises(UsageError, match="takes whole recordings"):
-        pieces_of(_making(Path(f"{long_walk}@0::1")), "walk", Split(6, 3))
+        split_recording(_making(Path(f"{long_walk}@0::1")), "walk", SplitOptions(6, 3))
     for frames, shared in ((6, 4), (6, 2), (0, 0)):
         with pytest.raises(UsageError, match="--split takes the frames of a piece and"):
-            Split(frames, shared)
-    missing = pieces_of(_making(tmp_path / "none"), "none", Split(6, 3))
-    assert len(missing.makings) == 1
+            SplitOptions(frames, shared)
+    missing = split_recording(_making(tmp_path / "none"), "none", SplitOptions(6, 3))
+    assert len(missing.piece_jobs) == 1
     assert main(["build", str(long_walk), str(tmp_path / "a.topo"), "--split", "6"]) == 2
     for text in ("6,4", "6,", "six", "-6", "6,3,2", "²"):
         assert (
             main(["build", str(long_walk), str(tmp_path / "a"), "--ray", "local", "--split", text])
             == 2
         )
-    assert Split.of("600") == Split(600, 60)
-    assert Split.of("12") == Split(12, 3)
-    assert Split.of("600,90") == Split(600, 90)
+    assert SplitOptions.of("600") == SplitOptions(600, 60)
+    assert SplitOptions.of("12") == SplitOptions(12, 3)
+    assert SplitOptions.of("600,90") == SplitOptions(600, 90)
 
 
 def _built(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:

@@ -10,8 +10,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from topoloc.apps.cluster.building import TileTask
-from topoloc.apps.cluster.remote import Board, Terms, Work, _reporter, run_task
+from topoloc.apps.cluster.atlas_building import TileTask
+from topoloc.apps.cluster.remote import (
+    ProgressBoard,
+    TaskPayload,
+    TaskRequirements,
+    _create_reporter,
+    run_task,
+)
 from topoloc.apps.cluster.tiles import Outcome, TileJob
 from topoloc.errors import ClusterError, RecordingError
 
@@ -39,8 +45,8 @@ def undone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("topoloc.compiled.set_num_threads", lambda number: None)
 
 
-def _asked(work: Work) -> str:
-    outcome: Outcome = pickle.loads(run_task(pickle.dumps(work), Terms(3), None, 0))
+def _asked(work: TaskPayload) -> str:
+    outcome: Outcome = pickle.loads(run_task(pickle.dumps(work), TaskRequirements(3), None, 0))
     assert outcome.state == "failed"
     assert outcome.reason is not None
     return outcome.reason
@@ -49,17 +55,17 @@ def _asked(work: Work) -> str:
 @pytest.mark.usefixtures("undone")
 def test_paths_days_and_threads_are_the_drivers(tmp_path: Path):
     task = TileTask(TileJob("walk", "walk", "walk", Witness()), str(tmp_path / "campus"), False)
-    assert _asked(Work(task, str(tmp_path), "86400")) == f"{tmp_path} 86400 3"
-    assert _asked(Work(task, str(tmp_path / "not here"), None)) == "/ None 3"
+    assert _asked(TaskPayload(task, str(tmp_path), "86400")) == f"{tmp_path} 86400 3"
+    assert _asked(TaskPayload(task, str(tmp_path / "not here"), None)) == "/ None 3"
 
 
 def test_another_version_of_topoloc():
     with pytest.raises(ClusterError, match=r"has topoloc \S+, and 9\.9 asks it"):
-        run_task(b"of another version", Terms(1, "9.9"), None, 0)
+        run_task(b"of another version", TaskRequirements(1, "9.9"), None, 0)
 
 
 def test_the_board_is_written_now_and_then(monkeypatch: pytest.MonkeyPatch):
-    board, now = Board(), [0.0]
+    board, now = ProgressBoard(), [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     written: list[tuple[str, int, int]] = []
 
@@ -67,7 +73,7 @@ def test_the_board_is_written_now_and_then(monkeypatch: pytest.MonkeyPatch):
         written.append(line)
         board.write(number, line)
 
-    report = _reporter(SimpleNamespace(write=SimpleNamespace(remote=write)), 4)
+    report = _create_reporter(SimpleNamespace(write=SimpleNamespace(remote=write)), 4)
     for done in range(1, 11):
         report("nodes", done, 10)
         now[0] += 0.07

@@ -8,14 +8,14 @@ from typing import Any
 from small_jobs import Noting
 
 from topoloc.apps.cluster.config import ClusterConfig
-from topoloc.apps.cluster.connection import connected
-from topoloc.apps.cluster.tasks import Running, run_on_ray
+from topoloc.apps.cluster.connection import connect_to_cluster
+from topoloc.apps.cluster.tasks import JobProgress, run_on_ray
 
 
 def test_each_failure_is_that_of_its_job(cluster: Any, tmp_path: Path):
     does = ("nothing", "refuse", "die", "break", "nothing")
     jobs = [Noting(number, str(tmp_path / "log"), what) for number, what in enumerate(does)]
-    heard: list[tuple[int, str | Running]] = []
+    heard: list[tuple[int, str | JobProgress]] = []
     outcomes = run_on_ray(
         jobs,
         cluster.address,
@@ -41,7 +41,7 @@ def test_jobs_of_one_line_are_done_one_after_the_other(cluster: Any, tmp_path: P
         Noting(number, str(logs[line]), what)
         for number, (line, what) in enumerate(zip(lines, does, strict=True))
     ]
-    with connected(cluster.address) as ray:
+    with connect_to_cluster(cluster.address) as ray:
         outcomes = run_on_ray(jobs, cluster.address, ClusterConfig(max_retries=0), lines=lines)
         assert ray.is_initialized()
     assert [outcome.split()[0] for outcome in outcomes] == ["done", "failed", "done", "done"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.apps.cluster.tiles import TileJob, build_tile, manifest_of, tile_ids
+from topoloc.apps.cluster.tiles import TileJob, build_tile, derive_tile_ids, read_manifest
 from topoloc.atlas.atlas import Atlas
 from topoloc.errors import AtlasError, RecordingError
 from topoloc.mapping.topomap import TopoMetricMap
@@ -58,7 +58,7 @@ def job(room_map: Path) -> TileJob:
     ],
 )
 def test_tiles_are_called_as_their_recordings(recordings: list[str], ids: list[str]):
-    assert tile_ids(recordings) == ids
+    assert derive_tile_ids(recordings) == ids
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_tiles_are_called_as_their_recordings(recordings: list[str], ids: list[s
 )
 def test_a_recording_that_is_named_twice(recordings: list[str]):
     with pytest.raises(AtlasError, match="named twice"):
-        tile_ids(recordings)
+        derive_tile_ids(recordings)
 
 
 def test_a_tile_is_made_once(job: TileJob, room_map: Path, tmp_path: Path):
@@ -100,12 +100,12 @@ def test_what_was_made_otherwise_is_replaced_only_when_it_is_said(job: TileJob, 
     refused = build_tile(otherwise, where, False, _nothing)
     assert refused.state == "failed"
     assert "--replace" in (refused.reason or "")
-    assert manifest_of(where).by_id["room"].recipe == job.digest()
+    assert read_manifest(where).by_id["room"].recipe == job.digest()
     assert build_tile(otherwise, where, True, _nothing).state == "built"
-    assert manifest_of(where).by_id["room"].recipe == otherwise.digest()
+    assert read_manifest(where).by_id["room"].recipe == otherwise.digest()
     elsewhere = replace(otherwise, world="campus")
     assert build_tile(elsewhere, where, True, _nothing).state == "built"
-    assert manifest_of(where).by_id["room"].world == "campus"
+    assert read_manifest(where).by_id["room"].world == "campus"
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from topoloc.apps.cli import main
-from topoloc.apps.viewer.map_scene import scene_of_map
+from topoloc.apps.viewer.map_scene import create_map_scene
 from topoloc.apps.viewer.scene import Scene
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -61,7 +61,7 @@ def results(placed_map: Path, queries: Path, tmp_path_factory: pytest.TempPathFa
 @pytest.fixture(scope="module")
 def scene(placed_map: Path) -> Scene:
     with TopoMetricMap.load(placed_map) as topomap:
-        return scene_of_map(topomap, "room")
+        return create_map_scene(topomap, "room")
 
 
 def export(source: Path, out: Path, *options: str) -> Path:

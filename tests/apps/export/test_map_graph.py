@@ -12,18 +12,18 @@ import numpy as np
 
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
-from topoloc.apps.export.map_graph import graph_of
+from topoloc.apps.export.map_graph import build_graph
 
 NS = {"g": "http://graphml.graphdrawing.org/xmlns"}
 
 
 def test_the_graph_is_that_of_the_map(room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
-        graph = graph_of(topomap)
+        graph = build_graph(topomap)
         assert list(graph.nodes) == [summary.node_id for summary in topomap.summaries]
-        assert set(graph.ways) == {(edge.source_id, edge.target_id) for edge in topomap.edges}
+        assert set(graph.edges) == {(edge.source_id, edge.target_id) for edge in topomap.edges}
         at = {summary.node_id: summary.world_from_cam for summary in topomap.summaries}
-        for (source, target), facts in graph.ways.items():
+        for (source, target), facts in graph.edges.items():
             way = at[source].inverse() @ at[target]
             np.testing.assert_allclose(
                 [facts["x"], facts["y"], facts["z"]], way.translation, atol=1e-12
@@ -37,7 +37,9 @@ def test_the_graph_is_that_of_the_map(room_map: Path):
             )
             assert facts["times"] >= 1
     degrees = {
-        node: len({b for a, b in graph.ways if a == node} | {a for a, b in graph.ways if b == node})
+        node: len(
+            {b for a, b in graph.edges if a == node} | {a for a, b in graph.edges if b == node}
+        )
         for node in graph.nodes
     }
     assert {node: facts["is_junction"] for node, facts in graph.nodes.items()} == {
@@ -73,9 +75,9 @@ def test_geojson_needs_a_place_on_earth(
     assert main(["info", str(path), "--graph", str(tmp_path / "room.geojson")]) == 0
     features = json.loads((tmp_path / "room.geojson").read_text())["features"]
     points = [feature for feature in features if feature["geometry"]["type"] == "Point"]
-    ways = [feature for feature in features if feature["geometry"]["type"] == "LineString"]
+    edges = [feature for feature in features if feature["geometry"]["type"] == "LineString"]
     with TopoMetricMap.load(path) as topomap:
-        assert (len(points), len(ways)) == (len(topomap.summaries), len(topomap.edges))
+        assert (len(points), len(edges)) == (len(topomap.summaries), len(topomap.edges))
     lon, lat, h = points[0]["geometry"]["coordinates"]
     assert abs(lon - 16.37) < 1e-6
     assert abs(lat - 48.2) < 1e-6

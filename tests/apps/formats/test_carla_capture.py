@@ -14,12 +14,12 @@ import pytest
 
 from topoloc.apps.formats.capture.carla_capture import (
     CarlaConfig,
-    camera_of,
+    carla_camera,
     carla_client,
     carla_frames,
-    world_from_cam_of,
+    world_from_carla_transform,
 )
-from topoloc.apps.formats.capture.folder_writer import FolderWriter
+from topoloc.apps.formats.capture.recording_writer import RecordingWriter
 from topoloc.errors import ConfigError, RecordingError
 from topoloc.recordings.open import open_sequence
 
@@ -39,7 +39,7 @@ def test_axes_are_those_of_the_client(angles: tuple[float, float, float]):
     transform = carla.Transform(
         carla.Location(3.0, 5.0, 7.0), carla.Rotation(pitch=pitch, yaw=yaw, roll=roll)
     )
-    pose = world_from_cam_of(transform)
+    pose = world_from_carla_transform(transform)
     np.testing.assert_allclose(pose.translation, [3.0, -5.0, 7.0], atol=1e-5)
     right, down, forward = pose.rotation.T
     np.testing.assert_allclose(forward, ours(transform.get_forward_vector()), atol=1e-5)
@@ -56,7 +56,9 @@ def test_points_in_front_of_a_camera_are_where_carla_has_them():
     )
     point_world = transform.transform(carla.Location(10.0, 2.0, -1.0))
     np.testing.assert_allclose(
-        world_from_cam_of(transform).inverse().apply(ours(point_world)), [2.0, 1.0, 10.0], atol=1e-4
+        world_from_carla_transform(transform).inverse().apply(ours(point_world)),
+        [2.0, 1.0, 10.0],
+        atol=1e-4,
     )
 
 
@@ -172,7 +174,7 @@ def client_of(world: StandInWorld) -> SimpleNamespace:
 
 def test_a_way_is_recorded(tmp_path: Path):
     world = StandInWorld()
-    with FolderWriter(tmp_path / "out") as writer:
+    with RecordingWriter(tmp_path / "out") as writer:
         for frame in carla_frames(carla, client_of(world), CONFIG):
             assert world.settings.synchronous_mode
             writer.write(frame)
@@ -187,7 +189,7 @@ def test_a_way_is_recorded(tmp_path: Path):
     assert last.rig is not None
     assert last.right is not None
     assert last.rig.baseline == pytest.approx(CONFIG.baseline_m)
-    assert last.rig.left == camera_of(CONFIG)
+    assert last.rig.left == carla_camera(CONFIG)
     assert last.image[3, 3].tolist()[1:] == [
         (100 + 20 + 9) % 256,
         0,
@@ -243,11 +245,11 @@ def test_settings_that_make_no_sense():
     with pytest.raises(ConfigError, match="must be above 0"):
         list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(spacing_m=0.0)))
     with pytest.raises(ConfigError, match="200 degrees"):
-        camera_of(CarlaConfig(fov_deg=200.0))
+        carla_camera(CarlaConfig(fov_deg=200.0))
 
 
 def test_the_middle_of_the_picture_looks_straight_on():
-    camera = camera_of(CarlaConfig(width=800, height=600, fov_deg=90.0))
+    camera = carla_camera(CarlaConfig(width=800, height=600, fov_deg=90.0))
     np.testing.assert_allclose(camera.img_from_cam(np.array([[1.0, 0.0, 1.0]])), [[799.5, 299.5]])
     assert camera.fx == pytest.approx(400.0)
 

@@ -22,7 +22,7 @@ from tiny_recordings import (
     tum_line,
     write,
 )
-from topoloc.apps.formats.colmap import aligned, open_colmap
+from topoloc.apps.formats.colmap import align_to_trajectory, open_colmap
 from topoloc.errors import (
     CalibrationError,
     MissingExtraError,
@@ -33,7 +33,7 @@ from topoloc.errors import (
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.open import find_format, open_sequence
-from topoloc.recordings.recording import has_scale, scaled, sequence_subset
+from topoloc.recordings.recording import has_scale, scale_poses, sequence_subset
 
 pycolmap = pytest.importorskip("pycolmap", reason="the extra colmap is not installed")
 Make = Callable[..., Path]
@@ -95,7 +95,7 @@ def test_pictures_cameras_and_poses(model: Make, binary: bool):
         "OPENCV", WIDTH, HEIGHT, (40.0, 41.0, 15.5, 11.5, 0.1, 0.0, 0.0, 0.0)
     )
     np.testing.assert_array_equal(sequence[2].image, picture(2))
-    for index, found in enumerate(scaled(sequence, METRES).poses):
+    for index, found in enumerate(scale_poses(sequence, METRES).poses):
         assert_same_pose(found, true_pose(index))
 
 
@@ -120,7 +120,7 @@ def test_a_model_has_no_scale_until_it_is_given_one(model: Make):
             TrajectoryError, match="a model of pictures alone has no scale; give --scale METRES"
         ):
             topoloc.build_map(unscaled)
-        assert has_scale(scaled(unscaled, 2.0))
+        assert has_scale(scale_poses(unscaled, 2.0))
     assert has_scale(topoloc.MemorySequence([sequence[0]]))
 
 
@@ -144,7 +144,7 @@ def test_a_trajectory_gives_scale_and_world(model: Make, tmp_path: Path, kind: s
     file.write_text("\n".join(rows))
     if kind == "times":
         assert sequence.t_ns == [12_500_000_000, 13_250_000_000, 14_000_000_000, 20_000_000_001]
-    found = aligned(sequence, file)
+    found = align_to_trajectory(sequence, file)
     assert has_scale(found)
     for ours, true in zip(found.poses, theirs, strict=True):
         assert_same_pose(ours, true, tolerance=1e-6)
@@ -155,10 +155,10 @@ def test_trajectories_that_fix_no_scale(model: Make, tmp_path: Path):
     file = tmp_path / "gnss.txt"
     file.write_text("\n".join(kitti_row(Rigid3.identity()) for _ in range(3)))
     with pytest.raises(TrajectoryError, match=r"gnss\.txt: 3 poses all in one place"):
-        aligned(sequence, file)
+        align_to_trajectory(sequence, file)
     file.write_text(tum_line("500.0", pose(0)))
     with pytest.raises(TrajectoryError, match="no frame has a pose"):
-        aligned(sequence, file)
+        align_to_trajectory(sequence, file)
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../outside.png", "a/../../b.png"])

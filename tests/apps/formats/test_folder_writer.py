@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tiny_recordings import assert_same_pose, pose
-from topoloc.apps.formats.capture.folder_writer import FolderWriter
+from topoloc.apps.formats.capture.recording_writer import RecordingWriter
 from topoloc.errors import RecordingError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
@@ -45,7 +45,7 @@ def frame(
 
 
 def write(folder: Path, frames: list[StereoFrame], jpeg: int | None = None) -> None:
-    with FolderWriter(folder, jpeg) as writer:
+    with RecordingWriter(folder, jpeg) as writer:
         for one in frames:
             writer.write(one)
 
@@ -91,7 +91,7 @@ def test_depth_of_a_pair_lies_beside_it(tmp_path: Path):
 
 
 def test_readable_after_each_frame(tmp_path: Path):
-    with FolderWriter(tmp_path / "out") as writer:
+    with RecordingWriter(tmp_path / "out") as writer:
         for index in range(4):
             writer.write(frame(index, RIGS["rectified"]))
             assert len(open_sequence(tmp_path / "out")) == index + 1
@@ -101,18 +101,18 @@ def test_what_is_there_is_never_overwritten(tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/thesis.tex").write_text("x")
     with pytest.raises(TopolocError, match=r"holds other things, such as thesis\.tex"):
-        FolderWriter(tmp_path / "out")
+        RecordingWriter(tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
     with pytest.raises(TopolocError, match="cannot write"):
-        FolderWriter(tmp_path / "no/such/folder")
+        RecordingWriter(tmp_path / "no/such/folder")
 
 
 def test_a_frame_that_fails_leaves_nothing_of_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from topoloc.apps.formats.capture import folder_writer
+    from topoloc.apps.formats.capture import recording_writer
 
-    written, write_bytes = [], folder_writer.write_bytes
+    written, write_bytes = [], recording_writer.write_bytes
 
     def until_the_disk_is_full(path: Path, data: bytes) -> None:
         if len(written) == 3:
@@ -120,7 +120,7 @@ def test_a_frame_that_fails_leaves_nothing_of_itself(
         written.append(path)
         write_bytes(path, data)
 
-    monkeypatch.setattr(folder_writer, "write_bytes", until_the_disk_is_full)
+    monkeypatch.setattr(recording_writer, "write_bytes", until_the_disk_is_full)
     frames = [frame(index, RIGS["rectified"]) for index in range(3)]
     with pytest.raises(TopolocError, match="No space left"):
         write(tmp_path / "out", frames)

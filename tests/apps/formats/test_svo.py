@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from topoloc.apps.formats.capture.folder_writer import FolderWriter
+from topoloc.apps.formats.capture.recording_writer import RecordingWriter
 from topoloc.apps.formats.capture.zed_capture import sdk_frames
 from topoloc.errors import MissingExtraError, RecordingError
 from topoloc.recordings.open import find_format, open_sequence
-from topoloc.recordings.recording import single_pictures
+from topoloc.recordings.recording import as_monocular
 
 NUM_FRAMES = 4
 
@@ -122,7 +122,7 @@ def test_frames_in_any_order(tmp_path: Path):
         assert frame.right[0, 0].tolist() == [index % NUM_FRAMES + 100, 2, 1]
         assert frame.rig is not None
         assert frame.rig.baseline == pytest.approx(0.12)
-    assert single_pictures(sequence)[2].image[0, 0, 0] == 2
+    assert as_monocular(sequence)[2].image[0, 0, 0] == 2
     assert sequence[0].image[0, 0, 0] == 0
     with pytest.raises(IndexError):
         sequence[NUM_FRAMES]
@@ -139,7 +139,7 @@ def test_a_file_that_the_sdk_cannot_open(tmp_path: Path):
 @pytest.mark.usefixtures("sdk")
 def test_a_zed_that_is_plugged_in(tmp_path: Path):
     frames = sdk_frames(threading.Event())
-    with FolderWriter(tmp_path / "out") as writer:
+    with RecordingWriter(tmp_path / "out") as writer:
         for _ in range(NUM_FRAMES):
             writer.write(next(frames))
     with pytest.raises(RecordingError, match="gives no more pictures"):

@@ -15,7 +15,7 @@ from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.rig import rectify
 from topoloc.geometry.rigid import exp_so3
 from topoloc.recordings.open import find_format, open_sequence
-from topoloc.recordings.recording import single_pictures
+from topoloc.recordings.recording import as_monocular
 from topoloc.recordings.trajectory import Trajectory, write_tum
 
 VGA = (672, 376)
@@ -64,7 +64,7 @@ def test_halves_are_left_and_right(film: Path):
         assert frame.rig is not None
         assert frame.camera == frame.rig.left
     np.testing.assert_allclose(np.array(sequence.t_ns) / 1e9, np.arange(3) / 15.0, atol=2e-3)
-    assert single_pictures(sequence)[1].right is None
+    assert as_monocular(sequence)[1].right is None
 
 
 def test_a_real_recording_side_by_side(shared: Path, tmp_path: Path):

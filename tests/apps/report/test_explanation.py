@@ -12,7 +12,7 @@ from built_room import unseen_views, write_pictures
 from tiny_world import CAMERA
 from topoloc.apps.cli import main
 from topoloc.apps.report.explanation import explain
-from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
@@ -36,7 +36,7 @@ def test_an_answer_is_among_what_was_tried(localizer: Localizer, queries: Path):
 
 def test_first_poses_that_lead_nowhere_new_are_told_so(localizer: Localizer):
     """Where no evidence is enough, all that looks alike is asked, and leads to the same pose."""
-    weights = weights_of("surf")
+    weights = load_fitted_weights("surf")
     weights = replace(weights, evidence=replace(weights.evidence, clear_log_odds=1e9))
     never_clear = Localizer(localizer.topomap, weights=weights)
     verdicts = [

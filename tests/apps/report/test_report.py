@@ -12,12 +12,16 @@ import numpy as np
 import pytest
 
 from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
-from topoloc.apps.report.map_figure import _with_gaps, draw_map, horizontal_axes
-from topoloc.apps.report.query_gallery import gallery, typical_queries, worst_queries
+from topoloc.apps.report.map_figure import _insert_gaps, draw_map, find_horizontal_axes
+from topoloc.apps.report.query_gallery import (
+    render_gallery,
+    select_typical_queries,
+    select_worst_queries,
+)
 from topoloc.apps.report.report import write_report
-from topoloc.apps.report.report_tables import PublishedResult, ReportWords
+from topoloc.apps.report.report_tables import PublishedResult, ReportTexts
 from topoloc.errors import TopolocError, UnreadableImageError
-from topoloc.evaluation.metrics import Answer, summarize
+from topoloc.evaluation.metrics import EvaluatedQuery, summarize
 from topoloc.localization.result import Localization
 
 GOOD = [answer(f"good{i}", 0.1 * i, error_m=0.001 * (i + 1), error_deg=0.1) for i in range(9)]
@@ -35,7 +39,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     return _write(tmp_path_factory.mktemp("page") / "report.html", MIXED)
 
 
-def _write(path: Path, answers: list[Answer]) -> str:
+def _write(path: Path, answers: list[EvaluatedQuery]) -> str:
     write_report(path, summarize(answers) | {"map": MAP_INFO}, answers, two_nodes())
     return path.read_text(encoding="utf-8")
 
@@ -51,7 +55,7 @@ def _write(path: Path, answers: list[Answer]) -> str:
     ids=["one", "none localized", "only false", "only elsewhere"],
 )
 @pytest.mark.filterwarnings("error")
-def test_a_page_for_any_outcome(answers: list[Answer], num_figures: int, tmp_path: Path):
+def test_a_page_for_any_outcome(answers: list[EvaluatedQuery], num_figures: int, tmp_path: Path):
     page = _write(tmp_path / "report.html", answers)
     figures = re.findall(r"<svg .*?</svg>", page, re.DOTALL)
     assert len(figures) == num_figures
@@ -84,9 +88,9 @@ def test_numbers_on_the_page_are_those_of_the_evaluation(page: str):
 
 
 def test_the_worst_come_first():
-    worst = worst_queries(MIXED)
+    worst = select_worst_queries(MIXED)
     assert [a.query for a in worst] == ["far", "moon", "lost", "good8", "good7", "good6"]
-    assert worst_queries([elsewhere("mars", accepted=False)]) == []
+    assert select_worst_queries([elsewhere("mars", accepted=False)]) == []
 
 
 def test_the_worst_are_shown_beside_the_node_they_were_matched_with(page: str):
@@ -107,14 +111,16 @@ def test_the_deviation_shown_is_the_cameras_own_wherever_the_world_begins(x: flo
     assert isinstance(asked.result, Localization)
     adjoint = asked.result.world_from_cam.adjoint()
     result = replace(asked.result, covariance=adjoint @ (1e-4 * np.eye(6)) @ adjoint.T)
-    assert "standard deviation 1.73 cm" in gallery([replace(asked, result=result)], two_nodes())
+    assert "standard deviation 1.73 cm" in render_gallery(
+        [replace(asked, result=result)], two_nodes()
+    )
 
 
 def test_a_picture_that_is_gone_leaves_a_gap(tmp_path: Path):
     def gone() -> np.ndarray:
         raise UnreadableImageError("far.png: no such picture")
 
-    without = Answer("far", MIXED[10].result, MIXED[10].world_from_cam, 0, "walk", gone)
+    without = EvaluatedQuery("far", MIXED[10].result, MIXED[10].world_from_cam, 0, "walk", gone)
     assert "picture cannot be read any more" in _write(tmp_path / "report.html", [without])
 
 
@@ -124,7 +130,7 @@ def test_many_marks_become_one_picture(page: str, monkeypatch: pytest.MonkeyPatc
     assert "data:image/png" not in page
 
 
-def _night(answers: list[Answer]) -> list[Answer]:
+def _night(answers: list[EvaluatedQuery]) -> list[EvaluatedQuery]:
     return [replace(a, recording="night & rain") for a in answers]
 
 
@@ -151,7 +157,7 @@ def test_each_recording_has_its_row_its_colour_and_its_curve(tmp_path: Path):
 
 
 def test_words_and_published_figures_stand_on_the_page(tmp_path: Path):
-    words = ReportWords(
+    words = ReportTexts(
         title="A <title>",
         paragraphs=["What the night costs."],
         about={"walk": "by day"},
@@ -169,12 +175,12 @@ def test_words_and_published_figures_stand_on_the_page(tmp_path: Path):
 
 def test_a_hard_recording_leaves_places_for_the_worst_of_the_others():
     hard = _night([answer(f"n{i}", 0.1 * i, 3.0 + i, 1.0) for i in range(9)])
-    worst = worst_queries([*GOOD, *hard])
+    worst = select_worst_queries([*GOOD, *hard])
     assert [a.query for a in worst] == ["n8", "n7", "n6", "good8", "good7", "good6"]
 
 
 def test_the_typical_query_is_that_of_the_median_error():
-    typical = typical_queries(
+    typical = select_typical_queries(
         [
             *GOOD,
             *_night([lost("n0", 0.0), lost("n1", 0.1), lost("n2", 0.2)]),
@@ -186,10 +192,10 @@ def test_the_typical_query_is_that_of_the_median_error():
 
 def test_the_path_is_broken_where_the_recording_jumps():
     path = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [20.0, 0.0], [21.0, 0.0]])
-    broken = _with_gaps(path)
+    broken = _insert_gaps(path)
     assert np.flatnonzero(np.isnan(broken[:, 0])).tolist() == [3]
     np.testing.assert_array_equal(broken[~np.isnan(broken[:, 0])], path)
-    np.testing.assert_array_equal(_with_gaps(path[:1]), path[:1])
+    np.testing.assert_array_equal(_insert_gaps(path[:1]), path[:1])
 
 
 @pytest.mark.parametrize(
@@ -199,7 +205,7 @@ def test_the_path_is_broken_where_the_recording_jumps():
 )
 def test_the_map_is_seen_from_above(down: list[float], across: int, up: int, is_mirrored: bool):
     points = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
-    axes = horizontal_axes(points, np.array([down, down]))
+    axes = find_horizontal_axes(points, np.array([down, down]))
     assert axes == (across, up, is_mirrored)
 
 

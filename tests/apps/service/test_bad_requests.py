@@ -61,7 +61,7 @@ def _pictures(view: Path) -> dict[str, tuple[bytes, int]]:
     }
 
 
-KINDS = [
+FEATURE_TYPES = [
     "empty",
     "truncated",
     "too many pixels",
@@ -83,7 +83,7 @@ def _check(answer: httpx.Response, status: int) -> str:
     return error
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FEATURE_TYPES)
 def test_pictures_that_are_none(client: httpx.Client, view: Path, kind: str):
     data, status = _pictures(view)[kind]
     _check(client.post(LOCALIZE, files={"image": ("picture.jpg", data)}), status)

@@ -12,7 +12,7 @@ from running_service import Running
 
 from topoloc import AsyncClient, Camera, Client, Localization, Localizer, TopoMetricMap
 from topoloc.errors import ServiceError
-from topoloc.recordings.pictures import read_image
+from topoloc.recordings.image_io import read_image
 
 
 def test_results_are_those_of_a_localizer(service: Running, maps: Path, view: Path, camera: str):

@@ -11,7 +11,7 @@ import httpx
 import jsonschema
 import pytest
 
-from topoloc.apps.service.asked import Said
+from topoloc.apps.service.query_request import QueryParameters
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def test_the_examples_of_cameras_are_accepted(
     from PIL import Image
 
     Image.new("L", (640, 400), 90).save(tmp_path / "grey.png")
-    examples = Said.model_json_schema()["properties"]["camera"]["examples"]
-    prior = Said.model_json_schema()["properties"]["prior"]["examples"][0]
+    examples = QueryParameters.model_json_schema()["properties"]["camera"]["examples"]
+    prior = QueryParameters.model_json_schema()["properties"]["prior"]["examples"][0]
     said = {"camera": examples[number], "prior": prior, "max_ms": "100"}
     picture = (tmp_path / "grey.png").read_bytes()
     answer = client.post(

@@ -14,14 +14,14 @@ import pytest
 from running_service import TOKEN, Running, running
 
 from in_browser import CONTRASTS, UNNAMED, WIDTHS, chromium, opened
-from topoloc.demo.recordings import SHIPPED, missing_recordings
+from topoloc.demo.recordings import SHIPPED, find_missing_recordings
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.open import open_sequence
 
 pytestmark = pytest.mark.skipif(
-    bool(missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
+    bool(find_missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
 )
 ANSWERED = "#answer h2.good, #answer h2.bad"
 # As if a picture were dropped on the page, or pasted.

@@ -16,7 +16,7 @@ from topoloc.apps.stores.object_store import ObjectStore
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles, remove_tiles
-from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
@@ -64,7 +64,7 @@ def test_pictures_are_localized_in_an_atlas_on_s3(s3_bucket: str, room_map: Path
 
     where = f"{s3_bucket}/deep/campus"
     create_atlas(where, new_tiles([str(room_map), str(other_map)]))
-    localizer = AtlasLocalizer(Atlas.open(where), Maps([], Localizer, 100_000_000))
+    localizer = AtlasLocalizer(Atlas.open(where), MapCache([], Localizer, 100_000_000))
     for seed, tile in ((0, "room"), (1, "other")):
         result = localizer.localize(unseen_views(seed)[1][0], CAMERA)
         assert isinstance(result, Localization)
@@ -106,7 +106,7 @@ def test_what_another_machine_wrote_since_the_last_listing_is_there(s3_bucket: s
     assert first.commit(None, b"1")
     assert second.manifest() == b"1"
     assert first.commit(b"1", b"2")
-    assert not second._created(f"{second._root}/manifests/000000002.json", b"3")
+    assert not second._create_object(f"{second._root}/manifests/000000002.json", b"3")
     assert second.commit(b"2", b"3")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from built_room import built_room
-from topoloc.apps.viewer.document import ResultSet, SceneBudget, document_of, script_json
+from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document, to_script_json
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
 
@@ -23,7 +23,7 @@ def _points(document: dict) -> np.ndarray:
 
 def test_points_and_nodes_stand_where_the_map_has_them(tiny_recording: Path):
     topomap = built_room(tiny_recording)
-    document = document_of(topomap, "room")
+    document = create_document(topomap, "room")
     node = topomap.nodes[0]
     of_node = node.summary.world_from_cam.apply(node.points_cam.astype(np.float64))
     shown = _points(document)
@@ -52,13 +52,13 @@ def test_points_and_nodes_stand_where_the_map_has_them(tiny_recording: Path):
 
 def test_a_budget_is_kept(tiny_recording: Path):
     topomap = built_room(tiny_recording)
-    small = document_of(
-        topomap, "room", budget=SceneBudget(max_points=100, max_picture_bytes=20_000)
+    small = create_document(
+        topomap, "room", budget=SceneBudget(max_points=100, max_image_bytes=20_000)
     )
     assert 50 < len(_points(small)) <= 100
     pictures = [node["picture"] for node in small["nodes"] if node["picture"]]
     assert 0 < sum(map(len, pictures)) <= 20_000
-    assert small["map"]["num_points"] == document_of(topomap, "room")["map"]["num_points"]
+    assert small["map"]["num_points"] == create_document(topomap, "room")["map"]["num_points"]
 
 
 @pytest.mark.parametrize(
@@ -75,9 +75,9 @@ def test_up_is_where_the_cameras_have_it(tiny_recording: Path, turn: np.ndarray)
         replace(node, summary=summary)
         for node, summary in zip(topomap.nodes, summaries, strict=True)
     ]
-    before = np.array(document_of(topomap, "room")["up"])
+    before = np.array(create_document(topomap, "room")["up"])
     np.testing.assert_allclose(
-        document_of(replace(topomap, summaries=summaries, nodes=nodes), "room")["up"],
+        create_document(replace(topomap, summaries=summaries, nodes=nodes), "room")["up"],
         moved.rotation @ before,
         atol=0.1,
     )
@@ -90,25 +90,25 @@ def test_up_is_up_on_earth_where_that_is_known(tiny_recording: Path):
         georeference=Georeference(GeoPoint(50.0, 4.0, 0.0), enu_from_world, "origin"),
     )
     np.testing.assert_allclose(
-        enu_from_world.rotation @ document_of(earth, "room")["up"], [0.0, 0.0, 1.0], atol=1e-5
+        enu_from_world.rotation @ create_document(earth, "room")["up"], [0.0, 0.0, 1.0], atol=1e-5
     )
 
 
 def test_a_path_breaks_where_it_jumps(tiny_recording: Path):
     positions = [np.array([x, 0.0, 0.0]) for x in (0.0, 1.0, 2.0, 30.0, 31.0)]
     walk = ResultSet("walk", path=[Rigid3(np.eye(3), position) for position in positions])
-    path = document_of(built_room(tiny_recording), "room", [walk])["paths"][-1]
+    path = create_document(built_room(tiny_recording), "room", [walk])["paths"][-1]
     assert path["name"] == "walk"
     assert [len(line) for line in path["lines"]] == [3, 2]
 
 
 def test_text_within_a_page_cannot_end_its_script(tiny_recording: Path):
-    document = document_of(
+    document = create_document(
         built_room(tiny_recording),
         "</script><b>&",
         [ResultSet("a", [{"query": "x", "localized": False, "ms": float("nan")}])],
     )
-    text = script_json(document)
+    text = to_script_json(document)
     assert not set("<>&") & set(text)
     assert json.loads(text)["name"] == "</script><b>&"
     assert json.loads(text)["results"][0]["answers"][0]["ms"] is None

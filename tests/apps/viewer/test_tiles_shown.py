@@ -12,13 +12,13 @@ import pytest
 
 from built_room import built_room
 from topoloc.apps.cli import main
-from topoloc.apps.viewer.document import ResultSet, document_of
-from topoloc.apps.viewer.world_document import answers_in, document_of_world
-from topoloc.apps.viewer.world_scene import scene_of_world
+from topoloc.apps.viewer.document import ResultSet, create_document
+from topoloc.apps.viewer.world_document import create_world_document, transform_answers
+from topoloc.apps.viewer.world_scene import create_world_scene
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, create_atlas
 from topoloc.atlas.joins import Join
-from topoloc.atlas.shared_world import shared_worlds, world_of_tile
+from topoloc.atlas.shared_world import group_shared_worlds, world_of_tile
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
@@ -46,13 +46,13 @@ def _points(document: dict) -> np.ndarray:
 
 def test_each_tile_stands_where_it_lies(campus: Path, tiny_recording: Path):
     atlas = Atlas.open(str(campus))
-    world, alone = shared_worlds(atlas.manifest)
+    world, alone = group_shared_worlds(atlas.manifest)
     assert ([placed.tile.tile_id for placed in world.tiles], alone.tiles[0].tile.tile_id) == (
         ["hall", "room"],
         "far",
     )
-    document = document_of_world(atlas, world, "campus")
-    room = document_of(built_room(tiny_recording), "room")
+    document = create_world_document(atlas, world, "campus")
+    room = create_document(built_room(tiny_recording), "room")
     assert document["map"]["num_nodes"] == 2 * room["map"]["num_nodes"]
     assert document["map"]["tiles"] == ["hall", "room"]
     assert len({session["id"] for session in document["map"]["sessions"]}) == 2
@@ -82,13 +82,13 @@ def test_each_tile_stands_where_it_lies(campus: Path, tiny_recording: Path):
 
 def test_answers_stand_where_their_tile_lies(campus: Path, tiny_recording: Path, room_map: Path):
     atlas = Atlas.open(str(campus))
-    world = shared_worlds(atlas.manifest)[0]
+    world = group_shared_worlds(atlas.manifest)[0]
     frame = open_sequence(str(tiny_recording))[3]
     with TopoMetricMap.load(room_map) as topomap:
         result = Localizer(topomap).localize(frame.image, frame.camera)
     assert isinstance(result, Localization)
     answer = result.to_json("3") | {"tile": "room"}
-    (moved,) = answers_in(world, [answer, answer | {"tile": "far"}])
+    (moved,) = transform_answers(world, [answer, answer | {"tile": "far"}])
     pose = HALL_FROM_ROOM @ result.world_from_cam
     np.testing.assert_allclose(moved["world_from_cam"]["translation"], pose.translation, atol=1e-9)
     covariance = HALL_FROM_ROOM.adjoint() @ result.covariance @ HALL_FROM_ROOM.adjoint().T
@@ -98,9 +98,9 @@ def test_answers_stand_where_their_tile_lies(campus: Path, tiny_recording: Path,
         {"world_from_cam": answer["world_from_cam"], "probability": 0.4, "node": 0, "tile": name}
         for name in ("hall", "room", "far")
     ]
-    (shown,) = answers_in(world, [refused | {"alternatives": poses}])
+    (shown,) = transform_answers(world, [refused | {"alternatives": poses}])
     assert [one["tile"] for one in shown["alternatives"]] == ["hall", "room"]
-    document = document_of_world(
+    document = create_world_document(
         atlas, world, "campus", [ResultSet("walk", [answer, answer | {"tile": "far"}])]
     )
     assert document["results"][0]["num_answers"] == 1
@@ -108,10 +108,10 @@ def test_answers_stand_where_their_tile_lies(campus: Path, tiny_recording: Path,
 
 def test_an_export_holds_all_of_them(campus: Path):
     atlas = Atlas.open(str(campus))
-    world = shared_worlds(atlas.manifest)[0]
+    world = group_shared_worlds(atlas.manifest)[0]
     both, one = (
-        scene_of_world(atlas, world, "campus"),
-        scene_of_world(atlas, world_of_tile(atlas.manifest, atlas.tile("room")), "room"),
+        create_world_scene(atlas, world, "campus"),
+        create_world_scene(atlas, world_of_tile(atlas.manifest, atlas.tile("room")), "room"),
     )
     half = len(one.views)
     assert (len(both.views), len(both.points.world)) == (2 * half, 2 * len(one.points.world))

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from built_room import built_room
-from topoloc.apps.export.colmap import colmap_files
-from topoloc.apps.viewer.map_scene import scene_of_map
+from topoloc.apps.export.colmap import to_colmap_model
+from topoloc.apps.viewer.map_scene import create_map_scene
 from topoloc.apps.viewer.tracks import MAX_ERROR_PX, find_tracks
 from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.topomap import TopoMetricMap
@@ -55,11 +55,11 @@ def test_nodes_without_points_or_pictures_are_views_all_the_same(tiny_recording:
     topomap = built_room(tiny_recording)
     first = without_points(topomap.nodes[0])
     for nodes in ([first, *topomap.nodes[1:]], [without_points(node) for node in topomap.nodes]):
-        scene = scene_of_map(replace(topomap, nodes=nodes), "room")
+        scene = create_map_scene(replace(topomap, nodes=nodes), "room")
         assert len(scene.views) == len(topomap.summaries)
         assert len(scene.views[0].points_img) == 0
         assert scene.views[0].jpeg == b""
-        assert set(colmap_files(scene)) >= {"images.txt", "points3D.txt"}
+        assert set(to_colmap_model(scene)) >= {"images.txt", "points3D.txt"}
 
 
 def test_pictures_of_one_name_are_told_apart(tiny_recording: Path):
@@ -75,8 +75,8 @@ def test_pictures_of_one_name_are_told_apart(tiny_recording: Path):
             for row, summary in enumerate(topomap.summaries)
         ],
     )
-    scene = scene_of_map(twice, "room", with_points=False)
+    scene = create_map_scene(twice, "room", with_points=False)
     assert [view.name for view in scene.views][:2] == ["session0/same.png", "session1/same.png"]
     assert [
-        view.name for view in scene_of_map(twice, "room", session_id=1, with_points=False).views
+        view.name for view in create_map_scene(twice, "room", session_id=1, with_points=False).views
     ] == ["session1/same.png"]

@@ -14,14 +14,17 @@ import topoloc
 from built_room import built_room
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts import correlated_errors
-from topoloc.localization.map_facts.correlated_errors import CorrelatedErrorsConfig, inflation
+from topoloc.localization.map_facts.correlated_errors import (
+    CorrelatedErrorsConfig,
+    covariance_inflation,
+)
 from topoloc.mapping.topomap import TopoMetricMap
 
-CONFIG, WEIGHTS = CorrelatedErrorsConfig(min_nodes=3), weights_of("surf").shared_errors
+CONFIG, WEIGHTS = CorrelatedErrorsConfig(min_nodes=3), load_fitted_weights("surf").shared_errors
 
 
 def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMetricMap:
@@ -54,13 +57,13 @@ def test_nodes_out_of_place_have_correlated_errors_and_nodes_in_place_do_not(tin
 def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
     """The maps that were measured since."""
     measured: list[TopoMetricMap] = []
-    measure = correlated_errors.measure_correlated_errors
+    measure = correlated_errors.measure_correlated_error_share
 
     def told(topomap: TopoMetricMap, *settings: Any) -> float:
         measured.append(topomap)
         return measure(topomap, *settings)
 
-    monkeypatch.setattr(correlated_errors, "measure_correlated_errors", told)
+    monkeypatch.setattr(correlated_errors, "measure_correlated_error_share", told)
     return measured
 
 
@@ -121,8 +124,8 @@ def test_a_map_of_one_node_is_taken_to_be_of_middling_quality(tiny_recording: Pa
 
 
 def test_without_correlated_errors_the_covariance_stays_as_it_is():
-    assert inflation(500, 0.0) == 1.0
-    assert inflation(100, 0.1) == pytest.approx(11.0)
+    assert covariance_inflation(500, 0.0) == 1.0
+    assert covariance_inflation(100, 0.1) == pytest.approx(11.0)
 
 
 def test_the_first_query_computes_nothing_of_the_map(
@@ -141,7 +144,7 @@ def test_the_first_query_computes_nothing_of_the_map(
         raise AssertionError("a digest of the nodes, or what the map knows, at a query")
 
     monkeypatch.setattr("topoloc.mapping.nodes.hashlib.sha256", never)
-    monkeypatch.setattr(correlated_errors, "measure_correlated_errors", never)
+    monkeypatch.setattr(correlated_errors, "measure_correlated_error_share", never)
     assert localizer.localize(frame.image, frame.camera).localized
     localizer.map.moves(0)
     with pytest.raises(AssertionError, match="a digest of the nodes"):

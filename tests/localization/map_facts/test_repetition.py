@@ -17,11 +17,15 @@ from topoloc.localization import open_map
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import with_repetitions
-from topoloc.localization.map_facts.repetition import copies, folded, shifts_of
+from topoloc.localization.map_facts.map_building import with_repetitions
+from topoloc.localization.map_facts.repetition import (
+    find_repetition_shifts,
+    fold_repetitions,
+    shifted_copies,
+)
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.checking import damages
+from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import Image, NodeScore
 
@@ -61,7 +65,7 @@ def _wall(num_panels: int, noise: float = 0.0) -> LocalMap:
 @pytest.mark.parametrize("noise", [0.0, 0.2])
 def test_a_wall_of_equal_panels_repeats_itself_by_whole_panels(noise: float):
     wall = _wall(4, noise)
-    shifts = shifts_of(wall, wall)
+    shifts = find_repetition_shifts(wall, wall)
     along = shifts[:, 0] / PERIOD[0]
     np.testing.assert_allclose(shifts[:, 1:], 0.0, atol=0.01)
     np.testing.assert_allclose(along, np.round(along), atol=0.02)
@@ -69,7 +73,7 @@ def test_a_wall_of_equal_panels_repeats_itself_by_whole_panels(noise: float):
 
 
 def test_what_is_there_once_does_not_repeat_itself():
-    assert len(shifts_of(_wall(1), _wall(1))) == 0
+    assert len(find_repetition_shifts(_wall(1), _wall(1))) == 0
 
 
 def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_panels():
@@ -82,19 +86,19 @@ def test_parts_of_a_panel_that_resemble_each_other_are_no_repetition_beside_the_
         wall.node_ids[few], wall.sizes[few], wall.directions[few],
     )  # fmt: skip
     np.testing.assert_allclose(
-        shifts_of(wall, LocalMap.pooled([wall, above]))[:, 2], 0.0, atol=0.01
+        find_repetition_shifts(wall, LocalMap.concatenate([wall, above]))[:, 2], 0.0, atol=0.01
     )
 
 
 def test_folded_points_of_all_panels_are_those_of_one():
-    points_world = folded(_wall(4).points_world, np.array([PERIOD, -PERIOD, 2 * PERIOD]))
+    points_world = fold_repetitions(_wall(4).points_world, np.array([PERIOD, -PERIOD, 2 * PERIOD]))
     spread = points_world.reshape(4, len(PANEL), 3) - points_world[: len(PANEL)]
     np.testing.assert_allclose(spread, 0.0, atol=1e-9)
 
 
 def test_copies_are_the_points_and_what_each_shift_makes_of_them():
     np.testing.assert_allclose(
-        copies(PANEL, PERIOD[None])[1] - PANEL, np.tile(PERIOD, (len(PANEL), 1))
+        shifted_copies(PANEL, PERIOD[None])[1] - PANEL, np.tile(PERIOD, (len(PANEL), 1))
     )
 
 
@@ -129,7 +133,7 @@ def test_what_the_build_found_is_kept_in_the_file_and_not_sought_again(
     built = with_repetitions(twice(room))
     built.save(tmp_path / "twice.topo")
     sought = []
-    monkeypatch.setattr(open_map, "shifts_of", lambda *given: sought.append(given))
+    monkeypatch.setattr(open_map, "find_repetition_shifts", lambda *given: sought.append(given))
     with TopoMetricMap.load(tmp_path / "twice.topo") as topomap:
         opened = OpenMap(topomap)
         for row, node_id in enumerate(opened.node_ids):
@@ -137,7 +141,7 @@ def test_what_the_build_found_is_kept_in_the_file_and_not_sought_again(
             np.testing.assert_array_equal(
                 opened.moves(row), built.repetitions.moves.get(node_id, np.zeros((0, 4, 4)))
             )
-        assert damages(tmp_path / "twice.topo") == []
+        assert find_map_damage(tmp_path / "twice.topo") == []
     assert sought == []
 
 

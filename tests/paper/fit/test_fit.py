@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topoloc.localization.evidence import Evidence, log_odds_of, node_log_odds
+from topoloc.localization.evidence import Evidence, compute_log_odds, compute_node_log_odds
 from topoloc.localization.fitted_weights import (
+    CorrelatedErrorWeights,
     EvidenceWeights,
     FittedWeights,
     RivalWeights,
-    SharedErrorWeights,
+    load_fitted_weights,
     read_weights,
-    weights_of,
 )
 from topoloc_paper.fit import __main__ as command
 from topoloc_paper.fit.evidence import (
@@ -97,7 +97,7 @@ def _drawn(num: int, seed: int = 0) -> list[TriedPose]:
     rng, poses = np.random.default_rng(seed), []
     for k in range(num):
         evidence = _evidence(rng)
-        is_right = rng.random() < 1.0 / (1.0 + math.exp(-node_log_odds(evidence, TRUE)))
+        is_right = rng.random() < 1.0 / (1.0 + math.exp(-compute_node_log_odds(evidence, TRUE)))
         poses.append(_pose(RIGHT if is_right else WRONG, evidence, k, MAPS[k % 3]))
     return poses
 
@@ -127,10 +127,11 @@ def test_weights_that_poses_were_drawn_with_are_found_again():
 def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
     poses = _drawn(1500)
     strongest = max(
-        (pose.evidence for pose in poses), key=lambda evidence: node_log_odds(evidence, TRUE)
+        (pose.evidence for pose in poses),
+        key=lambda evidence: compute_node_log_odds(evidence, TRUE),
     )
     fitted = fit_evidence([*poses, _pose(None, strongest)], PRIOR, 0.1)
-    assert 1.0 / (1.0 + math.exp(-node_log_odds(strongest, fitted))) == pytest.approx(
+    assert 1.0 / (1.0 + math.exp(-compute_node_log_odds(strongest, fitted))) == pytest.approx(
         0.35, abs=1e-6
     )
     assert fitted.bias < fit_evidence(poses, PRIOR, 0.1).bias - 1.0
@@ -151,7 +152,7 @@ def test_every_family_is_judged_by_a_fit_without_it():
 
 def test_few_poses_stay_with_the_prior_and_the_strength_follows_what_was_not_fitted_to():
     poses = _drawn(90)
-    assert fit_evidence(poses, TRUE, 1e4).in_order == pytest.approx(TRUE.in_order, abs=0.01)
+    assert fit_evidence(poses, TRUE, 1e4).parallel_map == pytest.approx(TRUE.parallel_map, abs=0.01)
     assert best_strength(poses, TRUE) > best_strength(
         _drawn(3000), replace(PRIOR, even_share=0.2, bias=-2.0)
     )
@@ -166,14 +167,16 @@ def test_calibration_error_is_the_mean_gap_of_what_would_be_answered():
 
 
 def test_shared_errors_put_95_percent_inside():
-    rng, before = np.random.default_rng(0), SharedErrorWeights(2.0, 0.005, 0.1)
+    rng, before = np.random.default_rng(0), CorrelatedErrorWeights(2.0, 0.005, 0.1)
     evidence = _evidence(rng)
 
     def poses(true_rho: float, said_rho: float) -> list[TriedPose]:
-        inflation = 1.0 + evidence.num_found * true_rho
+        covariance_inflation = 1.0 + evidence.num_found * true_rho
         return [
             replace(
-                _pose(RIGHT, evidence), square=float(inflation * rng.chisquare(6)), rho=said_rho
+                _pose(RIGHT, evidence),
+                square=float(covariance_inflation * rng.chisquare(6)),
+                rho=said_rho,
             )
             for _ in range(4000)
         ]
@@ -223,7 +226,7 @@ def test_the_command_writes_a_file_that_ships(
     weights = read_weights(out)
     assert weights.kind == "sift"
     assert weights.is_calibrated
-    prior = weights_of("surf").evidence
+    prior = load_fitted_weights("surf").evidence
     assert weights.evidence == fit_evidence(poses, prior, best_strength(poses, prior))
     assert "900 poses tried" in weights.corpus
     assert "corridor, fitted without it" in capsys.readouterr().out
@@ -253,13 +256,13 @@ def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose
             num_distinct=int(rng.integers(0, 60)),
             num_lesser_side=int(rng.integers(0, 40)),
         )
-        is_right = rng.random() < 1.0 / (1.0 + math.exp(-log_odds_of(evidence, weights)))
+        is_right = rng.random() < 1.0 / (1.0 + math.exp(-compute_log_odds(evidence, weights)))
         poses.append(_pose(RIGHT if is_right else WRONG, evidence, k))
     return poses
 
 
 def test_the_weights_of_walls_are_found_again_and_left_alone_where_poses_are_few():
-    before = weights_of("surf")
+    before = load_fitted_weights("surf")
     true = replace(
         before,
         walls=replace(before.walls, spread=2.0, lesser_side=0.7, bias=before.walls.bias - 3.5),
@@ -268,10 +271,10 @@ def test_the_weights_of_walls_are_found_again_and_left_alone_where_poses_are_few
     assert num == 4000
     told = _on_walls(500, true, seed=1)
     there, here = (
-        np.array([log_odds_of(pose.evidence, weights) for pose in told])
+        np.array([compute_log_odds(pose.evidence, weights) for pose in told])
         for weights in (true, replace(before, walls=fitted))
     )
     assert np.mean(np.abs(there - here)) < 0.4
-    assert np.mean(np.abs(there - [log_odds_of(pose.evidence, before) for pose in told])) > 1.0
+    assert np.mean(np.abs(there - [compute_log_odds(pose.evidence, before) for pose in told])) > 1.0
     assert fitted.doubt == before.walls.doubt
     assert fit_walls(_on_walls(MIN_POSES, true), before.walls) == (before.walls, 0)

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Generator, Tensor, nn
 
-from topoloc.retrieval.backbones import normalize_pictures
+from topoloc.retrieval.backbones import normalize_images
 from topoloc_training.classifier_config import AugmentationConfig
 
 
@@ -20,7 +20,7 @@ def augment(pictures: Tensor, config: AugmentationConfig, generator: Generator) 
     images = _relit(images, config, generator)
     images = _blurred(images, config, generator)
     images = _occluded(images, config, generator)
-    return normalize_pictures(images.permute(0, 2, 3, 1) * 255.0).contiguous(
+    return normalize_images(images.permute(0, 2, 3, 1) * 255.0).contiguous(
         memory_format=torch.channels_last
     )
 

@@ -7,7 +7,11 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.retrieval.network_config import ClassifierNetwork, PooledNetwork, VladNetworkConfig
+from topoloc.retrieval.network_config import (
+    ClassifierNetworkConfig,
+    PooledNetworkConfig,
+    VladNetworkConfig,
+)
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ class AugmentationConfig:
 
 
 @dataclass(frozen=True)
-class CnnFcConfig(ClassifierNetwork):
+class CnnFcConfig(ClassifierNetworkConfig):
     """Settings of cnn-fc: a network whose outputs are the nodes."""
 
     training: TrainingConfig = field(default_factory=lambda: TrainingConfig(max_epochs=40))
@@ -79,7 +83,7 @@ class CnnFcConfig(ClassifierNetwork):
 
 
 @dataclass(frozen=True)
-class CnnNnConfig(PooledNetwork):
+class CnnNnConfig(PooledNetworkConfig):
     """Settings of cnn-nn: features of a pretrained network, pooled, whitened; nearest
     neighbours."""
 

@@ -14,9 +14,9 @@ from torch import Generator, Tensor, nn
 from topoloc.errors import TrainingError
 from topoloc.retrieval.cnn_fc import NAME, NodeClassifier
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.inference import BATCH_SIZE, in_channels_last
+from topoloc.retrieval.inference import BATCH_SIZE, to_channels_last
 from topoloc.retrieval.network_config import BackboneName
-from topoloc.retrieval.network_pictures import network_pictures
+from topoloc.retrieval.network_images import prepare_network_images
 from topoloc_training.classifier_config import CnnFcConfig
 from topoloc_training.frozen_maps import FrozenMaps, plain_maps
 from topoloc_training.stored_weights import rounded_to_half, to_arrays
@@ -46,13 +46,13 @@ def train(
         config = _for_tuning(config)
     torch.manual_seed(config.training.seed)
     network = NodeClassifier(backbone, training_set.num_nodes)
-    in_channels_last(network)
+    to_channels_last(network)
     pretrained = [] if weights is None else _load(network, weights)
     trunk = _freeze(
         network, len(network.backbone.features) if weights is None else config.num_tuned
     )
     images, shape = decode_pictures(training_set)
-    pictures = torch.from_numpy(network_pictures(images, shape, config.picture))
+    pictures = torch.from_numpy(prepare_network_images(images, shape, config.picture))
     targets = torch.from_numpy(soft_labels(training_set, config.label_spread))
     held_out = hold_out(training_set.node_ids, config.training.held_out, config.training.seed)
     rows, judged = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from topoloc.retrieval.cnn_nn import network_of
+from topoloc.retrieval.cnn_nn import create_pooled_network
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.network_config import BackboneName
 from topoloc_training.classifier_config import CnnNnConfig
@@ -24,7 +24,7 @@ def train(
     Raises:
         MapError: a mapping image is damaged.
     """
-    network = network_of(backbone, config)
+    network = create_pooled_network(backbone, config)
     if weights is not None:
         load_features(network.backbone, weights)
     return fit_vectors(

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from topoloc.mapping.edit import editing
+from topoloc.mapping.edit import edit_map
 from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.sessions import Edit, today
 from topoloc.mapping.topomap import TopoMetricMap
@@ -25,7 +25,7 @@ def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: boo
     """
     name = f"train {model.name}"
     if target.exists() and path.samefile(target):
-        with editing(path) as edit:
+        with edit_map(path) as edit:
             edit.commit(_with_model(edit.topomap, model, make_default), name)
         return
     with TopoMetricMap.load(path) as topomap:

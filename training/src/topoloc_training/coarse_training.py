@@ -81,8 +81,8 @@ def train_coarse(
 
 
 def in_ids(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
-    """The inverse of `topomap.in_rows`: a model that was made of the map's rows, as the map keeps
-    it."""
+    """The inverse of `topomap.node_ids_to_rows`: a model that was made of the map's rows, as the
+    map keeps it."""
     if list(ids) == list(range(len(ids))):
         return model
     rows = model.arrays.get("node_ids", np.arange(len(ids)))

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Generator, Tensor, nn
 
-from topoloc.retrieval.backbones import normalize_pictures
+from topoloc.retrieval.backbones import normalize_images
 from topoloc.retrieval.inference import BATCH_SIZE
 from topoloc_training.augmentation import augment
 from topoloc_training.classifier_config import CnnFcConfig
@@ -70,7 +70,7 @@ def plain_maps(trunk: nn.Sequential, pictures: Tensor) -> Tensor:
     trunk.eval()
     with torch.no_grad():
         return torch.cat(
-            [_half(trunk(normalize_pictures(batch))) for batch in pictures.split(BATCH_SIZE)]
+            [_half(trunk(normalize_images(batch))) for batch in pictures.split(BATCH_SIZE)]
         )
 
 

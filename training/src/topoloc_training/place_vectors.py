@@ -10,9 +10,9 @@ import numpy as np
 from torch import nn
 
 from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.descriptor_index import Whitening, learn_whitening
 from topoloc.retrieval.inference import Predictor
-from topoloc.retrieval.neighbours import Whitening, learn_whitening
-from topoloc.retrieval.network_pictures import network_pictures
+from topoloc.retrieval.network_images import prepare_network_images
 from topoloc_training.classifier_config import CnnNnConfig, VladNnConfig
 from topoloc_training.stored_weights import rounded_to_half, to_arrays
 from topoloc_training.training_set import Progress, TrainingSet, decode_pictures
@@ -41,7 +41,7 @@ def fit_vectors(
     raw = []
     for start in range(0, len(pictures), _CHUNK):
         raw.append(
-            predict(network_pictures(pictures[start : start + _CHUNK], shape, config.picture))
+            predict(prepare_network_images(pictures[start : start + _CHUNK], shape, config.picture))
         )
         progress(f"{name}: vectors", min(start + _CHUNK, len(pictures)), len(pictures))
     vectors = np.concatenate(raw)

@@ -20,14 +20,14 @@ from jaxtyping import Float32
 
 import topoloc
 from topoloc.features.extraction import extract_features
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.features import Features
-from topoloc.features.kinds import FeatureConfig, find_kind
+from topoloc.recordings.image_io import to_grey
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.pictures import grey_image
-from topoloc.recordings.recording import single_pictures
-from topoloc.retrieval.neighbours import Whitening, learn_whitening
+from topoloc.recordings.recording import as_monocular
+from topoloc.retrieval.descriptor_index import Whitening, learn_whitening
 from topoloc.retrieval.shared_vocabulary import SharedVocabulary
-from topoloc.retrieval.vlad import VladConfig, learn_words, placed
+from topoloc.retrieval.vlad import VladConfig, append_positions, learn_words
 
 NUM_PICTURES = 160  # of each recording
 NUM_WORDS, DIMENSION = 32, 128
@@ -41,10 +41,12 @@ def learn_vocabulary(
 ) -> SharedVocabulary:
     """Words and whitening of pictures of several recordings, rounded to what the file keeps."""
     config = VladConfig(
-        num_words=num_words, dimension=dimension, position_weight=find_kind(kind).position_weight
+        num_words=num_words,
+        dimension=dimension,
+        position_weight=find_feature_type(kind).position_weight,
     )
     pictures = [picture for described in recordings.values() for picture in described]
-    descriptors = np.concatenate([placed(*picture, config) for picture in pictures])
+    descriptors = np.concatenate([append_positions(*picture, config) for picture in pictures])
     words = _rounded(learn_words(descriptors, config))
     unwhitened = SharedVocabulary(
         kind, words, Whitening(np.zeros(1, np.float32), np.zeros((1, 1), np.float32)), config, {}
@@ -52,7 +54,7 @@ def learn_vocabulary(
     rng = np.random.default_rng(0)
     raw = np.stack(
         [
-            unwhitened.raw_vector(*picture)
+            unwhitened.raw_descriptor(*picture)
             for picture in [*pictures, *(_half(picture, rng) for picture in pictures)]
         ]
     )
@@ -85,11 +87,11 @@ def _rounded(values: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
 
 
 def _described(path: str, config: FeatureConfig) -> list[Described]:
-    sequence = single_pictures(open_sequence(path))
+    sequence = as_monocular(open_sequence(path))
     rows = np.unique(np.linspace(0, len(sequence) - 1, NUM_PICTURES).round().astype(int))
     described = []
     for row in rows:
-        grey = grey_image(sequence[int(row)].image)
+        grey = to_grey(sequence[int(row)].image)
         described.append((extract_features(grey, config), grey.shape[1], grey.shape[0]))
     return described
 

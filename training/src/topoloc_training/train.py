@@ -12,9 +12,9 @@ import tyro
 
 from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, progress_bar, write_json
 from topoloc.apps.cli.settings_file import read_settings
-from topoloc.apps.cli.tile_option import TileOption, edited_at
+from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
 from topoloc.atlas.atlas import is_atlas
-from topoloc.mapping.checking import list_coarse
+from topoloc.mapping.integrity_check import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.network_config import BackboneName
@@ -67,7 +67,7 @@ class Command:
         )
         config = read_settings(self.config).of(CoarseTrainingConfig)
         start = time.perf_counter()
-        facts, model = edited_at(
+        facts, model = edit_map_or_tile(
             self.map, self.tile, lambda path: self._trained(path, Path(self.out or path), config)
         )
         facts |= {"seconds": round(time.perf_counter() - start, 1), "default": self.default}
@@ -94,7 +94,7 @@ class Command:
                 topomap, self.coarse, self.backbone, self.weights, config, progress, checkpoint
             )
         store_coarse(path, target, model, self.default)
-        (facts,) = [facts for facts in list_coarse(target) if facts["name"] == self.coarse]
+        (facts,) = [facts for facts in list_coarse_models(target) if facts["name"] == self.coarse]
         return facts, model
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Int
 from torch import Generator, Tensor, nn
 
 from topoloc.errors import TrainingError
-from topoloc.recordings.atomic import replaced_file
+from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.inference import has_bfloat16, threads
 from topoloc_training.classifier_config import TrainingConfig
 from topoloc_training.training_set import Progress
@@ -163,7 +163,7 @@ class _State:
             "optimizer": self.optimizer.state_dict(),
         }
         try:
-            with replaced_file(path) as part:
+            with atomic_write(path) as part:
                 torch.save(content, part)
         except (OSError, RuntimeError) as error:
             raise TrainingError(

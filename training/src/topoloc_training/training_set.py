@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.retrieval.network_pictures import PictureShape, RgbPicture, decode_picture
+from topoloc.retrieval.network_images import ImageShape, RgbImage, decode_stored_image
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, steps done and steps in all."""
@@ -46,12 +46,12 @@ class TrainingSet:
         return np.linalg.norm(centres[:, None] - centres[None], axis=2) + self.lambda_rot * angles
 
 
-def decode_pictures(training_set: TrainingSet) -> tuple[list[RgbPicture], PictureShape]:
+def decode_pictures(training_set: TrainingSet) -> tuple[list[RgbImage], ImageShape]:
     """The mapping pictures in colour, and the size that most of them have. Raises MapError where
     one is damaged."""
-    pictures = [decode_picture(jpeg) for jpeg in training_set.jpegs]
+    pictures = [decode_stored_image(jpeg) for jpeg in training_set.jpegs]
     sizes, counts = np.unique(
         [picture.shape[1::-1] for picture in pictures], axis=0, return_counts=True
     )
     width, height = sizes[int(counts.argmax())]
-    return pictures, PictureShape(int(width), int(height))
+    return pictures, ImageShape(int(width), int(height))

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float32
 from torch import Tensor, nn
 
 from topoloc.errors import TrainingError
-from topoloc.retrieval.backbones import Backbone, normalize_pictures
+from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc.retrieval.coarse import CoarseModel
+from topoloc.retrieval.descriptor_index import learn_visual_words
 from topoloc.retrieval.inference import BATCH_SIZE
-from topoloc.retrieval.neighbours import visual_words
 from topoloc.retrieval.network_config import BackboneName
-from topoloc.retrieval.network_pictures import RgbPictures, network_pictures
+from topoloc.retrieval.network_images import RgbImages, prepare_network_images
 from topoloc.retrieval.vlad_nn import DEPTHS, NetVlad, VladNetwork
 from topoloc_training.classifier_config import TripletConfig, VladNnConfig
 from topoloc_training.place_vectors import fit_vectors
@@ -49,7 +49,7 @@ def train(
     if weights is not None:
         load_features(network.backbone, weights)
     images, shape = decode_pictures(training_set)
-    pictures = network_pictures(images, shape, config.picture)
+    pictures = prepare_network_images(images, shape, config.picture)
     if weights is not None and weights.netvlad is not None:
         conv, centroids = weights.netvlad["conv.weight"], weights.netvlad["centroids"]
     else:
@@ -80,7 +80,7 @@ def learn_words(
     Weights are the unit centroids, scaled so that the second nearest word gets one hundredth of the
     nearest one's share on average.
     """
-    centroids = visual_words(features, num_clusters, seed)
+    centroids = learn_visual_words(features, num_clusters, seed)
     directions = centroids / np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), 1e-6)
     cosines = np.sort(features @ directions.T, axis=1)
     lead = float(np.mean(cosines[:, -1] - cosines[:, -2])) if len(centroids) > 1 else 1.0
@@ -91,7 +91,7 @@ def learn_words(
 
 
 def _sample_features(
-    backbone: Backbone, pictures: RgbPictures, config: VladNnConfig, progress: Progress
+    backbone: Backbone, pictures: RgbImages, config: VladNnConfig, progress: Progress
 ) -> Float32[np.ndarray, "n c"]:
     """Unit features from all mapping images, a few of each."""
     rng = np.random.default_rng(config.seed)
@@ -100,7 +100,7 @@ def _sample_features(
     with torch.inference_mode():
         for start in range(0, len(pictures), BATCH_SIZE):
             maps = backbone(
-                normalize_pictures(torch.from_numpy(pictures[start : start + BATCH_SIZE]))
+                normalize_images(torch.from_numpy(pictures[start : start + BATCH_SIZE]))
             )
             for features in nn.functional.normalize(maps, dim=1).flatten(2).transpose(1, 2).numpy():
                 chosen = rng.permutation(len(features))[: config.num_sampled_features]
@@ -111,7 +111,7 @@ def _sample_features(
 
 def tune(
     network: nn.Module,
-    pictures: RgbPictures,
+    pictures: RgbImages,
     training_set: TrainingSet,
     config: TripletConfig,
     progress: Progress,
@@ -169,9 +169,9 @@ def tune(
     return losses
 
 
-def _loss(network: nn.Module, pictures: RgbPictures, margin: float) -> Tensor:
+def _loss(network: nn.Module, pictures: RgbImages, margin: float) -> Tensor:
     """Of one image, one near it, and others from elsewhere, in this order."""
-    vectors = network(normalize_pictures(torch.from_numpy(pictures)))
+    vectors = network(normalize_images(torch.from_numpy(pictures)))
     squares = ((vectors[1:] - vectors[0]) ** 2).sum(dim=1)
     return torch.relu(margin + squares[0] - squares[1:]).sum()
 
@@ -186,13 +186,13 @@ def _pairs(
     return near, distances > config.far * training_set.d_thresh
 
 
-def _vectors(network: nn.Module, pictures: RgbPictures) -> Float32[np.ndarray, "n d"]:
+def _vectors(network: nn.Module, pictures: RgbImages) -> Float32[np.ndarray, "n d"]:
     with torch.inference_mode():
         batches = [
             pictures[start : start + BATCH_SIZE] for start in range(0, len(pictures), BATCH_SIZE)
         ]
         return np.concatenate(
-            [network(normalize_pictures(torch.from_numpy(batch))).numpy() for batch in batches]
+            [network(normalize_images(torch.from_numpy(batch))).numpy() for batch in batches]
         )
 
 

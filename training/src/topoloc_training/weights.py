@@ -24,7 +24,7 @@ from torch import Tensor
 
 from topoloc.errors import WeightsError
 from topoloc.features.network_files import cache_folder
-from topoloc.recordings.atomic import replaced_file
+from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.backbones import NUM_CHANNELS, Backbone
 from topoloc.retrieval.network_config import BackboneName
 from topoloc_training.efficientnet_weights import installed_file, is_efficientnet, named_as_backbone
@@ -129,14 +129,14 @@ def _published_file(backbone: BackboneName) -> Path:
     path = cache_folder() / name
     if path.is_file():
         return path
-    advice = (
+    install_hint = (
         f"fetch it on another machine and put it at {path}, or give --weights FILE (--weights"
         f" {SCRATCH}: none)"
     )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with (
-            replaced_file(path) as part,
+            atomic_write(path) as part,
             urllib.request.urlopen(_URL + name, timeout=_TIMEOUT_SECONDS) as answer,
         ):
             with part.open("wb") as file:
@@ -144,12 +144,13 @@ def _published_file(backbone: BackboneName) -> Path:
             digest = _sha256(part)
             if not digest.startswith(name.rpartition("-")[2].removesuffix(".pth")):
                 raise WeightsError(
-                    f"{_URL}{name} came with SHA-256 {digest[:8]}..., not as published; {advice}"
+                    f"{_URL}{name} came with SHA-256 {digest[:8]}..., not as published;"
+                    f" {install_hint}"
                 )
     except (urllib.error.URLError, OSError) as error:
         reason = getattr(error, "reason", None) or error
         raise WeightsError(
-            f"no weights of {backbone}: {_URL}{name} cannot be fetched ({reason}); {advice}"
+            f"no weights of {backbone}: {_URL}{name} cannot be fetched ({reason}); {install_hint}"
         ) from error
     return path
 

@@ -24,7 +24,7 @@ from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.atomic import write_bytes, write_text
 from topoloc.recordings.frame import Image
-from topoloc.recordings.pictures import grey_image
+from topoloc.recordings.image_io import to_grey
 from topoloc.recordings.trajectory import Trajectory, write_tum
 from topoloc_worlds.shots import Shot
 
@@ -140,7 +140,7 @@ def write_shot(layout: Layout, index: int, shot: Shot) -> None:
             data = _encoded(_depth_units(shot.depth, layout.depth_factor), None)
         else:
             image = shot.left if kind == "left" or shot.right is None else shot.right
-            data = _encoded(grey_image(image) if layout.grey else image, layout.jpeg)
+            data = _encoded(to_grey(image) if layout.grey else image, layout.jpeg)
         write_bytes(path, data)
 
 

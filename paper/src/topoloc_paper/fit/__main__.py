@@ -30,9 +30,9 @@ from pathlib import Path
 import numpy as np
 
 from topoloc.errors import TopolocError
-from topoloc.features.kinds import find_kind
-from topoloc.localization.evidence import log_odds_of
-from topoloc.localization.fitted_weights import STAND_IN, FittedWeights, weights_of
+from topoloc.features.feature_types import find_feature_type
+from topoloc.localization.evidence import compute_log_odds
+from topoloc.localization.fitted_weights import FALLBACK_TYPE, FittedWeights, load_fitted_weights
 from topoloc_paper.fit.corpus import FAMILIES, PLACES, AskedPlace, family_of, open_recordings
 from topoloc_paper.fit.evidence import (
     Judged,
@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     try:
-        find_kind(asked.kind)
+        find_feature_type(asked.kind)
     except TopolocError as error:
         raise SystemExit(f"error: {error}") from error
     if asked.load:
@@ -140,7 +140,7 @@ def ask_places(
 def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> FittedWeights:
     """Fitted weights of this kind, with a report of how they do beside those in use;
     `by_recording`: see `try_on_others`."""
-    before, prior = weights_of(kind), weights_of(STAND_IN).evidence
+    before, prior = load_fitted_weights(kind), load_fitted_weights(FALLBACK_TYPE).evidence
     walls, num_walls = fit_walls(poses, before.walls)
     poses = [pose for pose in poses if pose.evidence.num_distinct is None]
     strength = best_strength(poses, prior, by_recording)
@@ -163,7 +163,7 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
         evidence,
         rivals,
         walls,
-        fit_shared_errors(poses, weights_of(STAND_IN).shared_errors),
+        fit_shared_errors(poses, load_fitted_weights(FALLBACK_TYPE).shared_errors),
     )
     report(poses, before, fitted, held_out)
     print(f"{walls}, fitted to {num_walls} poses ({before.walls})")
@@ -173,12 +173,12 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
 def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
     """The weights in use with those of the walls fitted anew, for the kind by which the walls are
     described."""
-    before = weights_of(find_kind(kind).kind_of_sides)
+    before = load_fitted_weights(find_feature_type(kind).virtual_view_type)
     walls, num = fit_walls(poses, before.walls)
     told = told_by_walls(poses)
     for name, weights in (("in use", before.walls), ("fitted", walls)):
         log_odds = np.array(
-            [log_odds_of(pose.evidence, replace(before, walls=weights)) for pose in told]
+            [compute_log_odds(pose.evidence, replace(before, walls=weights)) for pose in told]
         )
         part = Judged("walls", log_odds, np.array([pose.is_right for pose in told], dtype=bool))
         clearest = max(log_odds[~part.is_right], default=-99.0)
@@ -210,8 +210,8 @@ def corpus_of(
     )
     return (
         f"{len(told)} poses tried, {num_right} of them right, {elsewhere} of pictures from"
-        f" elsewhere, of maps of {places}; drawn to the weights of {STAND_IN} with the strength"
-        f" {strength:g}; rivals {rivals}; walls"
+        f" elsewhere, of maps of {places}; drawn to the weights of {FALLBACK_TYPE} with the"
+        f" strength {strength:g}; rivals {rivals}; walls"
         f" {f'fitted to {num_walls} poses' if num_walls else 'taken over'}; taken over: the weights"
         " of the doubt; shared_errors where fewer than 200 right poses tell. Calibration error: of"
         f" poses that would be answered, each {'recording' if by_recording else 'family of places'}"

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from topoloc.localization.evidence import node_log_odds, score_features
-from topoloc.localization.fitted_weights import EvidenceWeights, SharedErrorWeights
+from topoloc.localization.evidence import compute_node_log_odds, compute_score_features
+from topoloc.localization.fitted_weights import CorrelatedErrorWeights, EvidenceWeights
 from topoloc_paper.fit.corpus import family_of
 from topoloc_paper.fit.tried_poses import TriedPose
 
@@ -75,13 +75,13 @@ def _logistic_regression(
     poses: list[TriedPose], prior: EvidenceWeights, strength: float
 ) -> EvidenceWeights:
     x, is_right = (
-        np.array([score_features(pose.evidence) for pose in poses]),
+        np.array([compute_score_features(pose.evidence) for pose in poses]),
         np.array([pose.is_right for pose in poses]),
     )
     signs, given = 2.0 * is_right - 1.0, prior.doubt * x[:, -1]
     x, start = (
         np.column_stack([x[:, :-1], np.ones(len(x))]),
-        np.array([*prior.in_order[:-1], prior.bias]),
+        np.array([*prior.parallel_map[:-1], prior.bias]),
     )
 
     def loss(weights: np.ndarray) -> float:
@@ -144,7 +144,7 @@ def best_strength(
 def judged(family: str, poses: list[TriedPose], weights: EvidenceWeights) -> Judged:
     """What these weights say of these poses."""
     odds, is_right = (
-        [node_log_odds(pose.evidence, weights) for pose in poses],
+        [compute_node_log_odds(pose.evidence, weights) for pose in poses],
         [pose.is_right for pose in poses],
     )
     return Judged(family, np.array(odds, dtype=float), np.array(is_right, dtype=bool))
@@ -161,7 +161,9 @@ def calibration_error(log_odds: Float[np.ndarray, " n"], is_right: Bool[np.ndarr
     )
 
 
-def fit_shared_errors(poses: list[TriedPose], before: SharedErrorWeights) -> SharedErrorWeights:
+def fit_shared_errors(
+    poses: list[TriedPose], before: CorrelatedErrorWeights
+) -> CorrelatedErrorWeights:
     """The least rho and the factor with which 95 % of the right poses' errors lie inside the 95 %
     ellipsoid, none smaller than before.
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from topoloc.localization.evidence import node_log_odds, score_features
+from topoloc.localization.evidence import compute_node_log_odds, compute_score_features
 from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights
 from topoloc_paper.fit.tried_poses import TriedPose
 
@@ -85,5 +85,5 @@ def num_mistaken(differences: Float[np.ndarray, "n 3"], weights: RivalWeights) -
 
 def _terms(pose: TriedPose, weights: EvidenceWeights) -> np.ndarray:
     """What is weighed between two poses, in the order of the weights."""
-    features = score_features(pose.evidence)
-    return np.array([node_log_odds(pose.evidence, weights), features[0], features[-1]])
+    features = compute_score_features(pose.evidence)
+    return np.array([compute_node_log_odds(pose.evidence, weights), features[0], features[-1]])

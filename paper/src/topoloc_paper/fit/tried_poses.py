@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.features.kinds import FeatureConfig
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.evidence import Evidence, EvidenceConfig, tolerated_translation
+from topoloc.localization.evidence import Evidence, EvidenceConfig, compute_translation_tolerance
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.search import Trace
 from topoloc.mapping.build import BuildConfig
-from topoloc.mapping.side_nodes import SideNodesConfig
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.virtual_nodes import VirtualNodesConfig
 from topoloc.recordings.frame import StereoSequence
 from topoloc_paper.fit.corpus import GAMMAS, AskedPlace, read_rigid
 from topoloc_paper.fit.pictures import darkened, drawn_pictures
@@ -58,7 +58,7 @@ class TriedPose:
         if self.error_m is None or self.error_deg is None:
             return False
         return (
-            self.error_m < tolerated_translation(self.depth, ASKED)
+            self.error_m < compute_translation_tolerance(self.depth, ASKED)
             and self.error_deg < ASKED.max_rotation_deg
         )
 
@@ -90,7 +90,7 @@ def ask_place(
     poses: list[TriedPose] = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "place.topo"
-        sides = SideNodesConfig() if place.asks_walls else SideNodesConfig(spacing=0.0)
+        sides = VirtualNodesConfig() if place.asks_walls else VirtualNodesConfig(spacing=0.0)
         config = BuildConfig(features=FeatureConfig(kind=kind), other_kinds=(), sides=sides)
         build_map(recordings[place.mapping], config).save(path)
         localizer = Localizer(TopoMetricMap.load(path))

@@ -2,8 +2,8 @@
 
 As those of the nodes: a logistic regression in which nothing that speaks for a pose may count
 against it, drawn to the weights in use, for there are few such poses. Whether a pose is precise
-enough is asked apart (`evidence.precision_of`), so a wrong one is one of another place; the weight
-of the doubt is given.
+enough is asked apart (`evidence.compute_precision_probability`), so a wrong one is one of another
+place; the weight of the doubt is given.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from topoloc.localization.evidence import wall_score_features
-from topoloc.localization.fitted_weights import WallWeights
+from topoloc.localization.evidence import compute_virtual_view_features
+from topoloc.localization.fitted_weights import VirtualViewWeights
 from topoloc_paper.fit.evidence import decided
 from topoloc_paper.fit.tried_poses import TriedPose
 
@@ -44,18 +44,18 @@ def _is_elsewhere(pose: TriedPose) -> bool:
     )
 
 
-def fit_walls(poses: list[TriedPose], before: WallWeights) -> tuple[WallWeights, int]:
+def fit_walls(poses: list[TriedPose], before: VirtualViewWeights) -> tuple[VirtualViewWeights, int]:
     """The weights, and the number of poses that they were fitted to; `before` and 0 where these are
     too few."""
     told = told_by_walls(poses)
     is_right = np.array([pose.is_right for pose in told], dtype=bool)
     if min(np.count_nonzero(is_right), np.count_nonzero(~is_right)) < MIN_POSES:
         return before, 0
-    x = np.array([wall_score_features(pose.evidence) for pose in told])
+    x = np.array([compute_virtual_view_features(pose.evidence) for pose in told])
     signs, given = 2.0 * is_right - 1.0, before.doubt * x[:, -1]
     x, start = (
         np.column_stack([x[:, :-1], np.ones(len(x))]),
-        np.array([*before.in_order[:-1], before.bias]),
+        np.array([*before.parallel_map[:-1], before.bias]),
     )
 
     def loss(weights: np.ndarray) -> float:

@@ -98,9 +98,13 @@ COMMANDS = {
         "all other settings as a TOML file, with defaults and meanings",
     ),
 }
-BROUGHT = {"simulate": "topoloc-worlds", "train": "topoloc-training", "benchmark": "topoloc-paper"}
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-_IN_HELP = (
+PLUGIN_PACKAGES = {
+    "simulate": "topoloc-worlds",
+    "train": "topoloc-training",
+    "benchmark": "topoloc-paper",
+}
+_DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+_HELP_ORDER = (
     "demo",
     "simulate",
     "slam",
@@ -112,9 +116,9 @@ _IN_HELP = (
     "benchmark",
     "info",
 )
-_IN_HELP += ("atlas", "update", "merge", "prune", "history", "undo", "view", "record", "export")
-_IN_HELP += ("georeference", "serve", "follow", "weights", "config")
-LEAST_ADDRESS_SPACE = 1_600_000_000
+_HELP_ORDER += ("atlas", "update", "merge", "prune", "history", "undo", "view", "record", "export")
+_HELP_ORDER += ("georeference", "serve", "follow", "weights", "config")
+MIN_ADDRESS_SPACE = 1_600_000_000
 
 
 def main(args: list[str] | None = None) -> int:
@@ -131,11 +135,11 @@ def main(args: list[str] | None = None) -> int:
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output went away
-        _abandon(sys.stdout)
+        _discard_output(sys.stdout)
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in _DISK_ERRNOS:
             raise
-        _abandon(sys.stdout)
+        _discard_output(sys.stdout)
         _print_error(f"cannot write the output: {error.strerror}")
     return 1
 
@@ -155,8 +159,8 @@ def _dispatch(args: list[str]) -> int:
         return _run(name, *commands[name], rest)
     known = f"unknown command {name!r}; commands: {', '.join(commands)}"
     _print_error(
-        f"`topoloc {name}` comes with {BROUGHT[name]}, which is not installed"
-        if name in BROUGHT
+        f"`topoloc {name}` comes with {PLUGIN_PACKAGES[name]}, which is not installed"
+        if name in PLUGIN_PACKAGES
         else known
     )
     return 2
@@ -165,10 +169,10 @@ def _dispatch(args: list[str]) -> int:
 def all_commands() -> dict[str, tuple[str, str]]:
     """Our commands and those that other distributions bring, as `COMMANDS`; a name of ours is
     ours."""
-    return brought("topoloc.commands") | COMMANDS
+    return load_plugins("topoloc.commands") | COMMANDS
 
 
-def brought(group: str) -> dict[str, Any]:
+def load_plugins(group: str) -> dict[str, Any]:
     """What other distributions bring by entry points of a group, all in one dictionary."""
     from importlib.metadata import entry_points
 
@@ -221,8 +225,8 @@ def _check_address_space() -> None:
     except ImportError:  # Windows
         return
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if 0 <= limit < LEAST_ADDRESS_SPACE:
-        least = LEAST_ADDRESS_SPACE // 10**6
+    if 0 <= limit < MIN_ADDRESS_SPACE:
+        least = MIN_ADDRESS_SPACE // 10**6
         raise TopolocError(
             f"too little memory: ulimit -v leaves {limit // 10**6} MB of address space, at least"
             f" {least} are needed"
@@ -233,24 +237,24 @@ def _print_error(text: str) -> None:
     try:
         print("error: " + " ".join(text.split()), file=sys.stderr)
     except OSError:  # the exit status says it
-        _abandon(sys.stderr)
+        _discard_output(sys.stderr)
 
 
-def _abandon(stream: TextIO) -> None:
+def _discard_output(stream: TextIO) -> None:
     """What `stream` still holds goes nowhere, so that it does not complain at exit."""
     with contextlib.suppress(OSError):  # a stream of its caller's without a file
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _place_in_help(name: str) -> int:
-    return _IN_HELP.index(name) if name in _IN_HELP else len(_IN_HELP)
+def _help_position(name: str) -> int:
+    return _HELP_ORDER.index(name) if name in _HELP_ORDER else len(_HELP_ORDER)
 
 
 def _help() -> str:
     listed = all_commands()
     width = max(map(len, listed))
     commands = "\n".join(
-        f"  {name:<{width}}  {listed[name][1]}" for name in sorted(listed, key=_place_in_help)
+        f"  {name:<{width}}  {listed[name][1]}" for name in sorted(listed, key=_help_position)
     )
     return (
         "usage: topoloc COMMAND ...\n\nWalk through a place once with a stereo or RGB-D camera;"

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc.apps.cli.joined_neighbours import joined_neighbours
-from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, print_facts, write_json
+from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, print_fields, write_json
 from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.cli.tile_joining import join_overlapping_tiles
 
 Names = Annotated[
     tyro.conf.Positional[tuple[str, ...]],
@@ -79,10 +79,10 @@ class Command:
                 ]
         else:
             settings = read_settings(self.config)
-            manifest = None if self.action == "join" else self._written()
+            manifest = None if self.action == "join" else self._write()
             if manifest is None or self.join:
-                ids = [tile.tile_id for tile in self._new()] if self.join else self.names
-                joined = joined_neighbours(
+                ids = [tile.tile_id for tile in self._create_tile()] if self.join else self.names
+                joined = join_overlapping_tiles(
                     self.atlas, ids, settings, self.json != "-", ray=self.ray
                 )
                 manifest, found = joined.manifest, joined.not_compared
@@ -95,19 +95,19 @@ class Command:
             print(f"error: {problem}", file=sys.stderr)
         return 1 if found else 0
 
-    def _written(self) -> Any:
+    def _write(self) -> Any:
         from topoloc.atlas.editing import add_tiles, create_atlas, remove_tiles
 
         if self.action == "remove":
             return remove_tiles(self.atlas, self.names)
-        new = self._new()
+        new = self._create_tile()
         return (
             create_atlas(self.atlas, new)
             if self.action == "create"
             else add_tiles(self.atlas, new, self.replace)
         )
 
-    def _new(self) -> Any:
+    def _create_tile(self) -> Any:
         from topoloc.atlas.editing import new_tiles
 
         return new_tiles(self.names, self.id, self.world)
@@ -149,13 +149,13 @@ def describe(where: str, manifest: Any) -> dict[str, Any]:
         "num_nodes": sum(tile.num_nodes for tile in manifest.tiles),
         "bytes": sum(stored.num_bytes for tile in manifest.tiles for stored in tile.files),
         "origin": None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h},
-        "worlds": worlds_of(manifest),
-        "joins": [_join_facts(join, manifest) for join in manifest.joins],
+        "worlds": group_tiles_by_world(manifest),
+        "joins": [_describe_join(join, manifest) for join in manifest.joins],
         "tiles": tiles,
     }
 
 
-def worlds_of(manifest: Any) -> dict[str, list[str]]:
+def group_tiles_by_world(manifest: Any) -> dict[str, list[str]]:
     """The ids of the tiles of each world, those that joins make one together."""
     worlds: dict[str, list[str]] = {}
     for tile in manifest.tiles:
@@ -163,7 +163,7 @@ def worlds_of(manifest: Any) -> dict[str, list[str]]:
     return worlds
 
 
-def _join_facts(join: Any, manifest: Any) -> dict[str, Any]:
+def _describe_join(join: Any, manifest: Any) -> dict[str, Any]:
     """What the manifest says of it, and one sigma of where the second tile's middle lies in the
     first's world."""
     from topoloc.atlas.joins import sigmas_at
@@ -176,20 +176,20 @@ def _join_facts(join: Any, manifest: Any) -> dict[str, Any]:
 def print_atlas(facts: dict[str, Any]) -> None:
     """For people: a line each tile."""
     width = max((len(tile["id"]) for tile in facts["tiles"]), default=0)
-    print_facts(
+    print_fields(
         [
             ("atlas", f"{facts['path']}, serial {facts['serial']}"),
             (
                 "tiles",
                 f"{facts['num_tiles']}, {facts['num_nodes']} nodes, {facts['bytes'] / 1e6:.2f} MB",
             ),
-            *(("", f"{tile['id']:<{width}}  {_tile_line(tile)}") for tile in facts["tiles"]),
+            *(("", f"{tile['id']:<{width}}  {_format_tile(tile)}") for tile in facts["tiles"]),
             *(
                 ("world", f"{name}: {', '.join(ids)}")
                 for name, ids in facts["worlds"].items()
                 if len(ids) > 1
             ),
-            *(("join", _join_line(join)) for join in facts["joins"]),
+            *(("join", _format_join(join)) for join in facts["joins"]),
             *(
                 [
                     (
@@ -208,14 +208,14 @@ def print_atlas(facts: dict[str, Any]) -> None:
     )
 
 
-def _join_line(join: dict[str, Any]) -> str:
+def _format_join(join: dict[str, Any]) -> str:
     said = f"{join['first']} and {join['second']}: {join['num_agreeing']} pictures agree"
     if join["residual"] is None:
         return f"{said}, but other joins contradict them; not used"
     return f"{said}, {100 * join['sigma_m']:.1f} cm, {join['sigma_deg']:.2f} deg"
 
 
-def _tile_line(tile: dict[str, Any]) -> str:
+def _format_tile(tile: dict[str, Any]) -> str:
     least, most = tile["box_world"]
     extent = " x ".join(f"{high - low:.1f}" for low, high in zip(least, most, strict=True))
     box = tile["geo_box"]

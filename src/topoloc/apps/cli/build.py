@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from topoloc.apps.cli.features_option import BUILD_FEATURES, kinds_to_build
-from topoloc.apps.cli.joined_neighbours import JoinedNeighbours, joined_neighbours
+from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
+from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -25,9 +25,9 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.cli.recording_maps import MapMaking, PosesAsked
-from topoloc.apps.cli.recording_pieces import Pieces, Split, pieces_of
+from topoloc.apps.cli.recording_pieces import Pieces, SplitOptions, split_recording
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
+from topoloc.apps.cli.tile_joining import JoinedTiles, join_overlapping_tiles
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.description import describe_map
 from topoloc.slam.slam import SlamConfig
@@ -136,7 +136,7 @@ class Command:
             self.world is not None or self.replace or self.join or self.split is not None
         ):
             raise UsageError("--world, --replace, --join and --split belong to --ray")
-        split = Split.of(self.split)
+        split = SplitOptions.of(self.split)
         recordings, target = self._split_paths()
         read = [
             path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)
@@ -148,22 +148,22 @@ class Command:
                 f" {self.scale[0][:80]}"
             )
         settings = read_settings(self.config)
-        making = self._making(recordings, settings)
+        map_job = self._map_job(recordings, settings)
         return (
-            self._make_map(making, Path(target))
+            self._make_map(map_job, Path(target))
             if self.ray is None
-            else self._make_tiles(making, target, settings, split)
+            else self._make_tiles(map_job, target, settings, split)
         )
 
-    def _making(self, recordings: list[str], settings: Settings) -> MapMaking:
+    def _map_job(self, recordings: list[str], settings: Settings) -> MapJob:
         config = with_option(
             settings.of(BuildConfig), "nodes.d_thresh", self.d_thresh, "--d-thresh"
         )
         config = with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
-        return MapMaking(
+        return MapJob(
             tuple(recordings),
-            PosesAsked(self.trajectory, self.poses, self.scale, self.allow_gaps),
-            kinds_to_build(config, self.features),
+            PoseOptions(self.trajectory, self.poses, self.scale, self.allow_gaps),
+            select_build_features(config, self.features),
             settings.of(SlamConfig),
             self.format,
             self.camera,
@@ -171,9 +171,9 @@ class Command:
             self.topics,
         )
 
-    def _make_map(self, making: MapMaking, target: Path) -> int:
+    def _make_map(self, map_job: MapJob, target: Path) -> int:
         with progress_bar() as progress:
-            topomap, poses_from = making.make(progress)
+            topomap, poses_from = map_job.make(progress)
         topomap.save(target)
         info = describe_map(topomap, target)
         if self.json != "-":
@@ -189,22 +189,22 @@ class Command:
         return 0
 
     def _make_tiles(
-        self, making: MapMaking, atlas: str, settings: Settings, split: Split | None
+        self, map_job: MapJob, atlas: str, settings: Settings, split: SplitOptions | None
     ) -> int:
         """Each recording a tile, on the cluster; status 1 where one could not be mapped."""
-        from topoloc.apps.cli.recordings_table import recordings_table, tell_notes
-        from topoloc.apps.cluster.building import AtlasBuild, build_on_ray
+        from topoloc.apps.cli.recordings_table import print_notes, recordings_table
+        from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
         from topoloc.apps.cluster.config import ClusterConfig
-        from topoloc.apps.cluster.connection import connected
+        from topoloc.apps.cluster.connection import connect_to_cluster
 
         assert self.ray is not None
-        rows = self._jobs(making, split)
+        rows = self._jobs(map_job, split)
         jobs = [job for row in rows for job in row]
-        with connected(self.ray):
+        with connect_to_cluster(self.ray):
             with recordings_table([job.recording for job in jobs]) as (show, is_live):
                 build = AtlasBuild(jobs, atlas, self.replace, settings.of(ClusterConfig))
                 outcomes = build_on_ray(build, self.ray, show, is_live)
-            tell_notes(outcomes, is_live)
+            print_notes(outcomes, is_live)
             counts = {
                 state: sum(outcome.state == state for outcome in outcomes)
                 for state in ("built", "there", "failed")
@@ -214,7 +214,7 @@ class Command:
                     f"{atlas}: {counts['built']} recordings mapped, {counts['there']} there"
                     f" already, {counts['failed']} failed"
                 )
-            joined = self._joined(rows, outcomes, atlas, settings)
+            joined = self._join_tiles(rows, outcomes, atlas, settings)
         facts = {
             "atlas": atlas,
             **counts,
@@ -226,28 +226,31 @@ class Command:
             print(f"error: {problem}", file=sys.stderr)
         return 1 if counts["failed"] or not_compared else 0
 
-    def _jobs(self, making: MapMaking, split: Split | None) -> list[list[TileJob]]:
+    def _jobs(self, map_job: MapJob, split: SplitOptions | None) -> list[list[TileJob]]:
         """What is to be made of each recording."""
-        from topoloc.apps.cluster.tiles import TileJob, tile_ids
+        from topoloc.apps.cluster.tiles import TileJob, derive_tile_ids
 
-        wholes = zip(tile_ids(making.recordings), making.one_each(), strict=True)
+        wholes = zip(derive_tile_ids(map_job.recordings), map_job.split_by_recording(), strict=True)
         pieces = [
-            Pieces([one]) if split is None else pieces_of(one, name, split) for name, one in wholes
+            Pieces([one]) if split is None else split_recording(one, name, split)
+            for name, one in wholes
         ]
-        ids = iter(tile_ids([piece.recordings[0] for one in pieces for piece in one.makings]))
+        ids = iter(
+            derive_tile_ids([piece.recordings[0] for one in pieces for piece in one.piece_jobs])
+        )
         return [
             [
                 TileJob(
                     piece.recordings[0], name := next(ids), self.world or one.world or name, piece
                 )
-                for piece in one.makings
+                for piece in one.piece_jobs
             ]
             for one in pieces
         ]
 
-    def _joined(
+    def _join_tiles(
         self, rows: list[list[TileJob]], outcomes: list[Outcome], atlas: str, settings: Settings
-    ) -> JoinedNeighbours | None:
+    ) -> JoinedTiles | None:
         """Pieces of one recording joined with the next one, where it is no matter of course; with
         --join all tiles."""
         there = {
@@ -262,7 +265,7 @@ class Command:
         if not there or not (self.join or pairs):
             return None
         named = None if self.join else [(there[a.recording], there[b.recording]) for a, b in pairs]
-        return joined_neighbours(
+        return join_overlapping_tiles(
             atlas, list(there.values()), settings, self.json != "-", named, self.ray
         )
 
@@ -284,7 +287,7 @@ class Command:
                 f"the last argument is the map file to write, but {last} is a recording or folder;"
                 " was MAP forgotten?"
             )
-        if target.is_file() and _first_bytes(target) not in (b"", b"SQLite"):
+        if target.is_file() and _read_header(target) not in (b"", b"SQLite"):
             raise UsageError(
                 f"the last argument is the map file to write, but {last} is a file of another kind;"
                 " was MAP forgotten?"
@@ -314,6 +317,6 @@ def _is_positive(text: str) -> bool:
         return False
 
 
-def _first_bytes(path: Path) -> bytes:
+def _read_header(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(6)

@@ -10,7 +10,7 @@ import tyro
 from topoloc.apps.cli.output import UsageError
 from topoloc.apps.cli.settings_file import all_tables, settings_text
 
-_ABOUT = """\
+_HEADER = """\
 # The settings of topoloc {version} that are no options of its commands, with their defaults.
 # Keep the lines that you change, and give the file to a command: --config FILE. Behind a value: what it may be.
 # `# key =` is not set (None)."""  # noqa: E501
@@ -41,5 +41,5 @@ class Command:
             raise UsageError(
                 f"{self.command} has no settings beside its options; {', '.join(known)} have"
             )
-        print(_ABOUT.format(version=__version__) + "\n\n" + settings_text(tables), end="")
+        print(_HEADER.format(version=__version__) + "\n\n" + settings_text(tables), end="")
         return 0

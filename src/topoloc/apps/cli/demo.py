@@ -15,18 +15,18 @@ from topoloc.apps.cli.output import (
     File,
     UsageError,
     check_outputs,
+    import_report_writer,
     print_recordings,
     progress_bar,
-    report_writer,
     write_json,
 )
-from topoloc.demo.recordings import ROLES, SHIPPED, Role, missing_recordings
-from topoloc.demo.words import PAPER_LAB, night_in_words, words_of
+from topoloc.demo.recordings import ROLES, SHIPPED, Role, find_missing_recordings
+from topoloc.demo.report_texts import PAPER_LAB, create_report_texts, describe_night
 from topoloc.errors import MissingExtraError, TopolocError
-from topoloc.evaluation.experiments import answer_elsewhere, answer_queries
-from topoloc.evaluation.metrics import Answer, by_recording, summarize
+from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording, summarize
+from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.building import build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.description import describe_map
 from topoloc.mapping.topomap import TopoMetricMap
@@ -36,7 +36,7 @@ from topoloc.recordings.open import open_sequence
 from topoloc.recordings.trajectory import Trajectory, write_tum
 
 Progress = Callable[[str, int, int], None]
-ELSEWHERE = "elsewhere"
+OUT_OF_MAP = "elsewhere"
 
 
 @dataclass(frozen=True)
@@ -57,19 +57,21 @@ class Command:
 
     def run(self) -> int:
         start = time.perf_counter()
-        out = _made_folder(Path(self.out))
+        out = _create_folder(Path(self.out))
         check_outputs(
             [str(out / "lab.topo"), str(out / "results.jsonl"), str(out / "report.html"), self.json]
         )
         with progress_bar() as progress:
-            folder = self._recordings()
-            topomap = _map_the_lab(folder, out / "lab.topo", progress)
+            folder = self._find_recordings()
+            topomap = _build_lab_map(folder, out / "lab.topo", progress)
             mapped = time.perf_counter()
-            answers = _ask(topomap, folder, progress)
+            answers = _localize_queries(topomap, folder, progress)
         evaluation = summarize(answers) | {"map": describe_map(topomap, out / "lab.topo")}
         _write_results(out, folder, answers)
         try:
-            report_writer()(out / "report.html", evaluation, answers, topomap, words_of(evaluation))
+            import_report_writer()(
+                out / "report.html", evaluation, answers, topomap, create_report_texts(evaluation)
+            )
             report = str(out / "report.html")
         except MissingExtraError as missing:
             report = f"none; {missing}"
@@ -82,7 +84,7 @@ class Command:
             _print(out, evaluation, seconds, report)
         return 0
 
-    def _recordings(self) -> Path:
+    def _find_recordings(self) -> Path:
         """The folder of the recordings, whole."""
         folder = Path(self.recordings) if self.recordings else SHIPPED
         if not folder.is_dir():
@@ -90,7 +92,7 @@ class Command:
                 f"{folder}: no such folder; `topoloc simulate demo {folder}` renders the recordings"
                 " into it"
             )
-        if missing := missing_recordings(folder):
+        if missing := find_missing_recordings(folder):
             what = (
                 "this installation of topoloc lacks the demo's recordings"
                 if folder == SHIPPED
@@ -102,7 +104,7 @@ class Command:
         return folder
 
 
-def _made_folder(folder: Path) -> Path:
+def _create_folder(folder: Path) -> Path:
     if not folder.name and not folder.is_dir():
         raise UsageError("--out names no folder")
     try:
@@ -118,20 +120,22 @@ def _open(folder: Path, role: Role) -> list[StereoSequence]:
     return [open_sequence(folder / name) for name, its_role in ROLES.items() if its_role == role]
 
 
-def _map_the_lab(folder: Path, path: Path, progress: Progress) -> TopoMetricMap:
+def _build_lab_map(folder: Path, path: Path, progress: Progress) -> TopoMetricMap:
     """Build the map and open it from its file, as everybody else will."""
     build_map(_open(folder, "map"), progress=progress).save(path)
     return TopoMetricMap.load(path)
 
 
-def _ask(topomap: TopoMetricMap, folder: Path, progress: Progress) -> list[Answer]:
+def _localize_queries(
+    topomap: TopoMetricMap, folder: Path, progress: Progress
+) -> list[EvaluatedQuery]:
     """Every query of the lab, then every picture of somewhere else."""
     localizer = Localizer(topomap)
-    answers: list[Answer] = []
+    answers: list[EvaluatedQuery] = []
     for sequence in _open(folder, "queries"):
-        answers += answer_queries(localizer, sequence, progress=progress, label=_label(sequence))
+        answers += localize_queries(localizer, sequence, progress=progress, label=_label(sequence))
     for sequence in _open(folder, "elsewhere"):
-        answers += answer_elsewhere(localizer, sequence, progress, ELSEWHERE)
+        answers += localize_out_of_map(localizer, sequence, progress, OUT_OF_MAP)
     return answers
 
 
@@ -139,11 +143,11 @@ def _label(sequence: StereoSequence) -> str:
     return sequence.name.replace("_", " ")
 
 
-def _write_results(out: Path, folder: Path, answers: Sequence[Answer]) -> None:
+def _write_results(out: Path, folder: Path, answers: Sequence[EvaluatedQuery]) -> None:
     """One JSON line a query, and the poses found in each recording as a trajectory."""
     lines = [json.dumps(a.result.to_json(f"{a.recording}/{a.query}")) for a in answers]
     write_text(out / "results.jsonl", "\n".join(lines) + "\n")
-    groups = by_recording(answers)
+    groups = group_by_recording(answers)
     for sequence in _open(folder, "queries"):
         t_ns = dict(zip(sequence.names, sequence.t_ns, strict=True))
         found = [
@@ -160,7 +164,7 @@ def _write_results(out: Path, folder: Path, answers: Sequence[Answer]) -> None:
 def _print(out: Path, evaluation: dict[str, Any], seconds: str, report: str) -> None:
     print_recordings(evaluation, [PAPER_LAB])
     m = evaluation["map"]
-    print(f"\n{night_in_words(evaluation)}\n")
+    print(f"\n{describe_night(evaluation)}\n")
     print(
         f"map: {out / 'lab.topo'} ({m['num_nodes']} nodes, {m['bytes'] / 1e6:.1f} MB,"
         f" {m['length_m']:.1f} m mapped; {seconds})"

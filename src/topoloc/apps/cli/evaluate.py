@@ -11,9 +11,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc.apps.cli.against_itself import evaluate_against_itself
-from topoloc.apps.cli.features_option import ASKED_FEATURES
-from topoloc.apps.cli.map_or_atlas import localizer_at
+from topoloc.apps.cli.features_option import QUERY_FEATURES
+from topoloc.apps.cli.map_or_atlas import open_localizer
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -22,29 +21,30 @@ from topoloc.apps.cli.output import (
     Topics,
     UsageError,
     check_outputs,
-    print_facts,
+    import_report_writer,
+    print_fields,
     print_recordings,
     progress_bar,
-    report_writer,
     write_json,
 )
-from topoloc.apps.cli.recording_queries import Queries, QueryRecording, SentMap, answers_on_ray
+from topoloc.apps.cli.remote_queries import OpenQueries, QueryRecording, RemoteMap, localize_on_ray
+from topoloc.apps.cli.self_evaluation import evaluate_map_itself
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.judged_tile import JudgedTile
+from topoloc.atlas.evaluated_tile import EvaluatedTile
 from topoloc.errors import TrajectoryError
 from topoloc.evaluation.metrics import (
     MAX_ROTATION_DEG,
     MAX_TRANSLATION,
-    Answer,
-    by_recording,
-    length_text,
+    EvaluatedQuery,
+    format_length,
+    group_by_recording,
     summarize,
 )
-from topoloc.evaluation.world_fit import WorldFit, fit_worlds
+from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.calibration_doubt import verdicts_of
+from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.description import describe_map
 from topoloc.recordings.frame import StereoSequence
@@ -87,7 +87,7 @@ class Command:
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
     ] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
-    features: ASKED_FEATURES = None
+    features: QUERY_FEATURES = None
     """Which of the map's features are asked; of several, the next where the one before leaves the
     pose unclear."""
     format: Format = None
@@ -123,11 +123,9 @@ class Command:
 
     def run(self) -> int:
         if self.against_itself:
-            self._refuse_beside_itself()
+            self._check_no_recordings()
             outputs = {"json": self.json, "report": self.report}
-            return evaluate_against_itself(
-                self.map, self.coarse, self.features, outputs, self.config
-            )
+            return evaluate_map_itself(self.map, self.coarse, self.features, outputs, self.config)
         if not self.sequences and not self.elsewhere:
             raise UsageError(
                 "evaluate takes a map and at least one recording, with truth or --elsewhere, or"
@@ -139,25 +137,27 @@ class Command:
         check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
         settings = read_settings(self.config)
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
-        write_report = report_writer() if self.report else None
-        judged = self._judged(settings, config)
+        write_report = import_report_writer() if self.report else None
+        judged = self._open_map(settings, config)
         topomap = judged.topomap
         info = describe_map(topomap, topomap.file.path if topomap.file else Path(self.map))
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
-        asked = self._opened(map_from_truth)
+        asked = self._open_recordings(map_from_truth)
         with progress_bar() as progress:
             if self.ray is None:
                 answers = [
                     answer for queries in asked for answer in queries.answers(judged, progress)
                 ]
             else:
-                sent = SentMap.of(judged, config, self.features)
-                answers = answers_on_ray(
+                sent = RemoteMap.of(judged, config, self.features)
+                answers = localize_on_ray(
                     sent, asked, self.ray, settings.of(ClusterConfig), progress
                 )
-        of_worlds = [] if isinstance(judged, JudgedTile) else by_recording(answers).values()
+        of_worlds = (
+            [] if isinstance(judged, EvaluatedTile) else group_by_recording(answers).values()
+        )
         fits = [fit for of_one in of_worlds if (fit := fit_worlds(of_one)) is not None]
-        calibrations = _calibrations(answers)
+        calibrations = _check_calibrations(answers)
         evaluation = summarize(answers) | {
             "map": info,
             "world_fits": [fit.to_json() for fit in fits],
@@ -167,7 +167,7 @@ class Command:
             _print(evaluation)
         for fit in fits:
             print(
-                _offer(fit, self.fit_map_from_truth),
+                _report_world_fit(fit, self.fit_map_from_truth),
                 file=sys.stderr if self.json == "-" else sys.stdout,
             )
         write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
@@ -178,21 +178,22 @@ class Command:
         self._write_fit(fits)
         return 0
 
-    def _opened(self, map_from_truth: Rigid3 | None) -> list[Queries]:
+    def _open_recordings(self, map_from_truth: Rigid3 | None) -> list[OpenQueries]:
         """The recordings, those with truth first."""
         paths, count = [*self.sequences, *self.elsewhere], len(self.sequences)
         how = (self.format, self.camera, self.topics, self.poses)
         recordings = [
-            QueryRecording(path, *how, is_elsewhere=number >= count)
+            QueryRecording(path, *how, is_out_of_map=number >= count)
             for number, path in enumerate(paths)
         ]
         sequences = [recording.open() for recording in recordings]
-        labels = _labels(paths, sequences)
+        labels = _unique_labels(paths, sequences)
         return [
-            Queries(*one, map_from_truth) for one in zip(recordings, sequences, labels, strict=True)
+            OpenQueries(*one, map_from_truth)
+            for one in zip(recordings, sequences, labels, strict=True)
         ]
 
-    def _refuse_beside_itself(self) -> None:
+    def _check_no_recordings(self) -> None:
         """Hold that nothing is given that is of recordings."""
         names = (
             "elsewhere",
@@ -211,10 +212,10 @@ class Command:
         if given:
             raise UsageError(f"--against-itself asks the map alone, without {', '.join(given)}")
 
-    def _judged(self, settings: Settings, config: LocalizerConfig) -> Localizer | JudgedTile:
+    def _open_map(self, settings: Settings, config: LocalizerConfig) -> Localizer | EvaluatedTile:
         """The map; or the atlas, in the world of the tile that the recordings' truth is given
         in."""
-        localizer = localizer_at(self.map, config, self.features, settings.of(AtlasConfig))
+        localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
         if isinstance(localizer, Localizer):
             if self.tile is not None:
                 raise UsageError(f"--tile is of an atlas, and {self.map} is none")
@@ -227,7 +228,7 @@ class Command:
             raise UsageError(
                 "--report and --fit-map-from-truth are of a map: give the tile's own file"
             )
-        return JudgedTile.of(localizer, tile_id)
+        return EvaluatedTile.of(localizer, tile_id)
 
     def _write_fit(self, fits: Sequence[WorldFit]) -> None:
         if self.fit_map_from_truth and not fits:
@@ -242,23 +243,23 @@ class Command:
             )
 
 
-def _calibrations(answers: Sequence[Answer]) -> list[dict[str, Any]]:
+def _check_calibrations(answers: Sequence[EvaluatedQuery]) -> list[dict[str, Any]]:
     """What the pictures of each recording say together of their cameras."""
     return [
         {"recording": name} | verdict.to_json()
-        for name, of_one in by_recording(answers).items()
-        for verdict in verdicts_of(
+        for name, of_one in group_by_recording(answers).items()
+        for verdict in check_camera_calibrations(
             answer.result for answer in of_one if answer.world_from_cam is not None
         )
     ]
 
 
-def _offer(fit: WorldFit, written: str | None) -> str:
+def _report_world_fit(fit: WorldFit, written: str | None) -> str:
     """One line: that the worlds differ, what is left of the errors in one world, and how to judge
     by that."""
-    left = f"{length_text(fit.median_translation_m)} and {fit.median_rotation_deg:.2f} deg"
+    left = f"{format_length(fit.median_translation_m)} and {fit.median_rotation_deg:.2f} deg"
     apart = (
-        f"{length_text(float(np.linalg.norm(fit.map_from_truth.translation)))},"
+        f"{format_length(float(np.linalg.norm(fit.map_from_truth.translation)))},"
         f" {np.degrees(fit.map_from_truth.angle()):.1f} deg"
     )
     how = (
@@ -273,7 +274,7 @@ def _offer(fit: WorldFit, written: str | None) -> str:
     )
 
 
-def _labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) -> list[str]:
+def _unique_labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) -> list[str]:
     """The recordings' names; where two have one name, the ends of their paths, or all of them."""
     choices = ([sequence.name for sequence in sequences], [Path(path).name for path in paths])
     return next((names for names in choices if len(set(names)) == len(names)), list(paths))
@@ -369,4 +370,4 @@ def _print(evaluation: dict[str, Any]) -> None:
             ),
         )
     )
-    print_facts(facts)
+    print_fields(facts)

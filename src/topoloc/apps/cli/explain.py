@@ -8,22 +8,22 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.apps.cli.features_option import ASKED_FEATURES, localizer_of
-from topoloc.apps.cli.map_or_atlas import camera_for, is_atlas, open_atlas
+from topoloc.apps.cli.features_option import QUERY_FEATURES, create_localizer
+from topoloc.apps.cli.map_or_atlas import is_atlas, open_atlas, parse_camera
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.settings_file import read_settings, with_option
-from topoloc.apps.report.explanation import Explanation, explain, facts_of
+from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
 from topoloc.apps.report.explanation_page import row_of, verdict, write_explanation
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.config import AtlasConfig
 from topoloc.localization.localizer import LocalizerConfig
-from topoloc.localization.query import Picture
-from topoloc.localization.query_camera import camera_of_frame, named_camera
+from topoloc.localization.query import QueryImage
+from topoloc.localization.query_camera import parse_camera_option, select_frame_camera
 from topoloc.localization.result import Localization
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import single_pictures
+from topoloc.recordings.recording import as_monocular
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Command:
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
     ] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
-    features: ASKED_FEATURES = None
+    features: QUERY_FEATURES = None
     """Which of the map's features are asked; of several, the next where the one before leaves the
     pose unclear."""
     out: File = None
@@ -64,14 +64,14 @@ class Command:
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         path, ranking = Path(self.map), list[str]()
         if is_atlas(self.map):
-            path, ranking = self._tile_of(
+            path, ranking = self._select_tile(
                 open_atlas(self.map, config, self.features, settings.of(AtlasConfig))
             )
         with TopoMetricMap.load(path) as topomap:
-            of_size = None if self.camera is None else named_camera(self.camera, topomap)
-            localizer = localizer_of(topomap, config, self.features)
-            frame = self._frame()
-            explanation = explain(localizer, frame.image, camera_of_frame(frame, of_size))
+            of_size = None if self.camera is None else parse_camera_option(self.camera, topomap)
+            localizer = create_localizer(topomap, config, self.features)
+            frame = self._read_frame()
+            explanation = explain(localizer, frame.image, select_frame_camera(frame, of_size))
             if self.out:
                 write_explanation(Path(self.out), frame.name, frame.image, explanation, topomap)
         if self.json != "-":
@@ -79,12 +79,13 @@ class Command:
                 print(line)
             _print(explanation, self.out)
         write_json(
-            self.json, facts_of(frame.name, explanation) | ({"tiles": ranking} if ranking else {})
+            self.json,
+            explanation_to_json(frame.name, explanation) | ({"tiles": ranking} if ranking else {}),
         )
         return 0
 
-    def _frame(self) -> StereoFrame:
-        sequence = single_pictures(open_sequence(self.image))
+    def _read_frame(self) -> StereoFrame:
+        sequence = as_monocular(open_sequence(self.image))
         if len(sequence) != 1:
             raise UsageError(
                 f"explain takes one picture, and {self.image} has {len(sequence)}; {self.image}@0"
@@ -92,20 +93,20 @@ class Command:
             )
         return sequence[0]
 
-    def _tile_of(self, localizer: AtlasLocalizer) -> tuple[Path, list[str]]:
+    def _select_tile(self, localizer: AtlasLocalizer) -> tuple[Path, list[str]]:
         """The map of the tile that answers for the picture, and in words what the atlas made of
         it."""
         frame, of_size = (
-            self._frame(),
-            None if self.camera is None else camera_for(localizer, self.camera),
+            self._read_frame(),
+            None if self.camera is None else parse_camera(localizer, self.camera),
         )
-        camera = camera_of_frame(frame, of_size)
+        camera = select_frame_camera(frame, of_size)
         result = localizer.localize(frame.image, camera)
         tile_id = result.provenance.tile
         assert tile_id is not None
         likest = ", ".join(
             f"{name} {likeness:.2f}"
-            for name, likeness in localizer.rank(Picture(frame.image, camera))[:5]
+            for name, likeness in localizer.rank(QueryImage(frame.image, camera))[:5]
         )
         said = f"in tile {tile_id}"
         if not isinstance(result, Localization):

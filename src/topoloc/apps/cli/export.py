@@ -11,16 +11,16 @@ import tyro
 from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
 from topoloc.apps.cli.tile_option import (
     TileOption,
+    atlas_name,
     check_tile_option,
-    chosen_world,
-    name_of_atlas,
-    say_warning,
+    print_warning,
+    select_world,
 )
 from topoloc.apps.export.formats import ExportFormat, find_export_format, write_scene
-from topoloc.apps.viewer.map_scene import scene_of_map
-from topoloc.apps.viewer.results_scene import scene_of_results
+from topoloc.apps.viewer.map_scene import create_map_scene
+from topoloc.apps.viewer.results_scene import create_results_scene
 from topoloc.apps.viewer.scene import Scene
-from topoloc.apps.viewer.world_scene import scene_of_world
+from topoloc.apps.viewer.world_scene import create_world_scene
 from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.errors import TopolocError
 from topoloc.mapping.topomap import TopoMetricMap
@@ -70,7 +70,7 @@ class Command:
             raise UsageError("OUT is what is to be exported")
         if not Path(self.out).absolute().parent.is_dir():
             raise TopolocError(f"cannot write {self.out}: its folder does not exist")
-        scene = self._scene(form)
+        scene = self._load_scene(form)
         write_scene(scene, Path(self.out), form)
         facts = {
             "out": self.out,
@@ -84,27 +84,27 @@ class Command:
         write_json(self.json, facts)
         return 0
 
-    def _scene(self, form: ExportFormat) -> Scene:
+    def _load_scene(self, form: ExportFormat) -> Scene:
         if is_atlas(self.source):
-            return self._scene_of_tiles(form)
+            return self._load_tiles_scene(form)
         if not _is_map(Path(self.source)):
             if self.session is not None:
                 raise UsageError("--session is of maps, and this is none")
-            return scene_of_results(Path(self.source))
+            return create_results_scene(Path(self.source))
         with TopoMetricMap.load(self.source) as topomap, progress_bar() as progress:
-            return scene_of_map(
+            return create_map_scene(
                 topomap, Path(self.source).stem, self.session, form.with_points, progress
             )
 
-    def _scene_of_tiles(self, form: ExportFormat) -> Scene:
+    def _load_tiles_scene(self, form: ExportFormat) -> Scene:
         if self.session is not None:
             raise UsageError(
                 "--session is of maps: the tiles of an atlas have sessions of their own"
             )
         atlas = Atlas.open(self.source)
-        world, name = chosen_world(atlas, self.tile), self.tile or name_of_atlas(self.source)
+        world, name = select_world(atlas, self.tile), self.tile or atlas_name(self.source)
         with progress_bar() as progress:
-            return scene_of_world(atlas, world, name, form.with_points, progress, say_warning)
+            return create_world_scene(atlas, world, name, form.with_points, progress, print_warning)
 
 
 def _is_map(path: Path) -> bool:

@@ -9,8 +9,13 @@ from typing import Annotated
 import tyro
 
 from topoloc.apps.cli.output import UsageError
-from topoloc.errors import FeatureKindError
-from topoloc.features.kinds import KINDS, SURF, check_available, learned_kind
+from topoloc.errors import FeatureTypeError
+from topoloc.features.feature_types import (
+    FEATURE_TYPES,
+    SURF,
+    check_available,
+    default_learned_type,
+)
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.topomap import TopoMetricMap
@@ -22,7 +27,7 @@ BUILD_FEATURES = Annotated[
         help_behavior_hint="(default: both where a network is here)",
     ),
 ]
-ASKED_FEATURES = Annotated[
+QUERY_FEATURES = Annotated[
     str | None,
     tyro.conf.arg(
         metavar="surf|learned|both|KIND[,KIND]",
@@ -31,7 +36,7 @@ ASKED_FEATURES = Annotated[
 ]
 
 
-def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
+def select_build_features(config: MapConfig, features: str | None) -> MapConfig:
     """The configuration with the kinds of features that the option names, the first one first.
 
     Raises:
@@ -41,12 +46,12 @@ def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
     if features is None:
         kinds = config.kinds
     elif features == "both":
-        kinds = [SURF.name, learned_kind()]
+        kinds = [SURF.name, default_learned_type()]
     else:
-        kinds = [learned_kind()] if features == "learned" else features.split(",")
+        kinds = [default_learned_type()] if features == "learned" else features.split(",")
         config = replace(config, other_kinds=())
-    if unknown := [kind for kind in kinds if kind not in KINDS]:
-        raise UsageError(f"no features {unknown[0]!r}; there are {', '.join(KINDS)}")
+    if unknown := [kind for kind in kinds if kind not in FEATURE_TYPES]:
+        raise UsageError(f"no features {unknown[0]!r}; there are {', '.join(FEATURE_TYPES)}")
     if len(set(kinds)) < len(kinds):
         raise UsageError(f"--features {features}: a kind is named twice")
     for kind in kinds:
@@ -56,7 +61,7 @@ def kinds_to_build(config: MapConfig, features: str | None) -> MapConfig:
     )
 
 
-def localizer_of(
+def create_localizer(
     topomap: TopoMetricMap, config: LocalizerConfig, features: str | None
 ) -> Localizer:
     """Asks the map by the kinds of features that the option names; one line on standard error for
@@ -66,13 +71,13 @@ def localizer_of(
         FeatureKindError: the map does not hold them.
         MissingExtraError, WeightsError: what they need is not here.
     """
-    localizer = Localizer(topomap, _with_kinds(topomap, config, features))
-    for kind, lacking in localizer.left_out.items():
+    localizer = Localizer(topomap, _with_feature_types(topomap, config, features))
+    for kind, lacking in localizer.unavailable_types.items():
         print(f"warning: features {kind} of the map are not asked: {lacking}", file=sys.stderr)
     return localizer
 
 
-def _with_kinds(
+def _with_feature_types(
     topomap: TopoMetricMap, config: LocalizerConfig, features: str | None
 ) -> LocalizerConfig:
     if features is None:
@@ -83,11 +88,11 @@ def _with_kinds(
     kinds = [
         kind
         for kind in topomap.kinds
-        if kind in named or (features == "learned" and KINDS[kind].network is not None)
+        if kind in named or (features == "learned" and FEATURE_TYPES[kind].network is not None)
     ]
     missing = [name for name in named if name not in kinds] if features != "learned" else []
     if missing or not kinds:
-        raise FeatureKindError(
+        raise FeatureTypeError(
             f"the map holds no features {(missing or [features])[0]} (it holds:"
             f" {', '.join(topomap.kinds)})"
         )

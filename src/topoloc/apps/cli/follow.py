@@ -11,30 +11,30 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.apps.cli.features_option import ASKED_FEATURES, localizer_of
-from topoloc.apps.cli.map_or_atlas import camera_for, is_atlas, open_atlas
+from topoloc.apps.cli.features_option import QUERY_FEATURES, create_localizer
+from topoloc.apps.cli.map_or_atlas import is_atlas, open_atlas, parse_camera
 from topoloc.apps.cli.output import (
     File,
     Flag,
     Format,
     Topics,
     UsageError,
-    ended_by_signals,
+    catch_stop_signals,
     open_recording,
 )
-from topoloc.apps.cli.query_answers import QueryAnswer, answer_line
+from topoloc.apps.cli.query_answers import QueryAnswer, format_answer
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.robots.ros_publisher import RosPublisher
 from topoloc.atlas.config import AtlasConfig
 from topoloc.errors import CalibrationError, UnreadableImageError
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import LocalizerConfig
-from topoloc.localization.query_camera import CameraOfSize, camera_of_frame
+from topoloc.localization.query_camera import CameraOfSize, select_frame_camera
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.recording import single_pictures
+from topoloc.recordings.recording import as_monocular
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tile_tracker import TileTracker
 from topoloc.tracking.tracker import Tracker, TrackerConfig
@@ -65,7 +65,7 @@ class Command:
     mcap, zed, video or folder."""
     topics: Topics = None
     """Of a bag, which topic is what: left=/cam0/image_raw."""
-    features: ASKED_FEATURES = None
+    features: QUERY_FEATURES = None
     """Which of the map's features are asked; of several, the next where the one before leaves the
     pose unclear."""
     plain: Flag = False
@@ -82,18 +82,19 @@ class Command:
         if self.ros is not None and is_atlas(self.map):
             raise UsageError("--ros is of a map: the tiles of an atlas have worlds of their own")
         settings = read_settings(self.config)
-        with self._tracker(settings) as tracker, ended_by_signals() as is_ended:
-            of_size = None if self.camera is None else camera_for(tracker.localizer, self.camera)
+        with self._tracker(settings) as tracker, catch_stop_signals() as is_ended:
+            of_size = None if self.camera is None else parse_camera(tracker.localizer, self.camera)
             robots = None if self.ros is None else RosPublisher(self.ros)
-            for name, t_ns, read in self._pictures(is_ended):
+            for name, t_ns, read in self._read_images(is_ended):
                 if is_ended.is_set():
                     break
-                streamed = _streamed(tracker, t_ns, read, of_size)
+                streamed = _track_frame(tracker, t_ns, read, of_size)
                 answer = QueryAnswer(name, t_ns, streamed.result, streamed)
                 if robots is not None and isinstance(streamed.result, Localization):
                     robots.publish(t_ns, streamed.result.world_from_cam, streamed.result.covariance)
                 print(
-                    answer_line(answer) if self.plain else json.dumps(answer.to_json()), flush=True
+                    format_answer(answer) if self.plain else json.dumps(answer.to_json()),
+                    flush=True,
                 )
         return 0
 
@@ -102,7 +103,7 @@ class Command:
         localizing, tracking = settings.of(LocalizerConfig), settings.of(TrackerConfig)
         if not is_atlas(self.map):
             with TopoMetricMap.load(self.map) as topomap:
-                yield Tracker(localizer_of(topomap, localizing, self.features), tracking)
+                yield Tracker(create_localizer(topomap, localizing, self.features), tracking)
             return
         tracker = TileTracker(
             open_atlas(self.map, localizing, self.features, settings.of(AtlasConfig)), tracking
@@ -112,35 +113,35 @@ class Command:
         finally:
             tracker.close()
 
-    def _pictures(self, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
+    def _read_images(self, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
         if is_live(self.source):
-            return _captured(self.source, is_ended)
-        return _recorded(
-            single_pictures(open_recording(self.source, self.format, None, self.topics))
+            return _capture_frames(self.source, is_ended)
+        return _read_recording(
+            as_monocular(open_recording(self.source, self.format, None, self.topics))
         )
 
 
-def _streamed(
+def _track_frame(
     tracker: Tracker | TileTracker, t_ns: int, read: ReadFrame, of_size: CameraOfSize | None
 ) -> StreamedPose:
     """The answer to the next picture. Raises CalibrationError where its camera is not known."""
     try:
         frame = read()
     except UnreadableImageError as error:
-        return tracker.miss(t_ns, NotLocalized("unreadable", detail=str(error)))
-    camera = camera_of_frame(frame, of_size)
-    if isinstance(camera, RoughCamera):
+        return tracker.process_missing(t_ns, NotLocalized("unreadable", detail=str(error)))
+    camera = select_frame_camera(frame, of_size)
+    if isinstance(camera, UncalibratedCamera):
         raise CalibrationError("a stream needs a calibration: --camera FILE, fx,fy,cx,cy or map")
     return tracker.process(frame.image, camera, t_ns)
 
 
-def _recorded(sequence: StereoSequence) -> Iterator[tuple[str, int, ReadFrame]]:
+def _read_recording(sequence: StereoSequence) -> Iterator[tuple[str, int, ReadFrame]]:
     """The pictures of a recording, by its own clock."""
     for index, (name, t_ns) in enumerate(zip(sequence.names, sequence.t_ns, strict=True)):
         yield name, t_ns, lambda index=index: sequence[index]
 
 
-def _captured(source: str, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
+def _capture_frames(source: str, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
     """The newest picture of a camera or an address whenever the one before is answered, by this
     machine's clock."""
     with LiveSource(source) as live:

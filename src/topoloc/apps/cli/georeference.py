@@ -9,21 +9,21 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc.apps.cli.output import File, UsageError, check_outputs, print_facts, write_json
-from topoloc.apps.cli.tile_option import TileOption, edited_at
-from topoloc.apps.cli.waiting import say_waiting
+from topoloc.apps.cli.output import File, UsageError, check_outputs, print_fields, write_json
+from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
+from topoloc.apps.cli.wait_message import print_waiting
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.edit import editing
+from topoloc.mapping.control_points import ControlPoints, read_control_points, read_gnss
+from topoloc.mapping.edit import edit_map
 from topoloc.mapping.georeferencing import (
-    Up,
-    WorldFit,
-    find_up,
+    GeoreferenceFit,
+    UpDirection,
+    estimate_up_direction,
     fit_georeference,
-    georeference_by_view,
+    georeference_from_heading,
 )
-from topoloc.mapping.known_places import KnownPlaces, read_gnss, read_points
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -65,28 +65,28 @@ class Command:
         check_outputs(
             [self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path]
         )
-        origin = None if self.origin is None else _origin_from(self.origin)
-        found, facts, fitted = edited_at(
-            self.map, self.tile, lambda path: self._edited(path, origin)
+        origin = None if self.origin is None else _parse_origin(self.origin)
+        found, facts, fitted = edit_map_or_tile(
+            self.map, self.tile, lambda path: self._edit_georeference(path, origin)
         )
         if self.json != "-":
             _print(found, facts, fitted)
         write_json(self.json, facts)
         return 0
 
-    def _edited(
+    def _edit_georeference(
         self, path: Path, origin: tuple[GeoPoint, float] | None
-    ) -> tuple[Georeference, dict[str, Any], tuple[KnownPlaces, WorldFit] | None]:
+    ) -> tuple[Georeference, dict[str, Any], tuple[ControlPoints, GeoreferenceFit] | None]:
         """Where the map lies, with what is said of it, and what it was fitted to."""
-        with editing(path, say_waiting) as edit:
+        with edit_map(path, print_waiting) as edit:
             topomap = edit.topomap
             posed = [image.world_from_cam for image in topomap.place_images] or [
                 s.world_from_cam for s in topomap.summaries
             ]
             if not posed:
                 raise GeoreferenceError(f"map {path} has no mapping picture")
-            up = find_up(posed, self.up)
-            found, fitted = self._found(topomap, posed[0], up, origin)
+            up = estimate_up_direction(posed, self.up)
+            found, fitted = self._estimate_georeference(topomap, posed[0], up, origin)
             edit.commit(replace(topomap, georeference=found), f"georeference {found.source}")
         facts = found.to_json() | {
             "heading_deg": found.heading_deg(posed[0].rotation[:, 2]),
@@ -95,20 +95,24 @@ class Command:
         if fitted is not None:
             fit = fitted[1]
             facts |= {
-                "num_points": len(fit.used),
-                "num_used": int(fit.used.sum()),
+                "num_points": len(fit.is_inlier),
+                "num_used": int(fit.is_inlier.sum()),
                 "residuals_m": fit.residuals_m.round(4).tolist(),
             }
         return found, facts, fitted
 
-    def _found(
-        self, topomap: TopoMetricMap, first: Rigid3, up: Up, origin: tuple[GeoPoint, float] | None
-    ) -> tuple[Georeference, tuple[KnownPlaces, WorldFit] | None]:
+    def _estimate_georeference(
+        self,
+        topomap: TopoMetricMap,
+        first: Rigid3,
+        up: UpDirection,
+        origin: tuple[GeoPoint, float] | None,
+    ) -> tuple[Georeference, tuple[ControlPoints, GeoreferenceFit] | None]:
         """Where the map lies, and what that was fitted to."""
         if origin is not None:
-            return georeference_by_view(first, *origin, up), None
+            return georeference_from_heading(first, *origin, up), None
         if self.points is not None:
-            known = read_points(Path(self.points))
+            known = read_control_points(Path(self.points))
             fit = fit_georeference(known.points_world, known.places, "points")
         else:
             known = read_gnss(Path(self.gnss or ""), topomap)
@@ -116,7 +120,7 @@ class Command:
         return fit.georeference, (known, fit)
 
 
-def _origin_from(text: str) -> tuple[GeoPoint, float]:
+def _parse_origin(text: str) -> tuple[GeoPoint, float]:
     try:
         lat, lon, h, heading_deg = map(float, text.split(","))
     except ValueError:
@@ -130,7 +134,7 @@ def _origin_from(text: str) -> tuple[GeoPoint, float]:
     return GeoPoint(lat, lon, h), heading_deg
 
 
-def place_line(georeference: Georeference) -> str:
+def format_georeference(georeference: Georeference) -> str:
     """Where a map lies, and how well that is known, in one line."""
     o, rms = georeference.origin, georeference.rms_m
     fitted = "" if rms is None else f", rms {rms:.2f} m"
@@ -138,10 +142,10 @@ def place_line(georeference: Georeference) -> str:
 
 
 def _print(
-    found: Georeference, facts: dict[str, Any], fitted: tuple[KnownPlaces, WorldFit] | None
+    found: Georeference, facts: dict[str, Any], fitted: tuple[ControlPoints, GeoreferenceFit] | None
 ) -> None:
     lines = [
-        ("origin", place_line(found)),
+        ("origin", format_georeference(found)),
         (
             "first picture looks to",
             f"{facts['heading_deg']:.1f} degrees from true north, clockwise",
@@ -151,7 +155,7 @@ def _print(
         lines.append(("up", f"the world's {facts['up']}"))
     if fitted is not None:
         known, fit = fitted
-        worst = int(np.argmax(np.where(fit.used, fit.residuals_m, -1.0)))
+        worst = int(np.argmax(np.where(fit.is_inlier, fit.residuals_m, -1.0)))
         lines.append(("points", f"{facts['num_used']} of {facts['num_points']} agree"))
         lines.append(
             (
@@ -162,7 +166,9 @@ def _print(
                 ),
             )
         )
-        if not fit.used.all():
-            left_out = ", ".join(known.names[k] for k in np.flatnonzero(~fit.used)[:5].tolist())
-            lines.append(("left out", f"{left_out}{', ...' if (~fit.used).sum() > 5 else ''}"))
-    print_facts(lines)
+        if not fit.is_inlier.all():
+            left_out = ", ".join(
+                known.names[k] for k in np.flatnonzero(~fit.is_inlier)[:5].tolist()
+            )
+            lines.append(("left out", f"{left_out}{', ...' if (~fit.is_inlier).sum() > 5 else ''}"))
+    print_fields(lines)

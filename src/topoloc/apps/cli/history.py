@@ -8,12 +8,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc.apps.cli.output import File, print_facts, write_json
-from topoloc.apps.cli.tile_option import of_each_tile
+from topoloc.apps.cli.output import File, print_fields, write_json
+from topoloc.apps.cli.tile_option import run_for_each_tile
 from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.atlas.manifest import Tile
-from topoloc.lifelong.earlier_recall import described
-from topoloc.mapping.edit import undoable_edits
+from topoloc.lifelong.recall_change import describe_recall_change
+from topoloc.mapping.edit import count_undoable_edits
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -28,40 +28,42 @@ class Command:
 
     def run(self) -> int:
         if is_atlas(self.map):
-            return self._of_tiles()
-        facts, num_undoable = _edits(self.map)
+            return self._show_tiles()
+        facts, num_undoable = _read_edits(self.map)
         if self.json != "-":
             _print_edits(facts, "nothing is known of how this map was made")
             _print_undo(self.map, num_undoable)
         write_json(self.json, {"map": self.map, "edits": facts})
         return 0
 
-    def _of_tiles(self) -> int:
+    def _show_tiles(self) -> int:
         atlas = Atlas.open(self.map)
 
-        def told(tile_id: str) -> dict[str, Any]:
-            edits, num_undoable = _edits_of_tile(atlas, atlas.tile(tile_id))
+        def print_tile_history(tile_id: str) -> dict[str, Any]:
+            edits, num_undoable = _read_tile_edits(atlas, atlas.tile(tile_id))
             if self.json != "-":
                 print(f"tile {tile_id}")
                 _print_edits(edits, "nothing is known of how this tile was made")
                 _print_undo(f"{self.map} --tile {tile_id}", num_undoable)
             return {"edits": edits}
 
-        tiles, are_all_told = of_each_tile(atlas, list(atlas.manifest.by_id), told)
+        tiles, are_all_told = run_for_each_tile(
+            atlas, list(atlas.manifest.by_id), print_tile_history
+        )
         write_json(self.json, {"atlas": self.map, "tiles": tiles})
         return 0 if are_all_told else 1
 
 
-def _edits_of_tile(atlas: Atlas, tile: Tile) -> tuple[list[dict[str, Any]], int]:
-    """As `_edits`. Raises MapError."""
-    log = None if tile.undo is None else atlas.store.local(tile.undo.name, tile.undo.sha256)
-    return _edits(atlas.map_path(tile), log)
+def _read_tile_edits(atlas: Atlas, tile: Tile) -> tuple[list[dict[str, Any]], int]:
+    """As `_read_edits`. Raises MapError."""
+    log = None if tile.undo is None else atlas.store.local_path(tile.undo.name, tile.undo.sha256)
+    return _read_edits(atlas.map_path(tile), log)
 
 
-def _edits(path: str | Path, log: Path | None = None) -> tuple[list[dict[str, Any]], int]:
+def _read_edits(path: str | Path, log: Path | None = None) -> tuple[list[dict[str, Any]], int]:
     """The edits of a map file, the first one first, and how many of the last ones can be taken
     back, by the undo file beside it or another one. Raises MapError."""
-    num_undoable = undoable_edits(path, log)
+    num_undoable = count_undoable_edits(path, log)
     with TopoMetricMap.load(path) as topomap:
         edits = [asdict(edit) for edit in topomap.edits]
     return [
@@ -79,18 +81,21 @@ def _print_undo(where: str, num_undoable: int) -> None:
 
 
 def _print_edits(edits: list[dict[str, Any]], without: str) -> None:
-    print_facts(
+    print_fields(
         [
-            (f"{edit['edit_id']} {edit['date']}", f"{edit['name']}{_said(edit['changes'])}")
+            (
+                f"{edit['edit_id']} {edit['date']}",
+                f"{edit['name']}{_format_changes(edit['changes'])}",
+            )
             for edit in edits
         ]
         or [("", without)]
     )
 
 
-def _said(changes) -> str:
+def _format_changes(changes) -> str:
     """What an edit changed, in the words of its numbers."""
-    recall, numbers = described(changes or {}), (changes or {}).items()
+    recall, numbers = describe_recall_change(changes or {}), (changes or {}).items()
     shown = {
         name.replace("_", " "): value
         for name, value in numbers

@@ -9,12 +9,12 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc.apps.cli import atlas
-from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_facts, write_json
+from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_fields, write_json
 from topoloc.atlas.atlas import is_atlas
 from topoloc.errors import MapError
 from topoloc.mapping.description import describe_map
 
-MAX_DAMAGES = 20
+MAX_PROBLEMS = 20
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class Command:
             return atlas.Command("info", self.map, check=self.check, json=self.json).run()
         check_outputs([self.json, self.graph], inputs=[self.map])
         with TopoMetricMap.load(self.map) as topomap:
-            found = _damages(topomap, Path(self.map)) if self.check else []
+            found = _find_damage(topomap, Path(self.map)) if self.check else []
             if found:
-                print("\n".join(found[:MAX_DAMAGES]))
+                print("\n".join(found[:MAX_PROBLEMS]))
                 raise MapError(
                     f"map {self.map} is damaged: {len(found)} things are wrong, the first:"
                     f" {found[0]}"
@@ -63,13 +63,13 @@ class Command:
         return 0
 
 
-def _damages(topomap: Any, path: Path) -> list[str]:
+def _find_damage(topomap: Any, path: Path) -> list[str]:
     """What is wrong with the bytes of the file, or, where nothing is, with what they say."""
-    from topoloc.localization.map_facts.contradictions import contradictions
-    from topoloc.mapping.checking import damages
+    from topoloc.localization.map_facts.contradictions import find_contradictions
+    from topoloc.mapping.integrity_check import find_map_damage
 
-    found = damages(path)
-    return found or [str(contradiction) for contradiction in contradictions(topomap)]
+    found = find_map_damage(path)
+    return found or [str(contradiction) for contradiction in find_contradictions(topomap)]
 
 
 def _print(info: dict[str, Any]) -> None:
@@ -78,7 +78,7 @@ def _print(info: dict[str, Any]) -> None:
         info["config"].get("features", {}).get("normalization"),
     )
     nan = float("nan")
-    print_facts(
+    print_fields(
         [
             ("map", info["path"]),
             ("id", f"{info['map']}, version {info['version']}"),
@@ -94,9 +94,9 @@ def _print(info: dict[str, Any]) -> None:
                 ),
             ),
             ("recordings", ", ".join(info["recordings"])),
-            ("on earth", _place_line(info["georeference"])),
+            ("on earth", _format_place(info["georeference"])),
             *(
-                ("coarse localizer", _coarse_line(facts, info["default_coarse"]))
+                ("coarse localizer", _format_coarse(facts, info["default_coarse"]))
                 for facts in info["coarse_models"]
             ),
             (
@@ -116,18 +116,18 @@ def _print(info: dict[str, Any]) -> None:
     )
 
 
-def _place_line(facts: dict[str, Any] | None) -> str:
-    from topoloc.apps.cli.georeference import place_line
+def _format_place(facts: dict[str, Any] | None) -> str:
+    from topoloc.apps.cli.georeference import format_georeference
     from topoloc.geometry.geodesy import Georeference
 
     return (
         "unknown (topoloc georeference says where)"
         if facts is None
-        else place_line(Georeference.from_json(facts))
+        else format_georeference(Georeference.from_json(facts))
     )
 
 
-def _coarse_line(facts: dict[str, Any], default: str) -> str:
+def _format_coarse(facts: dict[str, Any], default: str) -> str:
     weights = facts.get("weights")
     source = (
         f"{weights['file']}, SHA-256 {weights['sha256'][:12]}" if weights else "from random weights"

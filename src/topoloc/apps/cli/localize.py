@@ -11,9 +11,9 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.apps.cli.features_option import ASKED_FEATURES
-from topoloc.apps.cli.live_answers import NEEDS_CALIBRATION, live_answers, live_input
-from topoloc.apps.cli.map_or_atlas import camera_for, is_atlas, localizer_at
+from topoloc.apps.cli.features_option import QUERY_FEATURES
+from topoloc.apps.cli.live_localization import NEEDS_CALIBRATION, find_live_input, localize_live
+from topoloc.apps.cli.map_or_atlas import is_atlas, open_localizer, parse_camera
 from topoloc.apps.cli.output import (
     File,
     Flag,
@@ -28,16 +28,16 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.apps.cli.query_answers import (
     QueryAnswer,
-    answer_line,
     exit_status,
-    say_verdicts,
-    stream_summary,
-    trajectory_of,
+    format_answer,
+    report_calibrations,
+    summarize_stream,
+    to_trajectory,
 )
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.near import NearPlace
+from topoloc.atlas.location_prior import GeoPositionPrior
 from topoloc.errors import (
     AtlasError,
     CalibrationError,
@@ -46,15 +46,15 @@ from topoloc.errors import (
     UnreadableImageError,
 )
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.query_camera import CameraOfSize, camera_of_frame
+from topoloc.localization.query_camera import CameraOfSize, select_frame_camera
 from topoloc.localization.result import NotLocalized
-from topoloc.mapping.sessions import path_of
+from topoloc.mapping.sessions import find_source_path
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import find_format
-from topoloc.recordings.recording import single_pictures
-from topoloc.recordings.trajectory import frame_poses, read_trajectory, write_tum
+from topoloc.recordings.recording import as_monocular
+from topoloc.recordings.trajectory import match_frame_poses, read_trajectory, write_tum
 from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 
@@ -119,7 +119,7 @@ class Command:
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
     ] = None
     """Coarse localizer that is asked; `topoloc info` names those of the map."""
-    features: ASKED_FEATURES = None
+    features: QUERY_FEATURES = None
     """Which of the map's features are asked; of several, the next where the one before leaves the
     pose unclear."""
     max_ms: Annotated[
@@ -154,19 +154,19 @@ class Command:
                 if path
             ],
         )
-        near, settings = self._near, read_settings(self.config)
-        tracking = self._tracking(settings.of(TrackerConfig))
+        near, settings = self._parse_near, read_settings(self.config)
+        tracking = self._create_tracker(settings.of(TrackerConfig))
         localizer = self._localizer(settings, near)
         camera = (
             None
             if self.camera is None or self._stereo_calibration
-            else camera_for(localizer, self.camera)
+            else parse_camera(localizer, self.camera)
         )
-        live = live_input(self.inputs)
-        queries = [] if live else [self._open(path) for path in self.inputs]
+        live = find_live_input(self.inputs)
+        queries = [] if live else [self._open_query(path) for path in self.inputs]
         answers: list[QueryAnswer] = []
         total = sum(len(query.sequence) for query in queries)
-        coming = _answers(localizer, tracking, queries, camera)
+        coming = _localize_queries(localizer, tracking, queries, camera)
         if live:
             if camera is None:
                 raise UsageError(f"{live} has no calibration: --camera says it")
@@ -175,7 +175,7 @@ class Command:
                 if isinstance(localizer, Localizer) and not self.streams.single
                 else None
             )
-            coming = live_answers(localizer, tracker, live, camera)
+            coming = localize_live(localizer, tracker, live, camera)
         start = time.perf_counter()
         try:
             with interruptible(), progress_bar() as progress:
@@ -183,7 +183,8 @@ class Command:
                     answers.append(answer)
                     as_json = self.json == "-"
                     print(
-                        json.dumps(answer.to_json()) if as_json else answer_line(answer), flush=True
+                        json.dumps(answer.to_json()) if as_json else format_answer(answer),
+                        flush=True,
                     )
                     progress("queries", len(answers), total or len(answers))
         except (KeyboardInterrupt, TopolocError) as stopped:
@@ -196,14 +197,16 @@ class Command:
             ) from stopped
         self._write_files(answers)
         if any(answer.streamed for answer in answers) and self.json != "-":
-            print(stream_summary(answers, time.perf_counter() - start))
-        say_verdicts(answers)
+            print(summarize_stream(answers, time.perf_counter() - start))
+        report_calibrations(answers)
         return exit_status(answers)
 
-    def _localizer(self, settings: Settings, near: NearPlace | None) -> Localizer | AtlasLocalizer:
+    def _localizer(
+        self, settings: Settings, near: GeoPositionPrior | None
+    ) -> Localizer | AtlasLocalizer:
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
-        localizer = localizer_at(self.map, config, self.features, settings.of(AtlasConfig))
+        localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
         return (
             localizer.near(near)
             if isinstance(localizer, AtlasLocalizer) and near is not None
@@ -211,18 +214,20 @@ class Command:
         )
 
     @property
-    def _near(self) -> NearPlace | None:
+    def _parse_near(self) -> GeoPositionPrior | None:
         if self.near is not None and not is_atlas(self.map):
             raise UsageError("--near is of an atlas: a map is one place")
         try:
-            return None if self.near is None else NearPlace.parse(self.near)
+            return None if self.near is None else GeoPositionPrior.parse(self.near)
         except AtlasError as error:
             raise UsageError(f"--near: {error}") from None
 
     def _check_usage(self) -> None:
         if self.streams.stream and self.streams.single:
             raise UsageError("--stream and --single cannot both be meant")
-        if self.streams.odometry is not None and (len(self.inputs) > 1 or live_input(self.inputs)):
+        if self.streams.odometry is not None and (
+            len(self.inputs) > 1 or find_live_input(self.inputs)
+        ):
             raise UsageError("--odometry is that of one recorded stream: give one input with it")
         streams = self.streams
         if is_atlas(self.map) and (
@@ -233,14 +238,14 @@ class Command:
                 " --max-jump are for maps"
             )
 
-    def _open(self, path: str) -> _Query:
+    def _open_query(self, path: str) -> _Query:
         """Recordings and videos are streams; pictures, and folders of them, are single unless they
         are said not to be."""
         is_single = self.streams.single or is_atlas(self.map)
         is_stream = self.streams.stream or (
             not is_single and find_format(path, self.format) != "folder"
         )
-        sequence = single_pictures(
+        sequence = as_monocular(
             open_recording(path, self.format, self._stereo_calibration, self.topics)
         )
         is_stream = is_stream and len(sequence) > 1
@@ -250,7 +255,7 @@ class Command:
                 raise UsageError(
                     f"--odometry is for streams, and {path} is none; --stream makes it one"
                 )
-            odometry = frame_poses(
+            odometry = match_frame_poses(
                 read_trajectory(Path(self.streams.odometry)),
                 sequence.t_ns,
                 Path(self.streams.odometry),
@@ -263,7 +268,7 @@ class Command:
         """`--camera` where it is a pair's, which its recording is opened with."""
         return self.camera if self.camera is not None and self.camera.endswith(".conf") else None
 
-    def _tracking(self, config: TrackerConfig) -> TrackerConfig:
+    def _create_tracker(self, config: TrackerConfig) -> TrackerConfig:
         config = with_option(config, "max_jump", self.streams.max_jump, "--max-jump")
         return config if self.streams.max_jump is None else replace(config, mode="paper")
 
@@ -274,12 +279,12 @@ class Command:
             write_text(Path(self.json), "".join(json.dumps(a.to_json()) + "\n" for a in answers))
             files.append(self.json)
         if self.tum is not None:
-            write_tum(Path(self.tum), trajectory_of(answers, self.streams.smoothed))
+            write_tum(Path(self.tum), to_trajectory(answers, self.streams.smoothed))
             files.append(self.tum)
         return files
 
 
-def _answers(
+def _localize_queries(
     localizer: Localizer | AtlasLocalizer,
     tracking: TrackerConfig,
     queries: list[_Query],
@@ -300,7 +305,7 @@ def _answers(
                 else f"{query.path}/{frame_name}"
             )
             try:
-                answer = _answer(name, query, i, localizer, tracker, camera_of_size)
+                answer = _localize_frame(name, query, i, localizer, tracker, camera_of_size)
             except (QueryError, CalibrationError) as error:
                 if query.is_stream or len(queries) == len(query.sequence) == 1:
                     raise type(error)(f"{name}: {error}") from error
@@ -316,11 +321,11 @@ def _answers(
 def _has_times(photos: StereoSequence) -> bool:
     """Photos, and folders of them without times.txt, are read as if they were taken ten a
     second."""
-    root = path_of(photos)
+    root = find_source_path(photos)
     return root is None or (photos.names != [photos.name] and (Path(root) / "times.txt").is_file())
 
 
-def _answer(
+def _localize_frame(
     name: str,
     query: _Query,
     index: int,
@@ -333,23 +338,25 @@ def _answer(
     try:
         frame = query.sequence[index]
     except UnreadableImageError as error:
-        unreadable = localizer.completed(
+        unreadable = localizer.with_provenance(
             NotLocalized("unreadable", detail=str(error)), t_ns=t_ns if query.has_times else None
         )
         return QueryAnswer(
             name,
             t_ns,
             unreadable,
-            tracker.miss(t_ns, unreadable, odom_from_cam) if tracker is not None else None,
+            tracker.process_missing(t_ns, unreadable, odom_from_cam)
+            if tracker is not None
+            else None,
         )
-    camera = camera_of_frame(frame, camera_of_size)
+    camera = select_frame_camera(frame, camera_of_size)
     if tracker is None:
         return QueryAnswer(
             name,
             t_ns,
             localizer.localize(frame.image, camera, t_ns=t_ns if query.has_times else None),
         )
-    if isinstance(camera, RoughCamera):
+    if isinstance(camera, UncalibratedCamera):
         raise CalibrationError(NEEDS_CALIBRATION)
     streamed = tracker.process(frame.image, camera, t_ns, odom_from_cam)
     return QueryAnswer(name, t_ns, streamed.result, streamed)

@@ -10,10 +10,10 @@ from typing import Annotated
 import tyro
 
 from topoloc.apps.cli.atlas import describe, print_atlas
-from topoloc.apps.cli.joined_neighbours import joined_neighbours
 from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
-from topoloc.apps.cli.session_joining import describe_untaught
+from topoloc.apps.cli.session_update import describe_outdated_models
 from topoloc.apps.cli.settings_file import Settings, read_settings
+from topoloc.apps.cli.tile_joining import join_overlapping_tiles
 from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.lifelong.merge import merge_maps
 from topoloc.lifelong.update import UpdateConfig
@@ -78,7 +78,7 @@ class Command:
             )
             print(
                 f"{self.out}: {recognised}, {c['nodes_added']} added, {c['bytes'] / 1e6:.2f}"
-                f" MB{describe_untaught(c)}"
+                f" MB{describe_outdated_models(c)}"
             )
         write_json(self.json, {"map": self.out} | c)
         return 0
@@ -95,7 +95,7 @@ class Command:
             if is_atlas(self.second)
             else merged.by_id.keys() - first.keys()
         )
-        joined = joined_neighbours(self.out, sorted(second), settings, self.json != "-")
+        joined = join_overlapping_tiles(self.out, sorted(second), settings, self.json != "-")
         facts = describe(self.out, joined.manifest) | {"tried": joined.rows}
         if self.json != "-":
             print_atlas(facts)

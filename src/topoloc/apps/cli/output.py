@@ -16,10 +16,10 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc.errors import MissingExtraError, TopolocError
-from topoloc.recordings.atomic import remove_leftovers, write_text
+from topoloc.recordings.atomic import remove_stale_files, write_text
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import notes_of
+from topoloc.recordings.recording import recording_notes
 
 # Given or not: no `--no-...`, and no "(default: False)" in the help.
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
@@ -65,7 +65,7 @@ def open_recording(
     """`open_sequence`; what is to be known of the recording is said in a line each on stderr.
     Raises as that does."""
     sequence = open_sequence(path, format, camera, images, topics)
-    for note in notes_of(sequence):
+    for note in recording_notes(sequence):
         print(f"warning: {note}", file=sys.stderr)
     return sequence
 
@@ -98,7 +98,7 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> 
             raise TopolocError(f"cannot write {path}: folder {path.parent} is read-only")
         if path.resolve() in taken:
             raise TopolocError(f"cannot write {path}: this file is named for something else, too")
-        remove_leftovers(path)
+        remove_stale_files(path)
         taken.add(path.resolve())
 
 
@@ -120,7 +120,7 @@ def interruptible() -> Iterator[None]:
 
 
 @contextmanager
-def ended_by_signals() -> Iterator[threading.Event]:
+def catch_stop_signals() -> Iterator[threading.Event]:
     """Ctrl-C and SIGTERM set the event, at which work that could go on for ever ends in good order;
     a second one interrupts it."""
     stop = threading.Event()
@@ -195,7 +195,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
         yield update
 
 
-def report_writer() -> Callable[..., None]:
+def import_report_writer() -> Callable[..., None]:
     """`write_report`, of the extra `report`. Raises MissingExtraError where that is not
     installed."""
     try:
@@ -209,7 +209,7 @@ def report_writer() -> Callable[..., None]:
     return write_report
 
 
-def print_facts(facts: Sequence[tuple[str, str]]) -> None:
+def print_fields(facts: Sequence[tuple[str, str]]) -> None:
     """Names and values, one pair a line, the values in one column."""
     width = max(len(name) for name, _ in facts)
     for name, value in facts:

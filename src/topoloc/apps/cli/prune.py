@@ -11,11 +11,16 @@ import tyro
 
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.settings_file import read_settings
-from topoloc.apps.cli.tile_option import TileOption, check_tile_option, edited_at, of_each_tile
-from topoloc.apps.cli.waiting import say_waiting
+from topoloc.apps.cli.tile_option import (
+    TileOption,
+    check_tile_option,
+    edit_map_or_tile,
+    run_for_each_tile,
+)
+from topoloc.apps.cli.wait_message import print_waiting
 from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.lifelong.prune import PruneConfig, prune_map
-from topoloc.mapping.edit import editing
+from topoloc.mapping.edit import edit_map
 
 
 @dataclass(frozen=True)
@@ -53,24 +58,26 @@ class Command:
             config if self.descriptors is None else replace(config, descriptors=self.descriptors)
         )
         if not is_atlas(self.map):
-            changes = self._pruned(Path(self.map), config, self.map)
+            changes = self._prune_map(Path(self.map), config, self.map)
             write_json(self.json, {"map": self.map} | changes)
             return 0
         atlas = Atlas.open(self.map)
         ids = list(atlas.manifest.by_id) if self.tile is None else [atlas.tile(self.tile).tile_id]
-        tiles, are_all_pruned = of_each_tile(
+        tiles, are_all_pruned = run_for_each_tile(
             atlas,
             ids,
-            lambda name: edited_at(
-                self.map, name, lambda path: self._pruned(path, config, f"{self.map}, tile {name}")
+            lambda name: edit_map_or_tile(
+                self.map,
+                name,
+                lambda path: self._prune_map(path, config, f"{self.map}, tile {name}"),
             ),
         )
         write_json(self.json, {"atlas": self.map, "tiles": tiles})
         return 0 if are_all_pruned else 1
 
-    def _pruned(self, path: Path, config: PruneConfig, name: str) -> dict[str, Any]:
+    def _prune_map(self, path: Path, config: PruneConfig, name: str) -> dict[str, Any]:
         """What was dropped from a map file, which is said of it by its name."""
-        with editing(path, say_waiting) as edit:
+        with edit_map(path, print_waiting) as edit:
             before = edit.path.stat().st_size
             pruned = prune_map(
                 edit.topomap,

@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Any
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.calibration_doubt import verdicts_of
+from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.recordings.trajectory import Trajectory
 from topoloc.tracking.stream_result import StreamedPose
@@ -38,7 +38,7 @@ class QueryAnswer:
         )
 
 
-def trajectory_of(answers: list[QueryAnswer], smoothed: bool) -> Trajectory:
+def to_trajectory(answers: list[QueryAnswer], smoothed: bool) -> Trajectory:
     """The poses found, in the order of the queries; their numbers are their seconds where the times
     do not increase."""
     times = [answer.t_ns for answer in answers]
@@ -74,14 +74,14 @@ def exit_status(answers: list[QueryAnswer]) -> int:
     return 0
 
 
-def say_verdicts(answers: list[QueryAnswer]) -> None:
+def report_calibrations(answers: list[QueryAnswer]) -> None:
     """One line on stderr for each camera whose calibration the pictures contradict together."""
-    for verdict in verdicts_of(answer.result for answer in answers):
-        if verdict.contradicts:
+    for verdict in check_camera_calibrations(answer.result for answer in answers):
+        if verdict.is_contradicted:
             print(f"warning: {verdict}", file=sys.stderr)
 
 
-def answer_line(answer: QueryAnswer) -> str:
+def format_answer(answer: QueryAnswer) -> str:
     """One query for people."""
     result, state = (
         answer.result,
@@ -106,7 +106,7 @@ def answer_line(answer: QueryAnswer) -> str:
     )
 
 
-def stream_summary(answers: list[QueryAnswer], seconds: float) -> str:
+def summarize_stream(answers: list[QueryAnswer], seconds: float) -> str:
     """How often each state, and frames a second."""
     states = Counter(answer.streamed.state for answer in answers if answer.streamed is not None)
     counts = ", ".join(

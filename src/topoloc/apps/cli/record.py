@@ -14,8 +14,8 @@ import tyro
 from topoloc.apps.cli.output import (
     File,
     UsageError,
+    catch_stop_signals,
     check_outputs,
-    ended_by_signals,
     progress_bar,
     write_json,
 )
@@ -25,11 +25,11 @@ from topoloc.apps.formats.capture.carla_capture import (
     carla_client,
     carla_frames,
 )
-from topoloc.apps.formats.capture.folder_writer import FolderWriter
+from topoloc.apps.formats.capture.recording_writer import RecordingWriter
 from topoloc.apps.formats.capture.zed_capture import sdk_frames, side_by_side_frames
 from topoloc.apps.formats.live import LiveSource
 from topoloc.errors import CalibrationError, MissingExtraError, TopolocError
-from topoloc.recordings.calibration import CalibrationOfSize, calibration_of
+from topoloc.recordings.calibration import CalibrationForSize, parse_calibration
 from topoloc.recordings.frame import StereoFrame
 
 _ZED_SIZE = (2560, 720)
@@ -115,8 +115,8 @@ class Command:
     def run(self) -> int:
         self._check_usage()
         check_outputs([self.json])
-        with FolderWriter(Path(self.out), self.jpeg) as writer, ExitStack() as stack:
-            stop = stack.enter_context(ended_by_signals())
+        with RecordingWriter(Path(self.out), self.jpeg) as writer, ExitStack() as stack:
+            stop = stack.enter_context(catch_stop_signals())
             frames = stack.enter_context(closing(self._frames(stop, stack)))
             last = self._write(writer, frames, stop)
         if last is None:
@@ -135,7 +135,7 @@ class Command:
         return 0
 
     def _write(
-        self, writer: FolderWriter, frames: Iterator[StereoFrame], stop: threading.Event
+        self, writer: RecordingWriter, frames: Iterator[StereoFrame], stop: threading.Event
     ) -> StereoFrame | None:
         """Writes all frames that come, no more of them than are wanted a second; gives the last."""
         last, next_ns = None, None
@@ -185,7 +185,7 @@ class Command:
                 yield from side_by_side_frames(source, Path(self.camera))
             else:
                 yield from _single_frames(
-                    source, None if self.camera is None else calibration_of(self.camera)
+                    source, None if self.camera is None else parse_calibration(self.camera)
                 )
 
     def _check_usage(self) -> None:
@@ -241,7 +241,7 @@ class Command:
 
 
 def _single_frames(
-    source: LiveSource, calibration: CalibrationOfSize | None
+    source: LiveSource, calibration: CalibrationForSize | None
 ) -> Iterator[StereoFrame]:
     camera = None
     for picture in source:

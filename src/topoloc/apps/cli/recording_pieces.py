@@ -8,16 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 
+from topoloc.apps.cli.map_jobs import MapJob
 from topoloc.apps.cli.output import UsageError
-from topoloc.apps.cli.recording_maps import MapMaking
 from topoloc.errors import TopolocError
 from topoloc.recordings.open import open_sequence, split_selection
 
-LEAST_OVERLAP = 3
+MIN_OVERLAP = 3
 
 
 @dataclass(frozen=True)
-class Split:
+class SplitOptions:
     """Pieces of at most so many frames, and how many of these a piece shares with the next one at
     least.
 
@@ -29,15 +29,15 @@ class Split:
     num_shared: int
 
     def __post_init__(self) -> None:
-        if not LEAST_OVERLAP <= self.num_shared <= self.num_frames // 2:
+        if not MIN_OVERLAP <= self.num_shared <= self.num_frames // 2:
             raise UsageError(
                 "--split takes the frames of a piece and, behind a comma, how many of these the"
-                f" next one shares: {LEAST_OVERLAP} at least and at most half, not"
+                f" next one shares: {MIN_OVERLAP} at least and at most half, not"
                 f" {self.num_shared} of {self.num_frames}"
             )
 
     @staticmethod
-    def of(text: str | None) -> Split | None:
+    def of(text: str | None) -> SplitOptions | None:
         """As the option says it, `500` or `500,50`: a tenth is shared where that is not said.
         Raises UsageError."""
         if text is None:
@@ -48,8 +48,8 @@ class Split:
         ):
             raise UsageError(f"--split takes frames, such as 500 or 500,50, not {text[:40]!r}")
         num_frames = int(parts[0])
-        return Split(
-            num_frames, int(parts[1]) if len(parts) == 2 else max(num_frames // 10, LEAST_OVERLAP)
+        return SplitOptions(
+            num_frames, int(parts[1]) if len(parts) == 2 else max(num_frames // 10, MIN_OVERLAP)
         )
 
     def ranges(self, total: int) -> list[tuple[int, int]]:
@@ -68,13 +68,13 @@ class Pieces:
     """The maps to make of one recording, one after the other along it, and the world that they
     share by its own poses; None where it has none, or there is but one map."""
 
-    makings: list[MapMaking]
+    piece_jobs: list[MapJob]
     world: str | None = None
 
 
-def pieces_of(making: MapMaking, tile_id: str, split: Split) -> Pieces:
-    """The pieces of a recording, that of `making`; as it is where it is short, or cannot be opened,
-    of which its own task tells.
+def split_recording(map_job: MapJob, tile_id: str, split: SplitOptions) -> Pieces:
+    """The pieces of a recording, that of `map_job`; as it is where it is short, or cannot be
+    opened, of which its own task tells.
 
     Args:
         tile_id: what the tile of the whole recording would be called.
@@ -82,28 +82,28 @@ def pieces_of(making: MapMaking, tile_id: str, split: Split) -> Pieces:
     Raises:
         UsageError: it is long, and frames of it are chosen.
     """
-    (recording,) = making.recordings
+    (recording,) = map_job.recordings
     try:
         sequence = open_sequence(
-            recording, making.format, making.camera, making.images, making.topics
+            recording, map_job.format, map_job.camera, map_job.images, map_job.topics
         )
     except TopolocError:
-        return Pieces([making])
+        return Pieces([map_job])
     ranges = split.ranges(len(sequence))
     if len(ranges) == 1:
-        return Pieces([making])
-    asked = making.asked
+        return Pieces([map_job])
+    asked = map_job.asked
     if not asked.trajectory and any(sequence.poses):
         asked = replace(
             asked, trajectory=("truth",)
         )  # of every piece, also where one happens to have no pose
     has_poses = asked.trajectory not in ((), ("slam",))
-    named = _named(recording, ranges)
-    made = [replace(making, recordings=(name,), asked=asked) for name in named]
-    return Pieces(made, _world_of(recording, tile_id) if has_poses else None)
+    named = _select_frames(recording, ranges)
+    made = [replace(map_job, recordings=(name,), asked=asked) for name in named]
+    return Pieces(made, _world_name(recording, tile_id) if has_poses else None)
 
 
-def _named(recording: str, ranges: Sequence[tuple[int, int]]) -> list[str]:
+def _select_frames(recording: str, ranges: Sequence[tuple[int, int]]) -> list[str]:
     """The recording with these of its frames chosen. Raises UsageError."""
     path, selection = split_selection(recording)
     if selection is not None:
@@ -113,6 +113,6 @@ def _named(recording: str, ranges: Sequence[tuple[int, int]]) -> list[str]:
     return [f"{path}@{start}:{stop}" for start, stop in ranges]
 
 
-def _world_of(recording: str, tile_id: str) -> str:
+def _world_name(recording: str, tile_id: str) -> str:
     """A name for the world of a recording's own poses that no other recording's has."""
     return f"{tile_id[:80]}-{sha256(os.fsencode(os.path.abspath(recording))).hexdigest()[:8]}"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from topoloc.apps.cluster.tasks import Running
+from topoloc.apps.cluster.tasks import JobProgress
 from topoloc.apps.cluster.tiles import Outcome
 
 _STATES = {
@@ -19,16 +19,16 @@ _STATES = {
 }
 
 
-def state_text(state: Outcome | Running | None) -> str:
+def format_state(state: Outcome | JobProgress | None) -> str:
     """Where a recording is, in a few words."""
     if state is None:
         return "waits"
-    if isinstance(state, Running):
+    if isinstance(state, JobProgress):
         return f"{state.stage} {state.done}/{state.total}"
     return _STATES[state.state] if state.reason is None else f"failed: {state.reason}"
 
 
-def finished_line(outcome: Outcome) -> str:
+def format_outcome(outcome: Outcome) -> str:
     """One line of a recording that is finished."""
     if outcome.reason is not None:
         return (
@@ -43,26 +43,28 @@ def finished_line(outcome: Outcome) -> str:
     return f"{outcome.recording}: tile {outcome.tile_id}, {size}, {took}"
 
 
-def tell_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
+def print_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
     """What is to be known of recordings beside; below a table (`was_live`) also what failed once
     more, where it can be copied."""
     for outcome in outcomes:
         for note in outcome.notes:
             print(f"{outcome.recording}: {note}", file=sys.stderr)
         if was_live and outcome.reason is not None:
-            print(finished_line(outcome), file=sys.stderr)
+            print(format_outcome(outcome), file=sys.stderr)
 
 
 @contextmanager
 def recordings_table(
     recordings: Sequence[str],
-) -> Iterator[tuple[Callable[[int, Outcome | Running], None], bool]]:
+) -> Iterator[tuple[Callable[[int, Outcome | JobProgress], None], bool]]:
     """A callable (recording's number, its state) that shows it; and whether it wants to know of
     those that are being worked on, too."""
     if not sys.stderr.isatty():
         yield (
             lambda number, state: (
-                print(finished_line(state), file=sys.stderr) if isinstance(state, Outcome) else None
+                print(format_outcome(state), file=sys.stderr)
+                if isinstance(state, Outcome)
+                else None
             ),
             False,
         )
@@ -70,7 +72,7 @@ def recordings_table(
     from rich.console import Console
     from rich.live import Live
 
-    states: list[Outcome | Running | None] = [None] * len(recordings)
+    states: list[Outcome | JobProgress | None] = [None] * len(recordings)
     with Live(
         _table(recordings, states),
         console=Console(stderr=True),
@@ -78,14 +80,14 @@ def recordings_table(
         auto_refresh=False,
     ) as live:
 
-        def show(number: int, state: Outcome | Running) -> None:
+        def show(number: int, state: Outcome | JobProgress) -> None:
             states[number] = state
             live.update(_table(recordings, states), refresh=True)
 
         yield show, True
 
 
-def _table(recordings: Sequence[str], states: Sequence[Outcome | Running | None]) -> Any:
+def _table(recordings: Sequence[str], states: Sequence[Outcome | JobProgress | None]) -> Any:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -103,5 +105,5 @@ def _table(recordings: Sequence[str], states: Sequence[Outcome | Running | None]
                 f"{state.seconds:.1f}",
                 state.host,
             ]
-        table.add_row(recording, state_text(state), *cells)
+        table.add_row(recording, format_state(state), *cells)
     return table

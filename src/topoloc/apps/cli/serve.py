@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.apps.cli.features_option import ASKED_FEATURES
-from topoloc.apps.cli.output import File, Flag, UsageError, ended_by_signals
+from topoloc.apps.cli.features_option import QUERY_FEATURES
+from topoloc.apps.cli.output import File, Flag, UsageError, catch_stop_signals
 from topoloc.apps.cli.served_maps import ServedMaps, read_token
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ReplicasConfig
@@ -45,7 +45,7 @@ class Command:
     """Its private key (PEM)."""
     behind_proxy: Flag = False
     """A proxy in front of the service speaks TLS with the clients."""
-    features: ASKED_FEATURES = None
+    features: QUERY_FEATURES = None
     """Which of the maps' features are asked; of several, the next where the one before leaves the
     pose unclear."""
     memory_mb: Annotated[
@@ -93,35 +93,35 @@ class Command:
         if self.ray is not None:
             return self._run_on_ray(settings, config)
         cert, key = (None if path is None else Path(path) for path in (self.tls_cert, self.tls_key))
-        app = self._served(settings, config).application()
+        app = self._serve(settings, config).application()
         serve(app, Address(self.host, self.port, cert, key, self.behind_proxy), config)
         return 0
 
     def _run_on_ray(self, settings: Settings, config: ServiceConfig) -> int:
-        from topoloc.apps.service.on_ray import Front, serve_on_ray
+        from topoloc.apps.service.ray_serve import ProxyOptions, serve_on_ray
 
         assert self.ray is not None
         if self.port == 0:
             raise UsageError("--ray listens on the same port of all machines: --port 0 names none")
-        replicas = self._replicas(settings.of(ReplicasConfig))
+        replicas = self._parse_replicas(settings.of(ReplicasConfig))
         config = replace(config, workers=config.workers or replicas.cpus_per_replica)
-        served = self._served(settings, config)
-        front = Front(
+        served = self._serve(settings, config)
+        front = ProxyOptions(
             self.host,
             self.port,
             config.num_workers,
             config.max_queue,
-            _whole(self.tls_cert),
-            _whole(self.tls_key),
+            _absolute_path(self.tls_cert),
+            _absolute_path(self.tls_key),
         )
         serve_on_ray(served, self.ray, front, replicas, _wait_for_signal)
         return 0
 
-    def _served(self, settings: Settings, config: ServiceConfig) -> ServedMaps:
+    def _serve(self, settings: Settings, config: ServiceConfig) -> ServedMaps:
         return ServedMaps(
-            tuple(path if self.ray is None else str(_whole(path)) for path in self.maps),
+            tuple(path if self.ray is None else str(_absolute_path(path)) for path in self.maps),
             self.features,
-            _whole(self.token_file),
+            _absolute_path(self.token_file),
             self.host in _LOOPBACK and not self.behind_proxy,
             config,
             settings.of(LocalizerConfig),
@@ -129,7 +129,7 @@ class Command:
             settings.of(AtlasConfig),
         )
 
-    def _replicas(self, config: ReplicasConfig) -> ReplicasConfig:
+    def _parse_replicas(self, config: ReplicasConfig) -> ReplicasConfig:
         if self.replicas is None:
             return config
         least, dash, most = self.replicas.partition("-")
@@ -158,10 +158,10 @@ class Command:
 
 
 def _wait_for_signal() -> None:
-    with ended_by_signals() as stop:
+    with catch_stop_signals() as stop:
         stop.wait()
 
 
-def _whole(path: str | None) -> str | None:
+def _absolute_path(path: str | None) -> str | None:
     """The path as other processes find it, too."""
     return path if path is None or "://" in path else str(Path(path).absolute())

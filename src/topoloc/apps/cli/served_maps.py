@@ -6,19 +6,19 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from topoloc.apps.cli.features_option import localizer_of
+from topoloc.apps.cli.features_option import create_localizer
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.open_maps import Maps
-from topoloc.atlas.tile_fetches import TileFetches
+from topoloc.atlas.map_cache import MapCache
+from topoloc.atlas.tile_fetcher import TileFetcher
 from topoloc.compiled import set_num_threads
 from topoloc.errors import TopolocError
 from topoloc.localization.localizer import LocalizerConfig
-from topoloc.mapping.memory import set_node_memory
+from topoloc.mapping.node_cache import set_node_cache_size
 from topoloc.tracking.tracker import TrackerConfig
 from topoloc.tracking.warm_up import is_warm, warm_up
 
-LEAST_TOKEN = 16
+MIN_TOKEN_LENGTH = 16
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class ServedMaps:
 
     def application(self):  # no return type: the service is an extra, and loaded here alone
         """The application, its maps opened as they are asked for. Raises TopolocError."""
-        from topoloc.apps.service.application import Access, make_application
+        from topoloc.apps.service.application import Access, create_application
 
         access = Access(read_token(self.token_file), self.loopback_only)
-        return make_application(self._opened(), self.service, access, self.tracker, self.atlas)
+        return create_application(self._open_maps(), self.service, access, self.tracker, self.atlas)
 
-    def _opened(self) -> Maps:
+    def _open_maps(self) -> MapCache:
         """The maps, with half of the memory for nodes, and half for the rest of those that are
         open."""
         if not is_warm():
@@ -51,11 +51,11 @@ class ServedMaps:
         if self.service.num_workers > 1:
             set_num_threads(1)
         budget = self.service.memory_mb * 500_000
-        set_node_memory(budget)
-        fetches = TileFetches(self.service.fetch_s)
-        return Maps(
+        set_node_cache_size(budget)
+        fetches = TileFetcher(self.service.fetch_s)
+        return MapCache(
             self.paths,
-            lambda topomap: localizer_of(topomap, self.localizer, self.features),
+            lambda topomap: create_localizer(topomap, self.localizer, self.features),
             budget,
             fetches.path,
         )
@@ -71,8 +71,14 @@ def read_token(path: str | None) -> str | None:
         raise TopolocError(
             f"cannot read the token in {path}: {getattr(error, 'strerror', None) or 'no text'}"
         ) from None
-    if len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
+    if (
+        len(token) < MIN_TOKEN_LENGTH
+        or not token.isascii()
+        or not token.isprintable()
+        or " " in token
+    ):
         raise TopolocError(
-            f"{path}: a token has at least {LEAST_TOKEN} letters, digits or signs, and no spaces"
+            f"{path}: a token has at least {MIN_TOKEN_LENGTH} letters, digits or signs, and no"
+            " spaces"
         )
     return token

@@ -15,16 +15,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from topoloc.apps.cli import BROUGHT, all_commands, brought
+from topoloc.apps.cli import PLUGIN_PACKAGES, all_commands, load_plugins
 from topoloc.apps.cli.output import UsageError
 from topoloc.bounds import (
-    annotations_of,
-    bare,
-    bounds_of,
-    complaint,
-    did_you_mean,
-    quoted,
-    settings_from,
+    field_annotations,
+    field_bounds,
+    find_violation,
+    parse_settings,
+    quote_key,
+    strip_annotation,
+    suggest_name,
 )
 from topoloc.errors import ConfigError
 
@@ -32,13 +32,13 @@ T = TypeVar("T")
 
 # table of the file: module and class of its configuration, and the commands that it is for; more
 # come with other distributions
-_ASKING = ("localize", "evaluate", "explain", "serve", "follow")
+_QUERY_COMMANDS = ("localize", "evaluate", "explain", "serve", "follow")
 TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "build": ("topoloc.mapping.build", "BuildConfig", ("build",)),
     "localize": (
         "topoloc.localization.localizer",
         "LocalizerConfig",
-        (*_ASKING, "update", "merge"),
+        (*_QUERY_COMMANDS, "update", "merge"),
     ),
     "atlas": (
         "topoloc.atlas.config",
@@ -48,9 +48,9 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize", "serve", "follow")),
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
     "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
-    "tile_choice": ("topoloc.lifelong.tile_choice", "TileChoiceConfig", ("update",)),
-    "against_itself": ("topoloc.lifelong.weak_parts", "WeakPartsConfig", ("evaluate",)),
-    "join": ("topoloc.lifelong.tile_joins", "TileJoinConfig", ("atlas", "build", "merge")),
+    "tile_choice": ("topoloc.lifelong.tile_selection", "TileChoiceConfig", ("update",)),
+    "against_itself": ("topoloc.lifelong.weak_regions", "WeakPartsConfig", ("evaluate",)),
+    "join": ("topoloc.lifelong.tile_comparison", "TileJoinConfig", ("atlas", "build", "merge")),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.apps.service.config", "ServiceConfig", ("serve",)),
     "cluster": (
@@ -61,7 +61,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "replicas": ("topoloc.apps.cluster.config", "ReplicasConfig", ("serve",)),
 }
 _WIDTH = 110
-_LARGEST_FILE = 1_000_000
+_MAX_FILE_BYTES = 1_000_000
 
 
 class Settings:
@@ -87,16 +87,16 @@ def read_settings(path: str | None) -> Settings:
         return Settings({})
     try:
         configs = []
-        for name, table in _parsed(path).items():
+        for name, table in _parse_file(path).items():
             if name not in all_tables():
-                is_missing = name in BROUGHT and name not in all_commands()
-                unknown = f"no such table{did_you_mean(name, all_tables())}"
+                is_missing = name in PLUGIN_PACKAGES and name not in all_commands()
+                unknown = f"no such table{suggest_name(name, all_tables())}"
                 raise ConfigError(
-                    f"{quoted(name)}:"
-                    f" {f'comes with {BROUGHT[name]}, which is not installed' if is_missing else unknown}"  # noqa: E501
+                    f"{quote_key(name)}:"
+                    f" {f'comes with {PLUGIN_PACKAGES[name]}, which is not installed' if is_missing else unknown}"  # noqa: E501
                 )
             kind = config_class(name)
-            configs.append(settings_from(kind, table, name, default=kind()))
+            configs.append(parse_settings(kind, table, name, default=kind()))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return Settings({type(config): config for config in configs})
@@ -104,7 +104,7 @@ def read_settings(path: str | None) -> Settings:
 
 def all_tables() -> dict[str, tuple[str, str, tuple[str, ...]]]:
     """Our tables and those that other distributions bring, as `TABLES`; a name of ours is ours."""
-    return TABLES | brought("topoloc.settings") | TABLES
+    return TABLES | load_plugins("topoloc.settings") | TABLES
 
 
 def config_class(table: str) -> type:
@@ -125,67 +125,69 @@ def with_option(config: T, key: str, value: Any, option: str) -> T:
     name, _, rest = key.partition(".")
     if rest:
         return replace(config, **{name: with_option(getattr(config, name), rest, value, option)})  # pyright: ignore[reportArgumentType]
-    if wrong := complaint(value, annotations_of(type(config))[name]):
+    if wrong := find_violation(value, field_annotations(type(config))[name]):
         raise UsageError(f"{option}: {wrong}")
     return replace(config, **{name: value})  # pyright: ignore[reportArgumentType]
 
 
 def settings_text(tables: Sequence[str]) -> str:
     """The TOML of these tables: every setting with its default, what it means and its bounds."""
-    return "\n".join("\n".join(_table_lines(config_class(table)(), table)) for table in tables)
+    return "\n".join("\n".join(_format_table(config_class(table)(), table)) for table in tables)
 
 
-def _table_lines(config: Any, key: str, note: str = "") -> Iterator[str]:
+def _format_table(config: Any, key: str, note: str = "") -> Iterator[str]:
     """A table and those in it."""
-    kinds, notes = annotations_of(type(config)), meanings_of(type(config))
+    kinds, notes = field_annotations(type(config)), read_field_docs(type(config))
     nested = [name for name in kinds if is_dataclass(getattr(config, name))]
-    yield from _comment(" ".join(filter(None, (_about(type(config)), note))))
+    yield from _format_comment(" ".join(filter(None, (_class_summary(type(config)), note))))
     yield f"[{key}]"
     for name, kind in kinds.items():
         if name not in nested:
             value = getattr(config, name)
-            yield from _comment(notes.get(name, ""))
-            line = f"# {name} =" if value is None else f"{name} = {_toml(value)}"
-            yield f"{line}  # {_range(kind)}" if _range(kind) else line
+            yield from _format_comment(notes.get(name, ""))
+            line = f"# {name} =" if value is None else f"{name} = {_to_toml(value)}"
+            yield f"{line}  # {_format_range(kind)}" if _format_range(kind) else line
     yield ""
     for name in nested:
-        yield from _table_lines(getattr(config, name), f"{key}.{name}", notes.get(name, ""))
+        yield from _format_table(getattr(config, name), f"{key}.{name}", notes.get(name, ""))
 
 
-def _comment(text: str) -> list[str]:
+def _format_comment(text: str) -> list[str]:
     return textwrap.wrap(
         text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False
     )
 
 
-def _about(kind: type) -> str:
+def _class_summary(kind: type) -> str:
     """The first paragraph of a class's docstring."""
     return " ".join((inspect.getdoc(kind) or "").partition("\n\n")[0].split())
 
 
-def _range(kind: Any) -> str:
-    plain, _ = bare(kind)
+def _format_range(kind: Any) -> str:
+    plain, _ = strip_annotation(kind)
     if get_origin(plain) is Literal:
-        return "one of " + ", ".join(map(_toml, get_args(plain)))
-    return " and ".join(map(str, bounds_of(kind)))
+        return "one of " + ", ".join(map(_to_toml, get_args(plain)))
+    return " and ".join(map(str, field_bounds(kind)))
 
 
-def _toml(value: Any) -> str:
+def _to_toml(value: Any) -> str:
     if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
+        return f"[{', '.join(map(_to_toml, value))}]"
     if isinstance(value, bool | str):
         return json.dumps(value)
     return repr(value)
 
 
 @cache
-def meanings_of(kind: type) -> dict[str, str]:
+def read_field_docs(kind: type) -> dict[str, str]:
     """The docstrings of a dataclass's fields, each in one line."""
     if not is_dataclass(kind):
         return {}
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     assert isinstance(body, ast.ClassDef)
-    meanings = {name: text for base in kind.__bases__ for name, text in meanings_of(base).items()}
+    meanings = {
+        name: text for base in kind.__bases__ for name, text in read_field_docs(base).items()
+    }
     for item, after in zip(body.body, body.body[1:], strict=False):
         if (
             isinstance(item, ast.AnnAssign)
@@ -196,14 +198,14 @@ def meanings_of(kind: type) -> dict[str, str]:
     return meanings
 
 
-def _parsed(path: str) -> dict[str, Any]:
+def _parse_file(path: str) -> dict[str, Any]:
     try:
         with Path(path).open("rb") as file:
-            content = file.read(_LARGEST_FILE + 1)
+            content = file.read(_MAX_FILE_BYTES + 1)
     except OSError as error:
         raise ConfigError(error.strerror or "cannot be read") from None
-    if len(content) > _LARGEST_FILE:
-        raise ConfigError(f"larger than {_LARGEST_FILE} bytes, no file of settings")
+    if len(content) > _MAX_FILE_BYTES:
+        raise ConfigError(f"larger than {_MAX_FILE_BYTES} bytes, no file of settings")
     try:
         return tomllib.loads(content.decode())
     except (

@@ -18,7 +18,7 @@ from topoloc.apps.cli.output import (
     Topics,
     check_outputs,
     open_recording,
-    print_facts,
+    print_fields,
     progress_bar,
     write_json,
 )
@@ -151,4 +151,4 @@ def _print(out: str, facts: dict[str, Any]) -> None:
         rows.append(
             ("drift", f"{facts['drift_percent']:.2f} %, {facts['drift_deg_per_m']:.4f} deg/m")
         )
-    print_facts(rows)
+    print_fields(rows)

@@ -11,21 +11,21 @@ import tyro
 
 from topoloc.apps.cli.output import UsageError
 from topoloc.atlas.atlas import Atlas, is_atlas
-from topoloc.atlas.shared_world import SharedWorld, shared_worlds, world_of_tile
-from topoloc.errors import AtlasError, MapError, StoreError
+from topoloc.atlas.shared_world import SharedWorld, group_shared_worlds, world_of_tile
+from topoloc.errors import AtlasError, MapError, ObjectStoreError
 
 TileOption = Annotated[str | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(atlases only)")]
-_MAX_NAMED = 8
+_MAX_LISTED = 8
 T = TypeVar("T")
 
 
-def edited_at(where: str, tile_id: str | None, edit: Callable[[Path], T]) -> T:
+def edit_map_or_tile(where: str, tile_id: str | None, edit: Callable[[Path], T]) -> T:
     """What the edit of a map file says, or of the map of an atlas's tile, which is replaced by the
     edited one.
 
     Raises:
         UsageError: an atlas without a tile, or a tile of what is no atlas.
-        TopolocError: as of `edit`, and of `edited_tile`.
+        TopolocError: as of `edit`, and of `edit_tile`.
     """
     check_tile_option(where, tile_id)
     if not is_atlas(where):
@@ -33,11 +33,11 @@ def edited_at(where: str, tile_id: str | None, edit: Callable[[Path], T]) -> T:
     if tile_id is None:
         raise UsageError(
             f"{where} is an atlas: --tile says which of its maps is meant"
-            f" ({_listed(list(Atlas.open(where).manifest.by_id))})"
+            f" ({_format_ids(list(Atlas.open(where).manifest.by_id))})"
         )
-    from topoloc.lifelong.tile_update import edited_tile
+    from topoloc.lifelong.tile_editing import edit_tile
 
-    return edited_tile(where, tile_id, edit)[1]
+    return edit_tile(where, tile_id, edit)[1]
 
 
 def check_tile_option(where: str, tile_id: str | None) -> None:
@@ -46,11 +46,13 @@ def check_tile_option(where: str, tile_id: str | None) -> None:
         raise UsageError(f"--tile is of an atlas, and {where} is none")
 
 
-def _listed(ids: Sequence[str]) -> str:
-    return ", ".join(ids[:_MAX_NAMED]) + (", ..." if len(ids) > _MAX_NAMED else "") or "it has none"
+def _format_ids(ids: Sequence[str]) -> str:
+    return (
+        ", ".join(ids[:_MAX_LISTED]) + (", ..." if len(ids) > _MAX_LISTED else "") or "it has none"
+    )
 
 
-def chosen_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
+def select_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
     """The tile alone; without one the tiles that share a world, those with most nodes, and a line
     where there are others.
 
@@ -59,7 +61,7 @@ def chosen_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
     """
     if tile_id is not None:
         return world_of_tile(atlas.manifest, atlas.tile(tile_id))
-    worlds = shared_worlds(atlas.manifest)
+    worlds = group_shared_worlds(atlas.manifest)
     if not worlds:
         raise AtlasError(
             f"the atlas {atlas.store.where} has no tiles; `topoloc atlas add` adds them"
@@ -71,20 +73,20 @@ def chosen_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
             if len(others) == 1
             else f"{len(others)} tiles of other worlds are"
         )
-        say_warning(f"{what} left out ({_listed(others)}); --tile names one")
+        print_warning(f"{what} left out ({_format_ids(others)}); --tile names one")
     return worlds[0]
 
 
-def name_of_atlas(where: str) -> str:
+def atlas_name(where: str) -> str:
     """The last part of its address."""
     return where.rstrip("/").rpartition("/")[2] or "atlas"
 
 
-def say_warning(text: str) -> None:
+def print_warning(text: str) -> None:
     print(f"warning: {text}", file=sys.stderr)
 
 
-def of_each_tile(
+def run_for_each_tile(
     atlas: Atlas, tile_ids: Sequence[str], work: Callable[[str], dict[str, Any]]
 ) -> tuple[list[dict[str, Any]], bool]:
     """What `work` says of each tile, beside its id, and whether all went well: one that fails is
@@ -98,7 +100,7 @@ def of_each_tile(
     for tile_id in tile_ids:
         try:
             done.append({"tile_id": tile_id} | work(tile_id))
-        except StoreError:
+        except ObjectStoreError:
             raise
         except MapError as error:
             said = str(error)

@@ -14,79 +14,81 @@ from typing import Any
 
 from topoloc.apps.cli.map_or_atlas import open_atlas
 from topoloc.apps.cli.output import interruptible
-from topoloc.apps.cli.recordings_table import recordings_table, tell_notes
-from topoloc.apps.cli.session_joining import SessionJoining
+from topoloc.apps.cli.recordings_table import print_notes, recordings_table
+from topoloc.apps.cli.session_update import SessionUpdateOptions
 from topoloc.apps.cluster.config import ClusterConfig
-from topoloc.apps.cluster.connection import connected
-from topoloc.apps.cluster.tasks import Job, Running, Show, run_here, run_on_ray
-from topoloc.apps.cluster.tiles import Outcome, State, outcome_of
-from topoloc.atlas.atlas import Atlas, whole_address
+from topoloc.apps.cluster.connection import connect_to_cluster
+from topoloc.apps.cluster.tasks import Job, JobProgress, OnJobState, run_locally, run_on_ray
+from topoloc.apps.cluster.tiles import Outcome, State, run_tile_work
+from topoloc.atlas.atlas import Atlas, absolute_address
 from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.manifest import Tile
-from topoloc.errors import SessionKnownError
-from topoloc.lifelong.tile_choice import TileChoiceConfig, tile_of_recording
-from topoloc.lifelong.tile_update import edited_tile
+from topoloc.errors import DuplicateSessionError
+from topoloc.lifelong.tile_editing import edit_tile
+from topoloc.lifelong.tile_selection import TileSelectionConfig, find_tile_of_recording
 from topoloc.mapping.build import Progress
 
 
 @dataclass(frozen=True)
-class TileChoice:
+class TileSelectionJob:
     """Which tile of the atlas is the recording of? A job; its outcome names the tile."""
 
-    joining: SessionJoining
+    options: SessionUpdateOptions
     atlas: str
-    asked: AtlasConfig
-    config: TileChoiceConfig
+    atlas_config: AtlasConfig
+    config: TileSelectionConfig
 
     @property
     def name(self) -> str:
-        return f"which tile {self.joining.recording}"
+        return f"which tile {self.options.recording}"
 
     def run(self, progress: Progress) -> Outcome:
-        def recognised() -> tuple[State, Tile]:
+        def find_tile() -> tuple[State, Tile]:
             with interruptible():
-                sequence = self.joining.opened().sequence
-                localizer = open_atlas(self.atlas, self.joining.localize, None, self.asked)
-                return "recognised", tile_of_recording(localizer, sequence, self.config, progress)
+                sequence = self.options.open_session().sequence
+                localizer = open_atlas(self.atlas, self.options.localize, None, self.atlas_config)
+                return "recognised", find_tile_of_recording(
+                    localizer, sequence, self.config, progress
+                )
 
-        return outcome_of(self.joining.recording, "", recognised)
+        return run_tile_work(self.options.recording, "", find_tile)
 
-    def failed(self, reason: str) -> Outcome:
-        return Outcome(self.joining.recording, "", "failed", reason)
+    def failure_outcome(self, reason: str) -> Outcome:
+        return Outcome(self.options.recording, "", "failed", reason)
 
 
 @dataclass(frozen=True)
-class TileSession:
+class TileSessionJob:
     """The recording joins a tile of the atlas, unless it is in it. A job."""
 
-    joining: SessionJoining
+    options: SessionUpdateOptions
     atlas: str
     tile_id: str
 
     @property
     def name(self) -> str:
-        return f"update {self.tile_id} {self.joining.recording}"
+        return f"update {self.tile_id} {self.options.recording}"
 
     def run(self, progress: Progress) -> Outcome:
         changes = dict[str, Any]()
 
-        def updated() -> tuple[State, Tile]:
-            session = self.joining.opened()
+        def update_tile() -> tuple[State, Tile]:
+            session = self.options.open_session()
             try:
                 with interruptible():
-                    tile, update = edited_tile(
+                    tile, update = edit_tile(
                         self.atlas, self.tile_id, lambda path: session.join(path, progress)
                     )
-            except SessionKnownError:
+            except DuplicateSessionError:
                 return "there", Atlas.open(self.atlas).tile(self.tile_id)
             changes.update(update.changes)
             return "updated", tile
 
-        outcome = outcome_of(self.joining.recording, self.tile_id, updated)
+        outcome = run_tile_work(self.options.recording, self.tile_id, update_tile)
         return replace(outcome, changes=changes or None)
 
-    def failed(self, reason: str) -> Outcome:
-        return Outcome(self.joining.recording, self.tile_id, "failed", reason)
+    def failure_outcome(self, reason: str) -> Outcome:
+        return Outcome(self.options.recording, self.tile_id, "failed", reason)
 
 
 @dataclass(frozen=True)
@@ -94,12 +96,12 @@ class AtlasUpdate:
     """Recordings that join the atlas, each the tile that it is of, or all of them the tile
     `tile_id`; on the cluster `ray`, if that is given."""
 
-    joinings: Sequence[SessionJoining]
+    update_options: Sequence[SessionUpdateOptions]
     atlas: str
     tile_id: str | None = None
     ray: str | None = None
-    asked: AtlasConfig = field(default_factory=AtlasConfig)
-    choice: TileChoiceConfig = field(default_factory=TileChoiceConfig)
+    atlas_config: AtlasConfig = field(default_factory=AtlasConfig)
+    choice: TileSelectionConfig = field(default_factory=TileSelectionConfig)
     cluster: ClusterConfig = field(default_factory=ClusterConfig)
 
     def outcomes(self) -> list[Outcome]:
@@ -107,23 +109,23 @@ class AtlasUpdate:
 
         Raises:
             AtlasError: no atlas is there, or it has no tile `tile_id`.
-            MissingExtraError, ClusterError: as of `connected`.
+            MissingExtraError, ClusterError: as of `connect_to_cluster`.
         """
-        atlas, where = Atlas.open(self.atlas), whole_address(self.atlas)
+        atlas, where = Atlas.open(self.atlas), absolute_address(self.atlas)
         tile = None if self.tile_id is None else atlas.tile(self.tile_id)
-        names = [joining.recording for joining in self.joinings]
+        names = [options.recording for options in self.update_options]
         with (
-            nullcontext() if self.ray is None else connected(self.ray),
+            nullcontext() if self.ray is None else connect_to_cluster(self.ray),
             recordings_table(names) as (show, is_live),
         ):
             chosen = (
                 [Outcome(name, tile.tile_id, "recognised") for name in names]
                 if tile
-                else self._chosen(where, show, is_live)
+                else self._select_tiles(where, show, is_live)
             )
             known = [number for number, one in enumerate(chosen) if one.state == "recognised"]
             jobs = [
-                TileSession(self.joinings[number], where, chosen[number].tile_id)
+                TileSessionJob(self.update_options[number], where, chosen[number].tile_id)
                 for number in known
             ]
             joined = self._run(
@@ -133,29 +135,32 @@ class AtlasUpdate:
             chosen[number] = replace(
                 outcome, notes=tuple(dict.fromkeys(chosen[number].notes + outcome.notes))
             )
-        tell_notes(chosen, is_live)
+        print_notes(chosen, is_live)
         return chosen
 
-    def _chosen(self, where: str, show: Show[Outcome], is_live: bool) -> list[Outcome]:
+    def _select_tiles(self, where: str, show: OnJobState[Outcome], is_live: bool) -> list[Outcome]:
         """Which tile each recording is of, as the atlas is now; failed where it is of none."""
 
-        def show_until_known(number: int, state: Outcome | Running) -> None:
+        def show_failures(number: int, state: Outcome | JobProgress) -> None:
             if is_live or (isinstance(state, Outcome) and state.reason is not None):
                 show(number, state)
 
         return self._run(
-            [TileChoice(one, where, self.asked, self.choice) for one in self.joinings],
-            show_until_known,
+            [
+                TileSelectionJob(one, where, self.atlas_config, self.choice)
+                for one in self.update_options
+            ],
+            show_failures,
             is_live,
         )
 
     def _run(
         self,
         jobs: Sequence[Job[Outcome]],
-        show: Show[Outcome],
+        show: OnJobState[Outcome],
         is_live: bool,
         lines: Sequence[str] | None = None,
     ) -> list[Outcome]:
         if self.ray is None or not jobs:
-            return run_here(jobs, show, is_live)
+            return run_locally(jobs, show, is_live)
         return run_on_ray(jobs, self.ray, self.cluster, show, is_live, lines)

@@ -8,8 +8,8 @@ from typing import Annotated
 import tyro
 
 from topoloc.apps.cli.output import File, write_json
-from topoloc.apps.cli.tile_option import TileOption, edited_at
-from topoloc.apps.cli.waiting import say_waiting
+from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
+from topoloc.apps.cli.wait_message import print_waiting
 from topoloc.mapping.edit import undo_edit
 
 
@@ -26,7 +26,7 @@ class Command:
     """Write which edit was taken back to this file (- for standard output)."""
 
     def run(self) -> int:
-        undone = edited_at(self.map, self.tile, lambda path: undo_edit(path, say_waiting))
+        undone = edit_map_or_tile(self.map, self.tile, lambda path: undo_edit(path, print_waiting))
         tile = {} if self.tile is None else {"tile": self.tile}
         if self.json != "-":
             print(

@@ -19,12 +19,12 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.cli.session_joining import SessionJoining, describe_update
+from topoloc.apps.cli.session_update import SessionUpdateOptions, describe_update
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.atlas.atlas import is_atlas
 from topoloc.atlas.config import AtlasConfig
-from topoloc.lifelong.tile_choice import TileChoiceConfig
+from topoloc.lifelong.tile_selection import TileSelectionConfig
 from topoloc.lifelong.update import UpdateConfig
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.recordings.trajectory import Trajectory, write_tum
@@ -99,16 +99,16 @@ class Command:
             [self.json, self.joined], inputs=[path for path in (target, self.config) if path]
         )
         settings = read_settings(self.config)
-        joinings = [self._joining(path, settings) for path in recordings]
+        update_options = [self._session_options(path, settings) for path in recordings]
         return (
-            self._update_atlas(target, joinings, settings)
+            self._update_atlas(target, update_options, settings)
             if is_atlas(target)
-            else self._update_map(target, joinings)
+            else self._update_map(target, update_options)
         )
 
-    def _joining(self, path: str, settings: Settings) -> SessionJoining:
+    def _session_options(self, path: str, settings: Settings) -> SessionUpdateOptions:
         configs = settings.of(UpdateConfig), settings.of(LocalizerConfig), settings.of(SlamConfig)
-        return SessionJoining(
+        return SessionUpdateOptions(
             path,
             *configs,
             self.trajectory,
@@ -119,10 +119,10 @@ class Command:
             self.light,
         )
 
-    def _update_map(self, target: str, joinings: list[SessionJoining]) -> int:
+    def _update_map(self, target: str, update_options: list[SessionUpdateOptions]) -> int:
         done = []
-        for joining in joinings:
-            session = joining.opened()
+        for joining in update_options:
+            session = joining.open_session()
             with progress_bar() as progress:
                 update = session.join(Path(target), progress)
             if self.joined:
@@ -141,16 +141,18 @@ class Command:
         write_json(self.json, {"map": target, "updates": done})
         return 0
 
-    def _update_atlas(self, target: str, joinings: list[SessionJoining], settings: Settings) -> int:
+    def _update_atlas(
+        self, target: str, update_options: list[SessionUpdateOptions], settings: Settings
+    ) -> int:
         """Each recording joins the tile that it is of; status 1 where one could not."""
         from topoloc.apps.cli.tile_sessions import AtlasUpdate
 
         configs = (
             settings.of(AtlasConfig),
-            settings.of(TileChoiceConfig),
+            settings.of(TileSelectionConfig),
             settings.of(ClusterConfig),
         )
-        outcomes = AtlasUpdate(joinings, target, self.tile, self.ray, *configs).outcomes()
+        outcomes = AtlasUpdate(update_options, target, self.tile, self.ray, *configs).outcomes()
         counts = {
             state: sum(outcome.state == state for outcome in outcomes)
             for state in ("updated", "there", "failed")

@@ -15,21 +15,21 @@ import tyro
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.tile_option import (
     TileOption,
+    atlas_name,
     check_tile_option,
-    chosen_world,
-    name_of_atlas,
-    say_warning,
+    print_warning,
+    select_world,
 )
-from topoloc.apps.viewer.document import ResultSet, SceneBudget, document_of
+from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
 from topoloc.apps.viewer.page import write_scene_page
 from topoloc.apps.viewer.result_files import read_results
 from topoloc.apps.viewer.screenshot import find_browser, write_screenshot
-from topoloc.apps.viewer.world_document import document_of_world
+from topoloc.apps.viewer.world_document import create_world_document
 from topoloc.atlas.atlas import Atlas, is_atlas
-from topoloc.mapping.contents import map_id_of
+from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.topomap import TopoMetricMap
 
-_POINTS = SceneBudget().max_points
+_DEFAULT_MAX_POINTS = SceneBudget().max_points
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Command:
     tile: TileOption = None
     """Of an atlas: only this tile, in its own world."""
     points: Annotated[
-        int, tyro.conf.arg(metavar="N", help_behavior_hint=f"(default: {_POINTS})")
-    ] = _POINTS
+        int, tyro.conf.arg(metavar="N", help_behavior_hint=f"(default: {_DEFAULT_MAX_POINTS})")
+    ] = _DEFAULT_MAX_POINTS
     """At most so many of the map's points are shown; with the default a page has some 10 MB at
     most."""
 
@@ -73,22 +73,22 @@ class Command:
         budget = SceneBudget(max_points=self.points)
         if is_atlas(self.map):
             atlas = Atlas.open(self.map)
-            world = chosen_world(atlas, self.tile)
-            document = document_of_world(
-                atlas, world, self.tile or name_of_atlas(self.map), results, budget, say_warning
+            world = select_world(atlas, self.tile)
+            document = create_world_document(
+                atlas, world, self.tile or atlas_name(self.map), results, budget, print_warning
             )
             _warn_of_other_worlds(results, document["results"])
         else:
             with TopoMetricMap.load(self.map) as topomap:
-                _warn_of_other_maps(results, map_id_of(topomap))
-                document = document_of(topomap, Path(self.map).stem, results, budget)
+                _warn_of_other_maps(results, get_map_id(topomap))
+                document = create_document(topomap, Path(self.map).stem, results, budget)
         if self.out:
             write_scene_page(Path(self.out), document)
         if self.screenshot:
             self._write_screenshot(document)
-        shown = self.out or self.screenshot or self.json or _opened(document)
+        shown = self.out or self.screenshot or self.json or _open_in_browser(document)
         if self.json != "-":
-            print(f"{shown}: {_said(document['map'], results)}")
+            print(f"{shown}: {_format_summary(document['map'], results)}")
         write_json(self.json, document)
         return 0
 
@@ -99,7 +99,7 @@ class Command:
             write_screenshot(page, Path(str(self.screenshot)))
 
 
-def _opened(document: Mapping[str, Any]) -> str:
+def _open_in_browser(document: Mapping[str, Any]) -> str:
     """The page, which the browser reads after we have ended: it stays in the system's folder for
     such files."""
     page = Path(tempfile.mkdtemp(prefix="topoloc-")) / "scene.html"
@@ -112,7 +112,7 @@ def _opened(document: Mapping[str, Any]) -> str:
     return str(page)
 
 
-def _said(facts: dict[str, Any], results: Sequence[ResultSet]) -> str:
+def _format_summary(facts: dict[str, Any], results: Sequence[ResultSet]) -> str:
     answers = sum(len(one.answers) for one in results)
     tiles = f"{len(facts['tiles'])} tiles, " if "tiles" in facts else ""
     shown = (
@@ -127,7 +127,7 @@ def _warn_of_other_worlds(results: Sequence[ResultSet], shown: Sequence[Mapping[
     given = sum(len(one.answers) for one in results)
     missing = given - sum(one["num_answers"] for one in shown)
     if missing:
-        say_warning(f"{missing} of {given} answers are of no tile that is shown, and left out")
+        print_warning(f"{missing} of {given} answers are of no tile that is shown, and left out")
 
 
 def _warn_of_other_maps(results: Sequence[ResultSet], map_id: str) -> None:

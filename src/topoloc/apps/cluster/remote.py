@@ -21,13 +21,13 @@ from topoloc.errors import ClusterError
 if TYPE_CHECKING:
     from topoloc.apps.cluster.tasks import Job
 
-_BETWEEN_S = 0.3
+_REPORT_INTERVAL_S = 0.3
 Progress = Callable[[str, int, int], None]
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
-class Work:
+class TaskPayload:
     """A job. `folder` is the driver's, where relative paths begin; `epoch` its
     SOURCE_DATE_EPOCH."""
 
@@ -37,7 +37,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Terms:
+class TaskRequirements:
     """What is said before the work is unpacked: threads it may use, and the driver's version of
     topoloc."""
 
@@ -45,9 +45,9 @@ class Terms:
     version: str = field(default_factory=lambda: version("topoloc"))
 
 
-def run_task(packed: bytes, terms: Terms, board: Any, number: int) -> bytes:
-    """A pickled `Work` is done; returns the job's outcome, pickled. `number` is that of the job on
-    the board.
+def run_task(packed: bytes, terms: TaskRequirements, board: Any, number: int) -> bytes:
+    """A pickled `TaskPayload` is done; returns the job's outcome, pickled. `number` is that of the
+    job on the board.
 
     Raises:
         ClusterError: this machine has another version of topoloc.
@@ -57,8 +57,8 @@ def run_task(packed: bytes, terms: Terms, board: Any, number: int) -> bytes:
         raise ClusterError(
             f"{platform.node()} has topoloc {version('topoloc')}, and {terms.version} asks it"
         )
-    os.environ |= dict.fromkeys(_THREADS, str(terms.num_threads))
-    work: Work = pickle.loads(packed)
+    os.environ |= dict.fromkeys(_THREAD_VARIABLES, str(terms.num_threads))
+    work: TaskPayload = pickle.loads(packed)
     try:
         os.chdir(work.folder)
     except (
@@ -71,32 +71,32 @@ def run_task(packed: bytes, terms: Terms, board: Any, number: int) -> bytes:
     from topoloc.compiled import set_num_threads
 
     set_num_threads(terms.num_threads)
-    return pickle.dumps(work.job.run(_reporter(board, number)))
+    return pickle.dumps(work.job.run(_create_reporter(board, number)))
 
 
-def _reporter(board: Any, number: int) -> Progress:
+def _create_reporter(board: Any, number: int) -> Progress:
     """Writes on the board now and then; whether anybody reads it does not matter here."""
     if board is None:
         return lambda stage, done, total: None
-    return now_and_then(lambda *line: board.write.remote(number, line))
+    return throttle_progress(lambda *line: board.write.remote(number, line))
 
 
-def now_and_then(report: Progress) -> Progress:
+def throttle_progress(report: Progress) -> Progress:
     """Tells of each stage when it begins and when it ends, and in between a few times a second."""
     last = [("", 0.0)]
 
-    def tell(stage: str, done: int, total: int) -> None:
+    def report_throttled(stage: str, done: int, total: int) -> None:
         before, when = last[0]
         now = time.monotonic()
-        if stage == before and now - when < _BETWEEN_S and done < total:
+        if stage == before and now - when < _REPORT_INTERVAL_S and done < total:
             return
         last[0] = (stage, now)
         report(stage, done, total)
 
-    return tell
+    return report_throttled
 
 
-class Board:
+class ProgressBoard:
     """How far each job is, for the eyes of the driver; an actor."""
 
     def __init__(self) -> None:
@@ -111,9 +111,13 @@ class Board:
         return self._lines
 
 
-def progress_board(ray: Any) -> Any:
-    """A `Board` beside the driver; it begins empty again where it is lost."""
+def create_progress_board(ray: Any) -> Any:
+    """A `ProgressBoard` beside the driver; it begins empty again where it is lost."""
     near = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
         ray.get_runtime_context().get_node_id(), soft=True
     )
-    return ray.remote(Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=near).remote()
+    return (
+        ray.remote(ProgressBoard)
+        .options(num_cpus=0, max_restarts=-1, scheduling_strategy=near)
+        .remote()
+    )

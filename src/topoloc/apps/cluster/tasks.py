@@ -20,18 +20,18 @@ from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from topoloc.apps.cluster.config import ClusterConfig
-from topoloc.apps.cluster.connection import connected
+from topoloc.apps.cluster.connection import connect_to_cluster
 from topoloc.apps.cluster.remote import (
     Progress,
-    Terms,
-    Work,
-    now_and_then,
-    progress_board,
+    TaskPayload,
+    TaskRequirements,
+    create_progress_board,
     run_task,
+    throttle_progress,
 )
 from topoloc.errors import TopolocError
 
-_LOOK_S = 0.5
+_POLL_INTERVAL_S = 0.5
 T = TypeVar("T")
 Outcome_co = TypeVar("Outcome_co", covariant=True)
 
@@ -50,14 +50,14 @@ class Job(Protocol[Outcome_co]):
         again from the start."""
         ...
 
-    def failed(self, reason: str) -> Outcome_co:
+    def failure_outcome(self, reason: str) -> Outcome_co:
         """The outcome, where `run` raised a TopolocError or its worker could not say anything any
         more."""
         ...
 
 
 @dataclass(frozen=True)
-class Running:
+class JobProgress:
     """A job that is being done: the stage it is in, and how much of it is done."""
 
     stage: str
@@ -65,7 +65,7 @@ class Running:
     total: int
 
 
-Show = Callable[[int, T | Running], None]
+OnJobState = Callable[[int, T | JobProgress], None]
 """Called with a job's number and what is known of it now: its outcome, or how far it is."""
 
 
@@ -73,36 +73,36 @@ def run_on_ray(
     jobs: Sequence[Job[T]],
     address: str,
     config: ClusterConfig | None = None,
-    show: Show[T] | None = None,
+    show: OnJobState[T] | None = None,
     is_live: bool = False,
     lines: Sequence[str] | None = None,
 ) -> list[T]:
     """What became of each job, in their order.
 
     Args:
-        address: of the cluster, as `connected` takes it; inside of a block of that with the same
-            address, it is the same connection.
+        address: of the cluster, as `connect_to_cluster` takes it; inside of a block of that with
+            the same address, it is the same connection.
         show: is told of each job that is finished, and with `is_live` several times a second of
             those that are being done.
         lines: a name for each job; those of one name are done one after the other, in their order.
             None: all side by side.
 
     Raises:
-        MissingExtraError, ClusterError: as of `connected`.
+        MissingExtraError, ClusterError: as of `connect_to_cluster`.
     """
     config, show = config or ClusterConfig(), show or (lambda number, state: None)
     with (
         redirect_stdout(io.StringIO()),
-        connected(address) as ray,
+        connect_to_cluster(address) as ray,
     ):  # Ray prints there of workers that died, which are begun again
-        _warn_of_few_processors(ray, config.cpus_per_recording)
-        board = progress_board(ray) if is_live else None
-        queues = _queues(len(jobs), lines)
-        running = {_submitted(ray, jobs, queue[0], config, board): queue for queue in queues}
+        _warn_few_cpus(ray, config.cpus_per_recording)
+        board = create_progress_board(ray) if is_live else None
+        queues = _group_queues(len(jobs), lines)
+        running = {_submit_job(ray, jobs, queue[0], config, board): queue for queue in queues}
         outcomes: dict[int, T] = {}
         while running:
             done, _ = (
-                ray.wait(list(running), num_returns=len(running), timeout=_LOOK_S)
+                ray.wait(list(running), num_returns=len(running), timeout=_POLL_INTERVAL_S)
                 if is_live
                 else ray.wait(list(running))
             )
@@ -110,39 +110,41 @@ def run_on_ray(
                 queue = running.pop(ref)
                 number = queue.popleft()
                 if queue:
-                    running[_submitted(ray, jobs, queue[0], config, board)] = queue
-                outcomes[number] = _outcome(ray, ref, jobs[number])
+                    running[_submit_job(ray, jobs, queue[0], config, board)] = queue
+                outcomes[number] = _get_outcome(ray, ref, jobs[number])
                 show(number, outcomes[number])
             if board is not None:
-                _look(ray, board, outcomes, show)
+                _poll_progress(ray, board, outcomes, show)
         return [outcomes[number] for number in range(len(jobs))]
 
 
-def run_here(jobs: Sequence[Job[T]], show: Show[T] | None = None, is_live: bool = False) -> list[T]:
+def run_locally(
+    jobs: Sequence[Job[T]], show: OnJobState[T] | None = None, is_live: bool = False
+) -> list[T]:
     """As `run_on_ray`, in this process, one after the other."""
 
     show = show or (lambda number, state: None)
     outcomes = list[T]()
     for number, job in enumerate(jobs):
-        tell = partial(_tell_running, show, number) if is_live else _tell_nobody
+        tell = partial(_report_running, show, number) if is_live else _ignore_progress
         try:
-            outcome = job.run(now_and_then(tell))
+            outcome = job.run(throttle_progress(tell))
         except TopolocError as error:
-            outcome = job.failed(" ".join(str(error).split()))
+            outcome = job.failure_outcome(" ".join(str(error).split()))
         outcomes.append(outcome)
         show(number, outcome)
     return outcomes
 
 
-def _tell_running(show: Show[Any], number: int, stage: str, done: int, total: int) -> None:
-    show(number, Running(stage, done, total))
+def _report_running(show: OnJobState[Any], number: int, stage: str, done: int, total: int) -> None:
+    show(number, JobProgress(stage, done, total))
 
 
-def _tell_nobody(stage: str, done: int, total: int) -> None:
+def _ignore_progress(stage: str, done: int, total: int) -> None:
     pass
 
 
-def _queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]]:
+def _group_queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]]:
     """The numbers of the jobs, in queues of which each is done one after the other."""
     if lines is None:
         return [deque([number]) for number in range(num_jobs)]
@@ -152,7 +154,7 @@ def _queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]]:
     return list(queues.values())
 
 
-def _warn_of_few_processors(ray: Any, wanted: int) -> None:
+def _warn_few_cpus(ray: Any, wanted: int) -> None:
     """A cluster may grow as it is asked; one that does not would let the jobs wait for ever."""
     most = max(
         (node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0
@@ -165,32 +167,36 @@ def _warn_of_few_processors(ray: Any, wanted: int) -> None:
         )
 
 
-def _submitted(
+def _submit_job(
     ray: Any, jobs: Sequence[Job[Any]], number: int, config: ClusterConfig, board: Any
 ) -> Any:
-    work = Work(jobs[number], os.getcwd(), os.environ.get("SOURCE_DATE_EPOCH"))
+    work = TaskPayload(jobs[number], os.getcwd(), os.environ.get("SOURCE_DATE_EPOCH"))
     task = ray.remote(run_task).options(
         num_cpus=config.cpus_per_recording,
         memory=config.memory_mb_per_recording * 1_000_000 or None,
         max_retries=config.max_retries,
         name=f"topoloc {jobs[number].name}",
     )
-    return task.remote(pickle.dumps(work), Terms(config.cpus_per_recording), board, number)
+    return task.remote(
+        pickle.dumps(work), TaskRequirements(config.cpus_per_recording), board, number
+    )
 
 
-def _outcome(ray: Any, ref: Any, job: Job[T]) -> T:
+def _get_outcome(ray: Any, ref: Any, job: Job[T]) -> T:
     """What the task says; where it cannot say anything any more, why not."""
     try:
         return pickle.loads(ray.get(ref))
     except ray.exceptions.RayError as error:
         cause = getattr(error, "cause", None)
         text = " ".join(str(error if cause is None else cause).split())[:300]
-        return job.failed(text if isinstance(cause, TopolocError) else f"its worker ended: {text}")
+        return job.failure_outcome(
+            text if isinstance(cause, TopolocError) else f"its worker ended: {text}"
+        )
 
 
-def _look(ray: Any, board: Any, outcomes: dict[int, T], show: Show[T]) -> None:
+def _poll_progress(ray: Any, board: Any, outcomes: dict[int, T], show: OnJobState[T]) -> None:
     """Where the board, which is only for the eye, does not answer, the work goes on."""
     with suppress(ray.exceptions.RayError):
         for number, (stage, done, total) in ray.get(board.read.remote(), timeout=5.0).items():
             if number not in outcomes:
-                show(number, Running(stage, done, total))
+                show(number, JobProgress(stage, done, total))

@@ -27,15 +27,15 @@ from topoloc.atlas.manifest import Manifest, Tile, check_tile_id
 from topoloc.atlas.store import MANIFEST
 from topoloc.errors import AtlasError, TopolocError
 from topoloc.mapping.build import Progress
+from topoloc.mapping.map_writing import write_map
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.writing import write_map
-from topoloc.recordings.atomic import scratch_file
+from topoloc.recordings.atomic import temporary_file
 
 State = Literal["built", "recognised", "updated", "there", "failed"]
 
 
 @runtime_checkable
-class Maker(Protocol):
+class MapMaker(Protocol):
     """Makes the map of a recording; it may be pickled."""
 
     def make(self, progress: Progress) -> tuple[TopoMetricMap, list[str]]:
@@ -59,7 +59,7 @@ class TileJob:
     recording: str
     tile_id: str
     world: str
-    maker: Maker
+    maker: MapMaker
 
     def __post_init__(self) -> None:
         check_tile_id(self.tile_id)
@@ -112,10 +112,12 @@ def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> 
     Args:
         replaces: a tile of the same id that was made otherwise is replaced, else it is a failure.
     """
-    return outcome_of(job.recording, job.tile_id, lambda: _built(job, atlas, replaces, progress))
+    return run_tile_work(
+        job.recording, job.tile_id, lambda: _build_tile(job, atlas, replaces, progress)
+    )
 
 
-def outcome_of(recording: str, tile_id: str, work: Callable[[], tuple[State, Tile]]) -> Outcome:
+def run_tile_work(recording: str, tile_id: str, work: Callable[[], tuple[State, Tile]]) -> Outcome:
     """What becomes of a recording by this work, which says it, with the tile as it is then; or why
     nothing does."""
     started, cpu_started, said = time.monotonic(), time.process_time(), io.StringIO()
@@ -142,9 +144,9 @@ def outcome_of(recording: str, tile_id: str, work: Callable[[], tuple[State, Til
     )
 
 
-def _built(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tuple[State, Tile]:
+def _build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tuple[State, Tile]:
     recipe = job.digest()
-    before = manifest_of(atlas)
+    before = read_manifest(atlas)
     if made := [tile for tile in before.tiles if tile.recipe == recipe]:
         return "there", made[0]
     if job.tile_id in before.by_id and not replaces:
@@ -153,7 +155,7 @@ def _built(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tupl
             " replaces it"
         )
     topomap, _ = job.maker.make(progress)
-    with scratch_file(Path(tempfile.gettempdir()) / "topoloc-tile.topo") as path:
+    with temporary_file(Path(tempfile.gettempdir()) / "topoloc-tile.topo") as path:
         write_map(topomap, path)
         after = add_tiles(
             atlas, [NewTile(job.tile_id, path, job.world, recipe)], replaces, creates=True
@@ -161,20 +163,20 @@ def _built(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tupl
     return "built", after.by_id[job.tile_id]
 
 
-def manifest_of(atlas: str) -> Manifest:
+def read_manifest(atlas: str) -> Manifest:
     """As it is now; an empty one where there is no atlas yet. Raises AtlasError."""
     store = store_at(atlas)
     data = store.manifest()
     return Manifest() if data is None else Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
 
 
-def tile_ids(recordings: Sequence[str]) -> list[str]:
+def derive_tile_ids(recordings: Sequence[str]) -> list[str]:
     """Ids for the tiles of recordings: their names, with as many folders above as tell them apart.
 
     Raises:
         AtlasError: a recording is named twice.
     """
-    paths = [_words(recording) for recording in recordings]
+    paths = [_path_parts(recording) for recording in recordings]
     for recording, words in zip(recordings, paths, strict=True):
         if paths.count(words) > 1:
             raise AtlasError(
@@ -199,7 +201,7 @@ def tile_ids(recordings: Sequence[str]) -> list[str]:
     return ids
 
 
-def _words(recording: str) -> list[str]:
+def _path_parts(recording: str) -> list[str]:
     """The parts of a recording's path, each of letters that an id may have; the frames that are
     chosen of it belong to the last one."""
     folder, at, selection = recording.rpartition("@")

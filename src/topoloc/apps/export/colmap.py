@@ -16,7 +16,7 @@ from topoloc.geometry.rigid import Rigid3
 _HALF_PIXEL = 0.5  # the centre of COLMAP's top-left pixel
 
 
-def colmap_files(scene: Scene) -> dict[str, bytes]:
+def to_colmap_model(scene: Scene) -> dict[str, bytes]:
     """The files of a model, by their names.
 
     Raises:
@@ -25,7 +25,7 @@ def colmap_files(scene: Scene) -> dict[str, bytes]:
     ids = _camera_ids(scene.views)
     images, frames = [], []
     for number, view in enumerate(scene.views, 1):
-        camera_id, pose = ids[number - 1], _pose(view.world_from_cam.inverse())
+        camera_id, pose = ids[number - 1], _format_pose(view.world_from_cam.inverse())
         key_points = (
             f"{x:.6f} {y:.6f} {row + 1 if row >= 0 else -1}"
             for (x, y), row in zip(
@@ -36,24 +36,24 @@ def colmap_files(scene: Scene) -> dict[str, bytes]:
         frames.append(f"{number} {camera_id} {pose} 1 CAMERA {camera_id} {number}")
     known = sorted(set(ids))
     return {
-        "cameras.txt": _file(
+        "cameras.txt": _format_file(
             "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-            [_camera_line(k, scene.views[ids.index(k)]) for k in known],
+            [_format_camera(k, scene.views[ids.index(k)]) for k in known],
         ),
-        "images.txt": _file(
+        "images.txt": _format_file(
             "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, and a line of POINTS2D[] as (X,"
             " Y, POINT3D_ID)",
             images,
         ),
-        "points3D.txt": _file(
+        "points3D.txt": _format_file(
             "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-            _point_lines(scene),
+            _format_points(scene),
         ),
-        "rigs.txt": _file(
+        "rigs.txt": _format_file(
             "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]",
             [f"{k} 1 CAMERA {k}" for k in known],
         ),
-        "frames.txt": _file(
+        "frames.txt": _format_file(
             "FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], NUM_DATA_IDS,"
             " DATA_IDS[]",
             frames,
@@ -61,7 +61,7 @@ def colmap_files(scene: Scene) -> dict[str, bytes]:
     }
 
 
-def _file(columns: str, lines: Iterable[str]) -> bytes:
+def _format_file(columns: str, lines: Iterable[str]) -> bytes:
     return "\n".join([f"# {columns}", *lines, ""]).encode()
 
 
@@ -76,7 +76,7 @@ def _camera_ids(views: Iterable[View]) -> list[int]:
     return ids
 
 
-def _camera_line(camera_id: int, view: View) -> str:
+def _format_camera(camera_id: int, view: View) -> str:
     assert view.camera is not None
     model, width, height, params = view.camera.to_colmap()
     return f"{camera_id} {model} {width} {height} {' '.join(map(repr, params))}"
@@ -87,14 +87,14 @@ def _image_name(view: View) -> str:
     return re.sub(r"\s", "_", view.name) or "_"
 
 
-def _pose(cam_from_world: Rigid3) -> str:
+def _format_pose(cam_from_world: Rigid3) -> str:
     return " ".join(
         repr(value)
         for value in (*cam_from_world.quat_wxyz().tolist(), *cam_from_world.translation.tolist())
     )
 
 
-def _point_lines(scene: Scene) -> list[str]:
+def _format_points(scene: Scene) -> list[str]:
     tracks: list[list[str]] = [[] for _ in scene.points.world]
     for number, view in enumerate(scene.views, 1):
         for place in np.flatnonzero(view.point_rows >= 0).tolist():

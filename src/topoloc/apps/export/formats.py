@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from topoloc.apps.export.colmap import colmap_files
-from topoloc.apps.export.foxglove import mcap_file
-from topoloc.apps.export.nerfstudio import nerfstudio_files
-from topoloc.apps.export.text_forms import geojson_file, kitti_file, ply_file, tum_file
+from topoloc.apps.export.colmap import to_colmap_model
+from topoloc.apps.export.foxglove import to_mcap
+from topoloc.apps.export.nerfstudio import to_nerfstudio
+from topoloc.apps.export.text_formats import to_geojson, to_kitti, to_ply, to_tum
 from topoloc.apps.viewer.scene import Scene
 from topoloc.errors import TopolocError
 from topoloc.recordings.atomic import write_bytes, write_folder
@@ -25,13 +25,13 @@ class ExportFormat:
 
 
 FORMATS = {
-    "colmap": ExportFormat(folder=colmap_files),
-    "nerfstudio": ExportFormat(folder=nerfstudio_files),
-    "ply": ExportFormat(ply_file),
-    "geojson": ExportFormat(geojson_file, with_points=False),
-    "mcap": ExportFormat(mcap_file),
-    "tum": ExportFormat(tum_file, with_points=False),
-    "kitti": ExportFormat(kitti_file, with_points=False),
+    "colmap": ExportFormat(folder=to_colmap_model),
+    "nerfstudio": ExportFormat(folder=to_nerfstudio),
+    "ply": ExportFormat(to_ply),
+    "geojson": ExportFormat(to_geojson, with_points=False),
+    "mcap": ExportFormat(to_mcap),
+    "tum": ExportFormat(to_tum, with_points=False),
+    "kitti": ExportFormat(to_kitti, with_points=False),
 }
 
 

@@ -25,7 +25,7 @@ _STEP_NS = 1_000_000_000
 _MODELS = {True: "kannala_brandt", False: "rational_polynomial"}
 
 
-def mcap_file(scene: Scene) -> bytes:
+def to_mcap(scene: Scene) -> bytes:
     """A whole log; where views have no times, or those of two do not increase, they are a second
     apart from 0.
 
@@ -39,30 +39,32 @@ def mcap_file(scene: Scene) -> bytes:
         raise MissingExtraError(
             "MCAP needs mcap and Foxglove's schemas: pip install 'topoloc[bags]'"
         ) from error
-    views, times = _in_time(scene)
+    views, times = _assign_times(scene)
     buffer = io.BytesIO()
     with Writer(buffer) as writer:
 
         def write(topic: str, message: Any, t_ns: int) -> None:
             writer.write_message(topic, message, log_time=t_ns, publish_time=t_ns)
 
-        write("/path", _path(scene, times[0]), times[0])
+        write("/path", _to_path(scene, times[0]), times[0])
         if len(scene.points.world):
-            write("/points", _cloud(scene, times[0]), times[0])
+            write("/points", _to_point_cloud(scene, times[0]), times[0])
         for view, t_ns in zip(views, times, strict=True):
             write(
                 "/camera",
                 PoseInFrame(
-                    timestamp=_stamp(t_ns), frame_id=MAP_FRAME, pose=_pose(view.world_from_cam)
+                    timestamp=_to_timestamp(t_ns),
+                    frame_id=MAP_FRAME,
+                    pose=_to_pose(view.world_from_cam),
                 ),
                 t_ns,
             )
-            for topic, message in _messages(view, t_ns):
+            for topic, message in _view_messages(view, t_ns):
                 write(topic, message, t_ns)
     return buffer.getvalue()
 
 
-def _in_time(scene: Scene) -> tuple[list[View], list[int]]:
+def _assign_times(scene: Scene) -> tuple[list[View], list[int]]:
     views = sorted(scene.views, key=lambda view: view.t_ns or 0)
     times = [view.t_ns if view.t_ns is not None else -1 for view in views]
     if min(times) >= 0 and all(after >= before for before, after in pairwise(times)):
@@ -70,13 +72,13 @@ def _in_time(scene: Scene) -> tuple[list[View], list[int]]:
     return list(scene.views), [number * _STEP_NS for number in range(len(views))]
 
 
-def _messages(view: View, t_ns: int) -> list[tuple[str, Any]]:
+def _view_messages(view: View, t_ns: int) -> list[tuple[str, Any]]:
     from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
     from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 
-    pose, stamp = _pose(view.world_from_cam), _stamp(t_ns)
+    pose, stamp = _to_pose(view.world_from_cam), _to_timestamp(t_ns)
     frames = {"parent_frame_id": MAP_FRAME, "child_frame_id": CAMERA_FRAME}
     messages: list[tuple[str, Any]] = [
         (
@@ -84,7 +86,7 @@ def _messages(view: View, t_ns: int) -> list[tuple[str, Any]]:
             FrameTransform(
                 timestamp=stamp,
                 **frames,
-                translation=_vector(view.world_from_cam),
+                translation=_to_vector(view.world_from_cam),
                 rotation=pose.orientation,
             ),
         )
@@ -126,15 +128,17 @@ def _messages(view: View, t_ns: int) -> list[tuple[str, Any]]:
     return messages
 
 
-def _path(scene: Scene, t_ns: int) -> Any:
+def _to_path(scene: Scene, t_ns: int) -> Any:
     from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
     return PosesInFrame(
-        timestamp=_stamp(t_ns), frame_id=MAP_FRAME, poses=[_pose(pose) for pose in scene.trajectory]
+        timestamp=_to_timestamp(t_ns),
+        frame_id=MAP_FRAME,
+        poses=[_to_pose(pose) for pose in scene.trajectory],
     )
 
 
-def _cloud(scene: Scene, t_ns: int) -> Any:
+def _to_point_cloud(scene: Scene, t_ns: int) -> Any:
     from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 
@@ -152,10 +156,10 @@ def _cloud(scene: Scene, t_ns: int) -> Any:
         PackedElementField(name=name, offset=12 + k, type=PackedElementField.UINT8)
         for k, name in enumerate(_CHANNELS)
     ]
-    origin = _pose(Rigid3.identity())
+    origin = _to_pose(Rigid3.identity())
     step = struct.calcsize("<fffBBBB")
     return PointCloud(
-        timestamp=_stamp(t_ns),
+        timestamp=_to_timestamp(t_ns),
         frame_id=MAP_FRAME,
         pose=origin,
         point_stride=step,
@@ -164,22 +168,22 @@ def _cloud(scene: Scene, t_ns: int) -> Any:
     )
 
 
-def _stamp(t_ns: int) -> Any:
+def _to_timestamp(t_ns: int) -> Any:
     from google.protobuf.timestamp_pb2 import Timestamp
 
     return Timestamp(seconds=t_ns // _STEP_NS, nanos=t_ns % _STEP_NS)
 
 
-def _vector(world_from_cam: Rigid3) -> Any:
+def _to_vector(world_from_cam: Rigid3) -> Any:
     from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
     x, y, z = world_from_cam.translation.tolist()
     return Vector3(x=x, y=y, z=z)
 
 
-def _pose(world_from_cam: Rigid3) -> Any:
+def _to_pose(world_from_cam: Rigid3) -> Any:
     from foxglove_schemas_protobuf.Pose_pb2 import Pose
     from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 
     w, x, y, z = world_from_cam.quat_wxyz().tolist()
-    return Pose(position=_vector(world_from_cam), orientation=Quaternion(x=x, y=y, z=z, w=w))
+    return Pose(position=_to_vector(world_from_cam), orientation=Quaternion(x=x, y=y, z=z, w=w))

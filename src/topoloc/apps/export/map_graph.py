@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from topoloc.apps.export.text_forms import feature
+from topoloc.apps.export.text_formats import geojson_feature
 from topoloc.errors import GeoreferenceError, TopolocError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
@@ -23,7 +23,7 @@ _TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
 
 @dataclass(frozen=True, eq=False)
 class MapGraph:
-    """`nodes` by their ids and `ways` by the ids of the node that one leaves and the one that one
+    """`nodes` by their ids and `edges` by the ids of the node that one leaves and the one that one
     comes to, with what is known of each.
 
     Of a node: session, world_from_cam (x, y, z in metres; qw, qx, qy, qz), points, ways out,
@@ -32,10 +32,10 @@ class MapGraph:
     """
 
     nodes: dict[int, dict[str, Any]]
-    ways: dict[tuple[int, int], dict[str, Any]]
+    edges: dict[tuple[int, int], dict[str, Any]]
 
 
-def graph_of(topomap: TopoMetricMap) -> MapGraph:
+def build_graph(topomap: TopoMetricMap) -> MapGraph:
     """The graph of a map. Times are those of the place images that the map keeps."""
     poses = {summary.node_id: summary.world_from_cam for summary in topomap.summaries}
     out, neighbours = Counter(edge.source_id for edge in topomap.edges), defaultdict(set)
@@ -52,14 +52,14 @@ def graph_of(topomap: TopoMetricMap) -> MapGraph:
         | {"ways_out": out[s.node_id], "is_junction": len(neighbours[s.node_id]) > 2}
         for s in topomap.summaries
     }
-    walked = _times_walked(topomap)
-    ways = {}
+    walked = _count_traversals(topomap)
+    edges = {}
     for edge in topomap.edges:
         source_from_target = poses[edge.source_id].inverse() @ poses[edge.target_id]
         metres = float(np.linalg.norm(source_from_target.translation))
         pair = (edge.source_id, edge.target_id)
-        ways[pair] = {"metres": metres, **_pose(source_from_target), "times": walked[pair]}
-    return MapGraph(nodes, ways)
+        edges[pair] = {"metres": metres, **_pose(source_from_target), "times": walked[pair]}
+    return MapGraph(nodes, edges)
 
 
 def write_graph(topomap: TopoMetricMap, path: Path) -> None:
@@ -69,16 +69,16 @@ def write_graph(topomap: TopoMetricMap, path: Path) -> None:
         TopolocError: another ending, or the file cannot be written.
         GeoreferenceError: GeoJSON of a map of which nobody said where on earth it lies.
     """
-    graph, ending = graph_of(topomap), path.suffix.lower()
+    graph, ending = build_graph(topomap), path.suffix.lower()
     if ending == ".graphml":
-        write_bytes(path, _graphml(graph))
+        write_bytes(path, _to_graphml(graph))
     elif ending in (".geojson", ".json"):
-        write_bytes(path, _geojson(topomap, graph))
+        write_bytes(path, _to_geojson(topomap, graph))
     else:
         raise TopolocError(f"{path}: a graph is written as .graphml or .geojson")
 
 
-def _times_walked(topomap: TopoMetricMap) -> Counter[tuple[int, int]]:
+def _count_traversals(topomap: TopoMetricMap) -> Counter[tuple[int, int]]:
     """How often the mapping pictures of a session, one after the other, went from node to node."""
     last, walked = dict[int, int](), Counter[tuple[int, int]]()
     for image in topomap.place_images:
@@ -94,9 +94,9 @@ def _pose(a_from_b: Rigid3) -> dict[str, float]:
     return dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), values, strict=True))
 
 
-def _graphml(graph: MapGraph) -> bytes:
+def _to_graphml(graph: MapGraph) -> bytes:
     root = ElementTree.Element("graphml", xmlns="http://graphml.graphdrawing.org/xmlns")
-    for of, entries in (("node", graph.nodes), ("edge", graph.ways)):
+    for of, entries in (("node", graph.nodes), ("edge", graph.edges)):
         first = next(iter(entries.values()), {})
         for name, value in first.items():
             attributes = {
@@ -108,9 +108,9 @@ def _graphml(graph: MapGraph) -> bytes:
             ElementTree.SubElement(root, "key", attributes)
     top = ElementTree.SubElement(root, "graph", id="map", edgedefault="directed")
     for node_id, facts in graph.nodes.items():
-        _add_facts(ElementTree.SubElement(top, "node", id=f"n{node_id}"), "node", facts)
-    for (source, target), facts in graph.ways.items():
-        _add_facts(
+        _add_attributes(ElementTree.SubElement(top, "node", id=f"n{node_id}"), "node", facts)
+    for (source, target), facts in graph.edges.items():
+        _add_attributes(
             ElementTree.SubElement(top, "edge", source=f"n{source}", target=f"n{target}"),
             "edge",
             facts,
@@ -119,7 +119,7 @@ def _graphml(graph: MapGraph) -> bytes:
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
-def _add_facts(element: ElementTree.Element, of: str, facts: dict[str, Any]) -> None:
+def _add_attributes(element: ElementTree.Element, of: str, facts: dict[str, Any]) -> None:
     for name, value in facts.items():
         text = (
             str(value).lower()
@@ -129,7 +129,7 @@ def _add_facts(element: ElementTree.Element, of: str, facts: dict[str, Any]) -> 
         ElementTree.SubElement(element, "data", key=f"{of}_{name}").text = text
 
 
-def _geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
+def _to_geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
     if topomap.georeference is None:
         raise GeoreferenceError(
             "nobody said where on earth this map lies (topoloc georeference); .graphml needs no"
@@ -137,14 +137,14 @@ def _geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
         )
     places = {s.node_id: _lon_lat_h(topomap, s.world_from_cam) for s in topomap.summaries}
     features = [
-        feature("Point", places[node_id], {"node": node_id} | facts)
+        geojson_feature("Point", places[node_id], {"node": node_id} | facts)
         for node_id, facts in graph.nodes.items()
     ]
     features += [
-        feature(
+        geojson_feature(
             "LineString", [places[source], places[target]], {"from": source, "to": target} | facts
         )
-        for (source, target), facts in graph.ways.items()
+        for (source, target), facts in graph.edges.items()
     ]
     return json.dumps({"type": "FeatureCollection", "features": features}).encode()
 

@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.apps.export.text_forms import ply_file
+from topoloc.apps.export.text_formats import to_ply
 from topoloc.apps.viewer.scene import Scene, View
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
 
 _CAM_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_POINTS = "sparse_pc.ply"
+_POINTS_FILE = "sparse_pc.ply"
 
 
-def nerfstudio_files(scene: Scene) -> dict[str, bytes]:
+def to_nerfstudio(scene: Scene) -> dict[str, bytes]:
     """``transforms.json``, the pictures as a map keeps them (results name theirs), and the points
     that training may begin with.
 
@@ -33,11 +33,15 @@ def nerfstudio_files(scene: Scene) -> dict[str, bytes]:
         if camera is None:
             raise TopolocError(f"{view.name}: nerfstudio needs its camera, which is not known")
         if view.jpeg:
-            file_path = f"images/{number:06d}_{_plain(view)}.jpg"
+            file_path = f"images/{number:06d}_{_frame_to_json(view)}.jpg"
             files[file_path] = view.jpeg
         matrix = view.world_from_cam.matrix() @ _CAM_FROM_OPENGL
         frames.append(
-            {"file_path": file_path, **_intrinsics(camera), "transform_matrix": matrix.tolist()}
+            {
+                "file_path": file_path,
+                **_intrinsics_to_json(camera),
+                "transform_matrix": matrix.tolist(),
+            }
         )
     models = {frame.pop("camera_model") for frame in frames}
     if len(models) > 1:
@@ -47,18 +51,18 @@ def nerfstudio_files(scene: Scene) -> dict[str, bytes]:
         )
     transforms: dict[str, Any] = {"camera_model": models.pop(), "frames": frames}
     if len(scene.points.world):
-        transforms["ply_file_path"] = _POINTS
-        files[_POINTS] = ply_file(scene)
+        transforms["ply_file_path"] = _POINTS_FILE
+        files[_POINTS_FILE] = to_ply(scene)
     return {"transforms.json": (json.dumps(transforms, indent=1) + "\n").encode(), **files}
 
 
-def _plain(view: View) -> str:
+def _frame_to_json(view: View) -> str:
     return re.sub(r"[^\w.-]", "_", view.name.rpartition("/")[2].rpartition(".")[0] or view.name)[
         :100
     ]
 
 
-def _intrinsics(camera: Camera) -> dict[str, Any]:
+def _intrinsics_to_json(camera: Camera) -> dict[str, Any]:
     """Its pixels begin at the corner of the first one, as COLMAP's do."""
     model, width, height, _ = camera.to_colmap()
     names = (

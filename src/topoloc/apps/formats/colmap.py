@@ -4,7 +4,7 @@ they stood, in the model's own unit.
 Read by pycolmap (the extra `colmap`), which knows all versions of the files. Pictures come in the
 order of their names. A name that is a number is the picture's time in seconds (nanoseconds above
 1e12), so that a trajectory fits by time; else pictures are 1 s apart. A model made of pictures
-alone knows no metre (`Recording.has_scale`): `scaled` and `aligned` give it one.
+alone knows no metre (`Recording.has_scale`): `scaled` and `align_to_trajectory` give it one.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from topoloc.errors import CalibrationError, MissingExtraError, RecordingError, 
 from topoloc.geometry.alignment import align_scaled_poses
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.json_file import name_below
+from topoloc.recordings.json_file import parse_relative_path
 from topoloc.recordings.recording import Recording, SequenceView, natural_key
-from topoloc.recordings.text_rows import NANOSECONDS
-from topoloc.recordings.trajectory import frame_poses, read_trajectory
+from topoloc.recordings.text_files import NANOSECONDS_PER_SECOND
+from topoloc.recordings.trajectory import match_frame_poses, read_trajectory
 
-LOOKS_FOR = "cameras and images (.bin or .txt) of COLMAP"
+EXPECTED_FILES = "cameras and images (.bin or .txt) of COLMAP"
 _FILES = ("cameras", "images", "points3D")
-_BELOW = ("sparse/0", "sparse", "0")
+_SUBFOLDERS = ("sparse/0", "sparse", "0")
 _MAX_SECONDS = 10**12
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this folder is a model, or holds one where COLMAP puts it."""
-    return _model_of(path) is not None
+    return _find_model(path) is not None
 
 
 def open_colmap(path: Path, images: Path | None = None) -> Recording:
@@ -53,24 +53,24 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
         CalibrationError: a camera of a model that is not known here.
         MissingExtraError: pycolmap is not installed.
     """
-    model = _model_of(path)
+    model = _find_model(path)
     if model is None:
-        raise RecordingError(f"{path}: not a model of COLMAP, which has {LOOKS_FOR}")
+        raise RecordingError(f"{path}: not a model of COLMAP, which has {EXPECTED_FILES}")
     root = images or next(
-        (folder for folder in _picture_folders(path, model) if folder.is_dir()), None
+        (folder for folder in _image_folders(path, model) if folder.is_dir()), None
     )
     if root is None or not root.is_dir():
         raise RecordingError(
             f"{path}: the pictures of this model are needed, too; name their folder with --images"
         )
-    read = _read(model)
+    read = _read_model(model)
     posed = sorted(
         (image for image in read.images.values() if image.has_pose),
         key=lambda image: natural_key(image.name),
     )
     if not posed:
         raise RecordingError(f"{model}: no picture of this model has a pose")
-    names = [name_below(image.name, str(model), RecordingError) for image in posed]
+    names = [parse_relative_path(image.name, str(model), RecordingError) for image in posed]
     cameras = {number: _camera(camera, model) for number, camera in read.cameras.items()}
     of_images = [cameras[image.camera_id] for image in posed]
     poses: list[Rigid3 | None] = [_world_from_cam(image, model) for image in posed]
@@ -80,7 +80,7 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
         path.resolve().name,
         root,
         names,
-        times_of(names),
+        times_from_names(names),
         poses,
         of_frames[0],
         cameras=of_frames[1],
@@ -88,14 +88,14 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
     )
 
 
-def aligned(sequence: StereoSequence, path: Path) -> StereoSequence:
+def align_to_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
     """A model's recording in the world and the metres of a trajectory file: its own poses, moved
     and scaled to fit best.
 
     Raises:
         TrajectoryError: the file is malformed, fits no frame, or its positions fix no scale.
     """
-    theirs = frame_poses(read_trajectory(path), sequence.t_ns, path)
+    theirs = match_frame_poses(read_trajectory(path), sequence.t_ns, path)
     pairs = [
         (ours, other)
         for ours, other in zip(sequence.poses, theirs, strict=True)
@@ -116,14 +116,14 @@ def aligned(sequence: StereoSequence, path: Path) -> StereoSequence:
     return SequenceView(sequence, list(range(len(sequence))), poses)
 
 
-def _model_of(path: Path) -> Path | None:
+def _find_model(path: Path) -> Path | None:
     if not path.is_dir():
         return None
-    candidates = (path, *(path / below for below in _BELOW))
-    return next((folder for folder in candidates if _suffix(folder) is not None), None)
+    candidates = (path, *(path / below for below in _SUBFOLDERS))
+    return next((folder for folder in candidates if _model_suffix(folder) is not None), None)
 
 
-def _suffix(folder: Path) -> str | None:
+def _model_suffix(folder: Path) -> str | None:
     return next(
         (
             suffix
@@ -134,21 +134,21 @@ def _suffix(folder: Path) -> str | None:
     )
 
 
-def _picture_folders(path: Path, model: Path) -> list[Path]:
+def _image_folders(path: Path, model: Path) -> list[Path]:
     absolute = model.resolve()
     return [folder / "images" for folder in (path, model, absolute.parent, absolute.parent.parent)]
 
 
-def _read(model: Path) -> Any:
+def _read_model(model: Path) -> Any:
     try:
         import pycolmap  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtraError(
             f"{model}: models of COLMAP need the extra colmap: pip install 'topoloc[colmap]'"
         ) from None
-    if _suffix(model) == ".bin":
+    if _model_suffix(model) == ".bin":
         _check_counts(model)
-    with _silent(pycolmap):
+    with _silence_log(pycolmap):
         try:
             read = pycolmap.Reconstruction(str(model))
             "".join(image.name for image in read.images.values())  # one that is no text raises here
@@ -162,7 +162,7 @@ def _read(model: Path) -> Any:
 
 
 @contextmanager
-def _silent(pycolmap: Any) -> Iterator[None]:
+def _silence_log(pycolmap: Any) -> Iterator[None]:
     """No messages of its log on stderr beside the error that says it."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3
@@ -175,7 +175,7 @@ def _silent(pycolmap: Any) -> Iterator[None]:
 def _check_counts(model: Path) -> None:
     """Hold that binary files have room for what their counts announce: pycolmap would read on past
     the end without end."""
-    for name, length_of in _RECORDS.items():
+    for name, length_of in _RECORD_LENGTHS.items():
         file = model / f"{name}.bin"
         if not file.is_file():
             continue
@@ -223,7 +223,7 @@ def _rig_length(data: bytes, at: int) -> int:
     return end - at
 
 
-_RECORDS = {
+_RECORD_LENGTHS = {
     "images": _image_length,
     "points3D": _point_length,
     "frames": _frame_length,
@@ -252,7 +252,7 @@ def _world_from_cam(image: Any, model: Path) -> Rigid3:
         raise TrajectoryError(f"{model}, {image.name}: {error}") from None
 
 
-def times_of(names: list[str]) -> list[int]:
+def times_from_names(names: list[str]) -> list[int]:
     """Nanoseconds: the pictures' names where these are increasing numbers, else their places in the
     list as seconds."""
     stems = [PurePath(name).stem for name in names]
@@ -265,12 +265,14 @@ def times_of(names: list[str]) -> list[int]:
         whole = [stem.partition(".") for stem in stems]
         is_ns = max(int(seconds or 0) for seconds, _, _ in whole) > _MAX_SECONDS
         t_ns = [
-            int(seconds or 0) if is_ns else int(seconds or 0) * NANOSECONDS + int(f"{part:0<9.9}")
+            int(seconds or 0)
+            if is_ns
+            else int(seconds or 0) * NANOSECONDS_PER_SECOND + int(f"{part:0<9.9}")
             for seconds, _, part in whole
         ]
         if all(after > before for before, after in pairwise(t_ns)):
             return t_ns
-    return [number * NANOSECONDS for number in range(len(names))]
+    return [number * NANOSECONDS_PER_SECOND for number in range(len(names))]
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_colmap, ("images",))
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_colmap, ("images",))

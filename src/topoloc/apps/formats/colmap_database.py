@@ -16,13 +16,13 @@ from topoloc.apps.formats import colmap
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import SequenceFormat
-from topoloc.recordings.json_file import name_below
+from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.json_file import parse_relative_path
 from topoloc.recordings.recording import Recording, natural_key
 
-LOOKS_FOR = "database.db of COLMAP"
+EXPECTED_FILES = "database.db of COLMAP"
 _NAME = "database.db"
-_MODELS = (
+_CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
     "SIMPLE_RADIAL",
@@ -39,14 +39,14 @@ _MODELS = (
 _MAX_PARAMS, _MAX_ROWS = 64, 10_000_000
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this is a database, or a folder with one that holds no model."""
     if path.is_dir():
-        return (path / _NAME).is_file() and not colmap.recognises(path)
+        return (path / _NAME).is_file() and not colmap.can_open(path)
     return path.suffix == ".db" and path.is_file()
 
 
-def open_database(path: Path, images: Path | None = None) -> Recording:
+def open_colmap_database(path: Path, images: Path | None = None) -> Recording:
     """Open a database.
 
     Args:
@@ -63,23 +63,30 @@ def open_database(path: Path, images: Path | None = None) -> Recording:
             f"{path}: the pictures of this database are needed, too; name their folder with"
             " --images"
         )
-    cameras, of_pictures = _read(file)
-    if not of_pictures:
+    cameras, camera_id_by_image = _read_database(file)
+    if not camera_id_by_image:
         raise RecordingError(f"{file}: no picture in this database")
     names = sorted(
-        (name_below(name, str(file), RecordingError) for name in of_pictures), key=natural_key
+        (parse_relative_path(name, str(file), RecordingError) for name in camera_id_by_image),
+        key=natural_key,
     )
-    if missing := next((name for name in names if of_pictures[name] not in cameras), None):
+    if missing := next((name for name in names if camera_id_by_image[name] not in cameras), None):
         raise RecordingError(f"{file}: damaged, {missing} is of a camera that is missing")
-    of_frames = [cameras[of_pictures[name]] for name in names]
+    of_frames = [cameras[camera_id_by_image[name]] for name in names]
     poses: list[Rigid3 | None] = [None] * len(names)
     one, each = (of_frames[0], None) if len(set(of_frames)) == 1 else (None, of_frames)
     return Recording(
-        file.resolve().parent.name, root, names, colmap.times_of(names), poses, one, cameras=each
+        file.resolve().parent.name,
+        root,
+        names,
+        colmap.times_from_names(names),
+        poses,
+        one,
+        cameras=each,
     )
 
 
-def _read(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
+def _read_database(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
     """The cameras by their numbers, and the number of each picture's camera by the picture's
     name."""
     try:
@@ -91,7 +98,7 @@ def _read(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
             cameras = database.execute(
                 f"SELECT camera_id, model, width, height, params FROM cameras LIMIT {_MAX_ROWS}"
             ).fetchall()
-            pictures = database.execute(
+            images = database.execute(
                 f"SELECT name, camera_id FROM images LIMIT {_MAX_ROWS}"
             ).fetchall()
     except (
@@ -102,9 +109,9 @@ def _read(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
         raise RecordingError(
             f"{file}: no database of COLMAP, or damaged ({' '.join(str(error).split())[:120]})"
         ) from None
-    if not all(isinstance(name, str) and isinstance(number, int) for name, number in pictures):
+    if not all(isinstance(name, str) and isinstance(number, int) for name, number in images):
         raise RecordingError(f"{file}: damaged, a picture without a name or a camera")
-    return {row[0]: _camera(row, file) for row in cameras}, dict(pictures)
+    return {row[0]: _camera(row, file) for row in cameras}, dict(images)
 
 
 def _camera(row: tuple[Any, ...], file: Path) -> Camera:
@@ -116,7 +123,7 @@ def _camera(row: tuple[Any, ...], file: Path) -> Camera:
     )
     if not whole or len(params) % 8 or len(params) > 8 * _MAX_PARAMS:
         raise RecordingError(f"{file}: damaged, a camera that is none")
-    name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
+    name = _CAMERA_MODELS[model] if 0 <= model < len(_CAMERA_MODELS) else f"number {model}"
     try:
         return Camera.from_colmap(
             name, width, height, struct.unpack(f"<{len(params) // 8}d", params)
@@ -125,4 +132,4 @@ def _camera(row: tuple[Any, ...], file: Path) -> Camera:
         raise CalibrationError(f"{file}: camera {number}: {error}") from None
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_database, ("images",))
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_colmap_database, ("images",))

@@ -20,12 +20,12 @@ import cv2
 
 from topoloc.errors import RecordingError
 from topoloc.recordings.frame import Image
-from topoloc.recordings.video import opencv_silent
+from topoloc.recordings.video import silence_opencv
 
 _URL = re.compile(r"(rtsps?|rtmp|https?|udp|tcp)://\S+", re.IGNORECASE)
 _DEVICE = re.compile(r"\d{1,3}|/dev/video\d{1,3}")
 _WAIT_S = 0.2
-_CLOSING_S = 1.0
+_CLOSE_TIMEOUT_S = 1.0
 
 
 def is_live(source: str) -> bool:
@@ -37,7 +37,7 @@ def is_live(source: str) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class LivePicture:
+class LiveImage:
     """A picture as it arrived: grey (H, W) or RGB (H, W, 3), uint8; `t_ns` is the clock's time
     then, nanoseconds; `number` counts all that the source gave, also those that nobody took."""
 
@@ -69,10 +69,10 @@ class LiveSource:
     ) -> None:
         self.source, self.keep_all, self.stall_s = source, keep_all, stall_s
         self.num_read, self.stop = 0, threading.Event()
-        self._capture = _open(source, size, stall_s)
-        self._changed, self._newest = threading.Condition(), None
+        self._capture = _open_capture(source, size, stall_s)
+        self._changed, self._latest = threading.Condition(), None
         self._is_ended = self._is_closed = False
-        self._thread = threading.Thread(target=self._read_on, name=f"live {source}", daemon=True)
+        self._thread = threading.Thread(target=self._read_loop, name=f"live {source}", daemon=True)
         self._thread.start()
 
     def __enter__(self) -> LiveSource:
@@ -81,7 +81,7 @@ class LiveSource:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __iter__(self) -> Iterator[LivePicture]:
+    def __iter__(self) -> Iterator[LiveImage]:
         while (picture := self._next()) is not None:
             yield picture
 
@@ -90,20 +90,20 @@ class LiveSource:
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
-        self._thread.join(_CLOSING_S)
+        self._thread.join(_CLOSE_TIMEOUT_S)
 
-    def _next(self) -> LivePicture | None:
+    def _next(self) -> LiveImage | None:
         since = time.monotonic()
         with self._changed:
-            while self._newest is None and not self._is_ended and not self.stop.is_set():
+            while self._latest is None and not self._is_ended and not self.stop.is_set():
                 if time.monotonic() - since > self.stall_s:
                     raise RecordingError(f"{self.source}: no picture for {self.stall_s:g} s")
                 self._changed.wait(_WAIT_S)
-            picture, self._newest = self._newest, None
+            picture, self._latest = self._latest, None
             self._changed.notify_all()
         return None if self.stop.is_set() else picture
 
-    def _read_on(self) -> None:
+    def _read_loop(self) -> None:
         """The thread: reads until the source ends or is closed."""
         last_ns = 0
         while not self._is_closed:
@@ -112,10 +112,10 @@ class LiveSource:
             with self._changed:
                 if not is_read or pixels is None:
                     break
-                while self.keep_all and self._newest is not None and not self._is_closed:
+                while self.keep_all and self._latest is not None and not self._is_closed:
                     self._changed.wait(_WAIT_S)
                 image = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
-                self._newest = LivePicture(image, last_ns, self.num_read)
+                self._latest = LiveImage(image, last_ns, self.num_read)
                 self.num_read += 1
                 self._changed.notify_all()
         with self._changed:
@@ -124,7 +124,7 @@ class LiveSource:
         self._capture.release()
 
 
-def _open(source: str, size: tuple[int, int] | None, stall_s: float) -> Any:
+def _open_capture(source: str, size: tuple[int, int] | None, stall_s: float) -> Any:
     """An OpenCV capture. Raises RecordingError."""
     is_pipeline = " ! " in source
     if is_pipeline and not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
@@ -132,7 +132,7 @@ def _open(source: str, size: tuple[int, int] | None, stall_s: float) -> Any:
             f"{source}: OpenCV is built without GStreamer here; rtsp://, http:// and device numbers"
             " go without"
         )
-    with opencv_silent():
+    with silence_opencv():
         if is_pipeline:
             capture = cv2.VideoCapture(source, cv2.CAP_GSTREAMER)
         elif _URL.fullmatch(source):

@@ -20,12 +20,12 @@ import numpy as np
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import SequenceFormat
-from topoloc.recordings.json_file import json_number, json_rigid, name_below, read_json
-from topoloc.recordings.recording import DepthPictures, Recording, natural_key, times_by_rate
+from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.json_file import json_number, json_rigid, parse_relative_path, read_json
+from topoloc.recordings.recording import DepthImages, Recording, natural_key, times_from_rate
 
 FILE_NAME = "transforms.json"
-LOOKS_FOR = "transforms.json of nerfstudio"
+EXPECTED_FILES = "transforms.json of nerfstudio"
 DEPTH_UNIT = 0.001
 """Metres: nerfstudio's own default of `depth_unit_scale_factor`."""
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
@@ -42,7 +42,7 @@ _PERSPECTIVE = (
 _FISHEYE = ("OPENCV_FISHEYE", "fisheye")
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this is a transforms.json, or a folder with one."""
     return path.name == FILE_NAME if path.is_file() else (path / FILE_NAME).is_file()
 
@@ -69,20 +69,20 @@ def open_nerfstudio(path: Path) -> Recording:
             f"{file}: no list of frames, which a transforms.json of nerfstudio has"
         )
     named = [
-        (name_below(frame.get("file_path"), f"{file}, frame {k}", RecordingError), frame)
+        (parse_relative_path(frame.get("file_path"), f"{file}, frame {k}", RecordingError), frame)
         for k, frame in enumerate(frames)
     ]
     named.sort(key=lambda pair: natural_key(pair[0]))
     names = [_with_suffix(file.parent, name) for name, _ in named]
     where = [f"{file}, {name}" for name in names]
     ordered = [frame for _, frame in named]
-    scale = _positive(data, "applied_scale", 1.0, str(file))
+    scale = _positive_number(data, "applied_scale", 1.0, str(file))
     poses: list[Rigid3 | None] = [
         _pose(frame, scale, at) for frame, at in zip(ordered, where, strict=True)
     ]
     cameras = [_camera(data, frame, at) for frame, at in zip(ordered, where, strict=True)]
     depth = _depth(data, ordered, file, where)
-    name, t_ns = file.parent.resolve().name, times_by_rate(len(names))
+    name, t_ns = file.parent.resolve().name, times_from_rate(len(names))
     if len(set(cameras)) == 1:
         return Recording(name, file.parent, names, t_ns, poses, cameras[0], depth=depth)
     return Recording(name, file.parent, names, t_ns, poses, None, depth=depth, cameras=cameras)
@@ -144,25 +144,26 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], where: str) -> Camera:
 
 def _depth(
     data: dict[str, Any], frames: list[dict[str, Any]], file: Path, where: list[str]
-) -> DepthPictures | None:
-    with_depth = sum("depth_file_path" in frame for frame in frames)
-    if with_depth == 0:
+) -> DepthImages | None:
+    num_with_depth = sum("depth_file_path" in frame for frame in frames)
+    if num_with_depth == 0:
         return None
-    if with_depth != len(frames):
+    if num_with_depth != len(frames):
         raise RecordingError(
-            f"{file}: {len(frames)} frames but {with_depth} with a depth_file_path; all of them"
+            f"{file}: {len(frames)} frames but {num_with_depth} with a depth_file_path; all of them"
             " need one, or none"
         )
     pairs = zip(frames, where, strict=True)
     paths = [
-        file.parent / name_below(frame["depth_file_path"], f"{at}: depth_file_path", RecordingError)
+        file.parent
+        / parse_relative_path(frame["depth_file_path"], f"{at}: depth_file_path", RecordingError)
         for frame, at in pairs
     ]
-    unit = _positive(data, "depth_unit_scale_factor", DEPTH_UNIT, str(file))
-    return DepthPictures(paths, 1.0 / unit, None, Rigid3.identity())
+    unit = _positive_number(data, "depth_unit_scale_factor", DEPTH_UNIT, str(file))
+    return DepthImages(paths, 1.0 / unit, None, Rigid3.identity())
 
 
-def _positive(data: dict[str, Any], key: str, default: float, where: str) -> float:
+def _positive_number(data: dict[str, Any], key: str, default: float, where: str) -> float:
     number = json_number(data.get(key, default), f"{where}: {key}", RecordingError)
     if not 1e-12 < number < 1e12:
         raise RecordingError(f"{where}: {key} must be a positive number, not {number:g}")
@@ -174,4 +175,4 @@ def _with_suffix(folder: Path, name: str) -> str:
     return name if PurePath(name).suffix or os.path.exists(folder / name) else f"{name}.png"
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_nerfstudio)
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_nerfstudio)

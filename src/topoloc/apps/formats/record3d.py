@@ -19,26 +19,26 @@ from topoloc.apps.formats.nerfstudio import rigid_from_gl
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, matrix_from_quat_wxyz
-from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.image_io import image_size
 from topoloc.recordings.json_file import json_number, json_numbers, read_json
-from topoloc.recordings.pictures import image_size
 from topoloc.recordings.recording import (
-    DepthPictures,
+    DepthImages,
     Recording,
-    list_pictures,
+    list_images,
     natural_key,
-    times_by_rate,
+    times_from_rate,
 )
 
 FILE_NAME = "metadata.json"
-LOOKS_FOR = "rgb/ and metadata.json of Record3D's EXR + JPG export"
+EXPECTED_FILES = "rgb/ and metadata.json of Record3D's EXR + JPG export"
 _FOLDER = "EXR_RGBD"
 _RATE_HZ = 60
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this is such a folder, or holds one."""
-    return _root(path) is not None
+    return _find_root(path) is not None
 
 
 def open_record3d(path: Path) -> Recording:
@@ -50,36 +50,35 @@ def open_record3d(path: Path) -> Recording:
         CalibrationError: the intrinsics are missing or not usable.
         TrajectoryError: a row of the poses is no pose.
     """
-    root = _root(path)
+    root = _find_root(path)
     if root is None:
-        raise RecordingError(f"{path}: not an export of Record3D, which has {LOOKS_FOR}")
+        raise RecordingError(f"{path}: not an export of Record3D, which has {EXPECTED_FILES}")
     file = root / FILE_NAME
     data = read_json(file, RecordingError)
     if not isinstance(data, dict):
         raise RecordingError(f"{file}: not a JSON object")
-    pictures = list_pictures(root / "rgb")
+    images = list_images(root / "rgb")
     rows = data.get("poses")
-    if not isinstance(rows, list) or len(rows) != len(pictures):
+    if not isinstance(rows, list) or len(rows) != len(images):
         raise RecordingError(
-            f"{file}: {len(rows) if isinstance(rows, list) else 0} poses for {len(pictures)}"
-            " pictures"
+            f"{file}: {len(rows) if isinstance(rows, list) else 0} poses for {len(images)} pictures"
         )
     poses: list[Rigid3 | None] = [_pose(row, f"{file}, pose {k}") for k, row in enumerate(rows)]
-    cameras = _cameras(data, pictures, file)
+    cameras = _cameras(data, images, file)
     same = len(set(cameras)) == 1
     return Recording(
         path.resolve().name,
         root,
-        [picture.relative_to(root).as_posix() for picture in pictures],
-        _times(data, len(pictures), file),
+        [picture.relative_to(root).as_posix() for picture in images],
+        _times(data, len(images), file),
         poses,
         cameras[0] if same else None,
-        depth=_depth(root, pictures),
+        depth=_depth(root, images),
         cameras=None if same else cameras,
     )
 
 
-def _root(path: Path) -> Path | None:
+def _find_root(path: Path) -> Path | None:
     candidates = (path, path / _FOLDER, path / "EXR")
     return next(
         (
@@ -100,19 +99,19 @@ def _pose(row: Any, where: str) -> Rigid3:
     return rigid_from_gl(Rigid3(matrix_from_quat_wxyz(np.array([w, x, y, z])), numbers[4:]))
 
 
-def _cameras(data: dict[str, Any], pictures: list[Path], file: Path) -> list[Camera]:
+def _cameras(data: dict[str, Any], images: list[Path], file: Path) -> list[Camera]:
     """The camera of each picture, of the size that the pictures are of."""
     w, h = (
         int(json_number(data.get(key), f"{file}: {key}", CalibrationError)) for key in ("w", "h")
     )
-    width, height = image_size(pictures[0])
+    width, height = image_size(images[0])
     if abs(width * h - height * w) > max(w, h, width, height):
-        raise CalibrationError(f"{file}: of {w}x{h}, but {pictures[0].name} is {width}x{height}")
+        raise CalibrationError(f"{file}: of {w}x{h}, but {images[0].name} is {width}x{height}")
     per_frame = data.get("perFrameIntrinsicCoeffs")
     if isinstance(per_frame, list) and per_frame:
-        if len(per_frame) != len(pictures):
+        if len(per_frame) != len(images):
             raise CalibrationError(
-                f"{file}: {len(per_frame)} perFrameIntrinsicCoeffs for {len(pictures)} pictures"
+                f"{file}: {len(per_frame)} perFrameIntrinsicCoeffs for {len(images)} pictures"
             )
         numbers = [
             json_numbers(row, 4, f"{file}, perFrameIntrinsicCoeffs {k}", CalibrationError)
@@ -120,15 +119,18 @@ def _cameras(data: dict[str, Any], pictures: list[Path], file: Path) -> list[Cam
         ]
     else:
         k = json_numbers(data.get("K"), 9, f"{file}: K", CalibrationError)
-        numbers = [k[[0, 4, 6, 7]]] * len(pictures)
+        numbers = [k[[0, 4, 6, 7]]] * len(images)
     return [_camera(row, (w, h), (width, height), file) for row in numbers]
 
 
 def _camera(
-    numbers: Float[np.ndarray, "4"], stated: tuple[int, int], size: tuple[int, int], file: Path
+    numbers: Float[np.ndarray, "4"],
+    calibrated_size: tuple[int, int],
+    size: tuple[int, int],
+    file: Path,
 ) -> Camera:
     try:
-        return Camera.pinhole(*stated, *numbers.tolist()).rescaled(*size)
+        return Camera.pinhole(*calibrated_size, *numbers.tolist()).rescaled(*size)
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from None
 
@@ -138,14 +140,14 @@ def _times(data: dict[str, Any], count: int, file: Path) -> list[int]:
     seconds = data.get("frameTimestamps")
     if not isinstance(seconds, list) or not seconds:
         fps = json_number(data.get("fps", _RATE_HZ), f"{file}: fps", RecordingError)
-        return times_by_rate(count, round(fps) if fps >= 1.0 else _RATE_HZ)
+        return times_from_rate(count, round(fps) if fps >= 1.0 else _RATE_HZ)
     numbers = json_numbers(seconds, count, f"{file}: frameTimestamps", RecordingError)
     if np.any(np.diff(numbers) <= 0.0) or np.abs(numbers).max() > 1e9 * 9:
         raise RecordingError(f"{file}: frameTimestamps do not increase from frame to frame")
     return [round(float(number) * 1e9) for number in numbers]
 
 
-def _depth(root: Path, pictures: list[Path]) -> DepthPictures | None:
+def _depth(root: Path, images: list[Path]) -> DepthImages | None:
     folder = root / "depth"
     if not folder.is_dir():
         return None
@@ -153,12 +155,12 @@ def _depth(root: Path, pictures: list[Path]) -> DepthPictures | None:
         (file for file in folder.iterdir() if file.suffix.lower() == ".exr"),
         key=lambda file: natural_key(file.name),
     )
-    if [file.stem for file in paths] != [picture.stem for picture in pictures]:
+    if [file.stem for file in paths] != [picture.stem for picture in images]:
         raise RecordingError(
-            f"{folder}: {len(paths)} EXR files, but {len(pictures)} pictures in rgb/; every picture"
+            f"{folder}: {len(paths)} EXR files, but {len(images)} pictures in rgb/; every picture"
             " needs its partner"
         )
-    return DepthPictures(paths, 1.0, None, Rigid3.identity())
+    return DepthImages(paths, 1.0, None, Rigid3.identity())
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_record3d)
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_record3d)

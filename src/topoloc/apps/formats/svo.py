@@ -14,7 +14,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import Image, StereoFrame
-from topoloc.recordings.trajectory import read_truth
+from topoloc.recordings.trajectory import read_ground_truth
 
 SVO_SUFFIXES = frozenset({".svo", ".svo2"})
 
@@ -42,7 +42,7 @@ class SvoRecording:
     def __len__(self) -> int:
         return len(self.t_ns)
 
-    def single(self) -> SvoRecording:
+    def monocular(self) -> SvoRecording:
         """The same recording without the right pictures."""
         return replace(self, with_right=False)
 
@@ -66,16 +66,18 @@ class SvoRecording:
         frame = StereoFrame(
             self.names[index],
             self.t_ns[index],
-            self._view(view.LEFT),
+            self._retrieve_view(view.LEFT),
             self.rig.left,
             world_from_cam=self.poses[index],
         )
         return (
-            replace(frame, right=self._view(view.RIGHT), rig=self.rig) if self.with_right else frame
+            replace(frame, right=self._retrieve_view(view.RIGHT), rig=self.rig)
+            if self.with_right
+            else frame
         )
 
-    def _view(self, view: Any) -> Image:
-        return picture_of(self.sdk, self.camera, view)
+    def _retrieve_view(self, view: Any) -> Image:
+        return retrieve_image(self.sdk, self.camera, view)
 
 
 def open_svo(path: Path) -> SvoRecording:
@@ -107,8 +109,8 @@ def open_svo(path: Path) -> SvoRecording:
         t_ns.append(int(camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds()))
     if not t_ns:
         raise RecordingError(f"{path}: no frame of it can be decoded")
-    poses = read_truth(path.with_suffix(".tum"), [], t_ns)
-    return SvoRecording(path.name, path, t_ns, poses, rig_of(camera), sl, camera)
+    poses = read_ground_truth(path.with_suffix(".tum"), [], t_ns)
+    return SvoRecording(path.name, path, t_ns, poses, rig_from_sdk(camera), sl, camera)
 
 
 def sdk(what: str) -> Any:
@@ -122,14 +124,14 @@ def sdk(what: str) -> Any:
     return sl
 
 
-def picture_of(sdk: Any, camera: Any, view: Any) -> Image:
+def retrieve_image(sdk: Any, camera: Any, view: Any) -> Image:
     """What a camera of the SDK saw last, RGB."""
     picture = sdk.Mat()
     camera.retrieve_image(picture, view)
     return cv2.cvtColor(picture.get_data(), cv2.COLOR_BGRA2RGB)
 
 
-def rig_of(camera: Any) -> StereoRig:
+def rig_from_sdk(camera: Any) -> StereoRig:
     """Of the rectified pictures, which the SDK gives; metres."""
     configuration = camera.get_camera_information().camera_configuration
     parameters, size = configuration.calibration_parameters, configuration.resolution

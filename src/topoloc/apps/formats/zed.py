@@ -22,12 +22,12 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
-from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.text_rows import read_text
-from topoloc.recordings.video import VIDEO_SUFFIXES, Video, frame_size, uncalibrated_video
+from topoloc.recordings.text_files import read_text
+from topoloc.recordings.video import VIDEO_SUFFIXES, Video, open_uncalibrated_video, read_frame_size
 
-LOOKS_FOR = "a video of left and right side by side with SN*.conf beside it, or .svo"
+EXPECTED_FILES = "a video of left and right side by side with SN*.conf beside it, or .svo"
 # Stereolabs' names of the sizes of one picture.
 RESOLUTIONS = {
     (2208, 1242): "2K",
@@ -37,24 +37,24 @@ RESOLUTIONS = {
     (960, 600): "SVGA",
     (672, 376): "VGA",
 }
-_LEAST_SHAPE = 2.5  # width to height of two pictures side by side; a single one is 1.8 at most
-_CONF = re.compile(r"sn\d+\.conf", re.IGNORECASE)
+_MIN_ASPECT_RATIO = 2.5  # width to height of two pictures side by side; a single one is 1.8 at most
+_CONF_NAME = re.compile(r"sn\d+\.conf", re.IGNORECASE)
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this is an SVO file, or a video as wide as two pictures that has an SN*.conf beside
     it."""
     if not path.is_file():
         return False
     if path.suffix.lower() in SVO_SUFFIXES:
         return True
-    if path.suffix.lower() not in VIDEO_SUFFIXES or not _confs(path.parent):
+    if path.suffix.lower() not in VIDEO_SUFFIXES or not _list_conf_files(path.parent):
         return False
     try:
-        (width, height), _ = frame_size(path)
+        (width, height), _ = read_frame_size(path)
     except RecordingError:
         return False
-    return width >= _LEAST_SHAPE * height
+    return width >= _MIN_ASPECT_RATIO * height
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class SideBySideVideo:
     def __len__(self) -> int:
         return len(self.video)
 
-    def single(self) -> SideBySideVideo:
+    def monocular(self) -> SideBySideVideo:
         """The same recording without the right halves."""
         return replace(self, with_right=False)
 
@@ -114,12 +114,12 @@ def open_zed(path: Path, calibration: str | Path | None = None) -> StereoSequenc
     """
     if path.suffix.lower() in SVO_SUFFIXES:
         return open_svo(path)
-    video = uncalibrated_video(path)
+    video = open_uncalibrated_video(path)
     width, height = video.size
     if not is_side_by_side(width, height):
         raise RecordingError(f"{path}: {width}x{height} pixels are not two pictures side by side")
-    file = _calibration_beside(path) if calibration is None else Path(calibration)
-    rig = rig_of_file(file, (width // 2, height))
+    file = _find_calibration_file(path) if calibration is None else Path(calibration)
+    rig = read_rig(file, (width // 2, height))
     if (rig.left.width, rig.left.height) != (width // 2, height):
         raise CalibrationError(
             f"{file}: of {rig.left.width}x{rig.left.height}, but each half of {path.name} is"
@@ -130,13 +130,13 @@ def open_zed(path: Path, calibration: str | Path | None = None) -> StereoSequenc
 
 def is_side_by_side(width: int, height: int) -> bool:
     """Whether a picture of so many pixels can be two."""
-    return width % 2 == 0 and width >= _LEAST_SHAPE * height
+    return width % 2 == 0 and width >= _MIN_ASPECT_RATIO * height
 
 
-def rig_of_file(path: Path, size: tuple[int, int]) -> StereoRig:
+def read_rig(path: Path, size: tuple[int, int]) -> StereoRig:
     """The pair of an SN*.conf for halves of this size, or of a camera.json with a baseline. Raises
     CalibrationError."""
-    return _rectified_rig(path) if path.suffix.lower() == ".json" else read_conf(path, size)
+    return _read_rectified_rig(path) if path.suffix.lower() == ".json" else read_conf(path, size)
 
 
 def read_conf(path: Path, size: tuple[int, int]) -> StereoRig:
@@ -226,7 +226,7 @@ def _number(
     return number
 
 
-def _rectified_rig(path: Path) -> StereoRig:
+def _read_rectified_rig(path: Path) -> StereoRig:
     rig = read_camera_json(path).rig
     if rig is None:
         raise CalibrationError(
@@ -235,8 +235,8 @@ def _rectified_rig(path: Path) -> StereoRig:
     return rig
 
 
-def _calibration_beside(path: Path) -> Path:
-    confs = _confs(path.parent)
+def _find_calibration_file(path: Path) -> Path:
+    confs = _list_conf_files(path.parent)
     if len(confs) > 1:
         raise CalibrationError(
             f"{path}: several calibrations beside it ({', '.join(conf.name for conf in confs)});"
@@ -250,8 +250,8 @@ def _calibration_beside(path: Path) -> Path:
     return confs[0] if confs else path.parent / FILE_NAME
 
 
-def _confs(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if _CONF.fullmatch(path.name))
+def _list_conf_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if _CONF_NAME.fullmatch(path.name))
 
 
-FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_zed, ("calibration_file",))
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_zed, ("calibration_file",))

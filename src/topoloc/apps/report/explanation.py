@@ -12,26 +12,29 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Trace, Tried
-from topoloc.mapping.sessions import Light, light_of
+from topoloc.localization.search import Trace, TriedProposal
+from topoloc.mapping.sessions import Illumination, measure_illumination
 from topoloc.recordings.frame import Image
 
-_FEW_FEATURES, _LIKELY = 150, 0.5
+_MIN_FEATURES, _MIN_PROBABILITY = 150, 0.5
 _DARKER, _BRIGHTER = 0.6, 1.7  # times the light of the nearest session
-_OFF_VIEW_DEG, _FAR_NODES = 25.0, 4.0  # from the nearest node: degrees, and so many D_thresh
-_SAME_PLACE, _SAME_TURN = 0.3, math.radians(3.0)
+_MAX_VIEW_ANGLE_DEG, _MAX_NODE_DISTANCE = (
+    25.0,
+    4.0,
+)  # from the nearest node: degrees, and so many D_thresh
+_SAME_POSITION_M, _SAME_ROTATION = 0.3, math.radians(3.0)
 
 
 @dataclass(frozen=True, eq=False)
-class TriedPose:
+class EvaluatedPose:
     """One first pose and what became of it; `fit` is the last one of it. `probability` is that of
     it against "nowhere" alone."""
 
-    tried: Tried
+    tried: TriedProposal
     fit: PoseFit
     probability: float | None
     verdict: str
@@ -44,13 +47,13 @@ class Explanation:
 
     result: Localization | NotLocalized
     num_features: dict[str, int]
-    light: Light
-    session_lights: dict[str, Light]
-    poses: list[TriedPose]
+    light: Illumination
+    session_lights: dict[str, Illumination]
+    poses: list[EvaluatedPose]
     advice: list[str]
 
     @property
-    def best(self) -> TriedPose | None:
+    def best(self) -> EvaluatedPose | None:
         """What has most for it."""
         likely = [pose for pose in self.poses if pose.probability is not None]
         found = [pose for pose in self.poses if pose.fit.pose is not None]
@@ -62,23 +65,25 @@ class Explanation:
         return by_odds or max(found, key=lambda pose: pose.fit.num_inliers, default=None)
 
 
-def explain(localizer: Localizer, image: Image, camera: Camera | RoughCamera | None) -> Explanation:
+def explain(
+    localizer: Localizer, image: Image, camera: Camera | UncalibratedCamera | None
+) -> Explanation:
     """Localize a picture, and say why it came out so. Raises as `Localizer.localize` does."""
     trace = Trace()
     result = localizer.localize(image, camera, trace=trace)
-    poses = [_tried_pose(tried, result) for tried in trace.tried]
+    poses = [_evaluate_pose(tried, result) for tried in trace.tried]
     num_features = {pose.tried.features: len(pose.fit.features) for pose in poses}
     lights = {
         f"{session.session_id} ({session.name})": session.light
         for session in localizer.topomap.sessions
         if session.light is not None
     }
-    unsaid = Explanation(result, num_features, light_of(image), lights, poses, [])
-    advice = list(dict.fromkeys(_advice(unsaid, localizer)))
+    unsaid = Explanation(result, num_features, measure_illumination(image), lights, poses, [])
+    advice = list(dict.fromkeys(_collect_advice(unsaid, localizer)))
     return Explanation(result, num_features, unsaid.light, lights, poses, advice)
 
 
-def facts_of(name: str, explanation: Explanation) -> dict[str, Any]:
+def explanation_to_json(name: str, explanation: Explanation) -> dict[str, Any]:
     """The result of the picture of this name with all that was tried for it, as JSON."""
     poses = [
         {
@@ -99,7 +104,7 @@ def facts_of(name: str, explanation: Explanation) -> dict[str, Any]:
     }
 
 
-def _tried_pose(tried: Tried, result: Localization | NotLocalized) -> TriedPose:
+def _evaluate_pose(tried: TriedProposal, result: Localization | NotLocalized) -> EvaluatedPose:
     fit = (
         tried.refined
         if tried.refined is not None and tried.refined.pose is not None
@@ -107,14 +112,18 @@ def _tried_pose(tried: Tried, result: Localization | NotLocalized) -> TriedPose:
     )
     if tried.hypothesis is not None:
         fit, probability = tried.hypothesis.fit, tried.hypothesis.probability
-        return TriedPose(
+        return EvaluatedPose(
             tried, fit, probability, _verdict(tried.hypothesis.world_from_cam, probability, result)
         )
     if fit.pose is None:
-        return TriedPose(tried, fit, None, f"no pose: the {len(fit.matches)} matches agree on none")
+        return EvaluatedPose(
+            tried, fit, None, f"no pose: the {len(fit.matches)} matches agree on none"
+        )
     if tried.refined is None and tried.source != "walls":
-        return TriedPose(tried, fit, None, "the same as one that was found already")
-    return TriedPose(tried, fit, None, "hopeless: far too little of what must be in view was found")
+        return EvaluatedPose(tried, fit, None, "the same as one that was found already")
+    return EvaluatedPose(
+        tried, fit, None, "hopeless: far too little of what must be in view was found"
+    )
 
 
 def _verdict(
@@ -127,7 +136,7 @@ def _verdict(
         for other in getattr(result, "alternatives", ())
     ):
         return "one of the alternatives"
-    if probability < _LIKELY:
+    if probability < _MIN_PROBABILITY:
         return "lost: more speaks against it than for it"
     if isinstance(result, Localization):
         return "lost: the answer has more for it"
@@ -140,22 +149,28 @@ def _verdict(
 
 def _is_same(a: Rigid3, b: Rigid3) -> bool:
     apart = a.inverse() @ b
-    return bool(np.linalg.norm(apart.translation) < _SAME_PLACE) and apart.angle() < _SAME_TURN
+    return (
+        bool(np.linalg.norm(apart.translation) < _SAME_POSITION_M)
+        and apart.angle() < _SAME_ROTATION
+    )
 
 
-def _advice(of: Explanation, localizer: Localizer) -> Iterator[str]:
+def _collect_advice(explanation: Explanation, localizer: Localizer) -> Iterator[str]:
     """What would help, in words."""
-    result = of.result
+    result = explanation.result
     if isinstance(result, Localization) and result.calibration_doubt is not None:
         yield f"The calibration is doubtful: {result.calibration_doubt}."
     if isinstance(result, NotLocalized) and result.detail:
         yield f"{result.detail[0].upper()}{result.detail[1:]}."
-    yield from _on_alternatives(result)
-    yield from _on_picture(of)
-    best = of.best
+    yield from _advice_on_alternatives(result)
+    yield from _advice_on_image(explanation)
+    best = explanation.best
     if best is not None and best.tried.hypothesis is not None:
         evidence = best.tried.hypothesis.evidence
-        if isinstance(result, NotLocalized) and best.tried.hypothesis.probability < _LIKELY:
+        if (
+            isinstance(result, NotLocalized)
+            and best.tried.hypothesis.probability < _MIN_PROBABILITY
+        ):
             found = (
                 f"{evidence.num_found} of the {evidence.num_visible} points that must be in view"
                 " there"
@@ -167,18 +182,18 @@ def _advice(of: Explanation, localizer: Localizer) -> Iterator[str]:
                 "It may be elsewhere, changed, or seen from a side or in a light that the map does"
                 " not hold."
             )
-        yield from _on_viewpoint(best.fit.world_from_cam, localizer)
+        yield from _advice_on_viewpoint(best.fit.world_from_cam, localizer)
     elif isinstance(result, NotLocalized):
         yield (
             "No part of the map looks enough like this picture: it may be of somewhere else, or of"
             " something that changed."
         )
-    for kind, lacking in localizer.left_out.items():
+    for kind, lacking in localizer.unavailable_types.items():
         yield f"The map's features {kind}, made for other light, were not asked: {lacking}."
     if (
         isinstance(result, NotLocalized)
         and len(localizer.topomap.kinds) == 1
-        and not localizer.left_out
+        and not localizer.unavailable_types
     ):
         yield (
             f"The map holds features {localizer.topomap.kind} alone; `topoloc build --features"
@@ -186,7 +201,7 @@ def _advice(of: Explanation, localizer: Localizer) -> Iterator[str]:
         )
 
 
-def _on_alternatives(result: Localization | NotLocalized) -> Iterator[str]:
+def _advice_on_alternatives(result: Localization | NotLocalized) -> Iterator[str]:
     if isinstance(result, NotLocalized) and len(result.alternatives) > 1:
         nodes = " and ".join(str(other.node_id) for other in result.alternatives[:3])
         yield (
@@ -195,37 +210,37 @@ def _on_alternatives(result: Localization | NotLocalized) -> Iterator[str]:
         )
 
 
-def _on_picture(of: Explanation) -> Iterator[str]:
-    for kind, count in of.num_features.items():
-        if count < _FEW_FEATURES:
+def _advice_on_image(explanation: Explanation) -> Iterator[str]:
+    for kind, count in explanation.num_features.items():
+        if count < _MIN_FEATURES:
             yield (
                 f"Only {count} features ({kind}) were found: the picture is blurred, blank or very"
                 " dark."
             )
-    if of.session_lights:
-        grey = of.light.level
+    if explanation.session_lights:
+        grey = explanation.light.level
         name, nearest = min(
-            of.session_lights.items(),
+            explanation.session_lights.items(),
             key=lambda pair: abs(math.log((pair[1].level + 0.02) / (grey + 0.02))),
         )
-        ratio = (of.light.level + 0.02) / (nearest.level + 0.02)
+        ratio = (explanation.light.level + 0.02) / (nearest.level + 0.02)
         if ratio < _DARKER or ratio > _BRIGHTER:
             word = "darker" if ratio < 1.0 else "brighter"
             greys = f"mean grey {grey:.2f}; nearest is session {name} with {nearest.level:.2f}"
             yield f"It is {word} than any session of the map ({greys})."
 
 
-def _on_viewpoint(world_from_cam: Rigid3, localizer: Localizer) -> Iterator[str]:
+def _advice_on_viewpoint(world_from_cam: Rigid3, localizer: Localizer) -> Iterator[str]:
     """How far the pose is from what the map has seen."""
     nodes, d_thresh = localizer.map.node_poses, localizer.map.d_thresh
     ways = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
     cosines = nodes.rotations[:, :, 2] @ world_from_cam.rotation[:, 2]
-    near = ways < max(_FAR_NODES * d_thresh, float(ways.min()) * 1.5)
+    near = ways < max(_MAX_NODE_DISTANCE * d_thresh, float(ways.min()) * 1.5)
     turn = math.degrees(math.acos(min(1.0, float(cosines[near].max()))))
-    if float(ways.min()) > _FAR_NODES * d_thresh:
+    if float(ways.min()) > _MAX_NODE_DISTANCE * d_thresh:
         yield (
             f"It was taken {ways.min():.1f} m from the nearest node; nodes here are about"
             f" {d_thresh:.1f} m apart."
         )
-    if turn > _OFF_VIEW_DEG:
+    if turn > _MAX_VIEW_ANGLE_DEG:
         yield f"It looks {turn:.0f} degrees away from any view that the map holds there."

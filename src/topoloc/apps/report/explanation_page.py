@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.apps.report.explanation import Explanation, TriedPose
-from topoloc.apps.report.match_pictures import JPEG_QUALITY, NodeMatches, draw_pair
-from topoloc.apps.report.page_shell import page_text
+from topoloc.apps.report.explanation import EvaluatedPose, Explanation
+from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, draw_pair
+from topoloc.apps.report.page_template import render_page
 from topoloc.localization.result import Localization
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import write_text
 from topoloc.recordings.frame import Image
-from topoloc.recordings.pictures import jpeg_of
-from topoloc.retrieval.network_pictures import decode_picture
+from topoloc.recordings.image_io import encode_jpeg
+from topoloc.retrieval.network_images import decode_stored_image
 
-_POSES = (
+_POSES_TEXT = (
     "Of each first pose: points were sought where the map expects them, and weighed. Found counts"
     " those of all that must be in view."
 )
@@ -56,15 +56,15 @@ def explanation_page(
     )
     table = (
         '<div class="wide" tabindex="0" role="region" aria-label="What was'
-        f' tried">{_table(explanation)}</div>'
+        f' tried">{_render_table(explanation)}</div>'
     )
     sections = (
         '<section style="margin-top:-48px"><h2>What would'
         f" help</h2><ul>{advice}</ul></section><section><h2>What it was compared"
-        f" with</h2><p>{_shown_words(explanation)}</p>{_pairs(image, explanation, topomap)}</section><section><h2>What"  # noqa: E501
-        f" was tried</h2><p>{_POSES}</p>{table}</section>"
+        f" with</h2><p>{_shown_text(explanation)}</p>{_render_pairs(image, explanation, topomap)}</section><section><h2>What"  # noqa: E501
+        f" was tried</h2><p>{_POSES_TEXT}</p>{table}</section>"
     )
-    return page_text(title, verdict(explanation), sections)
+    return render_page(title, verdict(explanation), sections)
 
 
 def verdict(explanation: Explanation) -> str:
@@ -83,7 +83,7 @@ def verdict(explanation: Explanation) -> str:
     )
 
 
-def _ranked(explanation: Explanation) -> list[TriedPose]:
+def _rank_poses(explanation: Explanation) -> list[EvaluatedPose]:
     """The poses that are shown, the likeliest first, each node once."""
     with_pose = [
         pose for pose in explanation.poses if pose.fit.pose is not None and pose.fit.node_id >= 0
@@ -94,8 +94,8 @@ def _ranked(explanation: Explanation) -> list[TriedPose]:
     ]
 
 
-def _shown_words(explanation: Explanation) -> str:
-    if not _ranked(explanation):
+def _shown_text(explanation: Explanation) -> str:
+    if not _rank_poses(explanation):
         return (
             "No pose came of any part of the map; beside it stands the node that looks most"
             " like it."
@@ -103,25 +103,25 @@ def _shown_words(explanation: Explanation) -> str:
     return "Left the picture, right the node of the map. Lines join what the pose explains."
 
 
-def _pairs(image: Image, explanation: Explanation, topomap: TopoMetricMap) -> str:
-    articles = [_article(image, pose, topomap) for pose in _ranked(explanation)]
+def _render_pairs(image: Image, explanation: Explanation, topomap: TopoMetricMap) -> str:
+    articles = [_render_pose(image, pose, topomap) for pose in _rank_poses(explanation)]
     if not articles and explanation.result.candidates:
         node = topomap.nodes[topomap.row_of(explanation.result.candidates[0].node_id)]
-        pair = draw_pair(image, decode_picture(node.template_jpeg))
-        articles = [_figure(pair, f"left the picture, right node {node.summary.node_id}")]
+        pair = draw_pair(image, decode_stored_image(node.template_jpeg))
+        articles = [_render_figure(pair, f"left the picture, right node {node.summary.node_id}")]
     return '<div class="queries">' + "".join(articles) + "</div>"
 
 
-def compared_json(
+def compared_to_json(
     image: Image, explanation: Explanation, topomap: TopoMetricMap
 ) -> list[dict[str, Any]]:
     """The likeliest poses as the page shows them; rows of `matches` are a pixel of the picture and
     one of the node's camera."""
     compared = list[dict[str, Any]]()
-    for pose in _ranked(explanation):
+    for pose in _rank_poses(explanation):
         node, matches = (
             topomap.nodes[topomap.row_of(pose.fit.node_id)],
-            _matches_of(image, pose, topomap),
+            _find_explained_matches(image, pose, topomap),
         )
         pixels = np.column_stack([matches.points_query, matches.points_node]).round(1)[:MAX_MATCHES]
         facts = {
@@ -133,7 +133,9 @@ def compared_json(
     return compared
 
 
-def _matches_of(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> NodeMatches:
+def _find_explained_matches(
+    image: Image, pose: EvaluatedPose, topomap: TopoMetricMap
+) -> NodeMatches:
     """What the pose explains, as far as its node would see it."""
     node, fit = topomap.nodes[topomap.row_of(pose.fit.node_id)], pose.fit
     assert fit.pose is not None
@@ -154,14 +156,17 @@ def _matches_of(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> NodeMa
     )
 
 
-def _num_inliers(pose: TriedPose) -> int:
+def _num_inliers(pose: EvaluatedPose) -> int:
     return 0 if pose.fit.pose is None else int(pose.fit.pose.inliers.sum())
 
 
-def _article(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> str:
+def _render_pose(image: Image, pose: EvaluatedPose, topomap: TopoMetricMap) -> str:
     node = topomap.nodes[topomap.row_of(pose.fit.node_id)]
     pair = draw_pair(
-        image, decode_picture(node.template_jpeg), _matches_of(image, pose, topomap), node.camera
+        image,
+        decode_stored_image(node.template_jpeg),
+        _find_explained_matches(image, pose, topomap),
+        node.camera,
     )
     kind = "good" if pose.verdict == "the answer" else "bad"
     node_id = node.summary.node_id
@@ -169,18 +174,19 @@ def _article(image: Image, pose: TriedPose, topomap: TopoMetricMap) -> str:
         f'<div class="facts"><b>node {node_id}, {_num_inliers(pose)} inliers</b><p'
         f' class="{kind}">{escape(pose.verdict)}</p></div>'
     )
-    return f"<article>{_figure(pair, f'left the picture, right node {node_id}')}{facts}</article>"
+    figure = _render_figure(pair, f"left the image, right node {node_id}")
+    return f"<article>{figure}{facts}</article>"
 
 
-def _figure(pair: Image, caption: str) -> str:
-    data = base64.b64encode(jpeg_of(pair, JPEG_QUALITY)).decode("ascii")
+def _render_figure(pair: Image, caption: str) -> str:
+    data = base64.b64encode(encode_jpeg(pair, JPEG_QUALITY)).decode("ascii")
     return (
         f'<figure><img alt="{caption}"'
         f' src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'
     )
 
 
-def _table(explanation: Explanation) -> str:
+def _render_table(explanation: Explanation) -> str:
     head = "".join(f"<th>{name}</th>" for name in _COLUMNS)
     rows = [zip(_COLUMNS, row_of(pose), strict=True) for pose in explanation.poses]
     body = "".join(
@@ -192,7 +198,7 @@ def _table(explanation: Explanation) -> str:
     return f'<table class="tried folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 
-def row_of(pose: TriedPose) -> tuple[str, ...]:
+def row_of(pose: EvaluatedPose) -> tuple[str, ...]:
     """What `_COLUMNS` name, as text."""
     evidence = pose.tried.hypothesis.evidence if pose.tried.hypothesis is not None else None
     node = str(pose.fit.node_id) if pose.fit.node_id >= 0 else ""

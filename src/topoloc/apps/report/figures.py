@@ -27,16 +27,16 @@ from topoloc.apps.report.figure_style import (
     recording_colours,
     svg_text,
 )
-from topoloc.evaluation.metrics import Answer, by_recording
+from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording
 from topoloc.localization.result import NotLocalized
 
 STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp")
 
 
-def draw_error_curves(answers: Sequence[Answer]) -> tuple[str, str]:
+def draw_error_curves(answers: Sequence[EvaluatedQuery]) -> tuple[str, str]:
     """Which share of the queries with truth is within a given error, one line a recording:
     translation and rotation, a figure each."""
-    groups = by_recording([a for a in answers if a.world_from_cam is not None])
+    groups = group_by_recording([a for a in answers if a.world_from_cam is not None])
     everything = [a for group in groups.values() for a in group]
     metres = (
         max(
@@ -56,10 +56,10 @@ def draw_error_curves(answers: Sequence[Answer]) -> tuple[str, str]:
     )
 
 
-def draw_errors_along(answers: Sequence[Answer]) -> str:
+def draw_errors_along(answers: Sequence[EvaluatedQuery]) -> str:
     """The errors of query after query; those without a pose are marked at the top."""
     with_truth = [a for a in answers if a.world_from_cam is not None]
-    groups = by_recording(with_truth)
+    groups = group_by_recording(with_truth)
     colours = recording_colours(list(groups))
     numbers = np.arange(len(with_truth))
     lost = np.array([isinstance(a.result, NotLocalized) for a in with_truth])
@@ -67,8 +67,8 @@ def draw_errors_along(answers: Sequence[Answer]) -> str:
         figure = Figure(figsize=(9.0, 3.9), layout="constrained")
         panels = figure.subplots(2, 1, sharex=True)
         curves = (
-            ("translation", [a.translation_m for a in with_truth], _length),
-            ("rotation", [a.rotation_deg for a in with_truth], _angle),
+            ("translation", [a.translation_m for a in with_truth], _format_length),
+            ("rotation", [a.rotation_deg for a in with_truth], _format_angle),
         )
         for axes, (title, errors, label) in zip(panels, curves, strict=True):
             values = np.maximum(np.array(errors), 1e-5)
@@ -91,7 +91,7 @@ def draw_errors_along(answers: Sequence[Answer]) -> str:
                     markersize=4,
                     rasterized=len(numbers) > MAX_MARKS,
                 )
-            axes.set_ylim(*_decades(values))
+            axes.set_ylim(*_powers_of_ten(values))
             axes.yaxis.set_major_formatter(
                 FuncFormatter(lambda value, _, label=label: label(value))
             )
@@ -125,7 +125,7 @@ def draw_errors_along(answers: Sequence[Answer]) -> str:
         return svg_text(figure, "errors along the recordings")
 
 
-def draw_stage_times(answers: Sequence[Answer]) -> str:
+def draw_stage_times(answers: Sequence[EvaluatedQuery]) -> str:
     """Milliseconds of each stage: the median as a bar, a line up to what 95 % of the queries stay
     below."""
     names = {stage for a in answers for stage in a.result.times_ms}
@@ -225,7 +225,7 @@ def _draw_curve(
     )
 
 
-def _decades(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _powers_of_ten(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """Powers of ten around the finite values."""
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
@@ -234,11 +234,11 @@ def _decades(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     return float(10.0**low), float(10.0 ** max(high, low + 1))
 
 
-def _length(metres: float) -> str:
+def _format_length(metres: float) -> str:
     if metres < 0.01:
         return f"{1e3 * metres:g} mm"
     return f"{100 * metres:g} cm" if metres < 1.0 else f"{metres:g} m"
 
 
-def _angle(degrees: float) -> str:
+def _format_angle(degrees: float) -> str:
     return f"{degrees:g}°"

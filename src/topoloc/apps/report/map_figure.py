@@ -22,7 +22,7 @@ from topoloc.apps.report.figure_style import (
     recording_colours,
     svg_text,
 )
-from topoloc.evaluation.metrics import Answer, by_recording
+from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -32,7 +32,7 @@ MIN_ASPECT, MAX_ASPECT = 0.3, 0.8
 GAP_STEPS = 6.0
 
 
-def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
+def draw_map(answers: Sequence[EvaluatedQuery], topomap: TopoMetricMap) -> str:
     """The map from above, its longer side across: nodes, true paths and estimated positions, a line
     from one to the other.
 
@@ -43,13 +43,13 @@ def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
     truths = [a.world_from_cam.translation for a in with_truth if a.world_from_cam is not None]
     known = np.concatenate([centres, np.array(truths).reshape(-1, 3)])
-    across, up, is_mirrored = horizontal_axes(
+    across, up, is_mirrored = find_horizontal_axes(
         known, np.array([s.world_from_cam.rotation[:, 1] for s in topomap.summaries])
     )
     axes_idx = [across, up]
-    low, high = frame_around(known[:, axes_idx])
+    low, high = compute_plot_limits(known[:, axes_idx])
     width, height = high - low
-    groups = by_recording(with_truth)
+    groups = group_by_recording(with_truth)
     colours = recording_colours(list(groups))
     with matplotlib.rc_context(STYLE):
         figure = Figure(
@@ -61,7 +61,7 @@ def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
         for name, group in groups.items():
             _draw_recording(axes, group, axes_idx, colours[name])
         _draw_errors(axes, with_truth, axes_idx)
-        num_outside = _draw_false(axes, answers, axes_idx, low, high)
+        num_outside = _draw_false_accepts(axes, answers, axes_idx, low, high)
         axes.set(
             xlim=(low[0], high[0]),
             ylim=(low[1], high[1]),
@@ -78,7 +78,7 @@ def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
                 color=BAD,
             )
         figure.legend(
-            handles=_legend(answers, colours),
+            handles=_draw_legend(answers, colours),
             loc="outside lower center",
             ncols=5,
             handletextpad=0.5,
@@ -87,7 +87,7 @@ def draw_map(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
         return svg_text(figure, "map from above")
 
 
-def horizontal_axes(
+def find_horizontal_axes(
     points: Float[np.ndarray, "n 3"], downs: Float[np.ndarray, "m 3"]
 ) -> tuple[int, int, bool]:
     """The world's axes to draw across and up, and whether the latter must point down so that the
@@ -106,7 +106,7 @@ def horizontal_axes(
     return across, up, bool(towards_viewer @ down > 0)
 
 
-def frame_around(
+def compute_plot_limits(
     points: Float[np.ndarray, "n 2"],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """(low, high) corners around all points, with a margin, neither very flat nor very high."""
@@ -138,7 +138,7 @@ def _draw_nodes(axes: Axes, topomap: TopoMetricMap, axes_idx: list[int], span: f
 
 
 def _draw_recording(
-    axes: Axes, answers: Sequence[Answer], axes_idx: list[int], colour: str
+    axes: Axes, answers: Sequence[EvaluatedQuery], axes_idx: list[int], colour: str
 ) -> None:
     """The true path as a line with a ring at each query, estimated positions as dots, diamonds
     where there is no estimate."""
@@ -146,7 +146,9 @@ def _draw_recording(
     truths = np.array(
         [a.world_from_cam.translation[axes_idx] for a in answers if a.world_from_cam is not None]
     )
-    axes.plot(*_with_gaps(truths).T, "-", color=colour, linewidth=1.0, alpha=0.45, rasterized=many)
+    axes.plot(
+        *_insert_gaps(truths).T, "-", color=colour, linewidth=1.0, alpha=0.45, rasterized=many
+    )
     axes.plot(
         *truths.T,
         "o",
@@ -177,7 +179,7 @@ def _draw_recording(
         )
 
 
-def _legend(answers: Sequence[Answer], colours: dict[str, str]) -> list[Line2D]:
+def _draw_legend(answers: Sequence[EvaluatedQuery], colours: dict[str, str]) -> list[Line2D]:
     """Recordings by colour, where there are several; marks by shape."""
     names = colours if len(colours) > 1 else {}
     handles = [
@@ -235,7 +237,7 @@ def _legend(answers: Sequence[Answer], colours: dict[str, str]) -> list[Line2D]:
     return handles
 
 
-def _with_gaps(path: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+def _insert_gaps(path: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """The path with a row of NaN wherever the next position is far off: no line is drawn there."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     if len(steps) == 0:
@@ -244,7 +246,7 @@ def _with_gaps(path: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     return np.insert(path, gaps + 1, np.nan, axis=0)
 
 
-def _draw_errors(axes: Axes, answers: Sequence[Answer], axes_idx: list[int]) -> None:
+def _draw_errors(axes: Axes, answers: Sequence[EvaluatedQuery], axes_idx: list[int]) -> None:
     pairs = [
         (a.world_from_cam.translation[axes_idx], a.result.world_from_cam.translation[axes_idx])
         for a in answers
@@ -257,9 +259,9 @@ def _draw_errors(axes: Axes, answers: Sequence[Answer], axes_idx: list[int]) -> 
         )
 
 
-def _draw_false(
+def _draw_false_accepts(
     axes: Axes,
-    answers: Sequence[Answer],
+    answers: Sequence[EvaluatedQuery],
     axes_idx: list[int],
     low: Float[np.ndarray, "2"],
     high: Float[np.ndarray, "2"],

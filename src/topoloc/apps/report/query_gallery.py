@@ -9,47 +9,51 @@ from html import escape
 
 import numpy as np
 
-from topoloc.apps.report.match_pictures import JPEG_QUALITY, NodeMatches, draw_pair, match_with_node
+from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, draw_pair, match_with_node
 from topoloc.errors import UnreadableImageError
 from topoloc.evaluation.metrics import (
     MAX_ROTATION_DEG,
     MAX_TRANSLATION,
-    Answer,
-    by_recording,
-    length_text,
+    EvaluatedQuery,
+    format_length,
+    group_by_recording,
 )
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.recordings.frame import Image
-from topoloc.recordings.pictures import jpeg_of
-from topoloc.retrieval.network_pictures import decode_picture
+from topoloc.recordings.image_io import encode_jpeg
+from topoloc.retrieval.network_images import decode_stored_image
 
 NUM_WORST = 6
 
 
-def worst_queries(answers: Sequence[Answer], count: int = NUM_WORST) -> list[Answer]:
+def select_worst_queries(
+    answers: Sequence[EvaluatedQuery], count: int = NUM_WORST
+) -> list[EvaluatedQuery]:
     """False accepts first, then queries without a pose that should have one, then the largest
     errors.
 
     Where there are several recordings each gets its share of the places, so that a hard one does
     not hide the others.
     """
-    groups = by_recording([a for a in answers if a.world_from_cam is not None or a.is_false_accept])
+    groups = group_by_recording(
+        [a for a in answers if a.world_from_cam is not None or a.is_false_accept]
+    )
     share = max(count // max(len(groups), 1), 1)
     ranked = [
         (rank, answer)
         for group in groups.values()
-        for rank, answer in enumerate(sorted(group, key=_badness, reverse=True))
+        for rank, answer in enumerate(sorted(group, key=_error_rank, reverse=True))
     ]
-    ranked.sort(key=lambda entry: (entry[0] < share, _badness(entry[1])), reverse=True)
-    return sorted((answer for _, answer in ranked[:count]), key=_badness, reverse=True)
+    ranked.sort(key=lambda entry: (entry[0] < share, _error_rank(entry[1])), reverse=True)
+    return sorted((answer for _, answer in ranked[:count]), key=_error_rank, reverse=True)
 
 
-def typical_queries(answers: Sequence[Answer]) -> list[Answer]:
+def select_typical_queries(answers: Sequence[EvaluatedQuery]) -> list[EvaluatedQuery]:
     """Of each recording the query with the median error; the middle one where none was
     localized."""
     typical = []
-    for group in by_recording(answers).values():
+    for group in group_by_recording(answers).values():
         localized = sorted(
             (a for a in group if np.isfinite(a.translation_m)), key=lambda a: a.translation_m
         )
@@ -58,17 +62,17 @@ def typical_queries(answers: Sequence[Answer]) -> list[Answer]:
     return typical
 
 
-def gallery(answers: Sequence[Answer], topomap: TopoMetricMap) -> str:
+def render_gallery(answers: Sequence[EvaluatedQuery], topomap: TopoMetricMap) -> str:
     """HTML of these queries, each with its picture, its node's, the matches between them, and what
     came of it."""
     return (
         '<div class="queries">'
-        + "".join(_article(answer, topomap) for answer in answers)
+        + "".join(_render_query(answer, topomap) for answer in answers)
         + "</div>"
     )
 
 
-def _badness(answer: Answer) -> tuple[int, float]:
+def _error_rank(answer: EvaluatedQuery) -> tuple[int, float]:
     if answer.world_from_cam is None:
         return 2 * answer.is_false_accept, 0.0
     if isinstance(answer.result, NotLocalized):
@@ -78,16 +82,16 @@ def _badness(answer: Answer) -> tuple[int, float]:
     )
 
 
-def _article(answer: Answer, topomap: TopoMetricMap) -> str:
+def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> str:
     result = answer.result
-    node_id = _node_to_show(answer)
+    node_id = _select_node(answer)
     node = None if node_id is None else topomap.nodes[topomap.row_of(node_id)]
     evidence = f"{result.num_inliers} inliers of {result.num_matches} matches"
     if isinstance(result, Localization):
         sigma = float(np.sqrt(max(np.trace(result.camera_covariance[:3, :3]), 0.0)))
         evidence += (
             f", probability {result.probability:.2f}, its own standard deviation"
-            f" {length_text(sigma)}"
+            f" {format_length(sigma)}"
         )
     if answer.nearest_node_id is not None and answer.nearest_node_id != node_id:
         evidence += f"; nearest to the truth is node {answer.nearest_node_id}"
@@ -98,12 +102,12 @@ def _article(answer: Answer, topomap: TopoMetricMap) -> str:
     )
     title = escape(f"{answer.recording}/{answer.query}" if answer.recording else answer.query)
     return (
-        f'<article>{_pictures(answer, node, topomap)}<div class="facts"><b>{title}</b>'
-        f'<p class="{kind}">{_verdict(answer)}</p><p>{evidence}</p></div></article>'
+        f'<article>{_render_images(answer, node, topomap)}<div class="facts"><b>{title}</b>'
+        f'<p class="{kind}">{_describe_result(answer)}</p><p>{evidence}</p></div></article>'
     )
 
 
-def _node_to_show(answer: Answer) -> int | None:
+def _select_node(answer: EvaluatedQuery) -> int | None:
     """The node that the pose comes from; without a pose, the one that the picture should have been
     matched with."""
     if isinstance(answer.result, Localization):
@@ -113,7 +117,7 @@ def _node_to_show(answer: Answer) -> int | None:
     return answer.result.candidates[0].node_id if answer.result.candidates else None
 
 
-def _verdict(answer: Answer) -> str:
+def _describe_result(answer: EvaluatedQuery) -> str:
     if isinstance(answer.result, NotLocalized):
         reason = answer.result.reason.replace("_", " ")
         return (
@@ -123,12 +127,12 @@ def _verdict(answer: Answer) -> str:
         )
     if answer.world_from_cam is None:
         return "false accept: this image was not taken here"
-    error = f"{length_text(answer.translation_m)}, {answer.rotation_deg:.2f}°"
+    error = f"{format_length(answer.translation_m)}, {answer.rotation_deg:.2f}°"
     return f"false accept: off by {error}" if answer.is_false_accept else f"off by {error}"
 
 
-def _pictures(answer: Answer, node: TopoNode | None, topomap: TopoMetricMap) -> str:
-    image = _query_image(answer)
+def _render_images(answer: EvaluatedQuery, node: TopoNode | None, topomap: TopoMetricMap) -> str:
+    image = _load_query_image(answer)
     if image is None:
         shown, caption = (
             node.template_jpeg if node else None,
@@ -136,23 +140,23 @@ def _pictures(answer: Answer, node: TopoNode | None, topomap: TopoMetricMap) -> 
         )
     elif node is None:
         shown, caption = (
-            jpeg_of(draw_pair(image, None), JPEG_QUALITY),
+            encode_jpeg(draw_pair(image, None), JPEG_QUALITY),
             "query; no node to compare it with",
         )
     else:
         pair = draw_pair(
             image,
-            decode_picture(node.template_jpeg),
-            _matches(answer, image, node, topomap),
+            decode_stored_image(node.template_jpeg),
+            _find_matches(answer, image, node, topomap),
             node.camera,
         )
-        shown = jpeg_of(pair, JPEG_QUALITY)
+        shown = encode_jpeg(pair, JPEG_QUALITY)
         caption = f"left the query, right node {node.summary.node_id}"
-    return f"<figure>{_img(shown, caption)}<figcaption>{caption}</figcaption></figure>"
+    return f"<figure>{_img_tag(shown, caption)}<figcaption>{caption}</figcaption></figure>"
 
 
-def _matches(
-    answer: Answer, image: Image, node: TopoNode, topomap: TopoMetricMap
+def _find_matches(
+    answer: EvaluatedQuery, image: Image, node: TopoNode, topomap: TopoMetricMap
 ) -> NodeMatches | None:
     """Matches to draw; None where the node has no points or the camera is not known."""
     if answer.camera is None or node.summary.num_points == 0:
@@ -160,7 +164,7 @@ def _matches(
     return match_with_node(answer, image, answer.camera, node, topomap.config.features)
 
 
-def _query_image(answer: Answer) -> Image | None:
+def _load_query_image(answer: EvaluatedQuery) -> Image | None:
     """The query's picture, read again; None where it cannot be had any more."""
     try:
         return answer.read_image() if answer.read_image else None
@@ -168,10 +172,10 @@ def _query_image(answer: Answer) -> Image | None:
         return None
 
 
-def _img(jpeg: bytes | None, words: str) -> str:
+def _img_tag(jpeg: bytes | None, alt_text: str) -> str:
     if jpeg is None:
         return ""
     return (
         f'<img loading="lazy" src="data:image/jpeg;base64,{base64.b64encode(jpeg).decode("ascii")}"'
-        f' alt="{escape(words)}">'
+        f' alt="{escape(alt_text)}">'
     )

@@ -11,22 +11,26 @@ from typing import Any
 
 from topoloc.apps.report.figures import draw_error_curves, draw_errors_along, draw_stage_times
 from topoloc.apps.report.map_figure import draw_map
-from topoloc.apps.report.page_shell import page_text
-from topoloc.apps.report.query_gallery import gallery, typical_queries, worst_queries
-from topoloc.apps.report.report_tables import (
-    ReportWords,
-    cards,
-    numbers_tables,
-    recordings_table,
-    what_counts,
+from topoloc.apps.report.page_template import render_page
+from topoloc.apps.report.query_gallery import (
+    render_gallery,
+    select_typical_queries,
+    select_worst_queries,
 )
-from topoloc.apps.viewer.document import ResultSet, SceneBudget, document_of
+from topoloc.apps.report.report_tables import (
+    ReportTexts,
+    explain_shares,
+    render_headline_cards,
+    render_number_tables,
+    render_recordings_table,
+)
+from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
 from topoloc.apps.viewer.page import embedded_head, embedded_scene
-from topoloc.evaluation.metrics import Answer, by_recording
+from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import write_text
 
-_SCENE_BUDGET = SceneBudget(max_points=60_000, max_picture_bytes=1_500_000)
+_SCENE_BUDGET = SceneBudget(max_points=60_000, max_image_bytes=1_500_000)
 _SCENE = (
     "Turn it by mouse, finger or arrow keys. Each recording's pictures stand where they were found;"
     " of one that is chosen the ellipsoid holds its position in 95 of 100 cases, and what is dashed"
@@ -60,9 +64,9 @@ _TIMES = (
 def write_report(
     path: Path,
     evaluation: dict[str, Any],
-    answers: list[Answer],
+    answers: list[EvaluatedQuery],
     topomap: TopoMetricMap,
-    words: ReportWords | None = None,
+    texts: ReportTexts | None = None,
 ) -> None:
     """Write the page, at once or not at all; the same answers give the same bytes.
 
@@ -73,52 +77,70 @@ def write_report(
     Raises:
         TopolocError: the file cannot be written.
     """
-    write_text(path, _page(evaluation, answers, topomap, words or ReportWords()))
+    write_text(path, _render_page(evaluation, answers, topomap, texts or ReportTexts()))
 
 
-def _page(
-    evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMetricMap, words: ReportWords
+def _render_page(
+    evaluation: dict[str, Any],
+    answers: list[EvaluatedQuery],
+    topomap: TopoMetricMap,
+    texts: ReportTexts,
 ) -> str:
     recordings = (
         ", ".join(row["name"] for row in evaluation["recordings"] if row["name"]) or "no recordings"
     )
-    title = words.title or f"Localization in {Path(evaluation['map']['path']).name}"
-    body = "\n".join([cards(evaluation), *_sections(evaluation, answers, topomap, words)])
-    return page_text(title, words.subtitle or f"Asked about: {recordings}", body, embedded_head())
+    title = texts.title or f"Localization in {Path(evaluation['map']['path']).name}"
+    body = "\n".join(
+        [render_headline_cards(evaluation), *_render_sections(evaluation, answers, topomap, texts)]
+    )
+    return render_page(title, texts.subtitle or f"Asked about: {recordings}", body, embedded_head())
 
 
-def _sections(
-    evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMetricMap, words: ReportWords
+def _render_sections(
+    evaluation: dict[str, Any],
+    answers: list[EvaluatedQuery],
+    topomap: TopoMetricMap,
+    texts: ReportTexts,
 ) -> Iterator[str]:
     paragraphs = "".join(
-        f'<p class="lead">{escape(paragraph)}</p>' for paragraph in words.paragraphs
+        f'<p class="lead">{escape(paragraph)}</p>' for paragraph in texts.paragraphs
     )
-    yield _section(
-        "Results", what_counts(evaluation), recordings_table(evaluation, words) + paragraphs
+    yield _render_section(
+        "Results",
+        explain_shares(evaluation),
+        render_recordings_table(evaluation, texts) + paragraphs,
     )
-    yield _section("The place", _SCENE, embedded_scene(_document(evaluation, answers, topomap)))
-    yield _section("The map from above", _MAP, _wide(draw_map(answers, topomap)))
+    yield _render_section(
+        "The place", _SCENE, embedded_scene(_scene_document(evaluation, answers, topomap))
+    )
+    yield _render_section("The map from above", _MAP, _scrollable(draw_map(answers, topomap)))
     if evaluation["num_localized"]:
-        yield _section(
+        yield _render_section(
             "How large are the errors?",
             _CURVES,
             f'<div class="halves">{"".join(draw_error_curves(answers))}</div>',
         )
     if len(evaluation["recordings"]) > 1:
-        yield _section(
-            "What the queries look like", _TYPICAL, gallery(typical_queries(answers), topomap)
+        yield _render_section(
+            "What the queries look like",
+            _TYPICAL,
+            render_gallery(select_typical_queries(answers), topomap),
         )
-    worst = worst_queries(answers)
-    yield _section(
+    worst = select_worst_queries(answers)
+    yield _render_section(
         "The worst queries",
         _WORST if worst else _NO_WORST,
-        gallery(worst, topomap) if worst else "",
+        render_gallery(worst, topomap) if worst else "",
     )
     if evaluation["num_queries"]:
-        yield _section("Where do errors occur?", _ALONG, _wide(draw_errors_along(answers)))
+        yield _render_section(
+            "Where do errors occur?", _ALONG, _scrollable(draw_errors_along(answers))
+        )
     if evaluation["median_times_ms"]:
-        yield _section("Where does the time go?", _TIMES, _wide(draw_stage_times(answers)))
-    yield _section("All the numbers", "", numbers_tables(evaluation))
+        yield _render_section(
+            "Where does the time go?", _TIMES, _scrollable(draw_stage_times(answers))
+        )
+    yield _render_section("All the numbers", "", render_number_tables(evaluation))
     config = escape(json.dumps(evaluation["map"]["config"], indent=1, sort_keys=True))
     yield (
         "<section><details><summary>The configuration that the map was built"
@@ -126,18 +148,18 @@ def _sections(
     )
 
 
-def _document(
-    evaluation: dict[str, Any], answers: list[Answer], topomap: TopoMetricMap
+def _scene_document(
+    evaluation: dict[str, Any], answers: list[EvaluatedQuery], topomap: TopoMetricMap
 ) -> dict[str, Any]:
     """The map, and the answers of each recording."""
     sets = [
         ResultSet(name or "queries", [answer.to_json() for answer in group])
-        for name, group in by_recording(answers).items()
+        for name, group in group_by_recording(answers).items()
     ]
-    return document_of(topomap, Path(evaluation["map"]["path"]).name, sets, _SCENE_BUDGET)
+    return create_document(topomap, Path(evaluation["map"]["path"]).name, sets, _SCENE_BUDGET)
 
 
-def _section(title: str, explanation: str, content: str) -> str:
+def _render_section(title: str, explanation: str, content: str) -> str:
     return (
         f"<section><h2>{title}</h2>"
         + (f"<p>{explanation}</p>" if explanation else "")
@@ -145,6 +167,6 @@ def _section(title: str, explanation: str, content: str) -> str:
     )
 
 
-def _wide(figure: str) -> str:
+def _scrollable(figure: str) -> str:
     """A figure that is scrolled, not shrunk beyond reading, on a narrow screen."""
     return f'<div class="wide">{figure}</div>'

@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 from topoloc.apps.report.figure_style import recording_colours
-from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, length_text
+from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, format_length
 
 _COLUMNS = ("localized", "median error", "in 5 cm, 5°", "in 25 cm, 2°", "false accepts", "ms")
 
@@ -24,7 +24,7 @@ class PublishedResult:
 
 
 @dataclass(frozen=True)
-class ReportWords:
+class ReportTexts:
     """What a page says beside its numbers.
 
     `about` says of recordings what they are. `paragraphs` stand between the headline numbers and
@@ -38,7 +38,7 @@ class ReportWords:
     published: Sequence[PublishedResult] = ()
 
 
-def cards(evaluation: dict[str, Any]) -> str:
+def render_headline_cards(evaluation: dict[str, Any]) -> str:
     """The headline: of the first recording with truth where there are several, since a mean over
     easy and hard ones says nothing."""
     rows = [row for row in evaluation["recordings"] if row["num_queries"]]
@@ -55,7 +55,7 @@ def cards(evaluation: dict[str, Any]) -> str:
             )
         )
     if e["num_localized"]:
-        shown.append(("", length_text(e["median_translation_m"]), f"median position error{of}"))
+        shown.append(("", format_length(e["median_translation_m"]), f"median position error{of}"))
         shown.append(("", f"{e['median_rotation_deg']:.2f}°", f"median rotation error{of}"))
     if len(rows) > 1:
         hardest = min(rows[1:], key=lambda row: row["num_localized"] / row["num_queries"])
@@ -87,25 +87,25 @@ def cards(evaluation: dict[str, Any]) -> str:
     return f'<div class="cards">{inner}</div>'
 
 
-def recordings_table(evaluation: dict[str, Any], words: ReportWords) -> str:
+def render_recordings_table(evaluation: dict[str, Any], texts: ReportTexts) -> str:
     """A row for each recording, and below them what others published."""
     names = [row["name"] for row in evaluation["recordings"] if row["num_queries"]]
     colours = recording_colours(names)
     head = "".join(f"<th>{column}</th>" for column in ("recording", *_COLUMNS))
     body = "".join(
-        _recording_row(row, colours, words.about.get(row["name"], ""))
+        _render_recording_row(row, colours, texts.about.get(row["name"], ""))
         for row in evaluation["recordings"]
     )
-    for other in words.published:
-        median = f"{length_text(other.median_translation_m)}, {other.median_rotation_deg:.2f}°"
-        body += f'<tr class="published"><td>{escape(other.name)}</td>{_cells(["", median, "", "", "", ""])}</tr>'  # noqa: E501
+    for other in texts.published:
+        median = f"{format_length(other.median_translation_m)}, {other.median_rotation_deg:.2f}°"
+        body += f'<tr class="published"><td>{escape(other.name)}</td>{_render_cells(["", median, "", "", "", ""])}</tr>'  # noqa: E501
     return (
         '<div class="wide"><table class="recordings'
         f' folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     )
 
 
-def numbers_tables(evaluation: dict[str, Any]) -> str:
+def render_number_tables(evaluation: dict[str, Any]) -> str:
     """All of the evaluation in two columns: the queries, the map."""
     e, m = evaluation, evaluation["map"]
     rows = (
@@ -118,7 +118,7 @@ def numbers_tables(evaluation: dict[str, Any]) -> str:
             metres, degrees = name.removesuffix("deg").split("m_")
             rows.append(
                 (
-                    f"Within {length_text(float(metres), digits=0)} and {degrees}°",
+                    f"Within {format_length(float(metres), digits=0)} and {degrees}°",
                     f"{100 * share:.1f} % of all queries",
                 )
             )
@@ -144,10 +144,10 @@ def numbers_tables(evaluation: dict[str, Any]) -> str:
         if "total" in e["median_times_ms"]
         else []
     )
-    return f'<div class="columns">{_facts(rows)}{_facts(about_map)}</div>'
+    return f'<div class="columns">{_render_facts(rows)}{_render_facts(about_map)}</div>'
 
 
-def what_counts(evaluation: dict[str, Any]) -> str:
+def explain_shares(evaluation: dict[str, Any]) -> str:
     """One sentence or two on how the shares are to be read."""
     false = (
         "A false accept is a pose for an image from elsewhere, or one off by more than"
@@ -160,7 +160,7 @@ def what_counts(evaluation: dict[str, Any]) -> str:
     )
 
 
-def _recording_row(row: dict[str, Any], colours: Mapping[str, str], about: str) -> str:
+def _render_recording_row(row: dict[str, Any], colours: Mapping[str, str], about: str) -> str:
     about = about or (
         "images from elsewhere" if row["num_elsewhere"] and not row["num_queries"] else ""
     )
@@ -180,15 +180,17 @@ def _recording_row(row: dict[str, Any], colours: Mapping[str, str], about: str) 
             f"{100 * row['recall'][key]:.0f} %" for key in ("0.05m_5deg", "0.25m_2deg")
         )
     if row["num_localized"]:
-        cells[1] = f"{length_text(row['median_translation_m'])}, {row['median_rotation_deg']:.2f}°"
+        cells[1] = (
+            f"{format_length(row['median_translation_m'])}, {row['median_rotation_deg']:.2f}°"
+        )
     cells.append(f'<span class="{"bad" if false else "good"}">{false}</span> of {num_asked}')
     cells.append(
         f"{row['median_times_ms']['total']:.0f}" if "total" in row["median_times_ms"] else ""
     )
-    return f"<tr><td>{mark}{name}</td>{_cells(cells)}</tr>"
+    return f"<tr><td>{mark}{name}</td>{_render_cells(cells)}</tr>"
 
 
-def _cells(cells: Sequence[str]) -> str:
+def _render_cells(cells: Sequence[str]) -> str:
     """With their columns' names, which stand beside them where the screen is too narrow for
     columns."""
     return "".join(
@@ -197,7 +199,7 @@ def _cells(cells: Sequence[str]) -> str:
     )
 
 
-def _facts(rows: list[tuple[str, str]]) -> str:
+def _render_facts(rows: list[tuple[str, str]]) -> str:
     return (
         "<table>"
         + "".join(

@@ -14,22 +14,22 @@ from fastapi.responses import JSONResponse, Response
 
 import topoloc
 from topoloc.apps.service import geopose_routes, map_routes, page_routes, stream_routes
-from topoloc.apps.service.answers import Answerer
+from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.apps.service.guard import App, Door, Guard
-from topoloc.apps.service.housekeeping import keep_house
 from topoloc.apps.service.logs import log
+from topoloc.apps.service.maintenance import run_maintenance
 from topoloc.apps.service.metrics import Metrics
-from topoloc.apps.service.refusals import Refusal
+from topoloc.apps.service.query_handler import QueryHandler
+from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.served_atlases import ServedAtlases
 from topoloc.apps.service.state import Service
 from topoloc.apps.service.streams import Streams
 from topoloc.apps.service.workers import Workers
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.map_cache import MapCache
 from topoloc.tracking.tracker import TrackerConfig
 
-_ABOUT = """Where was this picture taken? Pictures become 6-DoF poses in maps that `topoloc build` made.
+_DESCRIPTION = """Where was this picture taken? Pictures become 6-DoF poses in maps that `topoloc build` made.
 
 A picture that cannot be localized is an answer (200, `"localized": false` and why); requests that make no sense are refused in one
 sentence."""  # noqa: E501
@@ -43,31 +43,31 @@ class Access:
     loopback_only: bool = True
 
 
-def make_application(
-    maps: Maps,
+def create_application(
+    maps: MapCache,
     config: ServiceConfig,
     access: Access,
     tracking: TrackerConfig | None = None,
-    asked: AtlasConfig | None = None,
+    atlas_config: AtlasConfig | None = None,
 ) -> App:
-    """The application; its maps are closed when it ends. `asked` says how the tiles of its atlases
-    are asked."""
+    """The application; its maps are closed when it ends. `atlas_config` says how the tiles of its
+    atlases are asked."""
     metrics = Metrics()
-    atlases = ServedAtlases(maps, asked or AtlasConfig())
-    answerer = Answerer(maps, config.max_pixels, 1e3 * config.answer_s, atlases)
+    atlases = ServedAtlases(maps, atlas_config or AtlasConfig())
+    query_handler = QueryHandler(maps, config.max_pixels, 1e3 * config.answer_s, atlases)
     streams = Streams(
-        maps, answerer, tracking or TrackerConfig(), config.max_sessions, config.session_idle_s
+        maps, query_handler, tracking or TrackerConfig(), config.max_sessions, config.session_idle_s
     )
     service = Service(
-        maps, answerer, Workers(config.num_workers, config.max_queue), config, metrics, streams
+        maps, query_handler, Workers(config.num_workers, config.max_queue), config, metrics, streams
     )
-    _watch(service)
+    _start_watching(service)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         log("ready", maps=maps.names(), workers=config.num_workers)
         atlases.watch()
-        house = asyncio.create_task(keep_house(streams))
+        house = asyncio.create_task(run_maintenance(streams))
         yield
         house.cancel()
         await service.close()
@@ -76,7 +76,7 @@ def make_application(
     app = FastAPI(
         title="topoloc",
         version=topoloc.__version__,
-        description=_ABOUT,
+        description=_DESCRIPTION,
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
@@ -84,18 +84,18 @@ def make_application(
     app.state.service = service
     for routes in (map_routes, geopose_routes, stream_routes, page_routes):
         app.include_router(routes.router)
-    for kind in (Refusal, HTTPException, RequestValidationError):
-        app.add_exception_handler(kind, _refused)
-    app.add_exception_handler(404, _refused)
-    app.add_exception_handler(405, _refused)
-    return Guard(
+    for kind in (RequestError, HTTPException, RequestValidationError):
+        app.add_exception_handler(kind, _error_response)
+    app.add_exception_handler(404, _error_response)
+    app.add_exception_handler(405, _error_response)
+    return AccessMiddleware(
         app,
-        Door(access.token, access.loopback_only, config.max_upload_bytes, config.upload_s),
+        RequestLimits(access.token, access.loopback_only, config.max_upload_bytes, config.upload_s),
         metrics,
     )
 
 
-def _watch(service: Service) -> None:
+def _start_watching(service: Service) -> None:
     gauge = service.metrics.gauge
     gauge(
         "topoloc_jobs",
@@ -111,10 +111,10 @@ def _watch(service: Service) -> None:
     )
 
 
-async def _refused(request: Request, error: Exception) -> Response:
+async def _error_response(request: Request, error: Exception) -> Response:
     """The one form of every refusal."""
     status, text, headers = 500, str(error), dict[str, str]()
-    if isinstance(error, Refusal):
+    if isinstance(error, RequestError):
         status, text, headers = error.status, error.text, error.headers
     elif isinstance(error, RequestValidationError):
         first: dict[str, Any] = dict(error.errors()[0])

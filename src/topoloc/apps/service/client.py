@@ -18,14 +18,14 @@ from topoloc.localization.result import Localization, NotLocalized, result_from_
 if TYPE_CHECKING:
     import httpx
 
-Picture = str | Path | bytes | np.ndarray
-CameraName = Camera | str | None
+ImageInput = str | Path | bytes | np.ndarray
+CameraSpec = Camera | str | None
 """A camera, or what the service calls one: `map`, `unknown`, `exif`, `fx,fy,cx,cy`."""
-_MAX_TRIES, _LONGEST_WAIT_S = 5, 10.0
+_MAX_TRIES, _MAX_WAIT_S = 5, 10.0
 
 
 @dataclass(frozen=True)
-class _Asking:
+class _ClientRequest:
     """One request, whoever sends it."""
 
     method: str
@@ -53,7 +53,7 @@ class Client:
     """
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 60.0) -> None:
-        self._http = _httpx().Client(**_options(url, token, timeout_s))
+        self._http = _import_httpx().Client(**_client_options(url, token, timeout_s))
 
     def __enter__(self) -> Client:
         return self
@@ -66,18 +66,18 @@ class Client:
 
     def maps(self) -> list[str]:
         """The names of its maps. Raises ServiceError."""
-        return self._answer(_Asking("GET", "/v1/maps"))["maps"]
+        return self._send_request(_ClientRequest("GET", "/v1/maps"))["maps"]
 
     def map(self, name: str) -> dict[str, Any]:
         """What a map holds, as `topoloc info --json` says it, with its nodes. Raises
         ServiceError."""
-        return self._answer(_Asking("GET", f"/v1/maps/{_quoted(name)}"))
+        return self._send_request(_ClientRequest("GET", f"/v1/maps/{_quote_name(name)}"))
 
     def localize(
         self,
         map: str,
-        image: Picture,
-        camera: CameraName = None,
+        image: ImageInput,
+        camera: CameraSpec = None,
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
     ) -> Localization | NotLocalized:
@@ -93,33 +93,35 @@ class Client:
             ServiceError: the service does not answer, or refuses; its text says why.
         """
         return result_from_json(
-            self._answer(
-                _localizing(f"/v1/maps/{_quoted(map)}/localize", image, camera, prior, max_ms)
+            self._send_request(
+                _localize_request(
+                    f"/v1/maps/{_quote_name(map)}/localize", image, camera, prior, max_ms
+                )
             )
         )
 
     def localize_everywhere(
-        self, image: Picture, camera: CameraName = None, max_ms: float | None = None
+        self, image: ImageInput, camera: CameraSpec = None, max_ms: float | None = None
     ) -> dict[str, Any]:
         """By all maps of the service: `{"map": ..., "answers": [{"map": ..., "result": ...}]}`.
         Raises ServiceError."""
-        return self._answer(_localizing("/v1/localize", image, camera, None, max_ms))
+        return self._send_request(_localize_request("/v1/localize", image, camera, None, max_ms))
 
-    def explain(self, map: str, image: Picture, camera: CameraName = None) -> dict[str, Any]:
+    def explain(self, map: str, image: ImageInput, camera: CameraSpec = None) -> dict[str, Any]:
         """Why the picture gets its answer, as `topoloc explain --json`. Raises ServiceError."""
-        return self._answer(
-            _localizing(f"/v1/maps/{_quoted(map)}/explain", image, camera, None, None)
+        return self._send_request(
+            _localize_request(f"/v1/maps/{_quote_name(map)}/explain", image, camera, None, None)
         )
 
-    def _answer(self, asking: _Asking) -> Any:
+    def _send_request(self, request: _ClientRequest) -> Any:
         for tries_left in reversed(range(_MAX_TRIES)):
             try:
-                response = self._http.request(asking.method, asking.path, **asking.options())
-            except _httpx().HTTPError as error:
-                raise _unanswered(self._http, error) from error
-            wait_s = _wait_s(response) if tries_left else None
+                response = self._http.request(request.method, request.path, **request.options())
+            except _import_httpx().HTTPError as error:
+                raise _connection_error(self._http, error) from error
+            wait_s = _retry_delay_s(response) if tries_left else None
             if wait_s is None:
-                return _read(response)
+                return _parse_response(response)
             time.sleep(wait_s)
         raise AssertionError("the last try answers or raises")
 
@@ -128,7 +130,7 @@ class AsyncClient:
     """`Client` for programs that run in an event loop: the same methods, each to be awaited."""
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 60.0) -> None:
-        self._http = _httpx().AsyncClient(**_options(url, token, timeout_s))
+        self._http = _import_httpx().AsyncClient(**_client_options(url, token, timeout_s))
 
     async def __aenter__(self) -> AsyncClient:
         return self
@@ -141,55 +143,63 @@ class AsyncClient:
 
     async def maps(self) -> list[str]:
         """As `Client.maps`."""
-        return (await self._answer(_Asking("GET", "/v1/maps")))["maps"]
+        return (await self._send_request(_ClientRequest("GET", "/v1/maps")))["maps"]
 
     async def map(self, name: str) -> dict[str, Any]:
         """As `Client.map`."""
-        return await self._answer(_Asking("GET", f"/v1/maps/{_quoted(name)}"))
+        return await self._send_request(_ClientRequest("GET", f"/v1/maps/{_quote_name(name)}"))
 
     async def localize(
         self,
         map: str,
-        image: Picture,
-        camera: CameraName = None,
+        image: ImageInput,
+        camera: CameraSpec = None,
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
     ) -> Localization | NotLocalized:
         """As `Client.localize`."""
         return result_from_json(
-            await self._answer(
-                _localizing(f"/v1/maps/{_quoted(map)}/localize", image, camera, prior, max_ms)
+            await self._send_request(
+                _localize_request(
+                    f"/v1/maps/{_quote_name(map)}/localize", image, camera, prior, max_ms
+                )
             )
         )
 
     async def localize_everywhere(
-        self, image: Picture, camera: CameraName = None, max_ms: float | None = None
+        self, image: ImageInput, camera: CameraSpec = None, max_ms: float | None = None
     ) -> dict[str, Any]:
         """As `Client.localize_everywhere`."""
-        return await self._answer(_localizing("/v1/localize", image, camera, None, max_ms))
-
-    async def explain(self, map: str, image: Picture, camera: CameraName = None) -> dict[str, Any]:
-        """As `Client.explain`."""
-        return await self._answer(
-            _localizing(f"/v1/maps/{_quoted(map)}/explain", image, camera, None, None)
+        return await self._send_request(
+            _localize_request("/v1/localize", image, camera, None, max_ms)
         )
 
-    async def _answer(self, asking: _Asking) -> Any:
+    async def explain(
+        self, map: str, image: ImageInput, camera: CameraSpec = None
+    ) -> dict[str, Any]:
+        """As `Client.explain`."""
+        return await self._send_request(
+            _localize_request(f"/v1/maps/{_quote_name(map)}/explain", image, camera, None, None)
+        )
+
+    async def _send_request(self, request: _ClientRequest) -> Any:
         import asyncio
 
         for tries_left in reversed(range(_MAX_TRIES)):
             try:
-                response = await self._http.request(asking.method, asking.path, **asking.options())
-            except _httpx().HTTPError as error:
-                raise _unanswered(self._http, error) from error
-            wait_s = _wait_s(response) if tries_left else None
+                response = await self._http.request(
+                    request.method, request.path, **request.options()
+                )
+            except _import_httpx().HTTPError as error:
+                raise _connection_error(self._http, error) from error
+            wait_s = _retry_delay_s(response) if tries_left else None
             if wait_s is None:
-                return _read(response)
+                return _parse_response(response)
             await asyncio.sleep(wait_s)
         raise AssertionError("the last try answers or raises")
 
 
-def _httpx() -> Any:
+def _import_httpx() -> Any:
     try:
         import httpx
     except ModuleNotFoundError as error:
@@ -199,14 +209,14 @@ def _httpx() -> Any:
     return httpx
 
 
-def _options(url: str, token: str | None, timeout_s: float) -> dict[str, Any]:
+def _client_options(url: str, token: str | None, timeout_s: float) -> dict[str, Any]:
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
     return {"base_url": url, "headers": headers, "timeout": timeout_s}
 
 
-def _localizing(
-    path: str, image: Picture, camera: CameraName, prior: Rigid3 | None, max_ms: float | None
-) -> _Asking:
+def _localize_request(
+    path: str, image: ImageInput, camera: CameraSpec, prior: Rigid3 | None, max_ms: float | None
+) -> _ClientRequest:
     said = {"camera": json.dumps(camera.to_json()) if isinstance(camera, Camera) else camera}
     if prior is not None:
         said["prior"] = json.dumps(
@@ -214,15 +224,15 @@ def _localizing(
         )
     if max_ms is not None:
         said["max_ms"] = str(max_ms)
-    return _Asking(
+    return _ClientRequest(
         "POST",
         path,
         {name: value for name, value in said.items() if value is not None},
-        _encoded(image),
+        _encode_image(image),
     )
 
 
-def _encoded(image: Picture) -> tuple[str, bytes]:
+def _encode_image(image: ImageInput) -> tuple[str, bytes]:
     """Name and bytes; an array goes without loss."""
     if isinstance(image, bytes):
         return "image", image
@@ -237,21 +247,21 @@ def _encoded(image: Picture) -> tuple[str, bytes]:
         raise ServiceError(f"{image}: {error.strerror}") from None
 
 
-def _quoted(name: str) -> str:
+def _quote_name(name: str) -> str:
     from urllib.parse import quote
 
     return quote(name, safe="")
 
 
-def _wait_s(response: httpx.Response) -> float | None:
+def _retry_delay_s(response: httpx.Response) -> float | None:
     """Seconds after which to ask again; None where this is the answer."""
     if response.status_code != 429:
         return None
     named = response.headers.get("retry-after", "1")
-    return min(float(named), _LONGEST_WAIT_S) if named.isdigit() else 1.0
+    return min(float(named), _MAX_WAIT_S) if named.isdigit() else 1.0
 
 
-def _read(response: httpx.Response) -> Any:
+def _parse_response(response: httpx.Response) -> Any:
     try:
         data = response.json()
     except ValueError:
@@ -267,7 +277,7 @@ def _read(response: httpx.Response) -> Any:
     return data
 
 
-def _unanswered(http: httpx.Client | httpx.AsyncClient, error: Exception) -> ServiceError:
+def _connection_error(http: httpx.Client | httpx.AsyncClient, error: Exception) -> ServiceError:
     return ServiceError(
         f"{http.base_url}: no answer ({' '.join(str(error).split()) or type(error).__name__})"
     )

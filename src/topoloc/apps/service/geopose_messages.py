@@ -18,13 +18,13 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from topoloc.apps.service.refusals import Refusal
-from topoloc.atlas.near import NearPlace
+from topoloc.apps.service.request_errors import RequestError
+from topoloc.atlas.location_prior import GeoPositionPrior
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.localization.result import Localization
 from topoloc.recordings.frame import Image
-from topoloc.recordings.pictures import PictureBytes
+from topoloc.recordings.image_io import EncodedImage
 
 R = TypeVar("R", bound=BaseModel)
 MEDIA_TYPE = "application/vnd.oscp+json"
@@ -118,18 +118,18 @@ class GeoPoseRequest(BaseModel):
             found = readings.cameraReadings or []
         else:
             found = [
-                _flat_reading(one, CameraReading)
+                _flatten_reading(one, CameraReading)
                 for one in readings
                 if "imageBytes" in (one.reading or {})
             ]
         if not found:
-            raise Refusal(400, "the request has no reading of a camera")
+            raise RequestError(400, "the request has no reading of a camera")
         params = {sensor.id: sensor.params for sensor in self.sensors}
         return found[0].model_copy(
             update={"params": found[0].params or params.get(found[0].sensorId)}
         )
 
-    def near(self, slack_m: float) -> NearPlace | None:
+    def near(self, slack_m: float) -> GeoPositionPrior | None:
         """Where the device takes itself to be, by the first reading that says how exactly, with
         three times that and `slack_m` metres around it. None where no reading says so, or one makes
         no sense: then nothing is known."""
@@ -138,7 +138,7 @@ class GeoPoseRequest(BaseModel):
             found = readings.geolocationReadings or []
         else:
             found = [
-                _flat_reading(one, GeolocationReading)
+                _flatten_reading(one, GeolocationReading)
                 for one in readings
                 if "latitude" in (one.reading or {})
             ]
@@ -151,7 +151,7 @@ class GeoPoseRequest(BaseModel):
             ):  # some send 0 for "unknown"
                 continue
             with suppress(AtlasError):
-                return NearPlace(one.latitude, one.longitude, 3.0 * one.accuracy + slack_m)
+                return GeoPositionPrior(one.latitude, one.longitude, 3.0 * one.accuracy + slack_m)
         return None
 
 
@@ -203,7 +203,7 @@ def check_version(accept: str) -> None:
     2.0."""
     named = _VERSION.search(accept)
     if named and named.group(1) not in _KNOWN_VERSIONS:
-        raise Refusal(
+        raise RequestError(
             400,
             f"version {named.group(1)} of the GeoPose Protocol is not spoken here; 1.0 and 2.0 are",
         )
@@ -215,12 +215,12 @@ def read_request(body: bytes) -> GeoPoseRequest:
         return GeoPoseRequest.model_validate_json(body)
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
-        raise Refusal(
+        raise RequestError(
             400, f"no GeoPose request: {'.'.join(map(str, first['loc']))}: {first['msg']}"
         ) from None
 
 
-def picture_of(reading: CameraReading) -> PictureBytes | Image:
+def read_image_bytes(reading: CameraReading) -> EncodedImage | Image:
     """The picture: a file's bytes, whatever the format is called (clients call JPEG files RGBA32),
     else bare pixels.
 
@@ -228,26 +228,26 @@ def picture_of(reading: CameraReading) -> PictureBytes | Image:
         Refusal: neither.
     """
     if reading.imageOrientation is not None and reading.imageOrientation.mirrored:
-        raise Refusal(400, "a mirrored picture; it must be sent as the camera saw the world")
+        raise RequestError(400, "a mirrored picture; it must be sent as the camera saw the world")
     if reading.imageFormat.upper() == "DEPTH":
-        raise Refusal(400, "a picture of depth cannot be localized")
+        raise RequestError(400, "a picture of depth cannot be localized")
     try:
         data = base64.b64decode(
             reading.imageBytes.rpartition(",")[2], validate=True
         )  # some send a data: address
     except (binascii.Error, ValueError):
-        raise Refusal(400, "imageBytes: not base64") from None
+        raise RequestError(400, "imageBytes: not base64") from None
     if not data:
-        raise Refusal(400, "imageBytes: empty")
+        raise RequestError(400, "imageBytes: empty")
     channels = _RAW_CHANNELS.get(reading.imageFormat.upper())
-    width, height = size_of(reading) or (0, 0)
+    width, height = read_image_size(reading) or (0, 0)
     if channels and width * height * channels == len(data):
         pixels = np.frombuffer(data, np.uint8).reshape(height, width, channels)
         return pixels[:, :, 0] if channels == 1 else np.ascontiguousarray(pixels[:, :, :3])
-    return PictureBytes("imageBytes", data)
+    return EncodedImage("imageBytes", data)
 
 
-def size_of(reading: CameraReading) -> tuple[int, int] | None:
+def read_image_size(reading: CameraReading) -> tuple[int, int] | None:
     """Width and height (pixels) as the reading tells them; None where it tells none."""
     size = reading.size or []
     if len(size) != 2 or not all(1.0 <= length <= 1e5 for length in size):
@@ -255,8 +255,9 @@ def size_of(reading: CameraReading) -> tuple[int, int] | None:
     return int(size[0]), int(size[1])
 
 
-def camera_json(reading: CameraReading) -> dict[str, Any] | None:
-    """The camera as `query_cameras.camera_of_json` takes it; None where the reading tells none."""
+def camera_to_json(reading: CameraReading) -> dict[str, Any] | None:
+    """The camera as `query_cameras.camera_from_json` takes it; None where the reading tells
+    none."""
     params = reading.params
     if (
         params is None
@@ -267,7 +268,7 @@ def camera_json(reading: CameraReading) -> dict[str, Any] | None:
     return {"model": (params.model or "").upper(), "params": params.modelParams}
 
 
-def reply_to(
+def create_reply(
     request: GeoPoseRequest, result: Localization, georeference: Georeference, now_ms: float
 ) -> GeoPoseReply:
     """The reply; where the map's place on earth was fitted, what that fit left over counts, too."""
@@ -284,11 +285,11 @@ def reply_to(
     )
 
 
-def _flat_reading(one: SensorReading, kind: type[R]) -> R:
+def _flatten_reading(one: SensorReading, kind: type[R]) -> R:
     try:
         return kind.model_validate({**(one.reading or {}), "sensorId": one.sensorId})
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
-        raise Refusal(
+        raise RequestError(
             400, f"no reading of this kind: {'.'.join(map(str, first['loc']))}: {first['msg']}"
         ) from None

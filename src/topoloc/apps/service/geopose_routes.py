@@ -11,9 +11,6 @@ import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse, Response
 
-from topoloc.apps.service.answers import decoded_picture
-from topoloc.apps.service.asked import read_body
-from topoloc.apps.service.documents import resolved
 from topoloc.apps.service.geopose_messages import (
     EXAMPLE,
     MEDIA_TYPE,
@@ -21,32 +18,35 @@ from topoloc.apps.service.geopose_messages import (
     GeoPoseError,
     GeoPoseReply,
     GeoPoseRequest,
-    camera_json,
+    camera_to_json,
     check_version,
-    picture_of,
+    create_reply,
+    read_image_bytes,
+    read_image_size,
     read_request,
-    reply_to,
-    size_of,
 )
-from topoloc.apps.service.query_cameras import camera_named, camera_of_json
-from topoloc.apps.service.refusals import Refusal
-from topoloc.apps.service.state import Service, service_of
+from topoloc.apps.service.openapi_schemas import resolve_references
+from topoloc.apps.service.query_cameras import camera_from_json, parse_camera_field
+from topoloc.apps.service.query_handler import decode_image
+from topoloc.apps.service.query_request import read_body
+from topoloc.apps.service.request_errors import RequestError
+from topoloc.apps.service.state import Service, get_service
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import Image
-from topoloc.recordings.pictures import PictureBytes
+from topoloc.recordings.image_io import EncodedImage
 
 router = APIRouter()
-_CONTRADICTION_M = 10.0
-_REFUSED = {
+_MAX_DISAGREEMENT_M = 10.0
+_ERRORS = {
     400: "no such request, or of another version",
     404: "not localized: why",
     409: "no map knows its place on earth",
 }
-_REFUSED |= {
+_ERRORS |= {
     401: "no token",
     408: "too slow",
     413: "too large",
@@ -58,7 +58,7 @@ _BODY = {
         "required": True,
         "content": {
             "application/json": {
-                "schema": resolved(GeoPoseRequest.model_json_schema()),
+                "schema": resolve_references(GeoPoseRequest.model_json_schema()),
                 "example": EXAMPLE,
             }
         },
@@ -79,54 +79,56 @@ async def geopose_lives() -> dict[str, str]:
     "/localize/geopose",
     response_model=GeoPoseReply,
     responses={
-        status: {"model": GeoPoseError, "description": text} for status, text in _REFUSED.items()
+        status: {"model": GeoPoseError, "description": text} for status, text in _ERRORS.items()
     },
     openapi_extra=_BODY,
 )
 async def localize_geopose(request: Request, only: MapOnly = None) -> Response:
     """Where on earth was this picture taken? The camera as a body, x forward, y left, z up, in
     east-north-up."""
-    service = service_of(request)
+    service = get_service(request)
     try:
         check_version(request.headers.get("accept", ""))
         body = await read_body(request)
-        reply, results = await service.work(request, lambda: _replied(service, body, only))
-    except Refusal as refusal:
-        return _refused(request, refusal)
+        reply, results = await service.run_job(
+            request, lambda: _localize_and_reply(service, body, only)
+        )
+    except RequestError as refusal:
+        return _error_response(request, refusal)
     for name, result in results.items():
         service.count(request, name, result)
     if reply is None:
         return _not_localized(request, results)
     return JSONResponse(
-        reply.model_dump(), media_type=f"{MEDIA_TYPE};version={_version_of(request)}"
+        reply.model_dump(), media_type=f"{MEDIA_TYPE};version={_parse_version(request)}"
     )
 
 
-def _replied(
+def _localize_and_reply(
     service: Service, body: bytes, only: str | None
 ) -> tuple[GeoPoseReply | None, dict[str, Localization | NotLocalized]]:
     """The work of a request: the answer of each map, and of each atlas; and the reply where they
     agree on one place."""
     asked = read_request(body)
     reading = asked.camera_reading()
-    picture = picture_of(reading)
+    picture = read_image_bytes(reading)
     image = (
-        decoded_picture(picture, service.answerer.max_pixels)
-        if isinstance(picture, PictureBytes)
+        decode_image(picture, service.query_handler.max_pixels)
+        if isinstance(picture, EncodedImage)
         else picture
     )
-    localizers = [] if only is not None else service.answerer.atlases.localizers()
+    localizers = [] if only is not None else service.query_handler.atlases.localizers()
     tiles = {tile_id for localizer in localizers for tile_id in localizer.atlas.manifest.by_id}
     results, georeferences = dict[str, Localization | NotLocalized](), dict[str, Georeference]()
     for name in (
         [only] if only is not None else [name for name in service.maps.names() if name not in tiles]
     ):
-        with service.maps.lent(name) as opened:
+        with service.maps.use_map(name) as opened:
             topomap = opened.localizer.topomap
             if topomap.georeference is not None:
-                camera = _camera_of(reading, picture, image, topomap)
+                camera = _select_camera(reading, picture, image, topomap)
                 results[name] = opened.localizer.localize(
-                    image, camera, max_ms=service.answerer.max_ms
+                    image, camera, max_ms=service.query_handler.max_ms
                 )
                 georeferences[name] = topomap.georeference
     near = asked.near(service.config.geolocation_m)
@@ -138,40 +140,40 @@ def _replied(
             if (place := manifest.georeference_of(tile)) is not None
         }
         if known:
-            camera = _camera_of(reading, picture, image, None)
-            result = localizer.near(near, placed_only=True).localize(
-                image, camera, max_ms=service.answerer.max_ms
+            camera = _select_camera(reading, picture, image, None)
+            result = localizer.near(near, georeferenced_only=True).localize(
+                image, camera, max_ms=service.query_handler.max_ms
             )
             results[result.provenance.tile or ""] = result
             georeferences |= known
     if not results:
-        raise Refusal(
+        raise RequestError(
             409, "no map here knows where on earth it lies; `topoloc georeference` tells it"
         )
     found = {name: result for name, result in results.items() if isinstance(result, Localization)}
-    best = _agreed(found)
+    best = _select_agreeing_map(found)
     if best is None:
         return None, results
-    return reply_to(asked, found[best], georeferences[best], 1e3 * time.time()), results
+    return create_reply(asked, found[best], georeferences[best], 1e3 * time.time()), results
 
 
-def _camera_of(
+def _select_camera(
     reading: CameraReading,
-    picture: PictureBytes | Image,
+    picture: EncodedImage | Image,
     image: Image,
     topomap: TopoMetricMap | None,
-) -> Camera | RoughCamera:
+) -> Camera | UncalibratedCamera:
     """What the request says of the camera, else the picture's file, else any usual lens."""
     height, width = image.shape[:2]
-    told = camera_json(reading)
-    if told is None and isinstance(picture, PictureBytes):
-        return camera_named(None, picture, (width, height), topomap)
+    told = camera_to_json(reading)
+    if told is None and isinstance(picture, EncodedImage):
+        return parse_camera_field(None, picture, (width, height), topomap)
     if told is None:
-        return RoughCamera.unknown(width, height)
-    told_width, told_height = size_of(reading) or (width, height)
-    camera = camera_of_json(told, told_width, told_height)
+        return UncalibratedCamera.unknown(width, height)
+    told_width, told_height = read_image_size(reading) or (width, height)
+    camera = camera_from_json(told, told_width, told_height)
     if abs(told_width * height - told_height * width) > max(told_width, told_height):
-        raise Refusal(
+        raise RequestError(
             400, f"the picture is {width}x{height}, its reading says {told_width}x{told_height}"
         )
     return (
@@ -179,7 +181,7 @@ def _camera_of(
     )
 
 
-def _agreed(found: dict[str, Localization]) -> str | None:
+def _select_agreeing_map(found: dict[str, Localization]) -> str | None:
     """The map whose pose has most for it; None where another one says that it was far from
     there."""
     if not found:
@@ -192,7 +194,7 @@ def _agreed(found: dict[str, Localization]) -> str | None:
     }
     for name, place in ecef.items():
         sigmas = math.hypot(found[name].position_sigma_m, found[best].position_sigma_m)
-        if np.linalg.norm(place - ecef[best]) > _CONTRADICTION_M + 3.0 * sigmas:
+        if np.linalg.norm(place - ecef[best]) > _MAX_DISAGREEMENT_M + 3.0 * sigmas:
             return None
     return best
 
@@ -218,7 +220,7 @@ def _not_localized(
     )
 
 
-def _refused(request: Request, refusal: Refusal) -> JSONResponse:
+def _error_response(request: Request, refusal: RequestError) -> JSONResponse:
     """The protocol knows 400 for all that a request can have wrong."""
     status = 400 if refusal.status in (415, 422) else refusal.status
     return JSONResponse(
@@ -226,5 +228,5 @@ def _refused(request: Request, refusal: Refusal) -> JSONResponse:
     )
 
 
-def _version_of(request: Request) -> str:
+def _parse_version(request: Request) -> str:
     return "1.0" if "version=1" in request.headers.get("accept", "") else "2.0"

@@ -12,10 +12,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request
 from fastapi.responses import HTMLResponse, Response
 
-from topoloc.apps.service.documents import errors
-from topoloc.apps.service.refusals import Refusal
-from topoloc.apps.service.state import Service, service_of
-from topoloc.apps.viewer.document import SceneBudget, document_of
+from topoloc.apps.service.openapi_schemas import error_responses
+from topoloc.apps.service.request_errors import RequestError
+from topoloc.apps.service.state import Service, get_service
+from topoloc.apps.viewer.document import SceneBudget, create_document
 from topoloc.apps.viewer.page import MODULES, import_map, static_text
 
 router = APIRouter()
@@ -30,13 +30,13 @@ _TYPES = {
     ".md": "text/plain",
 }
 _BUDGET = SceneBudget()
-_NUM_KEPT = 4
+_NUM_CACHED_SCENES = 4
 
 
 @router.get("/", response_class=HTMLResponse, include_in_schema=False)
 async def page() -> Response:
     """The page, which asks this service alone."""
-    text, policy = _page()
+    text, policy = _render_page()
     return HTMLResponse(
         text, headers={"content-security-policy": policy, "referrer-policy": "no-referrer"}
     )
@@ -45,8 +45,8 @@ async def page() -> Response:
 @router.get("/static/{name:path}", include_in_schema=False)
 async def static(name: str) -> Response:
     """A file of the page."""
-    if name not in _static_files():
-        raise Refusal(404, f"nothing is at /static/{name[:80]}")
+    if name not in _load_static_files():
+        raise RequestError(404, f"nothing is at /static/{name[:80]}")
     media_type = _TYPES[name[name.rindex(".") :]]
     return Response(
         static_text(name),
@@ -55,33 +55,33 @@ async def static(name: str) -> Response:
     )
 
 
-@router.get("/v1/maps/{map}/scene", responses=errors(401, 404, 422, 429, 503))
+@router.get("/v1/maps/{map}/scene", responses=error_responses(401, 404, 422, 429, 503))
 async def scene(request: Request, map: Annotated[str, Path(max_length=200)]) -> Response:
     """What a map looks like: points, nodes with their pictures, paths; as docs/viewer.md says.
     `topoloc view` makes pages of the same."""
-    service = service_of(request)
-    body = await service.work(request, lambda: _scene_bytes(service, map))
+    service = get_service(request)
+    body = await service.run_job(request, lambda: _build_scene(service, map))
     return Response(body, media_type="application/json")
 
 
-def _scene_bytes(service: Service, name: str) -> bytes:
+def _build_scene(service: Service, name: str) -> bytes:
     """The document of a map, as long as its file is the same."""
     kept = service.scenes
-    with service.maps.lent(name) as opened:
+    with service.maps.use_map(name) as opened:
         if name in kept and kept[name][0] == opened.stamp:
             return kept[name][1]
         body = json.dumps(
-            document_of(opened.localizer.topomap, name, budget=_BUDGET), separators=(",", ":")
+            create_document(opened.localizer.topomap, name, budget=_BUDGET), separators=(",", ":")
         ).encode()
         kept.pop(name, None)
-        while len(kept) >= _NUM_KEPT:
+        while len(kept) >= _NUM_CACHED_SCENES:
             kept.pop(next(iter(kept)), None)
         kept[name] = opened.stamp, body
         return body
 
 
 @cache
-def _page() -> tuple[str, str]:
+def _render_page() -> tuple[str, str]:
     """The page's text, and the policy that keeps it from asking, or running, anything else."""
     element = import_map(lambda file: f"/static/{file}", _PAGE_MODULES)
     inside = element[element.index(">") + 1 : element.rindex("<")]
@@ -95,7 +95,7 @@ def _page() -> tuple[str, str]:
 
 
 @cache
-def _static_files() -> frozenset[str]:
+def _load_static_files() -> frozenset[str]:
     root: Any = resources.files("topoloc.apps.viewer").joinpath("static")
     folders = [("", root), ("page/", root.joinpath("page"))]
     return frozenset(

@@ -11,21 +11,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from topoloc.apps.service.asked import json_of
+from topoloc.apps.service.query_request import parse_json
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rough_camera import RoughCamera
-from topoloc.localization.query_camera import named_camera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.query_camera import parse_camera_option
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.calibration import calibration_of_numbers
-from topoloc.recordings.pictures import PictureBytes, exif_focal_length
+from topoloc.recordings.calibration import parse_intrinsics
+from topoloc.recordings.image_io import EncodedImage, exif_focal_length
 
 _MAX_PARAMS = 20
 
 
-def camera_named(
-    text: str | None, picture: PictureBytes, size: tuple[int, int], topomap: TopoMetricMap | None
-) -> Camera | RoughCamera:
+def parse_camera_field(
+    text: str | None, picture: EncodedImage, size: tuple[int, int], topomap: TopoMetricMap | None
+) -> Camera | UncalibratedCamera:
     """The camera of a picture of this width and height (pixels); `map` only where one map is asked.
 
     Raises:
@@ -37,22 +37,22 @@ def camera_named(
     if text == "exif":
         focal = exif_focal_length(picture, width, height)
         return (
-            RoughCamera.unknown(width, height)
+            UncalibratedCamera.unknown(width, height)
             if focal is None
-            else RoughCamera.noted(width, height, focal)
+            else UncalibratedCamera.from_focal_guess(width, height, focal)
         )
     if text == "unknown" or (text == "map" and topomap is not None):
-        return named_camera(text, topomap)(width, height)
+        return parse_camera_option(text, topomap)(width, height)
     if text.startswith("{"):
-        return camera_of_json(json_of(text, "camera"), width, height)
+        return camera_from_json(parse_json(text, "camera"), width, height)
     if "," in text:
-        return calibration_of_numbers(text)(width, height).camera
+        return parse_intrinsics(text)(width, height).camera
     raise CalibrationError(
         f"camera {text[:40]!r}: exif, unknown, map, fx,fy,cx,cy or a JSON object is expected"
     )
 
 
-def camera_of_json(data: Any, width: int, height: int) -> Camera:
+def camera_from_json(data: Any, width: int, height: int) -> Camera:
     """The camera of an object; its size is the picture's where it names none.
 
     Raises:

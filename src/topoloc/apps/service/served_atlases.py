@@ -13,11 +13,11 @@ from topoloc.apps.service.logs import log
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.open_maps import Maps
+from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.watched_atlas import WatchedAtlas
 from topoloc.errors import TopolocError
 
-LOOK_S = 5.0
+POLL_INTERVAL_S = 5.0
 """Seconds between two looks at an object store: one listing each, a reading where a manifest was
 written."""
 
@@ -26,7 +26,7 @@ class ServedAtlases:
     """Localizers of the atlases of these maps, which open their tiles as the maps of the
     service."""
 
-    def __init__(self, maps: Maps, config: AtlasConfig) -> None:
+    def __init__(self, maps: MapCache, config: AtlasConfig) -> None:
         self._maps, self._config = maps, config
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._opened: dict[str, tuple[Atlas, AtlasLocalizer]] = {}
@@ -34,21 +34,21 @@ class ServedAtlases:
     def localizers(self) -> list[AtlasLocalizer]:
         """One an atlas, as its manifest is now. Raises AtlasError."""
         with self._lock:
-            return [self._localizer(watched) for watched in self._maps.atlases]
+            return [self._open_localizer(watched) for watched in self._maps.atlases]
 
     def watch(self) -> None:
         """Look at those in object stores from now on, until `close`."""
         for watched in self._maps.atlases:
             if watched.is_remote:
                 threading.Thread(
-                    target=self._look_at, args=(watched,), name="atlas", daemon=True
+                    target=self._poll_atlas, args=(watched,), name="atlas", daemon=True
                 ).start()
 
     def close(self) -> None:
         """No more looks; one that waits for its store is not waited for."""
         self._ended.set()
 
-    def _localizer(self, watched: WatchedAtlas) -> AtlasLocalizer:
+    def _open_localizer(self, watched: WatchedAtlas) -> AtlasLocalizer:
         atlas, known = watched.now(), self._opened.get(watched.where)
         if known is None or known[0] is not atlas:
             self._opened[watched.where] = known = (
@@ -57,9 +57,9 @@ class ServedAtlases:
             )
         return known[1]
 
-    def _look_at(self, watched: WatchedAtlas) -> None:
+    def _poll_atlas(self, watched: WatchedAtlas) -> None:
         told = ""
-        while not self._ended.wait(LOOK_S):
+        while not self._ended.wait(POLL_INTERVAL_S):
             try:
                 if watched.look():
                     log("atlas", where=watched.where, serial=watched.now().manifest.serial)

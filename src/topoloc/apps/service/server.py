@@ -15,8 +15,8 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from topoloc.apps.service.access_middleware import App
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.apps.service.guard import App
 from topoloc.apps.service.logs import log_json
 from topoloc.errors import TopolocError
 
@@ -45,7 +45,7 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
     """
     config = uvicorn.Config(
         app,
-        http=type("_PatientHere", (_Patient,), {"head_s": limits.upload_s}),
+        http=type("_PatientHere", (_HeadTimeoutProtocol,), {"head_s": limits.upload_s}),
         ws_max_size=limits.max_upload_bytes,
         ws_per_message_deflate=False,
         access_log=False,
@@ -59,7 +59,7 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
         ssl_keyfile=address.tls_key,
         lifespan="on",
     )
-    listener = _listener(address)
+    listener = _create_socket(address)
     log_json()
     scheme = "https" if address.tls_cert else "http"
     host, port = listener.getsockname()[:2]
@@ -71,7 +71,7 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
     asyncio.run(_Server(config).serve([listener]))
 
 
-def _listener(address: Address) -> socket.socket:
+def _create_socket(address: Address) -> socket.socket:
     try:
         family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
         return socket.create_server((address.host, address.port), family=family, backlog=256)
@@ -97,7 +97,7 @@ class _Server(uvicorn.Server):
                 loop.remove_signal_handler(number)
 
 
-class _Patient(H11Protocol):
+class _HeadTimeoutProtocol(H11Protocol):
     """HTTP/1.1; a connection on which no request's head arrives in time is closed."""
 
     head_s = 10.0
@@ -119,9 +119,9 @@ class _Patient(H11Protocol):
         super().on_response_complete()
 
     def _wait_for_head(self, seconds: float) -> None:
-        self._timer = self.loop.call_later(seconds, self._give_up, self.cycle)
+        self._timer = self.loop.call_later(seconds, self._close_if_idle, self.cycle)
 
-    def _give_up(self, before: Any) -> None:
+    def _close_if_idle(self, before: Any) -> None:
         if (
             self.cycle is before
             and self.transport.get_protocol() is self

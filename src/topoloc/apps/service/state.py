@@ -11,15 +11,15 @@ from typing import TypeVar
 
 from starlette.requests import HTTPConnection
 
-from topoloc.apps.service.answers import Answerer
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.logs import log
 from topoloc.apps.service.metrics import Metrics
-from topoloc.apps.service.refusals import Refusal, refusal_of
+from topoloc.apps.service.query_handler import QueryHandler
+from topoloc.apps.service.request_errors import RequestError, to_request_error
 from topoloc.apps.service.streams import Streams
 from topoloc.apps.service.workers import Workers
-from topoloc.atlas.open_maps import Maps
-from topoloc.atlas.tile_fetches import Fetch, TileAwaited
+from topoloc.atlas.map_cache import MapCache
+from topoloc.atlas.tile_fetcher import TileFetch, TilePending
 from topoloc.errors import TopolocError
 from topoloc.localization.result import Localization, NotLocalized
 
@@ -31,8 +31,8 @@ class Service:
     """Maps, those who answer from them, and what is counted; `scenes` are the documents of some
     maps with the stamps of their files."""
 
-    maps: Maps
-    answerer: Answerer
+    maps: MapCache
+    query_handler: QueryHandler
     workers: Workers
     config: ServiceConfig
     metrics: Metrics
@@ -40,7 +40,7 @@ class Service:
     scenes: dict[str, tuple[tuple[int, ...], bytes]] = field(default_factory=dict)
     num_awaiting: int = 0
 
-    async def work(self, request: HTTPConnection, job: Callable[[], R]) -> R:
+    async def run_job(self, request: HTTPConnection, job: Callable[[], R]) -> R:
         """What a worker makes of the job, which may be done again from its beginning: where it
         needs a tile that is not here, the worker is free for others until that has come. Raises
         Refusal, whatever it raised."""
@@ -51,19 +51,19 @@ class Service:
                     return await self.workers.run(
                         job, self.config.answer_s, time.monotonic() - start
                     )
-                except TileAwaited as awaited:
-                    await self._ended(awaited.fetch)
+                except TilePending as awaited:
+                    await self._wait_for_fetch(awaited.fetch)
         except Exception as error:
-            refusal = refusal_of(error)
-            if not isinstance(error, TopolocError | Refusal):
+            refusal = to_request_error(error)
+            if not isinstance(error, TopolocError | RequestError):
                 log("failure", logging.ERROR, error, request_id=request.scope["request_id"])
             raise refusal from error
 
-    async def _ended(self, fetch: Fetch) -> None:
+    async def _wait_for_fetch(self, fetch: TileFetch) -> None:
         """When the tile is here, will not come, or has been waited for long enough. Raises Refusal
         where too many wait already."""
         if self.num_awaiting >= self.workers.number + self.workers.max_queue:
-            raise Refusal(
+            raise RequestError(
                 429,
                 f"{self.num_awaiting} requests wait already for tiles that are being fetched",
                 retry_after_s=5,
@@ -71,7 +71,8 @@ class Service:
         self.num_awaiting += 1
         try:
             await asyncio.wait(
-                [asyncio.wrap_future(fetch.ended)], timeout=max(0.0, fetch.until - time.monotonic())
+                [asyncio.wrap_future(fetch.future)],
+                timeout=max(0.0, fetch.deadline - time.monotonic()),
             )
         finally:
             self.num_awaiting -= 1
@@ -88,11 +89,11 @@ class Service:
 
     async def close(self) -> None:
         """What has begun is finished; then the maps are closed."""
-        self.answerer.atlases.close()
+        self.query_handler.atlases.close()
         await asyncio.to_thread(self.workers.close)
         self.streams.close()
         self.maps.close()
 
 
-def service_of(request: HTTPConnection) -> Service:
+def get_service(request: HTTPConnection) -> Service:
     return request.app.state.service

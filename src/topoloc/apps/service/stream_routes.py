@@ -12,13 +12,18 @@ from fastapi import APIRouter, Query, Request, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel
 
-from topoloc.apps.service.asked import Asked, json_of, read_asked
-from topoloc.apps.service.documents import PICTURE_BODY, answers, errors, result_schema
-from topoloc.apps.service.map_routes import MapName, SaidInAddress
-from topoloc.apps.service.refusals import Refusal
-from topoloc.apps.service.state import Service, service_of
+from topoloc.apps.service.map_routes import MapName, UrlParameters
+from topoloc.apps.service.openapi_schemas import (
+    IMAGE_BODY,
+    error_responses,
+    result_schema,
+    success_response,
+)
+from topoloc.apps.service.query_request import QueryRequest, parse_json, read_query_request
+from topoloc.apps.service.request_errors import RequestError
+from topoloc.apps.service.state import Service, get_service
 from topoloc.apps.service.streams import Stream
-from topoloc.recordings.pictures import PictureBytes
+from topoloc.recordings.image_io import EncodedImage
 
 router = APIRouter()
 PROTOCOL = "topoloc"
@@ -42,41 +47,52 @@ class StreamFacts(BaseModel):
 
 
 @router.post(
-    "/v1/maps/{map}/sessions", status_code=201, responses=errors(401, 403, 404, 422, 429, 503)
+    "/v1/maps/{map}/sessions",
+    status_code=201,
+    responses=error_responses(401, 403, 404, 422, 429, 503),
 )
 async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> StreamFacts:
     """Begin a stream: pictures that follow each other, so that each helps with the next."""
-    service = service_of(request)
-    stream = await service.work(request, lambda: service.streams.begin(map, camera))
+    service = get_service(request)
+    stream = await service.run_job(request, lambda: service.streams.begin(map, camera))
     return StreamFacts(session=stream.id, map=map, idle_s=service.config.session_idle_s)
 
 
 @router.post(
     "/v1/maps/{map}/sessions/{session}/pictures",
-    responses=answers(result_schema(), "as of a single picture, with `state` and the smoothed pose")
-    | errors(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503),
-    openapi_extra=PICTURE_BODY,
+    responses=success_response(
+        result_schema(), "as of a single picture, with `state` and the smoothed pose"
+    )
+    | error_responses(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503),
+    openapi_extra=IMAGE_BODY,
 )
 async def next_picture(
-    request: Request, map: MapName, session: str, said: SaidInAddress, t_ns: TimeNs = None
+    request: Request, map: MapName, session: str, parameters: UrlParameters, t_ns: TimeNs = None
 ) -> Response:
     """The next picture of a stream."""
-    service = service_of(request)
-    stream, asked = service.streams.find(map, session), await read_asked(request, said)
-    answer = await service.work(
+    service = get_service(request)
+    stream, query_request = (
+        service.streams.find(map, session),
+        await read_query_request(request, parameters),
+    )
+    answer = await service.run_job(
         request,
-        lambda: service.streams.next(stream, asked, time.time_ns() if t_ns is None else t_ns),
+        lambda: service.streams.next(
+            stream, query_request, time.time_ns() if t_ns is None else t_ns
+        ),
     )
     request.scope["facts"].update({"map": map, "outcome": answer["state"]})
     return Response(json.dumps(answer), media_type="application/json")
 
 
 @router.delete(
-    "/v1/maps/{map}/sessions/{session}", status_code=204, responses=errors(401, 403, 404, 422, 503)
+    "/v1/maps/{map}/sessions/{session}",
+    status_code=204,
+    responses=error_responses(401, 403, 404, 422, 503),
 )
 async def end(request: Request, map: MapName, session: str) -> Response:
     """End a stream."""
-    service = service_of(request)
+    service = get_service(request)
     stream = service.streams.find(map, session)
     await asyncio.to_thread(service.streams.end, stream)
     return Response(status_code=204)
@@ -87,19 +103,19 @@ async def stream_over_websocket(socket: WebSocket, map: str) -> None:
     """A stream as long as the connection: a binary message is a picture, its answer a text. A text
     message says what holds for the pictures after it: `{"camera": ..., "t_ns": ...}` (the time for
     the next one alone)."""
-    service = service_of(socket)
+    service = get_service(socket)
     try:
-        stream = await service.work(
+        stream = await service.run_job(
             socket, lambda: service.streams.begin(map, socket.query_params.get("camera"))
         )
-    except Refusal as refusal:
-        await socket.send_denial_response(_denied(socket, refusal))
+    except RequestError as refusal:
+        await socket.send_denial_response(_reject_connection(socket, refusal))
         return
     try:
         await socket.accept(PROTOCOL if PROTOCOL in socket.scope.get("subprotocols", ()) else None)
-        await _talk(socket, service, stream)
-    except Refusal as refusal:
-        await _close(socket, refusal)
+        await _serve_websocket(socket, service, stream)
+    except RequestError as refusal:
+        await _close_socket(socket, refusal)
     except WebSocketDisconnect:
         pass
     finally:
@@ -107,65 +123,69 @@ async def stream_over_websocket(socket: WebSocket, map: str) -> None:
         await asyncio.to_thread(service.streams.end, stream)
 
 
-async def _talk(socket: WebSocket, service: Service, stream: Stream) -> None:
+async def _serve_websocket(socket: WebSocket, service: Service, stream: Stream) -> None:
     """Until the client goes away. Raises Refusal where it does not listen, or says nothing."""
-    said: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
     number = 0
     while True:
         try:
             message = await asyncio.wait_for(socket.receive(), service.config.session_idle_s)
         except TimeoutError:
-            raise Refusal(408, f"no picture for {service.config.session_idle_s:g} s") from None
+            raise RequestError(408, f"no picture for {service.config.session_idle_s:g} s") from None
         if message["type"] == "websocket.disconnect":
             return
         if message.get("text") is not None:
-            said |= _said(message["text"])
+            parameters |= _parse_message(message["text"])
             continue
-        t_ns = said.pop("t_ns", None) or time.time_ns()
-        asked = Asked(PictureBytes(str(number), message["bytes"]), said.get("camera"))
+        t_ns = parameters.pop("t_ns", None) or time.time_ns()
+        query_request = QueryRequest(
+            EncodedImage(str(number), message["bytes"]), parameters.get("camera")
+        )
         number += 1
-        await _send(
-            socket, await _answered(socket, service, stream, asked, t_ns), service.config.upload_s
+        await _send_text(
+            socket,
+            await _localize_image(socket, service, stream, query_request, t_ns),
+            service.config.upload_s,
         )
 
 
-async def _answered(
-    socket: WebSocket, service: Service, stream: Stream, asked: Asked, t_ns: int
+async def _localize_image(
+    socket: WebSocket, service: Service, stream: Stream, query_request: QueryRequest, t_ns: int
 ) -> str:
     """The answer, or why this picture has none; the stream goes on."""
     try:
         return json.dumps(
-            await service.work(socket, lambda: service.streams.next(stream, asked, t_ns))
+            await service.run_job(socket, lambda: service.streams.next(stream, query_request, t_ns))
         )
-    except Refusal as refusal:
-        return json.dumps({"query": asked.picture.name, "error": refusal.text})
+    except RequestError as refusal:
+        return json.dumps({"query": query_request.picture.name, "error": refusal.text})
 
 
-async def _send(socket: WebSocket, text: str, timeout_s: float) -> None:
+async def _send_text(socket: WebSocket, text: str, timeout_s: float) -> None:
     try:
         await asyncio.wait_for(socket.send_text(text), timeout_s)
     except TimeoutError:
-        raise Refusal(408, "the answers are not read") from None
+        raise RequestError(408, "the answers are not read") from None
 
 
-def _said(text: str) -> dict[str, Any]:
+def _parse_message(text: str) -> dict[str, Any]:
     """What a text message says. Raises Refusal."""
-    data = json_of(text, "the message")
+    data = parse_json(text, "the message")
     if not isinstance(data, dict) or not set(data) <= {"camera", "t_ns"}:
-        raise Refusal(422, 'a text message is an object of "camera" and "t_ns"')
+        raise RequestError(422, 'a text message is an object of "camera" and "t_ns"')
     t_ns, camera = data.get("t_ns"), data.get("camera")
     if t_ns is not None and (
         isinstance(t_ns, bool) or not isinstance(t_ns, int) or not 0 <= t_ns < 2**63
     ):
-        raise Refusal(422, "t_ns is an integer of nanoseconds")
+        raise RequestError(422, "t_ns is an integer of nanoseconds")
     return data if isinstance(camera, str | None) else data | {"camera": json.dumps(camera)}
 
 
-async def _close(socket: WebSocket, refusal: Refusal) -> None:
+async def _close_socket(socket: WebSocket, refusal: RequestError) -> None:
     with contextlib.suppress(TimeoutError, RuntimeError):  # it does not listen, or is gone
         await asyncio.wait_for(socket.close(1008, refusal.text[:120]), 1.0)
 
 
-def _denied(socket: WebSocket, refusal: Refusal) -> JSONResponse:
+def _reject_connection(socket: WebSocket, refusal: RequestError) -> JSONResponse:
     body = {"error": refusal.text, "request_id": socket.scope["request_id"]}
     return JSONResponse(body, refusal.status, refusal.headers)

@@ -8,12 +8,12 @@ import uuid
 from dataclasses import dataclass, field
 from typing import Any
 
-from topoloc.apps.service.answers import Answerer
-from topoloc.apps.service.asked import Asked
-from topoloc.apps.service.refusals import Refusal
-from topoloc.atlas.open_maps import Maps, OpenedMap
+from topoloc.apps.service.query_handler import QueryHandler
+from topoloc.apps.service.query_request import QueryRequest
+from topoloc.apps.service.request_errors import RequestError
+from topoloc.atlas.map_cache import CachedMap, MapCache
 from topoloc.errors import CalibrationError
-from topoloc.geometry.rough_camera import RoughCamera
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 
@@ -22,7 +22,7 @@ class Stream:
     """One stream; its lock is held while a picture of it is looked at."""
 
     map_name: str
-    opened: OpenedMap
+    opened: CachedMap
     tracker: Tracker
     camera: str | None
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -39,9 +39,14 @@ class Streams:
     """
 
     def __init__(
-        self, maps: Maps, answerer: Answerer, config: TrackerConfig, max_streams: int, idle_s: float
+        self,
+        maps: MapCache,
+        query_handler: QueryHandler,
+        config: TrackerConfig,
+        max_streams: int,
+        idle_s: float,
     ) -> None:
-        self._maps, self._answerer, self._config = maps, answerer, config
+        self._maps, self._answerer, self._config = maps, query_handler, config
         self._max_streams, self._idle_s = max_streams, idle_s
         self._lock = threading.Lock()
         self._streams: dict[str, Stream] = {}
@@ -58,15 +63,15 @@ class Streams:
             MapError: the map is damaged.
         """
         self.forget_idle()
-        opened = self._maps.lend(map_name)
+        opened = self._maps.acquire_map(map_name)
         stream = Stream(map_name, opened, Tracker(opened.localizer, self._config), camera)
         with self._lock:
             is_full = len(self._streams) >= self._max_streams
             if not is_full:
                 self._streams[stream.id] = stream
         if is_full:
-            self._maps.give_back(opened)
-            raise Refusal(
+            self._maps.release_map(opened)
+            raise RequestError(
                 429, f"{self._max_streams} streams are followed already", retry_after_s=10
             )
         return stream
@@ -75,12 +80,12 @@ class Streams:
         """Raises Refusal."""
         stream = self._streams.get(stream_id)
         if stream is None or stream.map_name != map_name:
-            raise Refusal(
+            raise RequestError(
                 404, "there is no such stream here; one without a picture for a while is forgotten"
             )
         return stream
 
-    def next(self, stream: Stream, asked: Asked, t_ns: int) -> dict[str, Any]:
+    def next(self, stream: Stream, query_request: QueryRequest, t_ns: int) -> dict[str, Any]:
         """The answer to the stream's next picture, as JSON.
 
         Raises:
@@ -88,22 +93,22 @@ class Streams:
             TopolocError: the picture, its camera or its time is none.
         """
         if not stream.lock.acquire(blocking=False):
-            raise Refusal(
+            raise RequestError(
                 409,
                 "the picture before is looked at still; the next one may come when that is"
                 " answered",
             )
         try:
             if stream.is_ended:
-                raise Refusal(404, "the stream has ended")
+                raise RequestError(404, "the stream has ended")
             stream.last_used = time.monotonic()
-            named = Asked(asked.picture, asked.camera or stream.camera)
-            image, camera = self._answerer.decoded(named, stream.opened.localizer.topomap)
-            if isinstance(camera, RoughCamera):
+            named = QueryRequest(query_request.picture, query_request.camera or stream.camera)
+            image, camera = self._answerer.decode_query(named, stream.opened.localizer.topomap)
+            if isinstance(camera, UncalibratedCamera):
                 raise CalibrationError(
                     "a stream needs a calibrated camera: `map`, fx,fy,cx,cy or a JSON object"
                 )
-            return stream.tracker.process(image, camera, t_ns).to_json(asked.picture.name)
+            return stream.tracker.process(image, camera, t_ns).to_json(query_request.picture.name)
         finally:
             stream.last_used = time.monotonic()
             stream.lock.release()
@@ -115,7 +120,7 @@ class Streams:
                 self._streams.pop(stream.id, None)
             if not stream.is_ended:
                 stream.is_ended = True
-                self._maps.give_back(stream.opened)
+                self._maps.release_map(stream.opened)
 
     def forget_idle(self) -> None:
         """End those that nobody has used for long."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from topoloc.apps.service.refusals import Refusal
+from topoloc.apps.service.request_errors import RequestError
 
 R = TypeVar("R")
 
@@ -37,30 +37,30 @@ class Workers:
         """
         if self._num_jobs >= self.number + self.max_queue:
             wait_s = max(1, round(self._num_jobs * self._seconds_a_job / self.number))
-            raise Refusal(
+            raise RequestError(
                 429,
                 f"{self._num_jobs} requests are being answered or wait already",
                 retry_after_s=wait_s,
             )
         self._num_jobs += 1
         loop = asyncio.get_running_loop()
-        future: Future[R] = self._pool.submit(self._timed, job)
-        future.add_done_callback(lambda _: loop.call_soon_threadsafe(self._done))
+        future: Future[R] = self._pool.submit(self._run_timed, job)
+        future.add_done_callback(lambda _: loop.call_soon_threadsafe(self._finish_job))
         try:
             return await asyncio.wait_for(asyncio.wrap_future(future), timeout_s - spent_s)
         except TimeoutError:
-            raise Refusal(503, f"no answer within {timeout_s:g} s", retry_after_s=5) from None
+            raise RequestError(503, f"no answer within {timeout_s:g} s", retry_after_s=5) from None
 
     def close(self) -> None:
         """What has begun is finished, what waits is not."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def _timed(self, job: Callable[[], R]) -> R:
+    def _run_timed(self, job: Callable[[], R]) -> R:
         start = time.perf_counter()
         try:
             return job()
         finally:
             self._seconds_a_job += 0.1 * (time.perf_counter() - start - self._seconds_a_job)
 
-    def _done(self) -> None:
+    def _finish_job(self) -> None:
         self._num_jobs -= 1

@@ -20,11 +20,11 @@ from typing import Any
 
 from topoloc.atlas.manifest import TILES
 from topoloc.atlas.store import sha256_of
-from topoloc.errors import AtlasError, MissingExtraError, StoreError
+from topoloc.errors import AtlasError, MissingExtraError, ObjectStoreError
 from topoloc.features.network_files import cache_folder
-from topoloc.recordings.atomic import replaced_file
+from topoloc.recordings.atomic import atomic_write
 
-_MANIFESTS, _KEPT = "manifests", 16
+_MANIFESTS, _NUM_KEPT = "manifests", 16
 S3_TRIES, S3_CLIENT = (
     2,
     {"connect_timeout": 5.0, "read_timeout": 15.0, "retries": {"total_max_attempts": 2}},
@@ -62,27 +62,27 @@ class ObjectStore:
             self._files.retries = S3_TRIES
 
     def manifest(self) -> bytes | None:
-        with self._told():
-            return self._newest()[1]
+        with self._translate_errors():
+            return self._latest()[1]
 
     def version(self) -> Hashable | None:
-        with self._told():
+        with self._translate_errors():
             names = self._manifests()
         return names[-1] if names else None
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
-        with self._told():
-            names, newest = self._newest()
+        with self._translate_errors():
+            names, newest = self._latest()
             if newest != before:
                 return False
             number = int(Path(names[-1]).stem) + 1 if names else 1
-            if not self._created(f"{self._root}/{_MANIFESTS}/{number:09d}.json", after):
+            if not self._create_object(f"{self._root}/{_MANIFESTS}/{number:09d}.json", after):
                 return False
-            for name in names[:-_KEPT]:
+            for name in names[:-_NUM_KEPT]:
                 self.remove(f"{_MANIFESTS}/{Path(name).name}")
         return True
 
-    def _created(self, name: str, data: bytes) -> bool:
+    def _create_object(self, name: str, data: bytes) -> bool:
         """Create an object; False where another writer was faster. One that holds these very bytes
         is ours: the client asks again where an answer was lost."""
         try:
@@ -98,15 +98,15 @@ class ObjectStore:
         return True
 
     def put(self, name: str, path: Path) -> None:
-        with self._told():
+        with self._translate_errors():
             self._files.put_file(str(path), f"{self._root}/{name}")
 
-    def local(self, name: str, sha256: str) -> Path:
-        kept = self.kept(name, sha256)
-        if kept is not None:
-            return kept
-        path = _kept_at(name, sha256)
-        with _made(path) as temporary, self._told():
+    def local_path(self, name: str, sha256: str) -> Path:
+        cached = self.cached(name, sha256)
+        if cached is not None:
+            return cached
+        path = _cache_path(name, sha256)
+        with _cache_file(path) as temporary, self._translate_errors():
             try:
                 self._files.get_file(f"{self._root}/{name}", str(temporary))
             except FileNotFoundError:
@@ -117,8 +117,8 @@ class ObjectStore:
                 )
         return path
 
-    def kept(self, name: str, sha256: str) -> Path | None:
-        path = _kept_at(name, sha256)
+    def cached(self, name: str, sha256: str) -> Path | None:
+        path = _cache_path(name, sha256)
         try:
             os.utime(
                 path, ns=(time.time_ns(), path.stat().st_mtime_ns)
@@ -129,17 +129,17 @@ class ObjectStore:
 
     def ages(self) -> dict[str, float]:
         now = time.time()
-        with self._told():
+        with self._translate_errors():
             return {
                 f"{TILES}/{Path(entry['name']).name}": now - self._modified(entry)
                 for entry in self._entries(TILES)
             }
 
     def remove(self, name: str) -> None:
-        with self._told(), suppress(FileNotFoundError):  # another writer was here
+        with self._translate_errors(), suppress(FileNotFoundError):  # another writer was here
             self._files.rm_file(f"{self._root}/{name}")
 
-    def _newest(self) -> tuple[list[str], bytes | None]:
+    def _latest(self) -> tuple[list[str], bytes | None]:
         """The names of all manifests, and what the newest holds. Old ones are removed, also between
         a listing and its reading."""
         for _ in range(3):
@@ -171,7 +171,7 @@ class ObjectStore:
         return when.timestamp() if isinstance(when, datetime) else float(when)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _translate_errors(self) -> Iterator[None]:
         """Whatever a store's client raises is one failure here: these have errors of their own
         each."""
         try:
@@ -180,22 +180,24 @@ class ObjectStore:
             raise
         except Exception as error:
             text = " ".join(str(error).split())[:200] or type(error).__name__
-            raise StoreError(f"{self.where} does not answer, or not as a store: {text}") from error
+            raise ObjectStoreError(
+                f"{self.where} does not answer, or not as a store: {text}"
+            ) from error
 
 
-def _kept_at(name: str, sha256: str) -> Path:
+def _cache_path(name: str, sha256: str) -> Path:
     return cache_folder() / "tiles" / f"{sha256}{Path(name).suffix}"
 
 
 @contextmanager
-def _made(path: Path) -> Iterator[Path]:
+def _cache_file(path: Path) -> Iterator[Path]:
     """A file to be, in the cache folder. Raises StoreError where it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced_file(path) as temporary:
+        with atomic_write(path) as temporary:
             yield temporary
     except OSError as error:
-        raise StoreError(f"cannot keep {path}: {error.strerror or error}") from error
+        raise ObjectStoreError(f"cannot keep {path}: {error.strerror or error}") from error
 
 
 def _is_s3(fsspec: Any, where: str) -> bool:
@@ -207,5 +209,5 @@ def _options(fsspec: Any, where: str) -> dict[str, Any]:
     counts."""
     if not _is_s3(fsspec, where):
         return {}
-    said = fsspec.config.conf.get(fsspec.utils.get_protocol(where), {})
-    return {"config_kwargs": S3_CLIENT | dict(said.get("config_kwargs", {}))}
+    user_config = fsspec.config.conf.get(fsspec.utils.get_protocol(where), {})
+    return {"config_kwargs": S3_CLIENT | dict(user_config.get("config_kwargs", {}))}

@@ -17,20 +17,20 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from topoloc.apps.viewer.map_scene import names_of, seen_colours
+from topoloc.apps.viewer.map_scene import sample_colours, unique_image_names
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import pose_json
-from topoloc.mapping.contents import map_id_of
+from topoloc.localization.result import pose_to_json
+from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.pictures import jpeg_of
+from topoloc.recordings.image_io import encode_jpeg
 
 GAP_STEPS = 6.0
 """A step so many times the path's median step is a gap, over which no line is drawn."""
 MAX_PATH, MAX_RESULTS = 5_000, 10_000
-_LIKELY_SIGMA = 0.1  # of a point's distance from its node; less certain ones are a haze
-_PICTURE_WIDTHS = (320, 240, 160, 120, 96)
-_PICTURE_QUALITY = 75
+_MAX_POINT_SIGMA = 0.1  # of a point's distance from its node; less certain ones are a haze
+_IMAGE_WIDTHS = (320, 240, 160, 120, 96)
+_JPEG_QUALITY = 75
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class SceneBudget:
     they stand in it."""
 
     max_points: int = 150_000
-    max_picture_bytes: int = 3_500_000
+    max_image_bytes: int = 3_500_000
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ResultSet:
     path: Sequence[Rigid3] = ()
 
 
-def document_of(
+def create_document(
     topomap: TopoMetricMap,
     name: str,
     results: Sequence[ResultSet] = (),
@@ -64,45 +64,52 @@ def document_of(
         MapError: the map cannot be read.
     """
     budget = budget or SceneBudget()
-    shown = _read(topomap, budget.max_points)
+    shown = _read_nodes(topomap, budget.max_points)
     poses = [summary.world_from_cam for summary in topomap.summaries]
     return {
         "format": "topoloc-scene",
         "version": 1,
         "name": name,
-        "up": _up(topomap, poses).round(6).tolist(),
+        "up": _find_up_axis(topomap, poses).round(6).tolist(),
         "focus": [
             corner.round(3).tolist()
-            for corner in _focus(np.array([pose.translation for pose in poses]), shown.points_world)
+            for corner in _find_focus_box(
+                np.array([pose.translation for pose in poses]), shown.points_world
+            )
         ],
-        "map": _facts(topomap, len(shown.points_world)),
-        "points": {"world": _base64(shown.points_world.astype("<f4")), "rgb": _base64(shown.rgb)},
-        "nodes": _nodes(topomap, shown.cameras, _pictures(shown.jpegs, budget.max_picture_bytes)),
+        "map": _describe_map(topomap, len(shown.points_world)),
+        "points": {
+            "world": _to_base64(shown.points_world.astype("<f4")),
+            "rgb": _to_base64(shown.rgb),
+        },
+        "nodes": _nodes_to_json(
+            topomap, shown.cameras, _encode_images(shown.jpegs, budget.max_image_bytes)
+        ),
         "paths": [
             *_mapped_paths(topomap),
             *(
-                path_json(one.name, [p.translation for p in one.path])
+                path_to_json(one.name, [p.translation for p in one.path])
                 for one in results
                 if one.path
             ),
         ],
-        "results": [results_json(one) for one in results if one.answers],
+        "results": [results_to_json(one) for one in results if one.answers],
     }
 
 
-def script_json(document: Mapping[str, Any]) -> str:
+def to_script_json(document: Mapping[str, Any]) -> str:
     """The document as text that can stand inside a script element of HTML or XHTML."""
     text = json.dumps(document, separators=(",", ":"), allow_nan=False)
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
-def _facts(topomap: TopoMetricMap, num_shown: int) -> dict[str, Any]:
+def _describe_map(topomap: TopoMetricMap, num_shown: int) -> dict[str, Any]:
     sessions = [
         {"id": s.session_id, "name": s.name, "date": s.start_date} for s in topomap.sessions
     ]
     num_points = sum(summary.num_points for summary in topomap.summaries)
     facts = {
-        "id": map_id_of(topomap),
+        "id": get_map_id(topomap),
         "version": topomap.version,
         "num_nodes": len(topomap.summaries),
         "num_points": num_points,
@@ -115,7 +122,7 @@ def _facts(topomap: TopoMetricMap, num_shown: int) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
+class _NodeContent:
     """What is read of the nodes: of each its camera and picture, of all together the points with
     their colours."""
 
@@ -125,7 +132,7 @@ class _Shown:
     rgb: UInt8[np.ndarray, "n 3"]
 
 
-def _read(topomap: TopoMetricMap, max_points: int) -> _Shown:
+def _read_nodes(topomap: TopoMetricMap, max_points: int) -> _NodeContent:
     """Of the points that a node knows well as many as there is room for, coloured by its
     picture."""
     share = min(1.0, max_points / max(1, sum(summary.num_points for summary in topomap.summaries)))
@@ -137,21 +144,21 @@ def _read(topomap: TopoMetricMap, max_points: int) -> _Shown:
     )
     for node in topomap.nodes:
         sigmas = np.linalg.norm(node.point_sqrt_covs.astype(np.float64), axis=1)
-        known = sigmas <= _LIKELY_SIGMA * np.linalg.norm(node.points_cam, axis=1)
+        known = sigmas <= _MAX_POINT_SIGMA * np.linalg.norm(node.points_cam, axis=1)
         rows = np.flatnonzero(known & np.isfinite(node.points_cam).all(axis=1))
         chosen = rows[
             np.linspace(0, len(rows), int(share * len(rows)), endpoint=False).astype(np.int64)
         ]
         points.append(node.summary.world_from_cam.apply(node.points_cam[chosen].astype(np.float64)))
-        colours.append(seen_colours(node, node.features.points_img[chosen].astype(np.float64)))
+        colours.append(sample_colours(node, node.features.points_img[chosen].astype(np.float64)))
         cameras.append(node.camera)
         jpegs.append(node.template_jpeg)
-    return _Shown(
+    return _NodeContent(
         cameras, jpegs, np.concatenate(points), np.concatenate(colours).round().astype(np.uint8)
     )
 
 
-def _up(topomap: TopoMetricMap, poses: Sequence[Rigid3]) -> Float[np.ndarray, "3"]:
+def _find_up_axis(topomap: TopoMetricMap, poses: Sequence[Rigid3]) -> Float[np.ndarray, "3"]:
     """Up on earth where the map knows it; else what its cameras agree on, an axis of the world
     where that is one of them nearly."""
     if topomap.georeference is not None:
@@ -166,7 +173,7 @@ def _up(topomap: TopoMetricMap, poses: Sequence[Rigid3]) -> Float[np.ndarray, "3
     return axis if axis @ up > np.cos(np.deg2rad(25.0)) else up
 
 
-def _focus(
+def _find_focus_box(
     centres: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """(low, high) corners of the box that a first view shows: all nodes, and the points but for the
@@ -180,7 +187,7 @@ def _focus(
     return low, high
 
 
-def _nodes(
+def _nodes_to_json(
     topomap: TopoMetricMap, cameras: Sequence[Camera], pictures: Sequence[str | None]
 ) -> list[dict[str, Any]]:
     return [
@@ -189,42 +196,44 @@ def _nodes(
             "name": name,
             "session": summary.session_id,
             "num_points": summary.num_points,
-            "world_from_cam": _rounded(pose_json(summary.world_from_cam)),
+            "world_from_cam": _round_values(pose_to_json(summary.world_from_cam)),
             "camera": camera.to_json(),
             "picture": picture,
         }
         for summary, name, camera, picture in zip(
-            topomap.summaries, names_of(topomap), cameras, pictures, strict=True
+            topomap.summaries, unique_image_names(topomap), cameras, pictures, strict=True
         )
     ]
 
 
-def _pictures(jpegs: Sequence[bytes], max_bytes: int) -> list[str | None]:
+def _encode_images(jpegs: Sequence[bytes], max_bytes: int) -> list[str | None]:
     """The nodes' pictures as base64, all of one width: the largest by which they fit; of very many
     only every k-th."""
     room = max_bytes * 3 // 4
     if sum(map(len, jpegs)) <= room:
-        return [_base64(np.frombuffer(jpeg, np.uint8)) if jpeg else None for jpeg in jpegs]
+        return [_to_base64(np.frombuffer(jpeg, np.uint8)) if jpeg else None for jpeg in jpegs]
     tried = jpegs[:: max(1, len(jpegs) // 12)]
     sizes = {
-        width: len(jpegs) * float(np.mean([len(_shrunk(jpeg, width)) for jpeg in tried]))
-        for width in _PICTURE_WIDTHS
+        width: len(jpegs) * float(np.mean([len(_resize_jpeg(jpeg, width)) for jpeg in tried]))
+        for width in _IMAGE_WIDTHS
     }
-    width = next((width for width, size in sizes.items() if size <= room), _PICTURE_WIDTHS[-1])
+    width = next((width for width, size in sizes.items() if size <= room), _IMAGE_WIDTHS[-1])
     step = max(1, int(np.ceil(sizes[width] / room)))
-    shrunk = (_shrunk(jpeg, width) if row % step == 0 else b"" for row, jpeg in enumerate(jpegs))
-    return [_base64(np.frombuffer(jpeg, np.uint8)) if jpeg else None for jpeg in shrunk]
+    shrunk = (
+        _resize_jpeg(jpeg, width) if row % step == 0 else b"" for row, jpeg in enumerate(jpegs)
+    )
+    return [_to_base64(np.frombuffer(jpeg, np.uint8)) if jpeg else None for jpeg in shrunk]
 
 
-def _shrunk(jpeg: bytes, width: int) -> bytes:
+def _resize_jpeg(jpeg: bytes, width: int) -> bytes:
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     if picture is None:
         return b""
     scale = min(1.0, width / picture.shape[1])
     size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
-    return jpeg_of(
+    return encode_jpeg(
         cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB),
-        _PICTURE_QUALITY,
+        _JPEG_QUALITY,
     )
 
 
@@ -243,12 +252,12 @@ def _mapped_paths(topomap: TopoMetricMap) -> Iterator[dict[str, Any]]:
         ]
         poses = images if len(images) > len(nodes) else nodes
         if poses:
-            yield path_json(session.name, [pose.translation for pose in poses]) | {
+            yield path_to_json(session.name, [pose.translation for pose in poses]) | {
                 "session": session.session_id
             }
 
 
-def path_json(name: str, positions: Sequence[Float[np.ndarray, "3"]]) -> dict[str, Any]:
+def path_to_json(name: str, positions: Sequence[Float[np.ndarray, "3"]]) -> dict[str, Any]:
     """A path as lines, a new one wherever the next position is far off; of a long one every k-th
     position."""
     path = np.array(positions).reshape(-1, 3)[:: max(1, -(-len(positions) // MAX_PATH))]
@@ -257,23 +266,23 @@ def path_json(name: str, positions: Sequence[Float[np.ndarray, "3"]]) -> dict[st
     return {"name": name, "lines": [line.round(4).tolist() for line in np.split(path, gaps)]}
 
 
-def results_json(results: ResultSet) -> dict[str, Any]:
+def results_to_json(results: ResultSet) -> dict[str, Any]:
     step = max(1, -(-len(results.answers) // MAX_RESULTS))
     return {
         "name": results.name,
         "num_answers": len(results.answers),
-        "answers": [_rounded(dict(one)) for one in results.answers[::step]],
+        "answers": [_round_values(dict(one)) for one in results.answers[::step]],
     }
 
 
-def _rounded(value: Any) -> Any:
+def _round_values(value: Any) -> Any:
     """Numbers with as many digits as a picture shows."""
     if isinstance(value, float):
         return float(f"{value:.8g}") if np.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {key: _rounded(one) for key, one in value.items()}
-    return [_rounded(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: _round_values(one) for key, one in value.items()}
+    return [_round_values(one) for one in value] if isinstance(value, list | tuple) else value
 
 
-def _base64(array: np.ndarray) -> str:
+def _to_base64(array: np.ndarray) -> str:
     return base64.b64encode(array.tobytes()).decode("ascii")

@@ -16,7 +16,7 @@ from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.topomap import TopoMetricMap
 
 
-def scene_of_map(
+def create_map_scene(
     topomap: TopoMetricMap,
     name: str,
     session_id: int | None = None,
@@ -39,12 +39,12 @@ def scene_of_map(
     if not rows:
         known = ", ".join(f"{session.session_id} ({session.name})" for session in topomap.sessions)
         raise MapError(f"the map has no session {session_id} with nodes; its sessions: {known}")
-    names = names_of(topomap)
+    names = unique_image_names(topomap)
     tracks = find_tracks(topomap, rows, progress) if with_points else None
-    views, seen_rgb, start = list[View](), list[np.ndarray](), 0
+    views, sampled_rgb, start = list[View](), list[np.ndarray](), 0
     for row in rows:
         node = topomap.nodes[row]
-        view = _view(topomap, node, names[row])
+        view = _node_view(topomap, node, names[row])
         if tracks is not None:
             pixels = node.features.points_img.astype(np.float64)
             point_rows = tracks.point_rows[start : start + len(pixels)]
@@ -52,23 +52,25 @@ def scene_of_map(
                 replace(view, points_img=pixels, point_rows=point_rows),
                 start + len(pixels),
             )
-            seen_rgb.append(seen_colours(node, pixels))
+            sampled_rgb.append(sample_colours(node, pixels))
         views.append(view)
     posed = [
         image
         for image in topomap.place_images
         if session_id is None or image.session_id == session_id
     ]
-    points = Points.none() if tracks is None else _points(tracks, np.concatenate(seen_rgb))
+    points = (
+        Points.none() if tracks is None else _to_scene_points(tracks, np.concatenate(sampled_rgb))
+    )
     return Scene(
         name, views, points, [image.world_from_cam for image in posed], topomap.georeference
     )
 
 
-def _view(topomap: TopoMetricMap, node: TopoNode, name: str) -> View:
+def _node_view(topomap: TopoMetricMap, node: TopoNode, name: str) -> View:
     s, georeference = node.summary, topomap.georeference
     geopose = None if georeference is None else georeference.geopose(s.world_from_cam)
-    picture = _decoded(node.template_jpeg)
+    picture = _decode_jpeg(node.template_jpeg)
     jpeg_camera = (
         None if picture is None else node.camera.rescaled(picture.shape[1], picture.shape[0])
     )
@@ -85,7 +87,7 @@ def _view(topomap: TopoMetricMap, node: TopoNode, name: str) -> View:
     )
 
 
-def names_of(topomap: TopoMetricMap) -> list[str]:
+def unique_image_names(topomap: TopoMetricMap) -> list[str]:
     """Each node's picture; where several sessions call pictures alike, with the session's number
     before it."""
     names = [summary.name for summary in topomap.summaries]
@@ -94,23 +96,23 @@ def names_of(topomap: TopoMetricMap) -> list[str]:
     return [f"session{summary.session_id}/{summary.name}" for summary in topomap.summaries]
 
 
-def _points(tracks: Tracks, seen_rgb: Float[np.ndarray, "m 3"]) -> Points:
+def _to_scene_points(tracks: Tracks, sampled_rgb: Float[np.ndarray, "m 3"]) -> Points:
     """Colour and error of a point are the means over the pictures that show it."""
     shown = tracks.point_rows >= 0
     rows, num_points = tracks.point_rows[shown], len(tracks.points_world)
     counts = np.maximum(np.bincount(rows, minlength=num_points), 1)
     rgb, errors = np.zeros((num_points, 3)), np.zeros(num_points)
-    np.add.at(rgb, rows, seen_rgb[shown])
+    np.add.at(rgb, rows, sampled_rgb[shown])
     np.add.at(errors, rows, tracks.errors_px[shown])
     return Points(
         tracks.points_world, np.rint(rgb / counts[:, None]).astype(np.uint8), errors / counts
     )
 
 
-def seen_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
+def sample_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
     """What the node's picture shows at pixels of its camera, RGB, 0 to 255; black where it cannot
     be read."""
-    picture = _decoded(node.template_jpeg)
+    picture = _decode_jpeg(node.template_jpeg)
     if picture is None or len(pixels) == 0:
         return np.zeros((len(pixels), 3))
     scale = np.array([picture.shape[1] / node.camera.width, picture.shape[0] / node.camera.height])
@@ -124,6 +126,6 @@ def seen_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.n
     )[:, 0].astype(float)
 
 
-def _decoded(jpeg: bytes) -> UInt8[np.ndarray, "h w 3"] | None:
+def _decode_jpeg(jpeg: bytes) -> UInt8[np.ndarray, "h w 3"] | None:
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     return None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)

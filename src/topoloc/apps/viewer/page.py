@@ -17,7 +17,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from topoloc.apps.viewer.document import script_json
+from topoloc.apps.viewer.document import to_script_json
 from topoloc.recordings.atomic import write_text
 
 MODULES = {
@@ -54,7 +54,7 @@ def embedded_scene(document: Mapping[str, Any], name: str = "scene") -> str:
     """A scene within the body of such a page, well-formed; `name` is its id on the page."""
     return (
         f'<div data-scene="{name}"><noscript>The scene in 3-D needs JavaScript.</noscript></div>'
-        f'<script type="application/json" id="{name}">{script_json(document)}</script>'
+        f'<script type="application/json" id="{name}">{to_script_json(document)}</script>'
         '<script type="module">import { showAll } from "topoloc/apps/viewer"; showAll();</script>'
     )
 

@@ -9,10 +9,10 @@ from topoloc.apps.viewer.scene import Points, Scene, View
 from topoloc.errors import ResultError
 from topoloc.localization import checked_json as checked
 from topoloc.localization.result import Localization, result_from_json
-from topoloc.recordings.text_rows import read_text
+from topoloc.recordings.text_files import read_text
 
 
-def scene_of_results(path: Path) -> Scene:
+def create_results_scene(path: Path) -> Scene:
     """Pictures without a pose are left out.
 
     Raises:
@@ -26,7 +26,7 @@ def scene_of_results(path: Path) -> Scene:
     ]
     for number, line in lines:
         try:
-            data = checked.object_of(line)
+            data = checked.parse_object(line)
             result, query = result_from_json(data), checked.text(data.get("query", ""), "query")
         except ResultError as error:
             raise ResultError(f"{path}, line {number}: {error}") from None

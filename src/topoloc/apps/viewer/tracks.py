@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.features.kinds import find_kind
+from topoloc.features.feature_types import find_feature_type
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.mapping.entries import TopoNode
@@ -27,7 +27,7 @@ MAX_ERROR_PX = 3.0
 do not show it."""
 _GUIDED = GuidedConfig(radius_px=MAX_ERROR_PX)
 _NUM_STEPS = 5
-_LEAST_SIGMA = 1e-4  # metres; no map knows its points better
+_MIN_SIGMA = 1e-4  # metres; no map knows its points better
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ def find_tracks(
     maps = [LocalMap.of_node(node) for node in nodes]
     pairs = [np.zeros((0, 3))]
     poses = NodePoses.of([node.summary.world_from_cam for node in nodes])
-    config = _GUIDED.resolved(find_kind(topomap.kind))
+    config = _GUIDED.resolved(find_feature_type(topomap.kind))
     for a, node in enumerate(nodes):
         order = np.argsort(
             node_distances(node.summary.world_from_cam, poses, topomap.config.lambda_rot),
@@ -74,11 +74,11 @@ def find_tracks(
             )
         if progress:
             progress("tracks", a + 1, len(nodes))
-    labels = _joined(np.concatenate(pairs), np.repeat(np.arange(len(nodes)), np.diff(starts)))
-    return _located(labels, nodes, maps)
+    labels = _merge_points(np.concatenate(pairs), np.repeat(np.arange(len(nodes)), np.diff(starts)))
+    return _triangulate_tracks(labels, nodes, maps)
 
 
-def _joined(
+def _merge_points(
     pairs: Float[np.ndarray, "p 3"], of_node: Int[np.ndarray, " m"]
 ) -> Int[np.ndarray, " m"]:
     """A label for each point: that of the points that it is one with. Rows of `pairs`: two points,
@@ -143,13 +143,15 @@ class _KeyPoints:
         return (points_cam[:, :2] / z[:, None] - self.normalized) * self.focals[:, None], points_cam
 
 
-def _located(labels: Int[np.ndarray, " m"], nodes: list[TopoNode], maps: list[LocalMap]) -> Tracks:
+def _triangulate_tracks(
+    labels: Int[np.ndarray, " m"], nodes: list[TopoNode], maps: list[LocalMap]
+) -> Tracks:
     """Each track's point by least squares: where its nodes have it, by their covariances, and where
     their key points are."""
     num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.of(nodes, labels)
     prior, pull = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
     information = np.linalg.inv(
-        np.concatenate([part.covariances for part in maps]) + _LEAST_SIGMA**2 * np.eye(3)
+        np.concatenate([part.covariances for part in maps]) + _MIN_SIGMA**2 * np.eye(3)
     )
     np.add.at(prior, labels, information)
     np.add.at(
@@ -159,7 +161,7 @@ def _located(labels: Int[np.ndarray, " m"], nodes: list[TopoNode], maps: list[Lo
     )
     points = first = np.linalg.solve(prior, pull[:, :, None])[:, :, 0]
     for _ in range(_NUM_STEPS):
-        points = points + _step(points, first, prior, key_points)
+        points = points + _gauss_newton_step(points, first, prior, key_points)
     errors = np.linalg.norm(key_points.residuals(points)[0], axis=1)
     kept = errors <= key_points.max_errors_px  # NaN is not
     of_kept, places = np.unique(labels[kept], return_inverse=True)
@@ -168,7 +170,7 @@ def _located(labels: Int[np.ndarray, " m"], nodes: list[TopoNode], maps: list[Lo
     return Tracks(points[of_kept], point_rows, errors)
 
 
-def _step(
+def _gauss_newton_step(
     points: Float[np.ndarray, "n 3"],
     first: Float[np.ndarray, "n 3"],
     prior: Float[np.ndarray, "n 3 3"],

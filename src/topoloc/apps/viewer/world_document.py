@@ -13,21 +13,21 @@ import numpy as np
 from topoloc.apps.viewer.document import (
     ResultSet,
     SceneBudget,
-    document_of,
-    path_json,
-    results_json,
+    create_document,
+    path_to_json,
+    results_to_json,
 )
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.shared_world import SharedWorld, opened_tiles
+from topoloc.atlas.shared_world import SharedWorld, iter_open_tiles
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import checked_json as checked
-from topoloc.localization.result import pose_json
+from topoloc.localization.result import pose_to_json
 
-_POSES = ("world_from_cam", "true_world_from_cam", "smoothed")
+_POSE_KEYS = ("world_from_cam", "true_world_from_cam", "smoothed")
 Document = dict[str, Any]
 
 
-def document_of_world(
+def create_world_document(
     atlas: Atlas,
     world: SharedWorld,
     name: str,
@@ -35,7 +35,7 @@ def document_of_world(
     budget: SceneBudget | None = None,
     warn: Callable[[str], None] = lambda text: None,
 ) -> Document:
-    """As `document_of`, of all tiles of a world together. Nodes name their tile, sessions are
+    """As `create_document`, of all tiles of a world together. Nodes name their tile, sessions are
     numbered anew, points and pictures are shared out by nodes. Answers stand where their tile lies;
     those of tiles of other worlds are left out.
 
@@ -44,13 +44,13 @@ def document_of_world(
         StoreError: the store does not answer.
     """
     budget, parts, first_session = budget or SceneBudget(), list[Document](), 0
-    for placed, topomap in opened_tiles(atlas, world.tiles, warn):
+    for placed, topomap in iter_open_tiles(atlas, world.tiles, warn):
         share = placed.tile.num_nodes / max(1, world.num_nodes)
         its_budget = SceneBudget(
-            int(share * budget.max_points), int(share * budget.max_picture_bytes)
+            int(share * budget.max_points), int(share * budget.max_image_bytes)
         )
-        part = _moved(
-            document_of(topomap, placed.tile.tile_id, budget=its_budget),
+        part = _transform_document(
+            create_document(topomap, placed.tile.tile_id, budget=its_budget),
             placed.world_from_map,
             first_session,
         )
@@ -60,17 +60,25 @@ def document_of_world(
         )
         parts.append(part)
     paths = [
-        path_json(one.name, [pose.translation for pose in one.path]) for one in results if one.path
+        path_to_json(one.name, [pose.translation for pose in one.path])
+        for one in results
+        if one.path
     ]
-    shown = [replace(one, answers=answers_in(world, one.answers)) for one in results if one.answers]
-    joined = _joined(parts, name)
+    shown = [
+        replace(one, answers=transform_answers(world, one.answers))
+        for one in results
+        if one.answers
+    ]
+    joined = _merge_documents(parts, name)
     return joined | {
         "paths": joined["paths"] + paths,
-        "results": [results_json(one) for one in shown],
+        "results": [results_to_json(one) for one in shown],
     }
 
 
-def answers_in(world: SharedWorld, answers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def transform_answers(
+    world: SharedWorld, answers: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
     """Answers of an atlas, as JSON, in the coordinates of a world that tiles share; those of other
     tiles are left out."""
     moved = list[dict[str, Any]]()
@@ -81,7 +89,9 @@ def answers_in(world: SharedWorld, answers: Sequence[Mapping[str, Any]]) -> list
         if pose is None:
             continue
         its = dict(answer) | {
-            key: _moved_pose(pose, answer[key]) for key in _POSES if answer.get(key) is not None
+            key: _transform_pose(pose, answer[key])
+            for key in _POSE_KEYS
+            if answer.get(key) is not None
         }
         if "covariance" in its:
             covariance = np.array(its["covariance"], np.float64)
@@ -91,7 +101,7 @@ def answers_in(world: SharedWorld, answers: Sequence[Mapping[str, Any]]) -> list
                 (one, world.world_from_map_of(one.get("tile") or named)) for one in alternatives
             ]
             its["alternatives"] = [
-                one | {"world_from_cam": _moved_pose(there, one["world_from_cam"])}
+                one | {"world_from_cam": _transform_pose(there, one["world_from_cam"])}
                 for one, there in placed
                 if there is not None
             ]
@@ -99,11 +109,11 @@ def answers_in(world: SharedWorld, answers: Sequence[Mapping[str, Any]]) -> list
     return moved
 
 
-def _moved_pose(world_from_map: Rigid3, pose: Any) -> dict[str, Any]:
-    return pose_json(world_from_map @ checked.rigid(pose, "world_from_cam"))
+def _transform_pose(world_from_map: Rigid3, pose: Any) -> dict[str, Any]:
+    return pose_to_json(world_from_map @ checked.rigid(pose, "world_from_cam"))
 
 
-def _moved(document: Document, world_from_map: Rigid3, first_session: int) -> Document:
+def _transform_document(document: Document, world_from_map: Rigid3, first_session: int) -> Document:
     """The document of one tile where that lies, its sessions counted on from others'."""
     tile_id = document["name"]
     points = np.frombuffer(base64.b64decode(document["points"]["world"]), "<f4").reshape(-1, 3)
@@ -119,7 +129,7 @@ def _moved(document: Document, world_from_map: Rigid3, first_session: int) -> Do
     nodes = [
         node
         | {"tile": tile_id, "session": numbers.get(node["session"], first_session)}
-        | {"world_from_cam": _moved_pose(world_from_map, node["world_from_cam"])}
+        | {"world_from_cam": _transform_pose(world_from_map, node["world_from_cam"])}
         for node in document["nodes"]
     ]
     return document | {
@@ -129,12 +139,12 @@ def _moved(document: Document, world_from_map: Rigid3, first_session: int) -> Do
         "points": {"world": moved, "rgb": base64.b64decode(document["points"]["rgb"])},
         "nodes": nodes,
         "paths": [
-            _moved_path(path, world_from_map, tile_id, numbers) for path in document["paths"]
+            _transform_path(path, world_from_map, tile_id, numbers) for path in document["paths"]
         ],
     }
 
 
-def _moved_path(
+def _transform_path(
     path: Document, world_from_map: Rigid3, tile_id: str, numbers: Mapping[int, int]
 ) -> Document:
     lines = [
@@ -148,7 +158,7 @@ def _moved_path(
     }
 
 
-def _joined(parts: Sequence[Document], name: str) -> Document:
+def _merge_documents(parts: Sequence[Document], name: str) -> Document:
     """One document of several that lie in one world."""
     facts = [part["map"] for part in parts]
     sums = {

@@ -8,16 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from topoloc.apps.viewer.map_scene import scene_of_map
+from topoloc.apps.viewer.map_scene import create_map_scene
 from topoloc.apps.viewer.scene import Points, Scene, View
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.shared_world import SharedWorld, opened_tiles
+from topoloc.atlas.shared_world import SharedWorld, iter_open_tiles
 from topoloc.geometry.rigid import Rigid3
 
 Progress = Callable[[str, int, int], None]
 
 
-def scene_of_world(
+def create_world_scene(
     atlas: Atlas,
     world: SharedWorld,
     name: str,
@@ -34,8 +34,8 @@ def scene_of_world(
     """
     views, trajectory, points = list[View](), list[Rigid3](), list[Points]()
     first_session = 0
-    for placed, topomap in opened_tiles(atlas, world.tiles, warn):
-        scene = scene_of_map(topomap, name, None, with_points, progress)
+    for placed, topomap in iter_open_tiles(atlas, world.tiles, warn):
+        scene = create_map_scene(topomap, name, None, with_points, progress)
         numbers = {
             session.session_id: first_session + k for k, session in enumerate(topomap.sessions)
         }
@@ -46,17 +46,21 @@ def scene_of_world(
         for view in scene.views:
             session_id = numbers.get(view.session_id, first_session)
             called = f"{placed.tile.tile_id}/{view.name}" if len(world.tiles) > 1 else view.name
-            views.append(_moved(view, placed.world_from_map, called, session_id, first_row))
+            views.append(
+                _transform_view(view, placed.world_from_map, called, session_id, first_row)
+            )
         trajectory += [placed.world_from_map @ pose for pose in scene.trajectory]
         points.append(replace(scene.points, world=placed.world_from_map.apply(scene.points.world)))
     if world.georeference is not None:
         views = [
             replace(view, geopose=world.georeference.geopose(view.world_from_cam)) for view in views
         ]
-    return Scene(name, views, _joined(points), trajectory, world.georeference)
+    return Scene(name, views, _merge_points(points), trajectory, world.georeference)
 
 
-def _moved(view: View, world_from_map: Rigid3, name: str, session_id: int, first_row: int) -> View:
+def _transform_view(
+    view: View, world_from_map: Rigid3, name: str, session_id: int, first_row: int
+) -> View:
     rows = np.where(view.point_rows >= 0, view.point_rows + first_row, -1)
     return replace(
         view,
@@ -67,7 +71,7 @@ def _moved(view: View, world_from_map: Rigid3, name: str, session_id: int, first
     )
 
 
-def _joined(points: Sequence[Points]) -> Points:
+def _merge_points(points: Sequence[Points]) -> Points:
     world, rgb, errors = (
         [getattr(one, name) for one in points] for name in ("world", "rgb", "errors_px")
     )

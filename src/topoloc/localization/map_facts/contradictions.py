@@ -15,9 +15,9 @@ import numpy as np
 
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
-from topoloc.localization.fitted_weights import weights_of
+from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.local_map import LocalMap
-from topoloc.localization.map_facts.correlated_errors import inflation
+from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
@@ -55,7 +55,7 @@ class Contradiction:
         )
 
 
-def contradictions(
+def find_contradictions(
     topomap: TopoMetricMap, config: ContradictionsConfig | None = None
 ) -> list[Contradiction]:
     """One for each node that is not where the larger part of the map sees it. Raises MapError from
@@ -65,7 +65,7 @@ def contradictions(
     rho = (
         topomap.shared_errors.rho
         if topomap.shared_errors is not None
-        else weights_of(topomap.kind).shared_errors.unknown
+        else load_fitted_weights(topomap.kind).shared_errors.unknown
     )
     group, found = list(range(len(topomap.summaries))), []
     for row, summary in enumerate(topomap.summaries):
@@ -76,7 +76,7 @@ def contradictions(
         neighbours += [k for k in (row - 1, row + 1) if 0 <= k < len(group) and k not in neighbours]
         node = topomap.nodes[row]
         for other_row in neighbours:
-            difference = _difference(node, topomap.nodes[other_row], rho, config)
+            difference = _pose_difference(node, topomap.nodes[other_row], rho, config)
             if difference is None:
                 continue
             square, metres, radians = difference
@@ -87,11 +87,11 @@ def contradictions(
             ):
                 found.append((row, other_row, metres, radians))
             else:
-                _join(group, row, other_row)
-    return _outside_the_largest(topomap, group, found)
+                _merge_groups(group, row, other_row)
+    return _outside_largest_group(topomap, group, found)
 
 
-def _difference(
+def _pose_difference(
     node: TopoNode, other: TopoNode, rho: float, config: ContradictionsConfig
 ) -> tuple[float, float, float] | None:
     """How far the node's pose is from where the points of the other see it: squared, in
@@ -111,23 +111,23 @@ def _difference(
         return None
     error = found.cam_from_world @ node.summary.world_from_cam
     xi = error.log()
-    covariance = inflation(int(np.count_nonzero(found.inliers)), rho) * found.covariance
-    way = float(
+    covariance = covariance_inflation(int(np.count_nonzero(found.inliers)), rho) * found.covariance
+    translation_error = float(
         np.linalg.norm(
             found.cam_from_world.inverse().translation - node.summary.world_from_cam.translation
         )
     )
-    return float(xi @ np.linalg.solve(covariance, xi)), way, error.angle()
+    return float(xi @ np.linalg.solve(covariance, xi)), translation_error, error.angle()
 
 
-def _join(group: list[int], a: int, b: int) -> None:
+def _merge_groups(group: list[int], a: int, b: int) -> None:
     """Both rows, and all that were joined with them, get the smaller number."""
     low, high = sorted((group[a], group[b]))
     if low != high:
         group[:] = [low if number == high else number for number in group]
 
 
-def _outside_the_largest(
+def _outside_largest_group(
     topomap: TopoMetricMap, group: list[int], found: list[tuple[int, int, float, float]]
 ) -> list[Contradiction]:
     """The contradictions across groups, each told of the node in the smaller one, and of the nodes

@@ -24,11 +24,11 @@ from jaxtyping import Float
 
 from topoloc.bounds import AtLeast, Between
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
-from topoloc.localization.fitted_weights import SharedErrorWeights
+from topoloc.localization.fitted_weights import CorrelatedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
-from topoloc.mapping.nodes import NodePoses, digest_of_nodes, node_distances
-from topoloc.mapping.topomap import SharedErrors, TopoMetricMap, TopoNode
+from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
+from topoloc.mapping.topomap import CorrelatedErrors, TopoMetricMap, TopoNode
 
 _MEDIAN_CHI_SQUARE_6 = 5.348
 _METHOD = 1  # part of the digest: one more whenever the same settings come to give another rho
@@ -54,17 +54,17 @@ class CorrelatedErrorsConfig:
     """Of the nodes' rho; above the median, since some parts of a map are worse than others."""
 
 
-def inflation(num_inliers: int, rho: float) -> float:
+def covariance_inflation(num_inliers: int, rho: float) -> float:
     """What PnP's covariance from so many inliers is multiplied by."""
     return 1.0 + num_inliers * rho
 
 
-def correlated_errors_of(
+def find_correlated_error_share(
     topomap: TopoMetricMap,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     config: CorrelatedErrorsConfig,
-    weights: SharedErrorWeights,
+    weights: CorrelatedErrorWeights,
 ) -> float:
     """rho as the map tells it, where it was measured of these nodes and with these settings; else
     measured now.
@@ -75,27 +75,27 @@ def correlated_errors_of(
     known = topomap.shared_errors
     if known is not None and known.digest == _digest(topomap, guided, pose, config, weights):
         return known.rho
-    return measure_correlated_errors(topomap, guided, pose, config, weights)
+    return measure_correlated_error_share(topomap, guided, pose, config, weights)
 
 
-def correlated_errors_to_keep(
+def measure_stored_error_share(
     topomap: TopoMetricMap,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     config: CorrelatedErrorsConfig,
-    weights: SharedErrorWeights,
-) -> SharedErrors:
+    weights: CorrelatedErrorWeights,
+) -> CorrelatedErrors:
     """rho measured, for the map to keep."""
-    rho = measure_correlated_errors(topomap, guided, pose, config, weights)
-    return SharedErrors(rho, _digest(topomap, guided, pose, config, weights))
+    rho = measure_correlated_error_share(topomap, guided, pose, config, weights)
+    return CorrelatedErrors(rho, _digest(topomap, guided, pose, config, weights))
 
 
-def measure_correlated_errors(
+def measure_correlated_error_share(
     topomap: TopoMetricMap,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     config: CorrelatedErrorsConfig,
-    weights: SharedErrorWeights,
+    weights: CorrelatedErrorWeights,
 ) -> float:
     """rho of the map: see above."""
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
@@ -110,7 +110,7 @@ def measure_correlated_errors(
             distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
             order = np.argsort(distances, kind="stable")
             helpers = order[distances[order] > min_distance * d_thresh][: config.num_helpers]
-            rho = _rho_of_node(
+            rho = _error_share_of_node(
                 node, [topomap.nodes[int(k)] for k in helpers], guided, pose, config.min_inliers
             )
             if rho is not None:
@@ -127,7 +127,7 @@ def _digest(
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     config: CorrelatedErrorsConfig,
-    weights: SharedErrorWeights,
+    weights: CorrelatedErrorWeights,
 ) -> str:
     """A short name for all that rho follows from."""
     settings = {
@@ -136,12 +136,12 @@ def _digest(
         "config": asdict(config) | asdict(weights),
         "nodes": asdict(topomap.config.nodes),
     }
-    return digest_of_nodes(
+    return compute_nodes_digest(
         topomap.summaries, json.dumps([_METHOD, settings], sort_keys=True).encode()
     )
 
 
-def _rho_of_node(
+def _error_share_of_node(
     node: TopoNode,
     helpers: list[TopoNode],
     guided: GuidedConfig,
@@ -153,7 +153,7 @@ def _rho_of_node(
     if not helpers:
         return None
     cam_from_world = node.summary.world_from_cam.inverse()
-    local_map = LocalMap.pooled([LocalMap.of_node(helper) for helper in helpers])
+    local_map = LocalMap.concatenate([LocalMap.of_node(helper) for helper in helpers])
     matches = match_guided(node.features, local_map, cam_from_world, node.camera, guided)
     if len(matches) < min_inliers:
         return None

@@ -23,40 +23,42 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from topoloc.features.matching import MatchingConfig, alike_pairs, match_features
+from topoloc.features.matching import MatchingConfig, find_similar_pairs, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.local_map import LocalMap
 from topoloc.mapping.entries import NodeSummary, TopoNode
-from topoloc.mapping.nodes import digest_of_nodes
+from topoloc.mapping.nodes import compute_nodes_digest
 
 NUM_NEIGHBOURS = 9
-LEAST_SHIFT = 0.3
+MIN_SHIFT = 0.3
 """Metres: from there on a copy is another place."""
 _NUM_POINTS = 128
 _MIN_SIMILARITY = 0.9
 _CELL = 0.1  # metres
-_MIN_VOTES, _LEAST_WITHIN = 12, 0.15
+_MIN_VOTES, _MIN_SELF_SHARE = 12, 0.15
 _MAX_SHIFTS = 6
 _MIN_COPIED, _MIN_COPIED_SHARE = 20, 0.3
-_NEAREST = MatchingConfig(ratio=0.0, mutual=False)
+_NEAREST_NEIGHBOR = MatchingConfig(ratio=0.0, mutual=False)
 _POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=500)
 _METHOD = 1  # part of the digest: one more whenever the same nodes come to have other repetitions
-_HALF = 1000  # cells to either side: more than any shift is long
+_MAX_CELL_OFFSET = 1000  # cells to either side: more than any shift is long
 
 
 def digest_of(summaries: Sequence[NodeSummary]) -> str:
     """A short name for what repetitions follow from."""
-    return digest_of_nodes(summaries, bytes([_METHOD]))
+    return compute_nodes_digest(summaries, bytes([_METHOD]))
 
 
-def may_repeat(node: LocalMap) -> bool:
+def has_repetitions(node: LocalMap) -> bool:
     """Is there anything in what a node shows that its own picture shows twice? What repeats itself
     mostly does."""
-    return len(shifts_of(node, node, _LEAST_WITHIN)) > 0
+    return len(find_repetition_shifts(node, node, _MIN_SELF_SHARE)) > 0
 
 
-def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float[np.ndarray, "k 3"]:
+def find_repetition_shifts(
+    node: LocalMap, neighbours: LocalMap, min_share: float = 0.5
+) -> Float[np.ndarray, "k 3"]:
     """The shifts (metres, world) by which what a node shows is there once more, those with most
     votes first; none in most places.
 
@@ -67,17 +69,17 @@ def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float
             of themselves.
     """
     points, descriptors = node.points_world[:_NUM_POINTS], node.descriptors[:_NUM_POINTS]
-    rows, columns = alike_pairs(descriptors, around.descriptors, _MIN_SIMILARITY)
-    shifts = around.points_world[columns] - points[rows]
-    far = np.linalg.norm(shifts, axis=1) > LEAST_SHIFT
+    rows, columns = find_similar_pairs(descriptors, neighbours.descriptors, _MIN_SIMILARITY)
+    shifts = neighbours.points_world[columns] - points[rows]
+    far = np.linalg.norm(shifts, axis=1) > MIN_SHIFT
     rows, shifts = rows[far], shifts[far]
     found: list[Float[np.ndarray, " 3"]] = []
     least, left = max(_MIN_VOTES, min_share * len(points)), np.ones(len(shifts), np.bool_)
     grids = [
-        _Votes.of(shifts, rows, offset) for offset in (0.0, 0.5)
+        _ShiftVotes.of(shifts, rows, offset) for offset in (0.0, 0.5)
     ]  # that overlap: no shift lies at the borders of both
     while left.any() and len(found) < _MAX_SHIFTS:
-        _, voters = max((grid.densest(left) for grid in grids), key=lambda most: most[0])
+        _, voters = max((grid.find_densest_cell(left) for grid in grids), key=lambda most: most[0])
         near = left & (
             np.linalg.norm(shifts - np.median(shifts[voters], axis=0), axis=1) < 1.5 * _CELL
         )
@@ -91,11 +93,11 @@ def shifts_of(node: LocalMap, around: LocalMap, min_share: float = 0.5) -> Float
     return np.array(found).reshape(-1, 3)
 
 
-def copy_of(node: TopoNode, others: LocalMap) -> Rigid3 | None:
+def find_copy_transform(node: TopoNode, others: LocalMap) -> Rigid3 | None:
     """The move (world) that takes what a node shows onto its copy among these points; None where
     there is none, or it is itself."""
     features = node.features.select(np.arange(min(_NUM_POINTS, len(node.features))))
-    matches = match_features(features.descriptors, others.descriptors, _NEAREST)
+    matches = match_features(features.descriptors, others.descriptors, _NEAREST_NEIGHBOR)
     alike = 1.0 - matches.distances**2 / 2.0 >= _MIN_SIMILARITY
     rows, columns = matches.query_idx[alike], matches.train_idx[alike]
     least = max(_MIN_COPIED, _MIN_COPIED_SHARE * len(features))
@@ -112,12 +114,12 @@ def copy_of(node: TopoNode, others: LocalMap) -> Rigid3 | None:
     points_world = node.summary.world_from_cam.apply(
         node.points_cam[rows[found.inliers]].astype(np.float64)
     )
-    way = np.linalg.norm(move.apply(points_world) - points_world, axis=1)
-    return move if float(np.median(way)) > LEAST_SHIFT else None
+    displacements = np.linalg.norm(move.apply(points_world) - points_world, axis=1)
+    return move if float(np.median(displacements)) > MIN_SHIFT else None
 
 
 @dataclass(frozen=True, eq=False)
-class _Votes:
+class _ShiftVotes:
     """Shifts by the cells of a grid that they lie in: `order` sorts them by cell and point, `cells`
     and `points` are sorted so."""
 
@@ -126,13 +128,15 @@ class _Votes:
     points: Int[np.ndarray, " n"]
 
     @staticmethod
-    def of(shifts: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], offset: float) -> _Votes:
-        x, y, z = (np.floor(shifts / (2.0 * _CELL) + offset).astype(np.int64) + _HALF).T
-        keys = ((x * 2 * _HALF + y) * 2 * _HALF + z) * _NUM_POINTS + rows
+    def of(
+        shifts: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], offset: float
+    ) -> _ShiftVotes:
+        x, y, z = (np.floor(shifts / (2.0 * _CELL) + offset).astype(np.int64) + _MAX_CELL_OFFSET).T
+        keys = ((x * 2 * _MAX_CELL_OFFSET + y) * 2 * _MAX_CELL_OFFSET + z) * _NUM_POINTS + rows
         order = np.argsort(keys, kind="stable")
-        return _Votes(order, *np.divmod(keys[order], _NUM_POINTS))
+        return _ShiftVotes(order, *np.divmod(keys[order], _NUM_POINTS))
 
-    def densest(self, left: Bool[np.ndarray, " n"]) -> tuple[int, Int[np.ndarray, " k"]]:
+    def find_densest_cell(self, left: Bool[np.ndarray, " n"]) -> tuple[int, Int[np.ndarray, " k"]]:
         """The most points that vote for one cell, and the shifts that lie in it, of those that are
         left (some are)."""
         is_left = left[self.order]
@@ -147,7 +151,7 @@ class _Votes:
         return int(votes.max()), self.order[is_left & (self.cells == cell)]
 
 
-def folded(
+def fold_repetitions(
     points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """The points with all copies moved onto one: along the shortest shift, by whole shifts, into
@@ -163,7 +167,7 @@ def folded(
     return points_world - np.floor(along - cut)[:, None] * shift
 
 
-def copies(
+def shifted_copies(
     points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "c n 3"]:
     """The points themselves, and moved by each shift."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_writing import (
-    KINDS,
+    FEATURE_TYPES,
     LEFT,
     RIGHT,
     Write,
@@ -41,7 +41,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import find_format, open_sequence
-from topoloc.recordings.recording import notes_of, single_pictures
+from topoloc.recordings.recording import as_monocular, recording_notes
 
 BagOf = Callable[..., Path]
 CAMERA = Camera.pinhole(64, 48, 50.0, 51.0, 31.0, 24.5)
@@ -74,14 +74,14 @@ def assert_same(one: StereoSequence, other: StereoSequence) -> None:
 
 
 @pytest.mark.parametrize("is_compressed", [False, True], ids=["raw", "compressed"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FEATURE_TYPES)
 def test_a_bag_is_the_recording_it_was_made_of(
     kind: str, is_compressed: bool, walk: StereoSequence, bag_of: BagOf
 ):
     path = bag_of(kind, is_compressed=is_compressed)
     assert find_format(path) == ("mcap" if kind == "mcap-zstd" else "rosbag")
     sequence = open_sequence(path)
-    assert notes_of(sequence) == []
+    assert recording_notes(sequence) == []
     assert_same(walk, sequence)
     assert_same(walk, open_sequence(f"{path}@0:5"))
 
@@ -92,7 +92,9 @@ def test_poses_come_from_what_there_is(
 ):
     sequence = open_sequence(bag_of("ros2", poses=poses))
     assert_same(walk, sequence)
-    assert ("it does not say whose they are" in " ".join(notes_of(sequence))) == (poses is by_pose)
+    assert ("it does not say whose they are" in " ".join(recording_notes(sequence))) == (
+        poses is by_pose
+    )
 
 
 def test_a_real_recording_as_a_bag(shared: Path, tmp_path: Path):
@@ -142,7 +144,7 @@ def test_pose_frame_names_the_frame_of_the_poses(walk: StereoSequence, tmp_path:
 
     path = write_stereo_bag(tmp_path / "body", "ros2", walk, poses)
     sequence = open_sequence(path, topics="left=/left/image_rect,pose=/pose,pose_frame=base_link")
-    assert notes_of(sequence) == []
+    assert recording_notes(sequence) == []
     assert_same(walk, sequence)
     with pytest.raises(TrajectoryError, match="no fixed transform from left_optical to wheel"):
         open_sequence(path, topics="left=/left/image_rect,pose=/pose,pose_frame=wheel")
@@ -196,7 +198,7 @@ def test_poses_of_another_time_are_none(walk: StereoSequence, tmp_path: Path):
     )
     sequence = open_sequence(path)
     assert sequence.poses == [None] * len(walk)
-    assert notes_of(sequence) == [
+    assert recording_notes(sequence) == [
         f"{path}: no pose of left_optical at the times of the pictures in /odom; the recording is"
         " taken as one without poses"
     ]
@@ -261,7 +263,7 @@ def test_depth_with_its_own_camera(tmp_path: Path):
     assert frame.depth.depth[1, 1] == 1.5
     assert np.isnan(frame.depth.depth[0, :2]).all()
     np.testing.assert_allclose(frame.depth.cam_from_depth.matrix(), cam_from_depth.matrix())
-    assert single_pictures(sequence)[2].depth is None
+    assert as_monocular(sequence)[2].depth is None
 
 
 def test_pictures_without_a_partner_are_left_out_and_said(walk: StereoSequence, tmp_path: Path):
@@ -297,7 +299,7 @@ def test_pictures_without_a_partner_are_left_out_and_said(walk: StereoSequence, 
     assert sequence.t_ns == [walk.t_ns[index] for index in (0, 2, 3)]
     assert (
         "1 of 4 pictures of /left/image_rect have none of /right/image_rect (3) within 5 ms and are"
-        " left out" in notes_of(sequence)[0]
+        " left out" in recording_notes(sequence)[0]
     )
     with pytest.raises(
         RecordingError, match=r"4 of 4 pictures .* within 5 ms; the nearest is 20\.0 ms away"

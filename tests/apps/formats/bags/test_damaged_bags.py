@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writing import KINDS
+from bag_writing import FEATURE_TYPES
 
 from topoloc.errors import RecordingError, TopolocError
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import notes_of
+from topoloc.recordings.recording import recording_notes
 
 FileOf = Callable[[str], Path]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FEATURE_TYPES)
 def test_a_bag_that_was_cut_off(
     kind: str, walk: StereoSequence, file_of: FileOf, capsys: pytest.CaptureFixture[str]
 ):
@@ -27,7 +27,7 @@ def test_a_bag_that_was_cut_off(
     path.write_bytes(whole[: int(len(whole) * 0.75)])
     sequence = open_sequence(path)
     assert 2 <= len(sequence) < len(walk)
-    assert any("what is whole is used" in note for note in notes_of(sequence))
+    assert any("what is whole is used" in note for note in recording_notes(sequence))
     for index in range(len(sequence)):
         assert sequence.t_ns[index] == walk.t_ns[index]
         np.testing.assert_array_equal(sequence[index].image, walk[index].image)
@@ -54,7 +54,7 @@ def test_a_bag_that_was_never_closed(file_of: FileOf, walk: StereoSequence):
     path.with_suffix(".bag.active").write_bytes(data[:place] + bytes(8) + data[place + 8 :])
     sequence = open_sequence(path.with_suffix(".bag.active"))
     assert len(sequence) == len(walk)
-    assert "never closed" in notes_of(sequence)[0]
+    assert "never closed" in recording_notes(sequence)[0]
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_a_topic_whose_name_is_damaged_is_not_shown(file_of: FileOf):
     assert str(failure.value).isprintable()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FEATURE_TYPES)
 def test_changed_bytes_raise_errors_of_this_house_alone(kind: str, file_of: FileOf, tmp_path: Path):
     """Bytes changed where structure is: within what is no picture, and lengths most of all."""
     path = file_of(kind)

@@ -10,7 +10,7 @@ from bag_writing import ROS1, ROS2, header, image, message, write_foxglove
 from foxglove_classes import foxglove_classes
 
 from topoloc.apps.formats.bags.message_file import Topic
-from topoloc.apps.formats.bags.messages import decode, frame_id, stamp_of_head, transforms_of
+from topoloc.apps.formats.bags.messages import decode, decode_transforms, frame_id, header_stamp_ns
 from topoloc.errors import RecordingError
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
@@ -44,9 +44,9 @@ def test_the_time_of_a_beginning(encoding: str):
         else _ros1(fields)
     )
     topic = Topic("/a", IMAGE, encoding)
-    assert stamp_of_head(topic, data[:32]) == NOW
+    assert header_stamp_ns(topic, data[:32]) == NOW
     assert frame_id(decode(topic, data)) == "left_optical"
-    assert stamp_of_head(topic, data[:5]) is None
+    assert header_stamp_ns(topic, data[:5]) is None
     with pytest.raises(RecordingError, match="/a: no whole message of type sensor_msgs/msg/Image"):
         decode(topic, data[:40])
 
@@ -61,7 +61,7 @@ def test_messages_that_cannot_be_read():
     with pytest.raises(RecordingError, match="no whole message of type nav/msg/Unknown"):
         decode(Topic("/a", "nav/msg/Unknown", "cdr"), b"123")
     with pytest.raises(RecordingError, match="not poses"):
-        transforms_of(
+        decode_transforms(
             Topic("/a", "foxglove.PoseInFrame", "json"),
             b'{"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "map", "pose": 7}',
         )
@@ -74,7 +74,7 @@ def test_a_pose_without_a_rotation(orientation: dict[str, float]):
     kind = "geometry_msgs/msg/PoseStamped"
     fields = {"header": header(NOW, "map"), "pose": {"orientation": orientation}}
     with pytest.raises(RecordingError, match="/pose: not poses"):
-        transforms_of(
+        decode_transforms(
             Topic("/pose", kind, "cdr"),
             bytes(ROS2.serialize_cdr(message(ROS2, kind, fields), kind)),
         )

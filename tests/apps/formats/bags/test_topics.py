@@ -9,7 +9,7 @@ import pytest
 
 from topoloc.apps.formats.bags.bag import Bag
 from topoloc.apps.formats.bags.message_file import Topic
-from topoloc.apps.formats.bags.topics import Roles, choose_topics, is_rectified, parse_topics
+from topoloc.apps.formats.bags.topics import Roles, is_rectified, parse_topics, select_topics
 from topoloc.errors import RecordingError
 
 IMAGE, COMPRESSED, INFO = (
@@ -42,7 +42,7 @@ def bag(**kinds: list[str]) -> Bag:
 
 
 def roles_of(its: Bag) -> dict[str, Any]:
-    roles = choose_topics(its, {})
+    roles = select_topics(its, {})
     return {name: value for name, value in vars(roles).items() if value}
 
 
@@ -160,7 +160,7 @@ def test_rectified_by_name(name: str, expected: bool):
 
 def test_several_cameras_are_said():
     its = bag(image=["/front/image_raw", "/rear/image_raw"], info=["/rear/camera_info"])
-    assert choose_topics(its, {}).left == "/rear/image_raw"
+    assert select_topics(its, {}).left == "/rear/image_raw"
     assert (
         "of several topics of pictures /rear/image_raw is taken, not /front/image_raw"
         in its.notes[0]
@@ -178,15 +178,15 @@ def test_what_is_said_counts():
         "pose": "/odom",
         "pose_frame": "imu",
     }
-    assert choose_topics(its, said) == Roles(
+    assert select_topics(its, said) == Roles(
         "/cam0/image_raw", None, "/depth", "/k", None, None, ("/odom",), "imu", True
     )
     with pytest.raises(
         RecordingError, match="/odom is nav_msgs/msg/Odometry, which cannot be left_info"
     ):
-        choose_topics(its, said | {"left_info": "/odom"})
+        select_topics(its, said | {"left_info": "/odom"})
     with pytest.raises(RecordingError, match="left must be, too"):
-        choose_topics(its, {"right": "/cam1/image_raw"})
+        select_topics(its, {"right": "/cam1/image_raw"})
 
 
 @pytest.mark.parametrize("text", ["left", "left=", "=/a", "left=/a,,", "lft=/a"])

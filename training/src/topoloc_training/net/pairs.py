@@ -18,8 +18,8 @@ from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.folder import open_folder
 from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.image_io import to_grey
 from topoloc.recordings.kitti import open_kitti
-from topoloc.recordings.pictures import grey_image
 
 _NEAREST = 3  # day's pictures for one of the others
 _REACH = 2.0  # metres
@@ -84,7 +84,7 @@ def located_pixels(frame: StereoFrame) -> tuple[np.ndarray, np.ndarray]:
     camera."""
     if frame.right is None or frame.rig is None:
         raise RecordingError(f"{frame.name}: no stereo pair")
-    left, right = grey_image(frame.image), grey_image(frame.right)
+    left, right = to_grey(frame.image), to_grey(frame.right)
     matcher = cv2.StereoSGBM.create(
         0,
         64,

@@ -1,5 +1,5 @@
 """The same walls seen from both ends: a rendered way out and the way back, as views to the sides
-show them (`topoloc.features.side_views`).
+show them (`topoloc.features.virtual_views`).
 
 Depth comes from the stereo pairs of the way out, poses from the truth. Views are kept as pictures
 of the size that the teacher sees: an upper and a lower band of each.
@@ -15,10 +15,10 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from topoloc.errors import RecordingError
-from topoloc.features.side_views import SideView, SideViewConfig, side_views
+from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.pictures import grey_image
+from topoloc.recordings.image_io import to_grey
 from topoloc_training.net.pairs import Pair, located_pixels, seen_by
 from topoloc_training.net.teacher import HEIGHT, WIDTH
 
@@ -32,7 +32,7 @@ class _Shown:
     """A band of a side view, kept as the picture `path`; `first` are the column and row of the view
     at which it begins."""
 
-    view: SideView
+    view: VirtualView
     band: int
     path: str
     first: tuple[int, int]
@@ -124,7 +124,7 @@ def _pairs_of(
             ):  # the other hand, the same band
                 continue
             at = [
-                one.pixels(one.view.cam_from_side.inverse().apply(p))
+                one.pixels(one.view.cam_from_virtual.inverse().apply(p))
                 for one, p in ((here, points), (there, moved))
             ]
             both = np.isfinite(at[0]).all(axis=1) & np.isfinite(at[1]).all(axis=1)
@@ -142,8 +142,8 @@ def _pairs_of(
 
 def _kept_views(frame: StereoFrame, recording: str, pictures: Path) -> list[_Shown]:
     assert frame.camera is not None
-    grey, kept = grey_image(frame.image), list[_Shown]()
-    for view in side_views(frame.camera, SideViewConfig()):
+    grey, kept = to_grey(frame.image), list[_Shown]()
+    for view in make_virtual_views(frame.camera, VirtualViewConfig()):
         picture = view.picture(grey)
         # the farthest columns are cut off, where there are too many
         column = 0 if view.name == "left" else max(0, picture.shape[1] - WIDTH)

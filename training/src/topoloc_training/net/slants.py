@@ -1,5 +1,5 @@
-"""A wall as a camera shows it that looks along it, and as `topoloc.features.side_views` turns that
-to the front again.
+"""A wall as a camera shows it that looks along it, and as `topoloc.features.virtual_views` turns
+that to the front again.
 
 What lies ahead on a wall is seen at a slant: it fills fewer and fewer pixels, so that its picture
 from the front is smeared, most where the camera saw it from farthest. Who comes back sees it from

@@ -13,8 +13,8 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, Float32, Int8, UInt8
 
-from topoloc.recordings.pictures import grey_image, read_image
-from topoloc.recordings.recording import list_pictures
+from topoloc.recordings.image_io import read_image, to_grey
+from topoloc.recordings.recording import list_images
 
 WIDTH, HEIGHT = 640, 384
 STRIDE = 4
@@ -73,7 +73,7 @@ def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
         str(teacher), options, providers=["CPUExecutionProvider"]
     )
     for i, path in enumerate(paths):
-        lessons.pictures[i], lessons.scales[i] = _fitted(grey_image(read_image(Path(path))))
+        lessons.pictures[i], lessons.scales[i] = _fitted(to_grey(read_image(Path(path))))
         outputs = session.run(
             None, {"image": lessons.pictures[i].astype(np.float32)[None, None] / 255}
         )
@@ -89,7 +89,7 @@ def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
 
 def _listed(folder: str) -> list[Path]:
     name, _, step = folder.partition("::")
-    return list_pictures(Path(name))[:: int(step or 1)]
+    return list_images(Path(name))[:: int(step or 1)]
 
 
 def _opened(

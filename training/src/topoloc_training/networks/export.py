@@ -17,14 +17,14 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from topoloc.recordings.atomic import replaced_file
+from topoloc.recordings.atomic import atomic_write
 from topoloc_training.networks.edgepoint2 import SIZES, EdgePoint2
 from topoloc_training.networks.lean import made_lean
 from topoloc_training.networks.xfeat import UNUSED, XFeat
 
 VERSION = 1
 _OPSET = 17
-KINDS = ("xfeat", *(f"edgepoint2-{size}" for size in SIZES))
+FEATURE_TYPES = ("xfeat", *(f"edgepoint2-{size}" for size in SIZES))
 
 
 def build_network(kind: str, tensors: dict[str, Tensor]) -> nn.Module:
@@ -33,8 +33,8 @@ def build_network(kind: str, tensors: dict[str, Tensor]) -> nn.Module:
     Raises:
         ValueError: unknown kind, or tensors of another network.
     """
-    if kind not in KINDS:
-        raise ValueError(f"no network {kind!r}: there are {', '.join(KINDS)}")
+    if kind not in FEATURE_TYPES:
+        raise ValueError(f"no network {kind!r}: there are {', '.join(FEATURE_TYPES)}")
     network = XFeat() if kind == "xfeat" else EdgePoint2(kind.removeprefix("edgepoint2-"))
     kept = {name: value for name, value in tensors.items() if not name.startswith(UNUSED)}
     try:
@@ -49,7 +49,7 @@ def export(network: nn.Module, path: Path, properties: dict[str, str]) -> None:
     metadata."""
     outputs = getattr(network, "outputs", ("scores", "descriptors"))
     axes = {name: {2: f"h_{name}", 3: f"w_{name}"} for name in outputs}
-    with replaced_file(path) as part:
+    with atomic_write(path) as part:
         with warnings.catch_warnings():
             # The exporter by tracing is called old, but needs no further package and gives the
             # smaller graph.

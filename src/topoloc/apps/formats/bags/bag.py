@@ -14,7 +14,7 @@ from topoloc.recordings.recording import natural_key
 
 BAG_SUFFIXES = (".bag", ".bag.active", ".db3")
 MCAP_SUFFIXES = (".mcap",)
-_PACKED_FILE, _ZSTD = ".zstd", b"\x28\xb5\x2f\xfd"
+_COMPRESSED_SUFFIX, _ZSTD_MAGIC = ".zstd", b"\x28\xb5\x2f\xfd"
 _MAX_MESSAGE_BYTES = 1 << 29
 
 
@@ -52,9 +52,9 @@ class Bag:
         """
         file = self.files[ref.file]
         data = file.read(ref, most)
-        return _unpacked(file.read(ref)) if data.startswith(_ZSTD) else data
+        return _decompress(file.read(ref)) if data.startswith(_ZSTD_MAGIC) else data
 
-    def listed(self) -> str:
+    def describe_topics(self) -> str:
         """The topics with their types, for errors."""
         names = [
             f"{topic.name} ({topic.type or topic.encoding})"
@@ -66,7 +66,7 @@ class Bag:
             else "none"
         )
 
-    def note_faults(self) -> None:
+    def add_fault_notes(self) -> None:
         """Adds what is wrong with the files; after the messages that are used were looked for."""
         self.notes += [
             f"{self.path}: {file.fault}; what is whole is used" for file in self.files if file.fault
@@ -76,7 +76,9 @@ class Bag:
 def is_bag(path: Path, suffixes: tuple[str, ...] = BAG_SUFFIXES) -> bool:
     """Whether this is a file of one of these names, or a folder of files that ROS 2 recorded."""
     if path.is_dir():
-        return suffixes == BAG_SUFFIXES and bool((path / "metadata.yaml").is_file() or _parts(path))
+        return suffixes == BAG_SUFFIXES and bool(
+            (path / "metadata.yaml").is_file() or _list_parts(path)
+        )
     return path.name.lower().endswith(suffixes) and path.is_file()
 
 
@@ -87,9 +89,11 @@ def open_bag_files(path: Path) -> Bag:
         RecordingError: no bag, or damaged at its beginning.
         MissingExtraError: the extra `bags` is not installed.
     """
-    paths = _parts(path) if path.is_dir() else [path]
+    paths = _list_parts(path) if path.is_dir() else [path]
     if not paths:
-        packed = [part.name for part in sorted(path.iterdir()) if part.name.endswith(_PACKED_FILE)]
+        packed = [
+            part.name for part in sorted(path.iterdir()) if part.name.endswith(_COMPRESSED_SUFFIX)
+        ]
         said = (
             f"{packed[0]} is packed as a whole: `zstd -d` unpacks it"
             if packed
@@ -99,7 +103,7 @@ def open_bag_files(path: Path) -> Bag:
     return Bag(path, [_open_file(part) for part in paths])
 
 
-def _parts(folder: Path) -> list[Path]:
+def _list_parts(folder: Path) -> list[Path]:
     parts = [
         part
         for part in folder.iterdir()
@@ -114,18 +118,18 @@ def _open_file(path: Path) -> MessageFile:
             begin = file.read(16)
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from None
-    for magic, kind in _KINDS.items():
+    for magic, kind in _OPENERS.items():
         if begin.startswith(magic):
             try:
                 return kind(path)
             except ModuleNotFoundError as error:
-                raise missing_bags(error, path) from error
+                raise missing_bags_error(error, path) from error
     raise RecordingError(
         f"{path}: {'empty' if not begin else 'neither a ROS bag (2.0, or SQLite) nor an MCAP file'}"
     )
 
 
-def missing_bags(error: ModuleNotFoundError, path: Path) -> Exception:
+def missing_bags_error(error: ModuleNotFoundError, path: Path) -> Exception:
     """What is said where a library of the extra is missing."""
     if error.name is None or error.name.split(".")[0] not in (
         "rosbags",
@@ -140,32 +144,32 @@ def missing_bags(error: ModuleNotFoundError, path: Path) -> Exception:
     )
 
 
-def _ros1(path: Path) -> MessageFile:
+def _open_ros1(path: Path) -> MessageFile:
     from topoloc.apps.formats.bags.ros1_file import Ros1File
 
     return Ros1File(path)
 
 
-def _mcap(path: Path) -> MessageFile:
+def _open_mcap(path: Path) -> MessageFile:
     from topoloc.apps.formats.bags.mcap_file import McapFile
 
     return McapFile(path)
 
 
-def _sqlite(path: Path) -> MessageFile:
+def _open_sqlite(path: Path) -> MessageFile:
     from topoloc.apps.formats.bags.sqlite_file import SqliteFile
 
     return SqliteFile(path)
 
 
-_KINDS: dict[bytes, Callable[[Path], MessageFile]] = {
-    b"#ROSBAG V2.0\n": _ros1,
-    b"\x89MCAP0\r\n": _mcap,
-    b"SQLite format 3\0": _sqlite,
+_OPENERS: dict[bytes, Callable[[Path], MessageFile]] = {
+    b"#ROSBAG V2.0\n": _open_ros1,
+    b"\x89MCAP0\r\n": _open_mcap,
+    b"SQLite format 3\0": _open_sqlite,
 }
 
 
-def _unpacked(data: bytes) -> bytes:
+def _decompress(data: bytes) -> bytes:
     import zstandard
 
     try:

@@ -6,24 +6,24 @@ from __future__ import annotations
 from pathlib import Path
 
 from topoloc.apps.formats.bags.bag import Bag
-from topoloc.apps.formats.bags.frame_tree import FrameTree, trajectory_of
-from topoloc.apps.formats.bags.messages import TRANSFORMS, TimedTransform, transforms_of
+from topoloc.apps.formats.bags.messages import TRANSFORM_TYPES, StampedTransform, decode_transforms
 from topoloc.apps.formats.bags.topics import TF, Roles
+from topoloc.apps.formats.bags.transform_tree import TransformTree, trajectory_from_transforms
 from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.trajectory import poses_at, read_truth
+from topoloc.recordings.trajectory import interpolate_poses, read_ground_truth
 
 
-def read_frames(bag: Bag) -> FrameTree:
+def read_transform_tree(bag: Bag) -> TransformTree:
     """All transforms of the bag. Messages that are damaged are left out, and counted in the bag's
     notes."""
-    tree, num_damaged = FrameTree(), 0
+    tree, num_damaged = TransformTree(), 0
     for name, topic in bag.topics.items():
-        if topic.type not in TRANSFORMS:
+        if topic.type not in TRANSFORM_TYPES:
             continue
         for ref in bag.messages(name):
             try:
-                for its in transforms_of(topic, bag.read(ref)):
+                for its in decode_transforms(topic, bag.read(ref)):
                     tree.add(its, is_static=name.endswith("static"))
             except RecordingError:
                 num_damaged += 1
@@ -35,7 +35,7 @@ def read_frames(bag: Bag) -> FrameTree:
 
 
 def camera_poses(
-    bag: Bag, roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]
+    bag: Bag, roles: Roles, camera_frame: str, tree: TransformTree, t_ns: list[int]
 ) -> list[Rigid3 | None]:
     """world_from_cam of each frame, None where unknown; without a topic of poses those of a TUM
     file beside the bag.
@@ -46,43 +46,43 @@ def camera_poses(
     """
     if not roles.poses:
         beside = bag.path / "truth.tum" if bag.path.is_dir() else bag.path.with_suffix(".tum")
-        return read_truth(Path(beside), [], t_ns)
+        return read_ground_truth(Path(beside), [], t_ns)
     for source in roles.poses:
         num_notes = len(bag.notes)
         if source == TF:
-            poses = _poses_of_tf(roles, camera_frame, tree, t_ns)
+            poses = _poses_from_tf(roles, camera_frame, tree, t_ns)
         else:
-            poses = _poses_of_topic(bag, source, roles.pose_frame, camera_frame, tree, t_ns)
+            poses = _poses_from_topic(bag, source, roles.pose_frame, camera_frame, tree, t_ns)
         if any(pose is not None for pose in poses):
             return poses
         del bag.notes[num_notes:]
-    said = (
+    message = (
         f"{bag.path}: no pose of {camera_frame or 'the camera'} at the times of the pictures in"
         f" {' or '.join(roles.poses)}"
     )
-    if roles.is_pose_said:
-        raise TrajectoryError(said)
-    bag.notes.append(f"{said}; the recording is taken as one without poses")
+    if roles.is_pose_requested:
+        raise TrajectoryError(message)
+    bag.notes.append(f"{message}; the recording is taken as one without poses")
     return [None] * len(t_ns)
 
 
-def _poses_of_tf(
-    roles: Roles, camera_frame: str, tree: FrameTree, t_ns: list[int]
+def _poses_from_tf(
+    roles: Roles, camera_frame: str, tree: TransformTree, t_ns: list[int]
 ) -> list[Rigid3 | None]:
     frame = roles.pose_frame or camera_frame
-    return tree.poses(frame, t_ns) if tree.moves(frame) else [None] * len(t_ns)
+    return tree.poses(frame, t_ns) if tree.is_moving(frame) else [None] * len(t_ns)
 
 
-def _poses_of_topic(
-    bag: Bag, name: str, frame: str | None, camera_frame: str, tree: FrameTree, t_ns: list[int]
+def _poses_from_topic(
+    bag: Bag, name: str, frame: str | None, camera_frame: str, tree: TransformTree, t_ns: list[int]
 ) -> list[Rigid3 | None]:
     """Poses of a topic, which are those of `frame`, or else of what its messages name, brought to
     the camera."""
-    transforms = _transforms(bag, name)
+    transforms = _read_topic_transforms(bag, name)
     if not transforms:
         return [None] * len(t_ns)
     whose = frame or transforms[0].child
-    body_from_cam = tree.fixed_between(whose, camera_frame) if whose else None
+    body_from_cam = tree.find_static_transform(whose, camera_frame) if whose else None
     if body_from_cam is None:
         body_from_cam = Rigid3.identity()
         if frame:
@@ -96,16 +96,16 @@ def _poses_of_topic(
             else "it does not say whose they are (pose_frame=FRAME would)"
         )
         bag.notes.append(f"{bag.path}: poses of {name} are taken for the camera's: {why}")
-    world_from_bodies = poses_at(trajectory_of(transforms), t_ns)
+    world_from_bodies = interpolate_poses(trajectory_from_transforms(transforms), t_ns)
     return [pose @ body_from_cam if pose is not None else None for pose in world_from_bodies]
 
 
-def _transforms(bag: Bag, name: str) -> list[TimedTransform]:
-    transforms: list[TimedTransform] = []
+def _read_topic_transforms(bag: Bag, name: str) -> list[StampedTransform]:
+    transforms: list[StampedTransform] = []
     num_damaged = 0
     for ref in bag.messages(name):
         try:
-            transforms += transforms_of(bag.topics[name], bag.read(ref))
+            transforms += decode_transforms(bag.topics[name], bag.read(ref))
         except RecordingError:
             num_damaged += 1
     if num_damaged:

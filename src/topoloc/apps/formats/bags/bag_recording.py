@@ -10,46 +10,52 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.apps.formats.bags.bag import MCAP_SUFFIXES, Bag, is_bag, missing_bags, open_bag_files
-from topoloc.apps.formats.bags.bag_pictures import depth_of, picture_of
-from topoloc.apps.formats.bags.bag_poses import camera_poses, read_frames
+from topoloc.apps.formats.bags.bag import (
+    MCAP_SUFFIXES,
+    Bag,
+    is_bag,
+    missing_bags_error,
+    open_bag_files,
+)
+from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image
+from topoloc.apps.formats.bags.bag_poses import camera_poses, read_transform_tree
 from topoloc.apps.formats.bags.camera_info import CameraInfo, camera_info
-from topoloc.apps.formats.bags.frame_tree import FrameTree
 from topoloc.apps.formats.bags.message_file import MessageRef, Topic
-from topoloc.apps.formats.bags.messages import decode, frame_id, head_size, stamp_of_head
+from topoloc.apps.formats.bags.messages import decode, frame_id, header_stamp_ns, num_header_bytes
 from topoloc.apps.formats.bags.topics import (
     Roles,
-    choose_topics,
     is_rectified,
     is_registered,
     parse_topics,
+    select_topics,
 )
+from topoloc.apps.formats.bags.transform_tree import TransformTree
 from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
-from topoloc.recordings.format import SequenceFormat
+from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.frame import DepthImage, Image, StereoFrame
-from topoloc.recordings.recording import nearest_rows
+from topoloc.recordings.recording import find_nearest_idx
 
-LOOKS_FOR = "a ROS bag: .bag, .db3, or a folder with metadata.yaml"
-LOOKS_FOR_MCAP = "an .mcap file"
+EXPECTED_FILES = "a ROS bag: .bag, .db3, or a folder with metadata.yaml"
+MCAP_EXPECTED_FILES = "an .mcap file"
 MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
 
 
-def recognises(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Whether this is a ROS bag, by its name."""
     return is_bag(path)
 
 
-def recognises_mcap(path: Path) -> bool:
+def can_open_mcap(path: Path) -> bool:
     """Whether this is an MCAP file, by its name."""
     return is_bag(path, MCAP_SUFFIXES)
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class ImageMessages:
     """The messages of a topic of pictures: one a frame."""
 
     topic: Topic
@@ -66,9 +72,9 @@ class BagRecording:
     t_ns: list[int]
     poses: list[Rigid3 | None]
     camera: Camera | None
-    left: Pictures
-    right: tuple[Pictures, StereoRig] | None = None
-    depth: tuple[Pictures, Camera, Rigid3] | None = None
+    left: ImageMessages
+    right: tuple[ImageMessages, StereoRig] | None = None
+    depth: tuple[ImageMessages, Camera, Rigid3] | None = None
     names: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -84,7 +90,7 @@ class BagRecording:
     def __len__(self) -> int:
         return len(self.t_ns)
 
-    def single(self) -> BagRecording:
+    def monocular(self) -> BagRecording:
         """The same recording without its right and depth pictures."""
         return replace(self, right=None, depth=None)
 
@@ -95,22 +101,22 @@ class BagRecording:
             IndexError: no such frame.
             UnreadableImageError: a picture is damaged, or of another size than its camera.
         """
-        frame = self.left_frame(index)
+        frame = self.read_left_frame(index)
         if self.right is not None:
             right, rig = self.right
-            return replace(frame, right=self._picture(right, index, rig.right))
+            return replace(frame, right=self._read_image(right, index, rig.right))
         if self.depth is not None:
-            pictures, camera, cam_from_depth = self.depth
-            message, name = self._message(pictures, index)
-            depth = depth_of(message, name)
+            images, camera, cam_from_depth = self.depth
+            message, name = self._read_message(images, index)
+            depth = decode_depth(message, name)
             _check_size(name, depth.shape, camera)
             return replace(frame, depth=DepthImage(depth, camera, cam_from_depth))
         return frame
 
-    def left_frame(self, index: int) -> StereoFrame:
+    def read_left_frame(self, index: int) -> StereoFrame:
         """Read one frame but for its right or depth picture. Raises as the whole frame does."""
         image, rig = (
-            self._picture(self.left, index, self.camera),
+            self._read_image(self.left, index, self.camera),
             None if self.right is None else self.right[1],
         )
         return StereoFrame(
@@ -122,17 +128,17 @@ class BagRecording:
             world_from_cam=self.poses[index],
         )
 
-    def _picture(self, pictures: Pictures, index: int, camera: Camera | None) -> Image:
-        message, name = self._message(pictures, index)
-        image = picture_of(message, name)
+    def _read_image(self, images: ImageMessages, index: int, camera: Camera | None) -> Image:
+        message, name = self._read_message(images, index)
+        image = decode_image(message, name)
         if camera is not None:
             _check_size(name, image.shape, camera)
         return image
 
-    def _message(self, pictures: Pictures, index: int) -> tuple[Any, str]:
-        name = f"{self.bag.path}, {pictures.topic.name} at {self.names[index]}"
+    def _read_message(self, images: ImageMessages, index: int) -> tuple[Any, str]:
+        name = f"{self.bag.path}, {images.topic.name} at {self.names[index]}"
         try:
-            return decode(pictures.topic, self.bag.read(pictures.refs[index])), name
+            return decode(images.topic, self.bag.read(images.refs[index])), name
         except RecordingError as error:
             raise UnreadableImageError(f"{name}: {error}") from None
 
@@ -154,38 +160,40 @@ def open_bag(path: Path, topics: str | Mapping[str, str] | None = None) -> BagRe
     """
     bag = open_bag_files(path)
     try:
-        said = parse_topics(topics) if isinstance(topics, str) else dict(topics or {})
-        roles = choose_topics(bag, said)
-        recording = _opened(bag, roles)
+        requested = parse_topics(topics) if isinstance(topics, str) else dict(topics or {})
+        roles = select_topics(bag, requested)
+        recording = _open_recording(bag, roles)
     except ModuleNotFoundError as error:
-        raise missing_bags(error, path) from error
-    bag.note_faults()
+        raise missing_bags_error(error, path) from error
+    bag.add_fault_notes()
     return recording
 
 
-def _opened(bag: Bag, roles: Roles) -> BagRecording:
-    t_ns, left = _timed(bag, roles.left)
-    tree, info = read_frames(bag), _read_info(bag, roles.left_info)
-    frame = (info.frame if info is not None else "") or _frame_of(bag, left)
-    camera = info.camera(is_rectified(roles.left)) if info is not None else _camera_beside(bag)[0]
+def _open_recording(bag: Bag, roles: Roles) -> BagRecording:
+    t_ns, left = _index_by_time(bag, roles.left)
+    tree, info = read_transform_tree(bag), _read_camera_info(bag, roles.left_info)
+    frame = (info.frame if info is not None else "") or _read_frame_id(bag, left)
+    camera = (
+        info.camera(is_rectified(roles.left)) if info is not None else _read_folder_camera(bag)[0]
+    )
     right, depth = None, None
     if roles.right is not None:
         rig = _rig(bag, roles, info, tree)
-        t_ns, left, pictures = _paired(bag, (t_ns, left), roles.right, MAX_PAIR_DELAY_MS)
-        camera, right = rig.left, (pictures, rig)
+        t_ns, left, images = _match_by_time(bag, (t_ns, left), roles.right, MAX_PAIR_DELAY_MS)
+        camera, right = rig.left, (images, rig)
     elif roles.depth is not None:
         if camera is None:
             raise CalibrationError(
                 f"{bag.path}: no calibration of {roles.left}; --topics left_info=TOPIC, or a"
                 " camera.json beside the bag"
             )
-        t_ns, left, pictures = _paired(bag, (t_ns, left), roles.depth, MAX_DEPTH_DELAY_MS)
-        depth = (pictures, *_depth_camera(bag, roles, camera, frame, tree))
+        t_ns, left, images = _match_by_time(bag, (t_ns, left), roles.depth, MAX_DEPTH_DELAY_MS)
+        depth = (images, *_depth_camera(bag, roles, camera, frame, tree))
     poses = camera_poses(bag, roles, frame, tree, t_ns)
     return BagRecording(bag.path.resolve().name, bag, t_ns, poses, camera, left, right, depth)
 
 
-def _timed(bag: Bag, name: str) -> tuple[list[int], Pictures]:
+def _index_by_time(bag: Bag, name: str) -> tuple[list[int], ImageMessages]:
     """The messages of a topic by their own times, in order; damaged ones are left out, and said."""
     topic, num_damaged = bag.topics[name], 0
     stamped: list[tuple[int | None, MessageRef]] = []
@@ -193,7 +201,7 @@ def _timed(bag: Bag, name: str) -> tuple[list[int], Pictures]:
         bag.messages(name), key=lambda ref: (ref.file, ref.chunk, ref.offset)
     ):  # as they lie: a chunk is unpacked once
         try:
-            stamped.append((stamp_of_head(topic, bag.read(ref, head_size(topic))), ref))
+            stamped.append((header_stamp_ns(topic, bag.read(ref, num_header_bytes(topic))), ref))
         except RecordingError:
             num_damaged += 1
     if num_damaged:
@@ -207,17 +215,17 @@ def _timed(bag: Bag, name: str) -> tuple[list[int], Pictures]:
     if not by_time:
         raise RecordingError(f"{bag.path}: no whole message of {name}")
     t_ns = sorted(by_time)
-    return t_ns, Pictures(topic, [by_time[time] for time in t_ns])
+    return t_ns, ImageMessages(topic, [by_time[time] for time in t_ns])
 
 
-def _paired(
-    bag: Bag, first: tuple[list[int], Pictures], name: str, delay_ms: int
-) -> tuple[list[int], Pictures, Pictures]:
+def _match_by_time(
+    bag: Bag, first: tuple[list[int], ImageMessages], name: str, delay_ms: int
+) -> tuple[list[int], ImageMessages, ImageMessages]:
     """Times and pictures that have a partner on the topic `name` within `delay_ms`, and the
     partners."""
     t_ns, left = first
-    others, pictures = _timed(bag, name)
-    nearest = nearest_rows(np.array(t_ns), np.array(others))
+    others, images = _index_by_time(bag, name)
+    nearest = find_nearest_idx(np.array(t_ns), np.array(others))
     kept = [
         row
         for row, other in enumerate(nearest)
@@ -237,12 +245,12 @@ def _paired(
     times, refs = [t_ns[row] for row in kept], [left.refs[row] for row in kept]
     return (
         times,
-        Pictures(left.topic, refs),
-        Pictures(pictures.topic, [pictures.refs[nearest[row]] for row in kept]),
+        ImageMessages(left.topic, refs),
+        ImageMessages(images.topic, [images.refs[nearest[row]] for row in kept]),
     )
 
 
-def _read_info(bag: Bag, name: str | None) -> CameraInfo | None:
+def _read_camera_info(bag: Bag, name: str | None) -> CameraInfo | None:
     """The first whole calibration of a topic."""
     if name is None:
         return None
@@ -256,23 +264,25 @@ def _read_info(bag: Bag, name: str | None) -> CameraInfo | None:
     raise CalibrationError(f"{bag.path}: no whole message of {name}")
 
 
-def _frame_of(bag: Bag, pictures: Pictures) -> str:
+def _read_frame_id(bag: Bag, images: ImageMessages) -> str:
     try:
-        return frame_id(decode(pictures.topic, bag.read(pictures.refs[0])))
+        return frame_id(decode(images.topic, bag.read(images.refs[0])))
     except (RecordingError, AttributeError):
         return ""
 
 
-def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: FrameTree) -> StereoRig:
+def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: TransformTree) -> StereoRig:
     """By P of both calibrations; else by the transform between their frames; else by a camera.json
     with a baseline."""
-    right = _read_info(bag, roles.right_info)
+    right = _read_camera_info(bag, roles.right_info)
     if left is not None and right is not None:
         rig = left.rig(right, is_rectified(roles.left))
         if rig is not None:
             return rig
         right_from_left = (
-            tree.fixed_between(right.frame, left.frame) if left.frame != right.frame else None
+            tree.find_static_transform(right.frame, left.frame)
+            if left.frame != right.frame
+            else None
         )
         if right_from_left is not None:
             if is_rectified(roles.left):
@@ -280,7 +290,7 @@ def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: FrameTree) -> St
                     left.camera(True), float(np.linalg.norm(right_from_left.translation))
                 )
             return StereoRig(left.camera(False), right.camera(False), right_from_left)
-    camera, baseline = _camera_beside(bag)
+    camera, baseline = _read_folder_camera(bag)
     if camera is not None and baseline is not None:
         return StereoRig.rectified(camera, baseline)
     lacking = " and ".join(
@@ -298,14 +308,14 @@ def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: FrameTree) -> St
 
 
 def _depth_camera(
-    bag: Bag, roles: Roles, camera: Camera, frame: str, tree: FrameTree
+    bag: Bag, roles: Roles, camera: Camera, frame: str, tree: TransformTree
 ) -> tuple[Camera, Rigid3]:
     """The camera of the depth pictures, and cam_from_depth; registered ones are the colour
     camera's."""
-    info = _read_info(bag, roles.depth_info)
+    info = _read_camera_info(bag, roles.depth_info)
     if info is None:
         return camera, Rigid3.identity()
-    cam_from_depth = tree.fixed_between(frame, info.frame) if frame and info.frame else None
+    cam_from_depth = tree.find_static_transform(frame, info.frame) if frame and info.frame else None
     if cam_from_depth is None:
         cam_from_depth = Rigid3.identity()
         if not is_registered(roles.depth or ""):
@@ -316,7 +326,7 @@ def _depth_camera(
     return info.camera(is_rectified(roles.depth or "")), cam_from_depth
 
 
-def _camera_beside(bag: Bag) -> tuple[Camera | None, float | None]:
+def _read_folder_camera(bag: Bag) -> tuple[Camera | None, float | None]:
     path = (bag.path if bag.path.is_dir() else bag.path.parent) / FILE_NAME
     if not path.is_file():
         return None, None
@@ -332,5 +342,5 @@ def _check_size(name: str, shape: tuple[int, ...], camera: Camera) -> None:
         )
 
 
-ROSBAG_FORMAT = SequenceFormat(LOOKS_FOR, recognises, open_bag, ("topics",))
-MCAP_FORMAT = SequenceFormat(LOOKS_FOR_MCAP, recognises_mcap, open_bag, ("topics",))
+ROSBAG_FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_bag, ("topics",))
+MCAP_FORMAT = RecordingFormat(MCAP_EXPECTED_FILES, can_open_mcap, open_bag, ("topics",))

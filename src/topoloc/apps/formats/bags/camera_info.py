@@ -47,20 +47,20 @@ class CameraInfo:
             CalibrationError: of a model that is not known here, or no camera's numbers.
         """
         if is_rectified and self.projection[0, 0] > 0.0:
-            return self._made("PINHOLE", self.projection, [])
+            return self._make_camera("PINHOLE", self.projection, [])
         if is_rectified or not np.any(self.distortion):
-            return self._made("PINHOLE", self.matrix, [])
+            return self._make_camera("PINHOLE", self.matrix, [])
         coefficients = self.distortion.tolist()
         if self.model in _FISHEYE and len(coefficients) >= 4:
-            return self._made("OPENCV_FISHEYE", self.matrix, coefficients[:4])
+            return self._make_camera("OPENCV_FISHEYE", self.matrix, coefficients[:4])
         if self.model not in _NO_DISTORTION or len(coefficients) < 4 or any(coefficients[8:]):
             raise CalibrationError(
                 f"{self.topic}: distortion_model {self.model!r} of {len(coefficients)} coefficients"
                 " is not known here"
             )
         if any(coefficients[4:]):
-            return self._made("FULL_OPENCV", self.matrix, (coefficients + [0.0] * 4)[:8])
-        return self._made("OPENCV", self.matrix, coefficients[:4])
+            return self._make_camera("FULL_OPENCV", self.matrix, (coefficients + [0.0] * 4)[:8])
+        return self._make_camera("OPENCV", self.matrix, coefficients[:4])
 
     def rig(self, right: CameraInfo, is_rectified: bool) -> StereoRig | None:
         """The pair of this left camera and its right one; None where P says nothing of where the
@@ -69,7 +69,7 @@ class CameraInfo:
         Raises:
             CalibrationError: as of `camera`, or the right camera is not to the right.
         """
-        shift = right._shift() - self._shift()
+        shift = right._projection_offset() - self._projection_offset()
         if not np.isfinite(shift) or shift == 0.0:
             return None
         if abs(shift) > _MAX_BASELINE:
@@ -99,7 +99,7 @@ class CameraInfo:
             rect_from_right.inverse() @ rect_right_from_rect_left @ rect_from_left,
         )
 
-    def _shift(self) -> float:
+    def _projection_offset(self) -> float:
         """Where the rectified camera is, along x, as P = K [I | t] has it; NaN without a P."""
         return (
             float(self.projection[0, 3]) / float(self.projection[0, 0])
@@ -107,7 +107,7 @@ class CameraInfo:
             else float("nan")
         )
 
-    def _made(self, model: str, matrix: np.ndarray, coefficients: list[float]) -> Camera:
+    def _make_camera(self, model: str, matrix: np.ndarray, coefficients: list[float]) -> Camera:
         params = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *coefficients)
         try:
             return Camera(model, self.width, self.height, tuple(float(value) for value in params))
@@ -122,7 +122,7 @@ def camera_info(message: Any, topic: str) -> CameraInfo:
         CalibrationError: a field is missing, or not finite numbers of its shape.
     """
     try:
-        fields = [np.array(_field(message, name), dtype=np.float64) for name in "DKRP"]
+        fields = [np.array(_get_field(message, name), dtype=np.float64) for name in "DKRP"]
         distortion, matrix, rotation, projection = fields
         if not all(np.all(np.isfinite(numbers)) for numbers in fields):
             raise ValueError("numbers that are not finite")
@@ -143,5 +143,5 @@ def camera_info(message: Any, topic: str) -> CameraInfo:
         raise CalibrationError(f"{topic}: no calibration ({error})") from None
 
 
-def _field(message: Any, name: str) -> Any:
+def _get_field(message: Any, name: str) -> Any:
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())

@@ -15,13 +15,13 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from topoloc.apps.formats.bags.message_file import CutShortError
+from topoloc.apps.formats.bags.message_file import TruncatedFileError
 from topoloc.errors import RecordingError
 
 WHOLE_FILE = -1
 MAX_CHUNK_BYTES = 1 << 29
-_BEGINNING = 1 << 17
-_KEPT_BYTES = 1 << 26  # of unpacked chunks; pictures of a pair lie in neighbouring ones
+_PREFIX_BYTES = 1 << 17
+_MAX_CACHE_BYTES = 1 << 26  # of unpacked chunks; pictures of a pair lie in neighbouring ones
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class Chunk:
     many they are unpacked."""
 
     start: int
-    num_packed: int
+    num_compressed_bytes: int
     num_bytes: int
     compression: str
 
     @property
-    def is_packed(self) -> bool:
+    def is_compressed(self) -> bool:
         return self.compression not in ("", "none")
 
 
@@ -47,8 +47,8 @@ class ChunkedBytes:
     chunks: list[Chunk] = field(default_factory=list)
     size: int = 0
     _descriptor: int = -1
-    _unpacked: OrderedDict[int, bytes] = field(default_factory=OrderedDict, repr=False)
-    _num_kept: int = 0
+    _decompressed: OrderedDict[int, bytes] = field(default_factory=OrderedDict, repr=False)
+    _num_cached_bytes: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def __post_init__(self) -> None:
@@ -62,8 +62,8 @@ class ChunkedBytes:
     def add(self, chunk: Chunk) -> None:
         """Adds a chunk; of one that was cut off, what is left and can be unpacked."""
         left = self.size - chunk.start
-        if chunk.is_packed and chunk.num_packed > left:
-            content = _unpacked(
+        if chunk.is_compressed and chunk.num_compressed_bytes > left:
+            content = _decompressed(
                 self.read(WHOLE_FILE, chunk.start, left),
                 chunk.compression,
                 min(chunk.num_bytes, MAX_CHUNK_BYTES),
@@ -71,61 +71,67 @@ class ChunkedBytes:
             chunk = Chunk(chunk.start, left, len(content), chunk.compression)
         self.chunks.append(chunk)
 
-    def end_of(self, chunk: int) -> int:
+    def readable_size(self, chunk: int) -> int:
         """How many bytes there are to read in a chunk, or in the file: of an open chunk that was
         cut off, those that are left."""
         if chunk == WHOLE_FILE:
             return self.size
         its = self.chunks[chunk]
-        return its.num_bytes if its.is_packed else min(its.num_packed, self.size - its.start)
+        return (
+            its.num_bytes
+            if its.is_compressed
+            else min(its.num_compressed_bytes, self.size - its.start)
+        )
 
     def read(self, chunk: int, offset: int, length: int) -> bytes:
         """`length` bytes. Raises CutShortError where there are not so many."""
-        if offset < 0 or length < 0 or offset + length > self.end_of(chunk):
-            raise CutShortError
-        if chunk != WHOLE_FILE and self.chunks[chunk].is_packed:
-            return self._unpack(chunk, offset + length)[offset : offset + length]
+        if offset < 0 or length < 0 or offset + length > self.readable_size(chunk):
+            raise TruncatedFileError
+        if chunk != WHOLE_FILE and self.chunks[chunk].is_compressed:
+            return self._read_decompressed(chunk, offset + length)[offset : offset + length]
         start = 0 if chunk == WHOLE_FILE else self.chunks[chunk].start
         try:
             data = os.pread(self._descriptor, length, start + offset)
         except OSError as error:
             raise RecordingError(f"{self.path}: {error.strerror}") from None
         if len(data) != length:  # shorter than when it was opened
-            raise CutShortError
+            raise TruncatedFileError
         return data
 
-    def _unpack(self, chunk: int, end: int) -> bytes:
+    def _read_decompressed(self, chunk: int, end: int) -> bytes:
         """At least the first `end` bytes of a chunk. Where few are needed, as for a message's time,
         the others stay packed."""
         with self._lock:
-            content = self._unpacked.pop(chunk, b"")
-            self._num_kept -= len(content)
-            if len(content) < end <= _BEGINNING:
-                content = self._beginning(self.chunks[chunk])
+            content = self._decompressed.pop(chunk, b"")
+            self._num_cached_bytes -= len(content)
+            if len(content) < end <= _PREFIX_BYTES:
+                content = self._decompress_prefix(self.chunks[chunk])
             if len(content) < end:
-                content = self._whole(self.chunks[chunk])
-            self._unpacked[chunk] = content
-            self._num_kept += len(content)
-            while len(self._unpacked) > 1 and self._num_kept > _KEPT_BYTES:
-                self._num_kept -= len(self._unpacked.popitem(last=False)[1])
+                content = self._decompress_chunk(self.chunks[chunk])
+            self._decompressed[chunk] = content
+            self._num_cached_bytes += len(content)
+            while len(self._decompressed) > 1 and self._num_cached_bytes > _MAX_CACHE_BYTES:
+                self._num_cached_bytes -= len(self._decompressed.popitem(last=False)[1])
             return content
 
-    def _beginning(self, its: Chunk) -> bytes:
-        packed = self.read(WHOLE_FILE, its.start, min(its.num_packed, 2 * _BEGINNING))
-        return _unpacked(packed, its.compression, min(its.num_bytes, _BEGINNING))
+    def _decompress_prefix(self, its: Chunk) -> bytes:
+        packed = self.read(WHOLE_FILE, its.start, min(its.num_compressed_bytes, 2 * _PREFIX_BYTES))
+        return _decompressed(packed, its.compression, min(its.num_bytes, _PREFIX_BYTES))
 
-    def _whole(self, its: Chunk) -> bytes:
+    def _decompress_chunk(self, its: Chunk) -> bytes:
         if its.num_bytes > MAX_CHUNK_BYTES:
-            raise CutShortError
-        content = _unpacked(
-            self.read(WHOLE_FILE, its.start, its.num_packed), its.compression, its.num_bytes
+            raise TruncatedFileError
+        content = _decompressed(
+            self.read(WHOLE_FILE, its.start, its.num_compressed_bytes),
+            its.compression,
+            its.num_bytes,
         )
         if len(content) != its.num_bytes:
-            raise CutShortError
+            raise TruncatedFileError
         return content
 
 
-def _unpacked(packed: bytes, compression: str, num_bytes: int) -> bytes:
+def _decompressed(packed: bytes, compression: str, num_bytes: int) -> bytes:
     """Unpacked, at most `num_bytes`."""
     import lz4.frame
     import zstandard
@@ -138,7 +144,7 @@ def _unpacked(packed: bytes, compression: str, num_bytes: int) -> bytes:
         if compression == "bz2":
             return bz2.BZ2Decompressor().decompress(packed, max_length=num_bytes)
     except (zstandard.ZstdError, RuntimeError, OSError, ValueError, EOFError):
-        raise CutShortError from None
+        raise TruncatedFileError from None
     raise RecordingError(
         f"chunks packed by {compression!r} cannot be read; known are lz4, zstd and bz2"
     )

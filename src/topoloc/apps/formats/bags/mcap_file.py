@@ -20,14 +20,19 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from topoloc.apps.formats.bags.chunks import WHOLE_FILE, Chunk, ChunkedBytes
-from topoloc.apps.formats.bags.message_file import CutShortError, MessageRef, Topic, damaged
+from topoloc.apps.formats.bags.message_file import (
+    MessageRef,
+    Topic,
+    TruncatedFileError,
+    damaged_message_error,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD, _MESSAGE, _CHUNK = struct.Struct("<BQ"), struct.Struct("<HIQQ"), struct.Struct("<QQQI")
 _INDEX_ENTRY = np.dtype([("t_ns", "<u8"), ("offset", "<u8")])
-_MAX_DEFINITION = 1 << 24
-_LATEST = (1 << 63) - 1
-_BROKEN = (McapError, struct.error, UnicodeDecodeError, EOFError)
+_MAX_DEFINITION_BYTES = 1 << 24
+_MAX_TIME_NS = (1 << 63) - 1
+_DAMAGE_ERRORS = (McapError, struct.error, UnicodeDecodeError, EOFError)
 
 
 @dataclass(eq=False)
@@ -43,14 +48,14 @@ class McapFile:
     # Of each channel: (chunk, where its index lies, its length in bytes), and messages that no
     # index names.
     _indexes: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
-    _found: dict[int, list[MessageRef]] = field(default_factory=dict)
+    _unindexed: dict[int, list[MessageRef]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._bytes = ChunkedBytes(self.path)
         indexed = self._scan()
         for chunk in range(len(self._bytes.chunks)):
             if chunk not in indexed:
-                self._walk(chunk, self._note_message)
+                self._scan_chunk(chunk, self._add_message)
         self._find_channels()
         for channel in self._channels.values():
             schema = self._schemas.get(channel.schema_id)
@@ -66,11 +71,11 @@ class McapFile:
         for number in (
             number for number, channel in self._channels.items() if channel.topic == topic
         ):
-            refs += self._found.get(number, [])
+            refs += self._unindexed.get(number, [])
             for chunk, start, length in self._indexes.get(number, []):
                 entries = np.frombuffer(self._bytes.read(WHOLE_FILE, start, length), _INDEX_ENTRY)
                 refs += [
-                    MessageRef(min(t_ns, _LATEST), chunk, offset)
+                    MessageRef(min(t_ns, _MAX_TIME_NS), chunk, offset)
                     for t_ns, offset in entries.tolist()
                 ]
         return sorted(refs)
@@ -78,40 +83,40 @@ class McapFile:
     def read(self, ref: MessageRef, most: int | None = None) -> bytes:
         """The bytes of a message, or the first `most` of them. Raises RecordingError."""
         try:
-            opcode, length = self._record(ref.chunk, ref.offset)
+            opcode, length = self._read_record_header(ref.chunk, ref.offset)
             if opcode != Opcode.MESSAGE or length < _MESSAGE.size:
-                raise CutShortError
+                raise TruncatedFileError
             length -= _MESSAGE.size
             start = ref.offset + _RECORD.size + _MESSAGE.size
             return self._bytes.read(ref.chunk, start, length if most is None else min(length, most))
-        except CutShortError:
-            raise damaged(self.path.name, ref) from None
+        except TruncatedFileError:
+            raise damaged_message_error(self.path.name, ref) from None
 
-    def _record(self, chunk: int, offset: int) -> tuple[int, int]:
+    def _read_record_header(self, chunk: int, offset: int) -> tuple[int, int]:
         return _RECORD.unpack(self._bytes.read(chunk, offset, _RECORD.size))
 
-    def _records(self, chunk: int) -> Iterator[tuple[int, int, int]]:
+    def _iterate_records(self, chunk: int) -> Iterator[tuple[int, int, int]]:
         """(opcode, where its content begins, its length) of each record that is whole."""
-        position, end = len(MAGIC) if chunk == WHOLE_FILE else 0, self._bytes.end_of(chunk)
+        position, end = len(MAGIC) if chunk == WHOLE_FILE else 0, self._bytes.readable_size(chunk)
         while position < end:
-            opcode, length = self._record(chunk, position)
+            opcode, length = self._read_record_header(chunk, position)
             position += _RECORD.size
             if position + length > end and opcode != Opcode.CHUNK:
-                raise CutShortError
+                raise TruncatedFileError
             yield opcode, position, length
             position += length
             if opcode == Opcode.FOOTER:
                 return
-        raise CutShortError
+        raise TruncatedFileError
 
     def _scan(self) -> set[int]:
         """Notes what the records of the file say; the chunks that have an index."""
         indexed: set[int] = set()
         position = 0
         try:
-            for opcode, position, length in self._records(WHOLE_FILE):
+            for opcode, position, length in self._iterate_records(WHOLE_FILE):
                 if opcode == Opcode.CHUNK:
-                    self._note_chunk(position, length)
+                    self._add_chunk(position, length)
                 elif opcode == Opcode.MESSAGE_INDEX and self._bytes.chunks:
                     channel, size = struct.unpack("<HI", self._bytes.read(WHOLE_FILE, position, 6))
                     size = (
@@ -124,56 +129,56 @@ class McapFile:
                     )
                     indexed.add(len(self._bytes.chunks) - 1)
                 elif opcode == Opcode.MESSAGE:
-                    self._note_message(WHOLE_FILE, opcode, position, length)
+                    self._add_message(WHOLE_FILE, opcode, position, length)
                 else:
-                    self._note_definition(WHOLE_FILE, opcode, position, length)
-        except (CutShortError, *_BROKEN):
+                    self._add_definition(WHOLE_FILE, opcode, position, length)
+        except (TruncatedFileError, *_DAMAGE_ERRORS):
             self.fault = f"cut off or damaged after {position / 1e6:.3f} MB"
         return indexed
 
-    def _walk(self, chunk: int, *notes) -> None:
+    def _scan_chunk(self, chunk: int, *handlers) -> None:
         """Goes through the records of one chunk, as far as it is whole."""
         try:
-            for record in self._records(chunk):
-                for note in notes:
-                    note(chunk, *record)
-        except (CutShortError, *_BROKEN):
+            for record in self._iterate_records(chunk):
+                for handler in handlers:
+                    handler(chunk, *record)
+        except (TruncatedFileError, *_DAMAGE_ERRORS):
             return
 
     def _find_channels(self) -> None:
         """Channels that are described within chunks alone, as in a file whose summary is
         missing."""
-        for number in [*self._indexes, *self._found]:
+        for number in [*self._indexes, *self._unindexed]:
             if number not in self._channels:
                 chunk = (
                     self._indexes[number][0][0]
                     if number in self._indexes
-                    else self._found[number][0].chunk
+                    else self._unindexed[number][0].chunk
                 )
-                self._walk(chunk, self._note_definition)
+                self._scan_chunk(chunk, self._add_definition)
 
-    def _note_chunk(self, position: int, length: int) -> None:
+    def _add_chunk(self, position: int, length: int) -> None:
         header = self._bytes.read(WHOLE_FILE, position, min(length, 64))
         *_, num_bytes, _ = _CHUNK.unpack_from(header)
         (name_length,) = struct.unpack_from("<I", header, _CHUNK.size)
         after = _CHUNK.size + 4 + name_length
-        (num_packed,) = struct.unpack_from("<Q", header, after)
+        (num_compressed_bytes,) = struct.unpack_from("<Q", header, after)
         compression = header[_CHUNK.size + 4 : after].decode()
-        if after + 8 + num_packed > length:
-            raise CutShortError
-        self._bytes.add(Chunk(position + after + 8, num_packed, num_bytes, compression))
+        if after + 8 + num_compressed_bytes > length:
+            raise TruncatedFileError
+        self._bytes.add(Chunk(position + after + 8, num_compressed_bytes, num_bytes, compression))
 
-    def _note_message(self, chunk: int, opcode: int, position: int, length: int) -> None:
+    def _add_message(self, chunk: int, opcode: int, position: int, length: int) -> None:
         if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
             channel, _, log_t_ns, _ = _MESSAGE.unpack(
                 self._bytes.read(chunk, position, _MESSAGE.size)
             )
-            self._found.setdefault(channel, []).append(
-                MessageRef(min(log_t_ns, _LATEST), chunk, position - _RECORD.size)
+            self._unindexed.setdefault(channel, []).append(
+                MessageRef(min(log_t_ns, _MAX_TIME_NS), chunk, position - _RECORD.size)
             )
 
-    def _note_definition(self, chunk: int, opcode: int, position: int, length: int) -> None:
-        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL) or length > _MAX_DEFINITION:
+    def _add_definition(self, chunk: int, opcode: int, position: int, length: int) -> None:
+        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL) or length > _MAX_DEFINITION_BYTES:
             return
         stream = ReadDataStream(io.BytesIO(self._bytes.read(chunk, position, length)))
         if opcode == Opcode.SCHEMA:

@@ -57,11 +57,11 @@ class MessageFile(Protocol):
         ...
 
 
-class CutShortError(Exception):
+class TruncatedFileError(Exception):
     """The bytes asked for are not there: the file ends, or what says so is damaged."""
 
 
-def damaged(name: str, ref: MessageRef) -> RecordingError:
+def damaged_message_error(name: str, ref: MessageRef) -> RecordingError:
     """What is said of a message that the index names and that is not there."""
     place = (
         f"row {ref.offset}"

@@ -18,11 +18,11 @@ from typing import Any
 from topoloc.apps.formats.bags.message_file import Topic
 from topoloc.errors import RecordingError
 
-RAW = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
-COMPRESSED = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
-PICTURES = RAW | COMPRESSED
-CALIBRATIONS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
-TRANSFORMS = frozenset(
+RAW_IMAGE_TYPES = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
+COMPRESSED_IMAGE_TYPES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
+IMAGE_TYPES = RAW_IMAGE_TYPES | COMPRESSED_IMAGE_TYPES
+CALIBRATION_TYPES = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
+TRANSFORM_TYPES = frozenset(
     {
         "tf2_msgs/msg/TFMessage",
         "tf/msg/tfMessage",
@@ -30,7 +30,7 @@ TRANSFORMS = frozenset(
         "foxglove.FrameTransforms",
     }
 )
-POSES = frozenset(
+POSE_TYPES = frozenset(
     {
         "nav_msgs/msg/Odometry",
         "geometry_msgs/msg/PoseStamped",
@@ -40,15 +40,15 @@ POSES = frozenset(
     }
 )
 _NANOSECONDS = 1_000_000_000
-_HEAD_BYTES = 32
-_FAR, _ROTATION_TOLERANCE = (
+_HEADER_BYTES = 32
+_MAX_TRANSLATION, _ROTATION_TOLERANCE = (
     1e9,
     1e-2,
 )  # metres that nobody goes; how far a quaternion's length may be from 1
 
 
 @dataclass(frozen=True)
-class TimedTransform:
+class StampedTransform:
     """`child` as seen from `parent` at a time: translation in metres, quaternion x y z w. An empty
     `child` is one that nobody named."""
 
@@ -96,24 +96,24 @@ def decode(topic: Topic, data: bytes) -> Any:
     )
 
 
-def head_size(topic: Topic) -> int | None:
+def num_header_bytes(topic: Topic) -> int | None:
     """How many bytes of a message are needed for its time; None where all are."""
-    return None if topic.encoding == "json" else _HEAD_BYTES
+    return None if topic.encoding == "json" else _HEADER_BYTES
 
 
-def stamp_of_head(topic: Topic, head: bytes) -> int | None:
+def header_stamp_ns(topic: Topic, header: bytes) -> int | None:
     """The time (nanoseconds) in the first bytes of a message that begins with a header; None where
     it has none."""
     try:
         if topic.encoding == "cdr":
-            seconds, nanoseconds = struct.unpack_from("<iI" if head[1] & 1 else ">iI", head, 4)
+            seconds, nanoseconds = struct.unpack_from("<iI" if header[1] & 1 else ">iI", header, 4)
         elif topic.encoding == "ros1":
-            seconds, nanoseconds = struct.unpack_from("<II", head, 4)
-        elif topic.encoding == "protobuf" and head[:1] == b"\x0a":  # field 1, a Timestamp
-            stamp = _timestamp_class().FromString(head[2 : 2 + head[1]])
+            seconds, nanoseconds = struct.unpack_from("<II", header, 4)
+        elif topic.encoding == "protobuf" and header[:1] == b"\x0a":  # field 1, a Timestamp
+            stamp = _timestamp_class().FromString(header[2 : 2 + header[1]])
             seconds, nanoseconds = stamp.seconds, stamp.nanos
         elif topic.encoding == "json":
-            return stamp_ns(decode(topic, head).timestamp)
+            return stamp_ns(decode(topic, header).timestamp)
         else:
             return None
     except ModuleNotFoundError:
@@ -147,12 +147,12 @@ def _frame_name(text: Any) -> str:
     return "".join(letter for letter in str(text) if letter.isprintable()).lstrip("/")
 
 
-def bytes_of(message: Any) -> bytes:
+def image_bytes(message: Any) -> bytes:
     """The data of a picture."""
     return base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
 
 
-def transforms_of(topic: Topic, data: bytes) -> list[TimedTransform]:
+def decode_transforms(topic: Topic, data: bytes) -> list[StampedTransform]:
     """The transforms of a message of TF, or the one of a message of a pose.
 
     Raises:
@@ -161,7 +161,7 @@ def transforms_of(topic: Topic, data: bytes) -> list[TimedTransform]:
     message = decode(topic, data)
     try:
         return [
-            _transform(part)
+            _stamped_transform(part)
             for part in getattr(message, "transforms", None)
             or ([] if hasattr(message, "transforms") else [message])
         ]
@@ -169,7 +169,7 @@ def transforms_of(topic: Topic, data: bytes) -> list[TimedTransform]:
         raise RecordingError(f"{topic.name}: not poses, or not as {topic.type} has them") from None
 
 
-def _transform(part: Any) -> TimedTransform:
+def _stamped_transform(part: Any) -> StampedTransform:
     stamp = stamp_ns(part.header.stamp if hasattr(part, "header") else part.timestamp)
     parent = (
         _frame_name(part.parent_frame_id) if hasattr(part, "parent_frame_id") else frame_id(part)
@@ -182,11 +182,11 @@ def _transform(part: Any) -> TimedTransform:
     translation = (float(position.x), float(position.y), float(position.z))
     quat_xyzw = (float(rotation.x), float(rotation.y), float(rotation.z), float(rotation.w))
     if (
-        not all(abs(value) < _FAR for value in translation)
+        not all(abs(value) < _MAX_TRANSLATION for value in translation)
         or not abs(math.hypot(*quat_xyzw) - 1.0) <= _ROTATION_TOLERANCE
     ):
         raise ValueError
-    return TimedTransform(stamp, parent, child, translation, quat_xyzw)
+    return StampedTransform(stamp, parent, child, translation, quat_xyzw)
 
 
 @cache

@@ -16,14 +16,19 @@ from typing import NamedTuple
 import numpy as np
 
 from topoloc.apps.formats.bags.chunks import WHOLE_FILE, Chunk, ChunkedBytes
-from topoloc.apps.formats.bags.message_file import CutShortError, MessageRef, Topic, damaged
+from topoloc.apps.formats.bags.message_file import (
+    MessageRef,
+    Topic,
+    TruncatedFileError,
+    damaged_message_error,
+)
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CONNECTION = 2, 3, 4, 5, 7
-_MAX_HEADER = 1 << 20
+_MAX_HEADER_BYTES = 1 << 20
 _U32 = struct.Struct("<I")
 _INDEX_ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])
-_BROKEN = (CutShortError, struct.error, UnicodeDecodeError, KeyError, IndexError)
+_DAMAGE_ERRORS = (TruncatedFileError, struct.error, UnicodeDecodeError, KeyError, IndexError)
 
 
 class _Record(NamedTuple):
@@ -54,24 +59,24 @@ class Ros1File:
     # Of each connection: (chunk, where its index lies, its length in bytes), and messages that no
     # index names.
     _indexes: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
-    _found: dict[int, list[MessageRef]] = field(default_factory=dict)
+    _unindexed: dict[int, list[MessageRef]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._bytes = ChunkedBytes(self.path)
         indexed = self._scan()
         for chunk in range(len(self._bytes.chunks)):
             if chunk not in indexed:
-                self._walk(chunk, self._note_message)
-        for number in [*self._indexes, *self._found]:
+                self._scan_chunk(chunk, self._add_message)
+        for number in [*self._indexes, *self._unindexed]:
             if (
                 number not in self._connections
             ):  # described within chunks alone: the index at the end is missing
                 chunk = (
                     self._indexes[number][0][0]
                     if number in self._indexes
-                    else self._found[number][0].chunk
+                    else self._unindexed[number][0].chunk
                 )
-                self._walk(chunk, self._note_connection)
+                self._scan_chunk(chunk, self._add_connection)
         for topic in self._connections.values():
             self.topics.setdefault(topic.name, topic)
 
@@ -79,7 +84,7 @@ class Ros1File:
         """The messages of a topic, in the order in which they were written."""
         refs: list[MessageRef] = []
         for number in (number for number, its in self._connections.items() if its.name == topic):
-            refs += self._found.get(number, [])
+            refs += self._unindexed.get(number, [])
             for chunk, start, length in self._indexes.get(number, []):
                 entries = np.frombuffer(self._bytes.read(WHOLE_FILE, start, length), _INDEX_ENTRY)
                 refs += [
@@ -93,47 +98,47 @@ class Ros1File:
         try:
             record = next(
                 record
-                for record in self._records(ref.chunk, ref.offset)
+                for record in self._iterate_records(ref.chunk, ref.offset)
                 if record.op != _CONNECTION
             )
             if record.op != _MESSAGE:
-                raise CutShortError
+                raise TruncatedFileError
             return self._bytes.read(
                 ref.chunk, record.start, record.length if most is None else min(record.length, most)
             )
-        except (StopIteration, *_BROKEN):
-            raise damaged(self.path.name, ref) from None
+        except (StopIteration, *_DAMAGE_ERRORS):
+            raise damaged_message_error(self.path.name, ref) from None
 
-    def _records(self, chunk: int, position: int) -> Iterator[_Record]:
+    def _iterate_records(self, chunk: int, position: int) -> Iterator[_Record]:
         """Each record from here on that is whole; the last may be a chunk whose end is missing."""
-        end = self._bytes.end_of(chunk)
+        end = self._bytes.readable_size(chunk)
         while position < end:
             begin = position
             (length,) = _U32.unpack(self._bytes.read(chunk, begin, 4))
-            if length > _MAX_HEADER:
-                raise CutShortError
+            if length > _MAX_HEADER_BYTES:
+                raise TruncatedFileError
             header = self._bytes.read(chunk, begin + 4, length + 4)
             record = _Record(
                 _fields(header[:-4]), begin, begin + length + 8, _U32.unpack(header[-4:])[0]
             )
             position = record.start + record.length
             if position > end and record.op != _CHUNK:
-                raise CutShortError
+                raise TruncatedFileError
             yield record
         if position > end:
-            raise CutShortError
+            raise TruncatedFileError
 
     def _scan(self) -> set[int]:
         """Notes what the records of the file say; the chunks that have an index."""
         indexed: set[int] = set()
         position, is_closed = 0, False
         try:
-            for record in self._records(WHOLE_FILE, len(MAGIC)):
+            for record in self._iterate_records(WHOLE_FILE, len(MAGIC)):
                 position, chunk = record.start, len(self._bytes.chunks) - 1
                 if record.op == _BAG:
                     is_closed = any(record.fields[b"index_pos"])
                 elif record.op == _CHUNK:
-                    self._note_chunk(record)
+                    self._add_chunk(record)
                 elif record.op == _INDEX and chunk >= 0:
                     size = record.length // _INDEX_ENTRY.itemsize * _INDEX_ENTRY.itemsize
                     self._indexes.setdefault(record.number(b"conn"), []).append(
@@ -141,22 +146,22 @@ class Ros1File:
                     )
                     indexed.add(chunk)
                 else:
-                    self._note_connection(WHOLE_FILE, record)
+                    self._add_connection(WHOLE_FILE, record)
             if not is_closed:
                 self.fault = "never closed by its recorder"
-        except _BROKEN:
+        except _DAMAGE_ERRORS:
             self.fault = f"cut off or damaged after {position / 1e6:.3f} MB"
         return indexed
 
-    def _walk(self, chunk: int, note: Callable[[int, _Record], None]) -> None:
+    def _scan_chunk(self, chunk: int, handler: Callable[[int, _Record], None]) -> None:
         """Goes through the records of one chunk, as far as it is whole."""
         try:
-            for record in self._records(chunk, 0):
-                note(chunk, record)
-        except _BROKEN:
+            for record in self._iterate_records(chunk, 0):
+                handler(chunk, record)
+        except _DAMAGE_ERRORS:
             return
 
-    def _note_chunk(self, record: _Record) -> None:
+    def _add_chunk(self, record: _Record) -> None:
         self._bytes.add(
             Chunk(
                 record.start,
@@ -166,15 +171,15 @@ class Ros1File:
             )
         )
 
-    def _note_message(self, chunk: int, record: _Record) -> None:
+    def _add_message(self, chunk: int, record: _Record) -> None:
         if record.op == _MESSAGE:
             s, ns = struct.unpack("<II", record.fields[b"time"])
-            self._found.setdefault(record.number(b"conn"), []).append(
+            self._unindexed.setdefault(record.number(b"conn"), []).append(
                 MessageRef(s * 1_000_000_000 + ns, chunk, record.begin)
             )
 
-    def _note_connection(self, chunk: int, record: _Record) -> None:
-        if record.op == _CONNECTION and record.length <= _MAX_HEADER:
+    def _add_connection(self, chunk: int, record: _Record) -> None:
+        if record.op == _CONNECTION and record.length <= _MAX_HEADER_BYTES:
             its = _fields(self._bytes.read(chunk, record.start, record.length))
             package, _, name = its[b"type"].decode().partition("/")
             kind = f"{package}/msg/{name}"

@@ -11,12 +11,12 @@ import sqlite3
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from topoloc.apps.formats.bags.message_file import MessageRef, Topic, damaged
+from topoloc.apps.formats.bags.message_file import MessageRef, Topic, damaged_message_error
 from topoloc.errors import RecordingError
 
 MAGIC = b"SQLite format 3\0"
 _ROW = -2  # in place of a chunk's number
-_BROKEN = (
+_DAMAGE_ERRORS = (
     sqlite3.Error,
     UnicodeDecodeError,
 )  # the second of an error's text, which quotes what is damaged
@@ -45,7 +45,7 @@ class SqliteFile:
             rows = self._database.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             ).fetchall()
-        except _BROKEN as error:
+        except _DAMAGE_ERRORS as error:
             why = " ".join(str(error).split())[:120]
             raise RecordingError(
                 f"{self.path}: not a ROS 2 bag, or damaged at its beginning ({why})"
@@ -67,7 +67,7 @@ class SqliteFile:
                 ):
                     if isinstance(row, int) and isinstance(t_ns, int):
                         refs.append(MessageRef(t_ns, _ROW, row))
-            except _BROKEN as error:
+            except _DAMAGE_ERRORS as error:
                 self.fault = self.fault or f"damaged ({' '.join(str(error).split())[:120]})"
         refs.sort()
         while self.fault and refs and not self._is_whole(refs[-1]):
@@ -79,8 +79,8 @@ class SqliteFile:
         try:
             with self._database.blobopen("messages", "data", ref.offset, readonly=True) as blob:
                 return blob.read(-1 if most is None else most)
-        except (ValueError, *_BROKEN):
-            raise damaged(self.path.name, ref) from None
+        except (ValueError, *_DAMAGE_ERRORS):
+            raise damaged_message_error(self.path.name, ref) from None
 
     def _is_whole(self, ref: MessageRef) -> bool:
         try:

@@ -8,12 +8,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from topoloc.apps.formats.bags.bag import Bag
-from topoloc.apps.formats.bags.messages import CALIBRATIONS, COMPRESSED, PICTURES, POSES, TRANSFORMS
-from topoloc.bounds import did_you_mean
+from topoloc.apps.formats.bags.messages import (
+    CALIBRATION_TYPES,
+    COMPRESSED_IMAGE_TYPES,
+    IMAGE_TYPES,
+    POSE_TYPES,
+    TRANSFORM_TYPES,
+)
+from topoloc.bounds import suggest_name
 from topoloc.errors import RecordingError
 
 ROLES = ("left", "right", "depth", "left_info", "right_info", "depth_info", "pose", "pose_frame")
-_ALSO = {
+_ROLE_ALIASES = {
     "image": "left",
     "mono": "left",
     "color": "left",
@@ -22,7 +28,7 @@ _ALSO = {
 }
 _NONE, TF = "none", "tf"
 # What tells the topic of a left picture from that of the right one.
-_SIDES = (
+_LEFT_RIGHT_NAMES = (
     ("left", "right"),
     ("infra1", "infra2"),
     ("cam0", "cam1"),
@@ -31,13 +37,16 @@ _SIDES = (
     ("image_0", "image_1"),
     ("Infrared_1", "Infrared_2"),
 )
-_DEPTH, _NO_PICTURE = ("depth",), ("disparity", "confidence", "mask", "segmentation", "thermal")
-_REGISTERED, _COLOUR, _TRUTH = (
+_DEPTH_WORDS, _NON_IMAGE_WORDS = (
+    ("depth",),
+    ("disparity", "confidence", "mask", "segmentation", "thermal"),
+)
+_REGISTERED_WORDS, _COLOUR_WORDS, _TRUTH_WORDS = (
     ("aligned", "registered"),
     ("color", "colour", "rgb"),
     ("truth", "gt", "mocap", "vicon", "optitrack"),
 )
-_TRANSPORTS = ("/compressedDepth", "/compressed")
+_TRANSPORT_SUFFIXES = ("/compressedDepth", "/compressed")
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,7 @@ class Roles:
     depth_info: str | None = None
     poses: tuple[str, ...] = ()
     pose_frame: str | None = None
-    is_pose_said: bool = False
+    is_pose_requested: bool = False
 
 
 def parse_topics(text: str) -> dict[str, str]:
@@ -62,138 +71,143 @@ def parse_topics(text: str) -> dict[str, str]:
     Raises:
         RecordingError: not of this form, or a role that there is not.
     """
-    said: dict[str, str] = {}
+    requested: dict[str, str] = {}
     for part in text.split(","):
         role, is_one, topic = (piece.strip() for piece in part.partition("="))
-        role = _ALSO.get(role, role)
+        role = _ROLE_ALIASES.get(role, role)
         if not is_one or not topic:
             raise RecordingError(
                 f"topics {part.strip()[:80]!r}: ROLE=TOPIC is expected, as in left=/cam0/image_raw"
             )
         if role not in ROLES:
             raise RecordingError(
-                f"topics: no role {role[:40]!r}{did_you_mean(role, ROLES)}; there are"
+                f"topics: no role {role[:40]!r}{suggest_name(role, ROLES)}; there are"
                 f" {', '.join(ROLES)}"
             )
-        said[role] = topic
-    return said
+        requested[role] = topic
+    return requested
 
 
-def choose_topics(bag: Bag, said: Mapping[str, str]) -> Roles:
+def select_topics(bag: Bag, requested: Mapping[str, str]) -> Roles:
     """The topic of each role: what is said, and for the others what is guessed.
 
     Raises:
         RecordingError: a topic that is not in the bag or of another kind, or no pictures in it;
             names those that there are.
     """
-    roles = _guessed_pictures(bag, said)
+    roles = _guess_images(bag, requested)
     for role, kinds in (
-        ("left", PICTURES),
-        ("right", PICTURES),
-        ("depth", PICTURES),
-        ("left_info", CALIBRATIONS),
+        ("left", IMAGE_TYPES),
+        ("right", IMAGE_TYPES),
+        ("depth", IMAGE_TYPES),
+        ("left_info", CALIBRATION_TYPES),
     ):
-        _check(bag, getattr(roles, role), role, kinds)
+        _check_topic(bag, getattr(roles, role), role, kinds)
     if not roles.left:
-        raise RecordingError(f"{bag.path}: no topic of pictures; there are {bag.listed()}")
+        raise RecordingError(f"{bag.path}: no topic of pictures; there are {bag.describe_topics()}")
     for role, of in (
         ("left_info", roles.left),
         ("right_info", roles.right),
         ("depth_info", roles.depth),
     ):
-        if role in said:
-            _check(bag, said[role], role, CALIBRATIONS)
-        roles = replace(roles, **{role: said.get(role) or _calibration_of(bag, of)})
-    pose = said.get("pose")
-    poses = _guessed_poses(bag) if pose is None else () if pose == _NONE else (pose,)
+        if role in requested:
+            _check_topic(bag, requested[role], role, CALIBRATION_TYPES)
+        roles = replace(roles, **{role: requested.get(role) or _find_calibration_topic(bag, of)})
+    pose = requested.get("pose")
+    poses = _guess_poses(bag) if pose is None else () if pose == _NONE else (pose,)
     if pose not in (None, _NONE, TF):
-        _check(bag, pose, "pose", POSES | TRANSFORMS)
-        poses = (TF,) if bag.topics[pose].type in TRANSFORMS else poses
+        _check_topic(bag, pose, "pose", POSE_TYPES | TRANSFORM_TYPES)
+        poses = (TF,) if bag.topics[pose].type in TRANSFORM_TYPES else poses
     return replace(
-        roles, poses=poses, pose_frame=said.get("pose_frame"), is_pose_said=pose is not None
+        roles,
+        poses=poses,
+        pose_frame=requested.get("pose_frame"),
+        is_pose_requested=pose is not None,
     )
 
 
-def _check(bag: Bag, name: str | None, role: str, kinds: frozenset[str]) -> None:
+def _check_topic(bag: Bag, name: str | None, role: str, kinds: frozenset[str]) -> None:
     if name is None or name == "":
         return
     if name not in bag.topics:
         raise RecordingError(
-            f"{bag.path}: no topic {name} for {role}{did_you_mean(name, list(bag.topics))}; there"
-            f" are {bag.listed()}"
+            f"{bag.path}: no topic {name} for {role}{suggest_name(name, list(bag.topics))}; there"
+            f" are {bag.describe_topics()}"
         )
     if bag.topics[name].type not in kinds:
         raise RecordingError(
             f"{bag.path}: {name} is {bag.topics[name].type}, which cannot be {role}; there are"
-            f" {bag.listed()}"
+            f" {bag.describe_topics()}"
         )
 
 
-def _guessed_pictures(bag: Bag, said: Mapping[str, str]) -> Roles:
+def _guess_images(bag: Bag, requested: Mapping[str, str]) -> Roles:
     """What is said of left, right and depth; where nothing is, a pair, or a picture with depth, or
     a picture."""
-    if "left" in said:
+    if "left" in requested:
         right, depth = (
-            None if said.get(role) == _NONE else said.get(role) for role in ("right", "depth")
+            None if requested.get(role) == _NONE else requested.get(role)
+            for role in ("right", "depth")
         )
-        if "right" not in said and "depth" not in said:
-            right = _right_of(bag, said["left"])
-        return Roles(said["left"], right, depth)
-    if "right" in said or "depth" in said:
+        if "right" not in requested and "depth" not in requested:
+            right = _find_right_topic(bag, requested["left"])
+        return Roles(requested["left"], right, depth)
+    if "right" in requested or "depth" in requested:
         raise RecordingError("topics: where right or depth is said, left must be, too")
     names = [
         name
         for name, topic in bag.topics.items()
-        if topic.type in PICTURES and not _has(name, _NO_PICTURE)
+        if topic.type in IMAGE_TYPES and not _contains_any(name, _NON_IMAGE_WORDS)
     ]
-    pictures = sorted(
-        (name for name in names if not _has(name, _DEPTH)), key=lambda name: _rank(bag, name)
+    images = sorted(
+        (name for name in names if not _contains_any(name, _DEPTH_WORDS)),
+        key=lambda name: _sort_key(bag, name),
     )
-    pairs = [(name, right) for name in pictures if (right := _right_of(bag, name))]
+    pairs = [(name, right) for name in images if (right := _find_right_topic(bag, name))]
     if pairs:
         return Roles(*pairs[0])
     depths = sorted(
-        (name for name in names if _has(name, _DEPTH)),
-        key=lambda name: (not is_registered(name), _rank(bag, name)),
+        (name for name in names if _contains_any(name, _DEPTH_WORDS)),
+        key=lambda name: (not is_registered(name), _sort_key(bag, name)),
     )
-    if not pictures:
+    if not images:
         return Roles()
-    if len(pictures) > 1:
-        others = ", ".join(pictures[1:4])
+    if len(images) > 1:
+        others = ", ".join(images[1:4])
         bag.notes.append(
-            f"{bag.path}: of several topics of pictures {pictures[0]} is taken, not {others};"
+            f"{bag.path}: of several topics of pictures {images[0]} is taken, not {others};"
             " --topics left=... says otherwise"
         )
-    return Roles(pictures[0], None, depths[0] if depths else None)
+    return Roles(images[0], None, depths[0] if depths else None)
 
 
-def _rank(bag: Bag, name: str) -> tuple[bool, bool, bool, bool, int, str]:
+def _sort_key(bag: Bag, name: str) -> tuple[bool, bool, bool, bool, int, str]:
     """Sorts the better topic first: rectified, calibrated, of a colour camera, not compressed."""
-    is_compressed = bag.topics[name].type in COMPRESSED
+    is_compressed = bag.topics[name].type in COMPRESSED_IMAGE_TYPES
     return (
         not is_rectified(name),
-        _calibration_of(bag, name) is None,
-        not _has(name, _COLOUR),
+        _find_calibration_topic(bag, name) is None,
+        not _contains_any(name, _COLOUR_WORDS),
         is_compressed,
         len(name),
         name,
     )
 
 
-def _right_of(bag: Bag, left: str) -> str | None:
-    for side, other in _SIDES:
+def _find_right_topic(bag: Bag, left: str) -> str | None:
+    for side, other in _LEFT_RIGHT_NAMES:
         right = left.replace(side, other)
-        if right != left and right in bag.topics and bag.topics[right].type in PICTURES:
+        if right != left and right in bag.topics and bag.topics[right].type in IMAGE_TYPES:
             return right
     return None
 
 
-def _calibration_of(bag: Bag, picture: str | None) -> str | None:
+def _find_calibration_topic(bag: Bag, picture: str | None) -> str | None:
     """The topic that drivers publish the calibration of a topic of pictures on."""
     if not picture:
         return None
     base = next(
-        (picture.removesuffix(end) for end in _TRANSPORTS if picture.endswith(end)), picture
+        (picture.removesuffix(end) for end in _TRANSPORT_SUFFIXES if picture.endswith(end)), picture
     )
     parent = base.rpartition("/")[0]
     for place in (
@@ -202,18 +216,18 @@ def _calibration_of(bag: Bag, picture: str | None) -> str | None:
         f"{parent.rpartition('/')[0]}/info",
     ):  # the last is how librealsense records
         for name in (f"{place}/camera_info", f"{place}/calibration"):
-            if name in bag.topics and bag.topics[name].type in CALIBRATIONS:
+            if name in bag.topics and bag.topics[name].type in CALIBRATION_TYPES:
                 return name
     return None
 
 
-def _guessed_poses(bag: Bag) -> tuple[str, ...]:
+def _guess_poses(bag: Bag) -> tuple[str, ...]:
     """Truth by its name, then TF, then odometry, then other poses."""
-    poses = sorted(name for name, topic in bag.topics.items() if topic.type in POSES)
-    truth = [name for name in poses if _has(name, _TRUTH)]
+    poses = sorted(name for name, topic in bag.topics.items() if topic.type in POSE_TYPES)
+    truth = [name for name in poses if _contains_any(name, _TRUTH_WORDS)]
     odometry = [name for name in poses if bag.topics[name].type == "nav_msgs/msg/Odometry"]
     has_tf = any(
-        topic.type in TRANSFORMS and "static" not in name for name, topic in bag.topics.items()
+        topic.type in TRANSFORM_TYPES and "static" not in name for name, topic in bag.topics.items()
     )
     return tuple(dict.fromkeys([*truth, *([TF] if has_tf else []), *odometry, *poses]))
 
@@ -226,8 +240,8 @@ def is_rectified(topic: str) -> bool:
 
 def is_registered(depth: str) -> bool:
     """Whether the name of a topic of depth says that it is of the colour camera's pixels."""
-    return _has(depth, _REGISTERED)
+    return _contains_any(depth, _REGISTERED_WORDS)
 
 
-def _has(name: str, words: tuple[str, ...]) -> bool:
+def _contains_any(name: str, words: tuple[str, ...]) -> bool:
     return any(word in name.lower() for word in words)

@@ -22,7 +22,7 @@ from jaxtyping import Float32
 
 from topoloc.errors import ConfigError, MissingExtraError, RecordingError, TrajectoryError
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.pose_conventions import mended
+from topoloc.geometry.pose_conventions import undo_pose_conventions
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import DepthImage, Image, StereoFrame
@@ -34,11 +34,11 @@ WEATHERS: dict[Weather, str] = {
     "rain": "HardRainNoon",
 }
 """The paper's three, by CARLA's names."""
-_FARTHEST_M = 1000.0  # the depth camera's whole range: sky
+_MAX_DEPTH_M = 1000.0  # the depth camera's whole range: sky
 _WARM_UP = 20  # steps until exposure and streamed textures have settled
 _STEP_S = 0.1
 _CONNECT_S = 5.0
-_PLAIN_LENS = (
+_DISABLED_EFFECTS = (
     "lens_k",
     "lens_kcube",
     "lens_x_size",
@@ -46,10 +46,10 @@ _PLAIN_LENS = (
     "lens_circle_multiplier",
     "chromatic_aberration_intensity",
 )
-_PLAIN_LENS += (
+_DISABLED_EFFECTS += (
     "motion_blur_intensity",
 )  # the cameras do not move between steps, they are put elsewhere
-_SAME_M = 0.01
+_POSITION_TOLERANCE_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -98,16 +98,18 @@ def carla_client(config: CarlaConfig) -> tuple[Any, Any]:
     return carla, client
 
 
-def world_from_cam_of(transform: Any) -> Rigid3:
+def world_from_carla_transform(transform: Any) -> Rigid3:
     """The pose in our axes of a camera that stands in CARLA as this `carla.Transform`. Raises
     RecordingError: it is no pose."""
     try:
-        return mended(Rigid3.from_matrix(np.array(transform.get_matrix())), ("unreal",))
+        return undo_pose_conventions(
+            Rigid3.from_matrix(np.array(transform.get_matrix())), ("unreal",)
+        )
     except TrajectoryError as error:
         raise RecordingError(f"CARLA gave a camera no pose ({error})") from None
 
 
-def camera_of(config: CarlaConfig) -> Camera:
+def carla_camera(config: CarlaConfig) -> Camera:
     """The pinhole that CARLA's cameras are. Raises ConfigError: of no size, or of no angle."""
     if not (config.width > 0 and config.height > 0 and 1.0 <= config.fov_deg <= 170.0):
         raise ConfigError(
@@ -132,7 +134,7 @@ def carla_frames(carla: Any, client: Any, config: CarlaConfig) -> Iterator[Stere
         ConfigError: a setting makes no sense; RecordingError: the server lacks the town or the
             spawn point, does not answer in time, or gives pictures of another step.
     """
-    camera = camera_of(config)
+    camera = carla_camera(config)
     if not (config.spacing_m > 0.0 and config.baseline_m > 0.0 and config.length_m > 0.0):
         raise ConfigError(
             "the spacing of the frames, the length of the way and the baseline must be above 0 m"
@@ -140,27 +142,31 @@ def carla_frames(carla: Any, client: Any, config: CarlaConfig) -> Iterator[Stere
     rig = StereoRig.rectified(camera, config.baseline_m)
     try:
         world = client.load_world(config.town) if config.town is not None else client.get_world()
-        with _synchronous(carla, world, config.weather), ExitStack() as stack:
-            shots = _Shots(
+        with _synchronous_mode(carla, world, config.weather), ExitStack() as stack:
+            shots = _SensorReader(
                 world,
                 [
-                    stack.enter_context(_sensor(carla, world, kind, config))
+                    stack.enter_context(_spawn_sensor(carla, world, kind, config))
                     for kind in ("rgb", "rgb", "depth")
                 ],
                 config.timeout_s,
             )
-            for index, transform in enumerate(_way(carla, world, config)):
-                places = [transform, _beside(carla, transform, config.baseline_m, 0.0), transform]
+            for index, transform in enumerate(_lane_transforms(carla, world, config)):
+                places = [
+                    transform,
+                    _offset_transform(carla, transform, config.baseline_m, 0.0),
+                    transform,
+                ]
                 for _ in range(_WARM_UP if index == 0 else 0):
-                    shots.take(places)
-                yield _frame(index, shots.take(places), camera, rig)
+                    shots.capture(places)
+                yield _make_frame(index, shots.capture(places), camera, rig)
     except RuntimeError as error:  # the client's own, of time limits and of what the server lacks
         raise RecordingError(
             f"CARLA at {config.host}:{config.port}: {' '.join(str(error).split())[:200]}"
         ) from None
 
 
-class _Shots:
+class _SensorReader:
     """The sensors, and what they saw in a step."""
 
     def __init__(
@@ -168,17 +174,17 @@ class _Shots:
     ) -> None:
         self._world, self._sensors, self._timeout_s = world, sensors, timeout_s
 
-    def take(self, transforms: list[Any]) -> list[Any]:
+    def capture(self, transforms: list[Any]) -> list[Any]:
         """Each sensor's picture of the next step, taken from these places."""
         for (sensor, _), transform in zip(self._sensors, transforms, strict=True):
             sensor.set_transform(transform)
         step = self._world.tick()
-        return [self._picture(pictures, step) for _, pictures in self._sensors]
+        return [self._next_image(images, step) for _, images in self._sensors]
 
-    def _picture(self, pictures: queue.Queue[Any], step: int) -> Any:
+    def _next_image(self, images: queue.Queue[Any], step: int) -> Any:
         while True:
             try:
-                picture = pictures.get(timeout=self._timeout_s)
+                picture = images.get(timeout=self._timeout_s)
             except queue.Empty:
                 raise RecordingError(
                     f"CARLA gave no picture of step {step} for {self._timeout_s:g} s"
@@ -193,7 +199,7 @@ class _Shots:
 
 
 @contextmanager
-def _synchronous(carla: Any, world: Any, weather: Weather) -> Iterator[None]:
+def _synchronous_mode(carla: Any, world: Any, weather: Weather) -> Iterator[None]:
     """The server steps when it is told to; afterwards as before."""
     before, settings = world.get_settings(), world.get_settings()
     settings.synchronous_mode, settings.fixed_delta_seconds = True, _STEP_S
@@ -206,7 +212,7 @@ def _synchronous(carla: Any, world: Any, weather: Weather) -> Iterator[None]:
 
 
 @contextmanager
-def _sensor(
+def _spawn_sensor(
     carla: Any, world: Any, kind: str, config: CarlaConfig
 ) -> Iterator[tuple[Any, queue.Queue[Any]]]:
     """A camera that stands anywhere, and the queue of its pictures."""
@@ -215,20 +221,20 @@ def _sensor(
         "image_size_x": config.width,
         "image_size_y": config.height,
         "fov": config.fov_deg,
-    } | dict.fromkeys(_PLAIN_LENS, 0)
+    } | dict.fromkeys(_DISABLED_EFFECTS, 0)
     for name, value in wanted.items():
         if blueprint.has_attribute(name):
             blueprint.set_attribute(name, str(value))
-    sensor, pictures = world.spawn_actor(blueprint, carla.Transform()), queue.Queue[Any]()
-    sensor.listen(pictures.put)
+    sensor, images = world.spawn_actor(blueprint, carla.Transform()), queue.Queue[Any]()
+    sensor.listen(images.put)
     try:
-        yield sensor, pictures
+        yield sensor, images
     finally:
         sensor.stop()
         sensor.destroy()
 
 
-def _way(carla: Any, world: Any, config: CarlaConfig) -> Iterator[Any]:
+def _lane_transforms(carla: Any, world: Any, config: CarlaConfig) -> Iterator[Any]:
     """Where the left camera stands, frame by frame; the way ends where the lane does. At junctions
     it goes straight on."""
     town = world.get_map()
@@ -237,19 +243,19 @@ def _way(carla: Any, world: Any, config: CarlaConfig) -> Iterator[Any]:
         raise RecordingError(f"spawn point {config.start} of {len(starts)} in {town.name}")
     here = town.get_waypoint(starts[config.start].location)
     for _ in range(math.floor(config.length_m / config.spacing_m) + 1):
-        yield _beside(carla, here.transform, config.lane_offset_m, config.height_m)
+        yield _offset_transform(carla, here.transform, config.lane_offset_m, config.height_m)
         ahead = here.next(config.spacing_m)
         if not ahead:
             return
-        here = min(ahead, key=_turn_from(here))
+        here = min(ahead, key=_heading_change(here))
 
 
-def _turn_from(here: Any) -> Callable[[Any], float]:
+def _heading_change(here: Any) -> Callable[[Any], float]:
     yaw = here.transform.rotation.yaw
     return lambda ahead: abs((ahead.transform.rotation.yaw - yaw + 180.0) % 360.0 - 180.0)
 
 
-def _beside(carla: Any, transform: Any, right_m: float, up_m: float) -> Any:
+def _offset_transform(carla: Any, transform: Any, right_m: float, up_m: float) -> Any:
     """The same orientation, metres to the right and up."""
     location, right = transform.location, transform.get_right_vector()
     moved = carla.Location(
@@ -260,34 +266,34 @@ def _beside(carla: Any, transform: Any, right_m: float, up_m: float) -> Any:
     return carla.Transform(moved, transform.rotation)
 
 
-def _frame(index: int, pictures: list[Any], camera: Camera, rig: StereoRig) -> StereoFrame:
-    left, right, depth = pictures
+def _make_frame(index: int, images: list[Any], camera: Camera, rig: StereoRig) -> StereoFrame:
+    left, right, depth = images
     world_from_cam, world_from_right = (
-        world_from_cam_of(left.transform),
-        world_from_cam_of(right.transform),
+        world_from_carla_transform(left.transform),
+        world_from_carla_transform(right.transform),
     )
     right_in_left = world_from_cam.inverse().apply(world_from_right.translation)
-    if np.abs(right_in_left - np.array([rig.baseline, 0.0, 0.0])).max() > _SAME_M:
+    if np.abs(right_in_left - np.array([rig.baseline, 0.0, 0.0])).max() > _POSITION_TOLERANCE_M:
         raise RecordingError(
             f"CARLA's cameras did not stand where they were put in step {left.frame}"
         )
     t_ns = round(left.timestamp * 1e9)
-    seen = DepthImage(_metres(depth), camera)
+    seen = DepthImage(_depth_in_metres(depth), camera)
     return StereoFrame(
-        f"{index:06d}", t_ns, _rgb(left), camera, _rgb(right), rig, seen, world_from_cam
+        f"{index:06d}", t_ns, _to_rgb(left), camera, _to_rgb(right), rig, seen, world_from_cam
     )
 
 
-def _rgb(picture: Any) -> Image:
-    return np.ascontiguousarray(_bgra(picture)[:, :, 2::-1])
+def _to_rgb(picture: Any) -> Image:
+    return np.ascontiguousarray(_to_bgra(picture)[:, :, 2::-1])
 
 
-def _metres(picture: Any) -> Float32[np.ndarray, "h w"]:
+def _depth_in_metres(picture: Any) -> Float32[np.ndarray, "h w"]:
     """Depth along z: 24 bits of a kilometre, red the least; NaN for the sky."""
-    blue, green, red = (_bgra(picture)[:, :, channel].astype(np.float64) for channel in range(3))
-    depth = (red + 256.0 * green + 65536.0 * blue) / (2.0**24 - 1.0) * _FARTHEST_M
-    return np.where(depth < _FARTHEST_M, depth, np.nan).astype(np.float32)
+    blue, green, red = (_to_bgra(picture)[:, :, channel].astype(np.float64) for channel in range(3))
+    depth = (red + 256.0 * green + 65536.0 * blue) / (2.0**24 - 1.0) * _MAX_DEPTH_M
+    return np.where(depth < _MAX_DEPTH_M, depth, np.nan).astype(np.float32)
 
 
-def _bgra(picture: Any) -> np.ndarray:
+def _to_bgra(picture: Any) -> np.ndarray:
     return np.frombuffer(picture.raw_data, np.uint8).reshape(picture.height, picture.width, 4)

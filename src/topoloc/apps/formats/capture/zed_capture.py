@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from topoloc.apps.formats.live import LiveSource
-from topoloc.apps.formats.svo import picture_of, rig_of, sdk
-from topoloc.apps.formats.zed import is_side_by_side, rig_of_file
+from topoloc.apps.formats.svo import retrieve_image, rig_from_sdk, sdk
+from topoloc.apps.formats.zed import is_side_by_side, read_rig
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.rig import StereoRig
 from topoloc.recordings.frame import StereoFrame
@@ -37,7 +37,7 @@ def side_by_side_frames(source: LiveSource, calibration: Path) -> Iterator[Stere
                 " --size asks the device for others"
             )
         if rig is None:
-            rig = rig_of_file(calibration, (width // 2, height))
+            rig = read_rig(calibration, (width // 2, height))
         if (rig.left.width, rig.left.height) != (width // 2, height):
             raise CalibrationError(
                 f"{calibration}: of {rig.left.width}x{rig.left.height}, but each half is"
@@ -65,7 +65,7 @@ def sdk_frames(stop: threading.Event) -> Iterator[StereoFrame]:
     if status != sl.ERROR_CODE.SUCCESS:
         raise RecordingError(f"the ZED SDK can open no camera ({status})")
     try:
-        rig, index, failed = rig_of(camera), 0, 0
+        rig, index, failed = rig_from_sdk(camera), 0, 0
         while not stop.is_set():
             if camera.grab() != sl.ERROR_CODE.SUCCESS:
                 failed += 1
@@ -73,7 +73,9 @@ def sdk_frames(stop: threading.Event) -> Iterator[StereoFrame]:
                     raise RecordingError("the ZED gives no more pictures")
                 continue
             t_ns = int(camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds())
-            left, right = (picture_of(sl, camera, view) for view in (sl.VIEW.LEFT, sl.VIEW.RIGHT))
+            left, right = (
+                retrieve_image(sl, camera, view) for view in (sl.VIEW.LEFT, sl.VIEW.RIGHT)
+            )
             yield StereoFrame(f"{index:06d}", t_ns, left, rig.left, right, rig)
             index, failed = index + 1, 0
     finally:

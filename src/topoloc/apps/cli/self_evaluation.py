@@ -1,0 +1,92 @@
+"""`topoloc evaluate MAP --against-itself`: a map judged without any recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from topoloc.apps.cli.features_option import create_localizer
+from topoloc.apps.cli.map_or_atlas import is_atlas
+from topoloc.apps.cli.output import (
+    UsageError,
+    check_outputs,
+    print_fields,
+    progress_bar,
+    write_json,
+)
+from topoloc.apps.cli.settings_file import read_settings, with_option
+from topoloc.errors import MissingExtraError
+from topoloc.lifelong.weak_regions import WeakRegions, WeakRegionsConfig, find_weak_regions
+from topoloc.localization.localizer import LocalizerConfig
+from topoloc.mapping.description import describe_map
+from topoloc.mapping.topomap import TopoMetricMap
+
+
+def evaluate_map_itself(
+    path: str,
+    coarse: str | None,
+    features: str | None,
+    outputs: Mapping[str, str | None],
+    config: str | None,
+) -> int:
+    """Prints which parts of a map are weakly held, and where to walk next; writes the files named
+    by `outputs`: json, report.
+
+    Raises:
+        UsageError: the map is an atlas, or an output is in the way.
+        TopolocError: from reading the map, asking it, and writing.
+    """
+    if is_atlas(path):
+        raise UsageError("--against-itself is of a map: give the tile's own file")
+    check_outputs(list(outputs.values()), [one for one in (path, config) if one])
+    settings = read_settings(config)
+    queried_nodes = with_option(settings.of(LocalizerConfig), "coarse", coarse, "--coarse")
+    json, report = outputs["json"], outputs["report"]
+    write_page = _import_page_writer() if report else None
+    with TopoMetricMap.load(path) as topomap:
+        info = describe_map(topomap, Path(path))
+        with progress_bar() as progress:
+            weak = find_weak_regions(
+                create_localizer(topomap, queried_nodes, features),
+                settings.of(WeakRegionsConfig),
+                progress,
+            )
+        if json != "-":
+            _print(weak)
+        write_json(json, {"map": info, "against_itself": weak.to_json()})
+        if write_page and report:
+            write_page(Path(report), weak, topomap, info)
+            if json != "-":
+                print(f"report: {report}")
+    return 0
+
+
+def _import_page_writer() -> Callable[..., None]:
+    try:
+        from topoloc.apps.report.weak_regions_page import write_weak_regions
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] != "matplotlib":
+            raise
+        raise MissingExtraError(
+            "a report needs matplotlib: pip install 'topoloc[report]'"
+        ) from error
+    return write_weak_regions
+
+
+def _print(weak: WeakRegions) -> None:
+    of, num_asked = len(weak.nodes), len(weak.queried_nodes)
+    held = f"{num_asked - weak.count('not_held')} of {num_asked} nodes, each asked without itself"
+    facts = [("held by the rest", held)]
+    if weak.weakest and (least := weak.weakest[0]).answer is not None:
+        facts.append(
+            (
+                "the weakest",
+                f"node {least.node_id} ({least.name}), {least.answer.num_inliers} inliers",
+            )
+        )
+    facts.append(("few landmarks", f"{weak.count('few_landmarks')} of {of}"))
+    facts.append(("nobody looks back", f"{weak.count('one_direction')} of {of}"))
+    sessions = f"{len(weak.session_names)} session{'s' if len(weak.session_names) > 1 else ''}"
+    facts.append(("one session alone", f"{weak.count('single_session')} of {of}, of {sessions}"))
+    facts.append(("where to walk next", weak.suggest_next_recording()))
+    print_fields(facts)

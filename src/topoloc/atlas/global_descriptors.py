@@ -1,0 +1,85 @@
+"""A tile's place vectors: what each of its nodes looks like, by the shared vocabularies, from the
+features that the nodes keep."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from topoloc.errors import AtlasError
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.shared_vocabulary import shared_vocabulary
+
+GlobalDescriptors = Mapping[str, Float32[np.ndarray, "_ _"]]
+"""Unit vectors of a tile's nodes by the kind of features."""
+
+
+def compute_global_descriptors(topomap: TopoMetricMap) -> dict[str, Float32[np.ndarray, "_ _"]]:
+    """Of all nodes of a map, in their order, by each of its kinds of features that has a shared
+    vocabulary.
+
+    Raises:
+        AtlasError: none has.
+    """
+    vectors = {}
+    for kind in topomap.kinds:
+        vocabulary = shared_vocabulary(kind)
+        if vocabulary is None:
+            continue
+        rows = [
+            vocabulary.global_descriptor(node.features, node.camera.width, node.camera.height)
+            for node in topomap.with_feature_type(kind).nodes
+        ]
+        vectors[kind] = np.stack(rows)
+    if not vectors:
+        raise AtlasError(
+            f"there is no shared vocabulary for features {', '.join(topomap.kinds)}, so that no"
+            " place of the map can be ranked"
+        )
+    return vectors
+
+
+def save_global_descriptors(path: Path, vectors: GlobalDescriptors) -> None:
+    """As half floats, each kind an array. Raises OSError."""
+    arrays: dict[str, Any] = {kind: rows.astype(np.float16) for kind, rows in vectors.items()}
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def load_global_descriptors(
+    path: Path, versions: Mapping[str, str]
+) -> dict[str, Float32[np.ndarray, "_ _"]]:
+    """The inverse of `save_global_descriptors`, of vectors by vocabularies of these versions (by
+    kind); other versions than ours are left out.
+
+    Raises:
+        AtlasError: missing, damaged, or of no vocabulary that this version has.
+    """
+    vectors = {}
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            for kind in stored.files:
+                vocabulary, rows = shared_vocabulary(kind), stored[kind]
+                if rows.ndim != 2 or rows.dtype != np.float16 or not np.isfinite(rows).all():
+                    raise AtlasError(f"{path} is damaged: the vectors of {kind} are none")
+                if (
+                    vocabulary is not None
+                    and vocabulary.version == versions.get(kind)
+                    and rows.shape[1] == vocabulary.dimension
+                ):
+                    vectors[kind] = rows.astype(np.float32)
+    except (OSError, ValueError, KeyError, EOFError, SyntaxError, zipfile.BadZipFile) as error:
+        raise AtlasError(
+            f"{path} is missing or damaged: {' '.join(str(error).split())[:120]}"
+        ) from None
+    if not vectors:
+        raise AtlasError(
+            f"{path} holds place vectors of another version of topoloc: `topoloc atlas add"
+            " --replace` makes them anew"
+        )
+    return vectors

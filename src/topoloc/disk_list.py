@@ -1,0 +1,198 @@
+"""A long list in the making whose entries lie on disk, but for those used last: what a map of any
+length is built with."""
+
+from __future__ import annotations
+
+import functools
+import io
+import pickle
+import sqlite3
+import threading
+from collections import OrderedDict
+from collections.abc import Container, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import is_dataclass
+from typing import Any, TypeVar, overload
+
+import numpy as np
+
+from topoloc.errors import TopolocError
+
+T = TypeVar("T")
+
+DEFAULT_MAX_BYTES = 64_000_000
+"""Of each shelf, where nobody says."""
+
+
+class DiskList(Sequence[T]):
+    """Entries that stay in memory up to a number of bytes; those used longest ago lie in a
+    temporary file, which ends with this process.
+
+    An entry that was changed has to be put back (``shelf[row] = entry``), or the change may be
+    lost. Threads may share a shelf. It is pickled as a list.
+
+    Args:
+        by_reference: objects that stay in memory in any case; entries that refer to them refer to
+            these same objects when they come back.
+
+    Raises:
+        TopolocError: the folder of temporary files has no room left; from whatever adds entries or
+            looks at them.
+    """
+
+    def __init__(
+        self,
+        entries: Iterable[T] = (),
+        max_bytes: int | None = None,
+        shared_objects: Sequence[object] = (),
+    ) -> None:
+        self._lock = threading.RLock()
+        self._cache: OrderedDict[int, tuple[T, int, bool]] = (
+            OrderedDict()
+        )  # by row: entry, bytes, whether the file has it as it is
+        self._length, self._num_bytes, self._max_bytes = (
+            0,
+            0,
+            DEFAULT_MAX_BYTES if max_bytes is None else max_bytes,
+        )
+        self._shared_objects, self._reference_ids = (
+            shared_objects,
+            {id(one): number for number, one in enumerate(shared_objects)},
+        )
+        self._database: sqlite3.Connection | None = None
+        for entry in entries:
+            self.append(entry)
+
+    def append(self, entry: T) -> None:
+        with self._lock:
+            self._length += 1
+            self._cache_entry(self._length - 1, entry, False)
+
+    def __len__(self) -> int:
+        return self._length
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        if isinstance(index, slice):
+            return [self[row] for row in range(*index.indices(len(self)))]
+        with self._lock:
+            row = self._row(index)
+            if row in self._cache:
+                self._cache.move_to_end(row)
+            else:
+                self._cache_entry(row, self._read(row), True)
+            return self._cache[row][0] if row in self._cache else self._read(row)
+
+    def __setitem__(self, index: int, entry: T) -> None:
+        with self._lock:
+            self._cache_entry(self._row(index), entry, False)
+
+    def __iter__(self) -> Iterator[T]:
+        return (self[row] for row in range(len(self)))
+
+    def __reduce__(self) -> Any:
+        return list, (list(self),)
+
+    def _row(self, index: int) -> int:
+        row = index + self._length if index < 0 else int(index)
+        if not 0 <= row < self._length:
+            raise IndexError(index)
+        return row
+
+    def _cache_entry(self, row: int, entry: T, is_written: bool) -> None:
+        """In memory, as the entry used last; others give way. An entry beyond the whole budget is
+        written at once."""
+        if row in self._cache:
+            self._num_bytes -= self._cache.pop(row)[1]
+        size = bytes_of(entry, self._reference_ids)
+        self._cache[row] = entry, size, is_written
+        self._num_bytes += size
+        while self._num_bytes > self._max_bytes and self._cache:
+            oldest, (evicted, freed, on_disk) = self._cache.popitem(last=False)
+            self._num_bytes -= freed
+            if not on_disk:
+                self._write(oldest, evicted)
+
+    def _write(self, row: int, entry: T) -> None:
+        with self._convert_disk_errors():
+            if self._database is None:
+                # an empty name is a file of nobody else's, gone when it is closed
+                self._database = sqlite3.connect("", isolation_level=None, check_same_thread=False)
+                for pragma in ("journal_mode = OFF", "synchronous = OFF"):
+                    self._database.execute(f"PRAGMA {pragma}")
+                self._database.execute(
+                    "CREATE TABLE entries (row INTEGER PRIMARY KEY, entry BLOB NOT NULL)"
+                )
+            buffer = io.BytesIO()
+            _Pickler(buffer, self._reference_ids).dump(entry)
+            self._database.execute(
+                "INSERT OR REPLACE INTO entries VALUES (?, ?)", (row, buffer.getbuffer())
+            )
+
+    def _read(self, row: int) -> T:
+        assert self._database is not None
+        with self._convert_disk_errors():
+            blob = self._database.execute(
+                "SELECT entry FROM entries WHERE row = ?", (row,)
+            ).fetchone()[0]
+        return _Unpickler(io.BytesIO(blob), self._shared_objects).load()
+
+    @contextmanager
+    def _convert_disk_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.OperationalError as error:
+            raise TopolocError(
+                "the folder of temporary files (TMPDIR) does not hold what is in the making:"
+                f" {error}"
+            ) from error
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(self, file: io.BytesIO, reference_ids: dict[int, int]) -> None:
+        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
+        self._reference_ids = reference_ids
+
+    def persistent_id(self, obj: Any) -> int | None:
+        return self._reference_ids.get(id(obj))
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, shared_objects: Sequence[object]) -> None:
+        super().__init__(file)
+        self._shared_objects = shared_objects
+
+    def persistent_load(self, pid: Any) -> object:
+        return self._shared_objects[pid]
+
+
+def bytes_of(value: Any, apart: Container[int] = ()) -> int:
+    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too;
+    objects of these `id` do not count."""
+    total, left = 0, [value]
+    while (
+        left
+    ):  # no recursion: a draft has hundreds of parts, and is counted whenever a picture has seen it
+        one = left.pop()
+        if id(one) in apart:
+            continue
+        if isinstance(one, np.ndarray):
+            total += one.nbytes
+        elif isinstance(one, bytes):
+            total += len(one)
+        elif isinstance(one, dict):
+            left.extend(one.values())
+        elif isinstance(one, list | tuple):
+            left.extend(one)
+        else:
+            left.extend([getattr(one, name) for name in _dataclass_fields(type(one))])
+    return total
+
+
+@functools.cache
+def _dataclass_fields(kind: type) -> tuple[str, ...]:
+    """Of a dataclass; else none."""
+    return tuple(kind.__dataclass_fields__) if is_dataclass(kind) else ()

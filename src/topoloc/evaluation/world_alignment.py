@@ -1,0 +1,98 @@
+"""Truth and map in different worlds: answers that agree with each other, and whose errors one rigid
+transform explains.
+
+Recordings of one place often have worlds of their own. Errors of 20 degrees then say nothing of the
+answers; what they would be in one world is offered beside them, never in their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.evaluation.metrics import EvaluatedQuery
+from topoloc.geometry.alignment import align_poses, rotation_error, translation_error
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.result import Localization
+
+_MIN_ANSWERS = 5
+_MIN_ERROR = 1.0  # of errors weighed as below; smaller ones need no explanation
+_POSITION_SCALE_M, _ROTATION_SCALE = 0.25, np.deg2rad(2.0)
+_MAX_SHARE = 0.2
+_GATE = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class WorldFit:
+    """`map_from_truth` by the answers to one recording; medians of the errors that are left, of
+    `num_answers` of `num_localized`."""
+
+    recording: str
+    map_from_truth: Rigid3
+    median_translation_m: float
+    median_rotation_deg: float
+    num_answers: int
+    num_localized: int
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "recording": self.recording,
+            "map_from_truth": self.map_from_truth.matrix().tolist(),
+            "median_translation_m": self.median_translation_m,
+            "median_rotation_deg": self.median_rotation_deg,
+            "num_answers": self.num_answers,
+            "num_localized": self.num_localized,
+        }
+
+
+def fit_worlds(answers: Sequence[EvaluatedQuery]) -> WorldFit | None:
+    """The transform that explains the errors of one recording's answers; None where they are small
+    already, or none explains most of them.
+
+    Each answer proposes one; the one that leaves the least median error is refined by the answers
+    that agree with it.
+    """
+    pairs = [
+        (a.result.world_from_cam, a.world_from_cam)
+        for a in answers
+        if isinstance(a.result, Localization) and a.world_from_cam
+    ]
+    if len(pairs) < _MIN_ANSWERS:
+        return None
+    before = float(np.median(_normalized_errors(Rigid3.identity(), pairs)))
+    if before < _MIN_ERROR:
+        return None
+    proposals = [found @ true.inverse() for found, true in pairs]
+    best = min(proposals, key=lambda one: float(np.median(_normalized_errors(one, pairs))))
+    errors = _normalized_errors(best, pairs)
+    agreeing = [
+        pair
+        for pair, error in zip(pairs, errors, strict=True)
+        if error < max(_GATE * float(np.median(errors)), 1e-3)
+    ]
+    map_from_truth = align_poses([found for found, _ in agreeing], [true for _, true in agreeing])
+    if float(np.median(_normalized_errors(map_from_truth, pairs))) > _MAX_SHARE * before or 2 * len(
+        agreeing
+    ) < len(pairs):
+        return None
+    translations = [translation_error(found, map_from_truth @ true) for found, true in pairs]
+    rotations = [rotation_error(found, map_from_truth @ true) for found, true in pairs]
+    medians = float(np.median(translations)), float(np.rad2deg(np.median(rotations)))
+    return WorldFit(answers[0].recording, map_from_truth, *medians, len(agreeing), len(pairs))
+
+
+def _normalized_errors(
+    map_from_truth: Rigid3, pairs: Sequence[tuple[Rigid3, Rigid3]]
+) -> Float[np.ndarray, " n"]:
+    """Of each answer, 1 for 25 cm or 2 degrees."""
+    moved = [(found, map_from_truth @ true) for found, true in pairs]
+    return np.array(
+        [
+            max(translation_error(a, b) / _POSITION_SCALE_M, rotation_error(a, b) / _ROTATION_SCALE)
+            for a, b in moved
+        ]
+    )

@@ -1,0 +1,75 @@
+"""Is a session's calibration that of its camera? The map's points that its pictures show say so."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from topoloc.errors import CalibrationError
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.lifelong.leave_one_out import sample_evenly
+from topoloc.localization.image_calibration_check import check_camera_calibrations
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.recordings.frame import StereoSequence
+
+_NUM_QUERIES, _MIN_LOCALIZED = 7, 3
+_FOCAL_LENGTH_RANGE = 1.5  # times the focal length that is said
+_MAX_LOG_RATIO = math.log(1.04)
+
+
+def check_calibration(name: str, results: Sequence[Localization | NotLocalized]) -> None:
+    """Hold that what the pictures say together does not contradict the calibration that they came
+    with. Raises CalibrationError."""
+    wrong = next(
+        (verdict for verdict in check_camera_calibrations(results) if verdict.is_contradicted), None
+    )
+    if wrong is not None:
+        raise CalibrationError(
+            f"{name}: its calibration is not that of its camera: {wrong}; the map stays as it is"
+        )
+
+
+def check_focal_length(
+    sequence: StereoSequence, indices: Sequence[int], localizer: Localizer
+) -> None:
+    """Of a session that the map recognises too little of: hold that it is not recognised where its
+    focal length is left open.
+
+    Args:
+        indices: the frames that were asked, of which a few are asked once more.
+
+    Raises:
+        CalibrationError: the pictures agree on another focal length.
+        UnreadableImageError, QueryError: from its pictures.
+    """
+    tried, found = sample_evenly(indices, _NUM_QUERIES), list[float]()
+    for index in tried:
+        frame = sequence[index]
+        if frame.camera is None:
+            return
+        camera = frame.camera
+        uncalibrated = UncalibratedCamera(
+            camera.width,
+            camera.height,
+            camera.fx / _FOCAL_LENGTH_RANGE,
+            camera.fx * _FOCAL_LENGTH_RANGE,
+        )
+        result = localizer.localize(frame.image, uncalibrated)
+        if isinstance(result, Localization) and result.focal_length_px is not None:
+            found.append(math.log(result.focal_length_px / camera.fx))
+    if len(found) < _MIN_LOCALIZED:
+        return
+    middle = float(np.median(found))
+    agreeing = sum(abs(one - middle) < _MAX_LOG_RATIO for one in found)
+    if abs(middle) > _MAX_LOG_RATIO and agreeing >= _MIN_LOCALIZED:
+        said = sequence[tried[0]].camera
+        assert said is not None, "it was asked"
+        lengths = f"{said.fx * math.exp(middle):.0f} pixels, not {said.fx:.0f}"
+        raise CalibrationError(
+            f"{sequence.name}: its calibration is not that of its camera: the map recognises"
+            f" {agreeing} of {len(tried)} pictures where the focal length is about {lengths}; the"
+            " map stays as it is"
+        )

@@ -1,0 +1,64 @@
+"""Long sequences changed without reading them: some entries changed and others behind them, some
+left out, all changed when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+class OverlaySequence(Sequence[T]):
+    """`base` with the entries of `changed` (by their rows) in place of its own, and `added`
+    behind it."""
+
+    def __init__(self, base: Sequence[T], changed: Mapping[int, T], added: Sequence[T]) -> None:
+        self._base, self._changed, self._added = base, changed, added
+
+    def __len__(self) -> int:
+        return len(self._base) + len(self._added)
+
+    def __getitem__(self, index):  # type: ignore[override]
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        row = index + len(self) if index < 0 else index
+        if not 0 <= row < len(self):
+            raise IndexError(index)
+        if row in self._changed:
+            return self._changed[row]
+        return self._base[row] if row < len(self._base) else self._added[row - len(self._base)]
+
+
+class SelectedSequence(Sequence[T]):
+    """Some rows of `base`."""
+
+    def __init__(self, base: Sequence[T], rows: Sequence[int]) -> None:
+        self._base, self._rows = base, rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index):  # type: ignore[override]
+        return (
+            [self._base[row] for row in self._rows[index]]
+            if isinstance(index, slice)
+            else self._base[self._rows[index]]
+        )
+
+
+class TransformedSequence(Sequence[T]):
+    """Each entry of `base` as `transform` makes it, every time that it is asked for."""
+
+    def __init__(self, base: Sequence[T], transform: Callable[[T], T]) -> None:
+        self._base, self._transform = base, transform
+
+    def __len__(self) -> int:
+        return len(self._base)
+
+    def __getitem__(self, index):  # type: ignore[override]
+        return (
+            [self._transform(one) for one in self._base[index]]
+            if isinstance(index, slice)
+            else self._transform(self._base[index])
+        )

@@ -1,0 +1,76 @@
+"""A tile's map is edited as any map file is, and put back where nobody was faster."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.editing import NewTile, replace_tile
+from topoloc.atlas.manifest import StoredFile, Tile
+from topoloc.atlas.store import sha256_of
+from topoloc.errors import AtlasError, TopolocError
+from topoloc.mapping.undo_log import undo_log_path
+from topoloc.recordings.atomic import temporary_folder
+
+_MAX_TRIES = 5
+T = TypeVar("T")
+
+
+def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Tile, T]:
+    """The tile with its map edited, in the same world and with the same joins, and what the edit
+    says.
+
+    Args:
+        edit: edits the map file at a path, a copy, as `map/edit.py` does; the undo file beside it
+            is kept with the tile. It is called again where another writer replaced the tile
+            meanwhile.
+
+    Raises:
+        AtlasError: there is no such atlas or tile, it cannot be read or written, or others replaced
+            it again and again.
+        TopolocError: as of `edit`; the atlas is as it was.
+    """
+    for _ in range(_MAX_TRIES):
+        atlas = Atlas.open(where)
+        before = atlas.tile(tile_id)
+        with temporary_folder("topoloc-tile-") as folder:
+            path = folder / f"{tile_id}.topo"
+            _copy_map(atlas, before.map, path)
+            if before.undo is not None:
+                _copy_map(atlas, before.undo, undo_log_path(path))
+            done = _edit_with_tile_name(edit, path, f"{where}, tile {tile_id}")
+            if sha256_of(path) == before.map.sha256:
+                return before, done
+            after = replace_tile(where, NewTile(tile_id, path, before.world, before.recipe), before)
+        if after is not None:
+            return after.by_id[tile_id], done
+    raise AtlasError(
+        f"{where}: tile {tile_id} was replaced by others {_MAX_TRIES} times meanwhile; it stays as"
+        " they left it"
+    )
+
+
+def _edit_with_tile_name(edit: Callable[[Path], T], path: Path, name: str) -> T:
+    """What the edit says; its failures name the tile and not the copy."""
+    try:
+        return edit(path)
+    except TopolocError as error:
+        error.args = (str(error).replace(str(path), name), *error.args[1:])
+        raise
+
+
+def _copy_map(atlas: Atlas, stored: StoredFile, path: Path) -> None:
+    try:
+        shutil.copyfile(atlas.store.local_path(stored.name, stored.sha256), path)
+    except OSError as error:
+        raise AtlasError(
+            f"cannot copy {stored.name} of {atlas.store.where}: {error.strerror}"
+        ) from None
+    if sha256_of(path) != stored.sha256:
+        raise AtlasError(
+            f"{stored.name} of {atlas.store.where} is not the file that was added: its checksum is"
+            " another"
+        )

@@ -1,0 +1,254 @@
+"""The tiles of an atlas that overlap are joined: read from `join_tiles`.
+
+Only tiles whose places look alike are compared, by the atlas's index over the places of all; each
+pair as `tile_comparison.py` says. What is found is committed at once, so that whoever is called
+again goes on. The manifest adjusts all joins together (`atlas/joint_worlds.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.editing import add_joins
+from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
+from topoloc.atlas.manifest import Manifest, Tile
+from topoloc.atlas.map_cache import MapCache
+from topoloc.bounds import check_bounds
+from topoloc.errors import AtlasError, MapError
+from topoloc.lifelong.tile_comparison import (
+    NotJoined,
+    OpenTile,
+    TileJoinConfig,
+    TileTransform,
+    compare_tiles,
+)
+from topoloc.localization.localizer import Localizer
+from topoloc.mapping.build import Progress
+
+_NUM_RETRIEVED = 32
+_NUM_BEST = 3
+_MAX_BYTES = 512_000_000
+
+OnCompared = Callable[["PairResult"], None]
+
+
+@dataclass(frozen=True)
+class NotCompared(NotJoined):
+    """Why nothing is known of two tiles: whoever compared them ended in the middle."""
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """Two tiles, and what was found of them."""
+
+    first: str
+    second: str
+    found: TileTransform | NotJoined
+
+
+@dataclass(frozen=True, eq=False)
+class TileJoiningResult:
+    """The atlas as it is afterwards, and what was tried."""
+
+    manifest: Manifest
+    pair_results: list[PairResult]
+
+
+def join_tiles(
+    where: str,
+    tile_ids: Sequence[str] = (),
+    config: TileJoinConfig | None = None,
+    on_compared: OnCompared | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
+) -> TileJoiningResult:
+    """Tiles that overlap joined, those of them that no join connects directly yet.
+
+    Args:
+        tile_ids: only pairs with one of these; none: all.
+        tell: is told of each pair that was compared.
+        pairs: just these are compared, by the ids of the tiles; None: those that look alike.
+
+    Raises:
+        ConfigError: a setting is out of its bounds.
+        AtlasError: no atlas is there, it has no such tile, or it cannot be written.
+        FeatureKindError, MissingExtraError, WeightsError: maps' features cannot be compared here.
+    """
+    config, atlas = config or TileJoinConfig(), Atlas.open(where)
+    maps, pair_results = MapCache([], Localizer, _MAX_BYTES), list[PairResult]()
+    try:
+        for first, second in _select_pairs(atlas, tile_ids, config, pairs):
+            pair_results.append(_join_pair(atlas, maps, (first, second), config))
+            if on_compared is not None:
+                on_compared(pair_results[-1])
+    finally:
+        maps.close()
+    return TileJoiningResult(Atlas.open(where).manifest, pair_results)
+
+
+def select_tile_pairs(
+    where: str,
+    tile_ids: Sequence[str] = (),
+    config: TileJoinConfig | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
+) -> list[tuple[str, str]]:
+    """The ids of the tiles that `join_tiles` compares, in its order. Raises ConfigError, AtlasError
+    as that does."""
+    found = _select_pairs(Atlas.open(where), tile_ids, config or TileJoinConfig(), pairs)
+    return [(first.tile_id, second.tile_id) for first, second in found]
+
+
+@dataclass(frozen=True)
+class PairJob:
+    """Two tiles of the atlas at `where`, which are compared, and joined if they overlap, by whoever
+    runs it: a job of a cluster."""
+
+    where: str
+    first: str
+    second: str
+    config: TileJoinConfig
+
+    @property
+    def name(self) -> str:
+        return f"join {self.first} {self.second}"
+
+    def run(self, progress: Progress) -> PairResult:
+        """Raises as `join_tiles`; AtlasError also where a tile is gone."""
+        maps = MapCache([], Localizer, _MAX_BYTES)
+        try:
+            atlas = Atlas.open(self.where)
+            return _join_pair(
+                atlas, maps, (atlas.tile(self.first), atlas.tile(self.second)), self.config
+            )
+        finally:
+            maps.close()
+
+    def failure_outcome(self, reason: str) -> PairResult:
+        return PairResult(self.first, self.second, NotCompared(reason))
+
+
+def _select_pairs(
+    atlas: Atlas,
+    tile_ids: Sequence[str],
+    config: TileJoinConfig,
+    pairs: Sequence[tuple[str, str]] | None,
+) -> list[tuple[Tile, Tile]]:
+    check_bounds(config)
+    wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
+    return (
+        find_candidate_pairs(atlas, wanted, config)
+        if pairs is None
+        else _find_unjoined_pairs(atlas, pairs)
+    )
+
+
+def _join_pair(
+    atlas: Atlas, maps: MapCache, pair: tuple[Tile, Tile], config: TileJoinConfig
+) -> PairResult:
+    """What is found of a pair; it stands in the manifest then."""
+    first, second = pair
+    try:
+        found = _compare_pair(atlas, maps, first, second, config)
+    except (MapError, AtlasError) as error:
+        found = NotJoined(str(error))
+    if isinstance(found, TileTransform):
+        join = Join(
+            first.tile_id,
+            second.tile_id,
+            found.first_from_second,
+            found.covariance,
+            found.num_agreeing,
+        )
+        add_joins(atlas.store.where, [join], {first.tile_id: first, second.tile_id: second})
+    return PairResult(first.tile_id, second.tile_id, found)
+
+
+def _compare_pair(
+    atlas: Atlas, maps: MapCache, first: Tile, second: Tile, config: TileJoinConfig
+) -> TileTransform | NotJoined:
+    places = [atlas.places_of(tile) for tile in (first, second)]
+    with (
+        maps.use_map(first.tile_id, atlas.map_path(first)) as one,
+        maps.use_map(second.tile_id, atlas.map_path(second)) as other,
+    ):
+        return compare_tiles(
+            OpenTile(one.localizer, places[0]), OpenTile(other.localizer, places[1]), config
+        )
+
+
+def _find_unjoined_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list[tuple[Tile, Tile]]:
+    """Those of the pairs, in the order of their ids, that are not joined yet."""
+    ordered = [(min(pair), max(pair)) for pair in pairs]
+    known = {join.pair for join in atlas.manifest.joins}
+    return [
+        (atlas.tile(first), atlas.tile(second))
+        for first, second in ordered
+        if (first, second) not in known
+    ]
+
+
+def find_candidate_pairs(
+    atlas: Atlas, wanted: Collection[str], config: TileJoinConfig
+) -> list[tuple[Tile, Tile]]:
+    """Pairs of tiles in the order of their ids that may overlap, the most alike first: of worlds of
+    their own, not joined yet, not known to lie far apart; their most similar places look alike."""
+    manifest, index = atlas.manifest, atlas.index
+    scores = dict[tuple[str, str], float]()
+    known = {join.pair for join in manifest.joins}
+    for tile in manifest.tiles:
+        if tile.tile_id not in wanted or tile.tile_id in atlas.problems:
+            continue
+        candidate_ids = [other.tile_id for other in manifest.tiles if _may_overlap(tile, other)]
+        for other_id, score in (
+            _find_similar_tiles(atlas, tile, candidate_ids, config)
+            if candidate_ids and index.kinds
+            else ()
+        ):
+            pair = (min(tile.tile_id, other_id), max(tile.tile_id, other_id))
+            if pair not in known and score >= config.min_likeness:
+                scores[pair] = max(score, scores.get(pair, -1.0))
+    best = sorted(scores, key=lambda pair: (-scores[pair], pair))[: config.max_pairs]
+    return [(manifest.by_id[first], manifest.by_id[second]) for first, second in best]
+
+
+def _find_similar_tiles(
+    atlas: Atlas, tile: Tile, candidate_ids: Sequence[str], config: TileJoinConfig
+) -> Iterator[tuple[str, float]]:
+    """The tiles that look most like a tile, with how much: the median of the most similar
+    places."""
+    places, found = atlas.places_of(tile), dict[str, list[float]]()
+    kind = next((kind for kind in tile.kinds if kind in places), next(iter(places)))
+    rows = np.unique(
+        np.linspace(0, len(places[kind]) - 1, min(len(places[kind]), _NUM_RETRIEVED))
+        .round()
+        .astype(int)
+    )
+    for row in rows:
+        for other_id, likeness in atlas.index.rank(
+            {kind: places[kind][row]}, config.num_neighbours, candidate_ids
+        ):
+            found.setdefault(other_id, []).append(likeness)
+    scores = {
+        other_id: float(np.median(sorted(values)[-_NUM_BEST:]))
+        for other_id, values in found.items()
+    }
+    yield from sorted(scores.items(), key=lambda pair: -pair[1])[: config.num_neighbours]
+
+
+def _may_overlap(tile: Tile, other: Tile) -> bool:
+    """Are these of two worlds that are not known to lie far from each other?"""
+    if tile.world == other.world:
+        return False
+    world_from_other = tile.from_world_of(other)
+    if world_from_other is None:
+        return True
+    reaches = [float(np.linalg.norm(np.diff(one.box_world, axis=0))) / 2.0 for one in (tile, other)]
+    centres = [one.box_world.mean(axis=0) for one in (tile, other)]
+    return (
+        float(np.linalg.norm(world_from_other.apply(centres[1]) - centres[0]))
+        <= sum(reaches) + MAX_WORLD_OFFSET_M
+    )

@@ -1,0 +1,131 @@
+"""A single camera's walk adjusted as a whole: all that its key frames see, and what the map
+answers, brought to agree.
+
+Odometry adjusts the last key frames alone, and a pose graph afterwards knows the steps alone:
+neither uses that all answers together say how long the whole walk is. Here each landmark and each
+key frame moves, and the map's answers hold them by their covariances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.geometry.rigid import Rigid3, inverse_covariance
+from topoloc.lifelong.scale_estimation import compute_path_lengths
+from topoloc.localization.result import Localization
+from topoloc.slam.bundle_adjustment import BundleConfig, PosePrior, adjust_bundle
+from topoloc.slam.keyframes import FramePose, KeyFrame
+from topoloc.slam.monocular_odometry import MonocularSubmap
+
+_NUM_NEIGHBOURS = 3
+
+
+def adjust_trajectory(
+    stretch: MonocularSubmap,
+    held: Sequence[Rigid3 | None],
+    anchors: Mapping[int, Localization],
+    points_widened: float,
+    config: BundleConfig,
+) -> list[Rigid3 | None]:
+    """world_from_cam of the frames, better than `held`, which has them in the map's world and
+    metres; None stays None.
+
+    The stretch's own key frames and landmarks move along: they are in the map's world afterwards.
+
+    Args:
+        anchors: the map's answers that are believed, by frame.
+        points_widened: how many times as large the sigmas of followed points are as odometry took
+            them for.
+    """
+    keyframes = _transform_to_map(stretch, held)
+    moved = set(map(id, keyframes))
+    frames = {
+        f.frame_idx: f
+        for f in stretch.frames
+        if id(f.keyframe) in moved and _has_pose(held, f.frame_idx)
+    }
+    relative = {index: _relative_pose(frame, held) for index, frame in frames.items()}
+    for keyframe in keyframes:
+        keyframe.observations.weights /= points_widened
+    map_anchors = [
+        _keyframe_anchor(relative[index], frame, anchors[index])
+        for index, frame in frames.items()
+        if index in anchors
+    ]
+    adjust_bundle(keyframes, [], stretch.landmarks, config, map_anchors)
+    adjusted = list(held)
+    for index, frame in frames.items():
+        adjusted[index] = (
+            relative[index] @ frame.keyframe.cam_from_world
+        ).inverse() @ frame.view_from_cam
+    return adjusted
+
+
+def _has_pose(held: Sequence[Rigid3 | None], index: int) -> bool:
+    return index < len(held) and held[index] is not None
+
+
+def _relative_pose(frame: FramePose, held: Sequence[Rigid3 | None]) -> Rigid3:
+    """cam_from_keyframe of a frame, in metres."""
+    pose = held[frame.frame_idx]
+    assert pose is not None
+    return frame.view_from_cam @ pose.inverse() @ frame.keyframe.cam_from_world.inverse()
+
+
+def _keyframe_anchor(
+    cam_from_keyframe: Rigid3, frame: FramePose, answer: Localization
+) -> PosePrior:
+    """What an answer to a frame says of its key frame."""
+    keyframe_from_cam = cam_from_keyframe.inverse() @ frame.view_from_cam
+    information = np.linalg.inv(inverse_covariance(answer.world_from_cam, answer.covariance))
+    turned = keyframe_from_cam.inverse().adjoint()
+    return PosePrior(
+        frame.keyframe,
+        keyframe_from_cam @ answer.world_from_cam.inverse(),
+        turned.T @ information @ turned,
+    )
+
+
+def _transform_to_map(stretch: MonocularSubmap, held: Sequence[Rigid3 | None]) -> list[KeyFrame]:
+    """Bring the key frames whose pose is known, and the landmarks that they see, into the map's
+    world and metres; these key frames."""
+    views = {f.frame_idx: f.view_from_cam for f in stretch.frames}
+    keyframes = [
+        k for k in stretch.keyframes if _has_pose(held, k.frame_idx) and k.frame_idx in views
+    ]
+    before = [k.cam_from_world for k in keyframes]
+    after = [
+        views[k.frame_idx] @ pose.inverse()
+        for k in keyframes
+        if (pose := held[k.frame_idx]) is not None
+    ]
+    moved = np.zeros(stretch.landmarks.num, np.bool_)
+    for keyframe, old, new, metres in zip(
+        keyframes, before, after, _metres_per_unit(before, after), strict=True
+    ):
+        ids = keyframe.observations.landmark_ids[keyframe.observations.active]
+        ids = ids[~moved[ids]]
+        moved[ids] = True
+        stretch.landmarks.positions[ids] = new.inverse().apply(
+            metres * old.apply(stretch.landmarks.positions[ids])
+        )
+        keyframe.cam_from_world = new
+    return keyframes
+
+
+def _metres_per_unit(before: Sequence[Rigid3], after: Sequence[Rigid3]) -> Float[np.ndarray, " k"]:
+    """What a unit of the motion is in metres at each key frame, by the way to the ones around
+    it."""
+    path_lengths = [
+        compute_path_lengths(
+            np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3)
+        )
+        for poses in (before, after)
+    ]
+    first = np.maximum(np.arange(len(before)) - _NUM_NEIGHBOURS, 0)
+    last = np.minimum(np.arange(len(before)) + _NUM_NEIGHBOURS, len(before) - 1)
+    odom, metres = (path_length[last] - path_length[first] for path_length in path_lengths)
+    return metres / np.maximum(odom, 1e-12)

@@ -1,0 +1,331 @@
+"""Which parts of a map are weakly held, by the map alone: read from `find_weak_regions`.
+
+Four things make a node weak: the rest of the map does not hold it (`leave_one_out.py`); it has few
+landmarks; nobody looked the other way within its reach; no other session saw it again, nor stood
+beside it. Weak nodes that are near each other are a part, which is what one walks to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from topoloc.bounds import Above, AtLeast, Between, check_bounds
+from topoloc.geometry.rigid import Rigid3
+from topoloc.lifelong.leave_one_out import LeaveOneOutResult, localize_left_out, sample_evenly
+from topoloc.localization.localizer import Localizer
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+
+Reason = Literal["not_held", "few_landmarks", "one_direction", "single_session"]
+REASONS: tuple[Reason, ...] = get_args(Reason)
+"""The worst first."""
+_BATCH_SIZE = 512  # nodes that are compared with all others in one step
+
+
+@dataclass(frozen=True)
+class WeakRegionsConfig:
+    """What is weak."""
+
+    max_asked: Annotated[int, AtLeast(0)] = 200
+    """Nodes that are asked of the rest of the map, at most, spread over all; 0 asks none."""
+    beside: Annotated[float, AtLeast(0)] = 0.0
+    """With a node those of its session are left out that are within so many D_thresh of it (Eq. 1).
+    Nodes of one session are more than one apart, so that by default a node alone is left out, and
+    asked from further away than any picture of the walk is."""
+    min_inliers: Annotated[int, Between(1, 10_000)] = 60
+    """The rest holds a node that it localizes with so many inliers: a session's picture like that
+    needs no node of its own."""
+    min_landmarks: Annotated[int, Between(1, 100_000)] = 100
+    """A node with fewer has few."""
+    reach: Annotated[float, Above(0)] = 4.0
+    """A node looks the other way where it stands within so many D_thresh ..."""
+    min_turn_deg: Annotated[float, Between(1, 180)] = 120.0
+    """... and is turned by at least so much."""
+    min_seen_share: Annotated[float, Between(0, 1)] = 0.2
+    """Another session saw a node again where it saw this share of its landmarks, or has a node of
+    its own ..."""
+    stood_by: Annotated[float, AtLeast(0)] = 1.5
+    """... within so many D_thresh (Eq. 1)."""
+    apart: Annotated[float, Above(0)] = 3.0
+    """Weak nodes within so many D_thresh of each other are one part."""
+
+
+@dataclass(frozen=True)
+class NodeQuality:
+    """How a node is held. `answer` is None where it was not asked; `seen_share` is the share of its
+    landmarks that other sessions saw."""
+
+    node_id: int
+    name: str
+    session_id: int
+    world_from_cam: Rigid3
+    num_landmarks: int
+    seen_share: float
+    answer: LeaveOneOutResult | None
+    reasons: tuple[Reason, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        queried_nodes = (
+            None
+            if self.answer is None
+            else {"localized": self.answer.is_localized, "inliers": self.answer.num_inliers}
+        )
+        return {
+            "node_id": self.node_id,
+            "name": self.name,
+            "session_id": self.session_id,
+            "position": self.world_from_cam.translation.round(3).tolist(),
+            "num_landmarks": self.num_landmarks,
+            "seen_by_other_sessions": round(self.seen_share, 3),
+            "without_itself": queried_nodes,
+            "weak": list(self.reasons),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class WeakRegion:
+    """Nodes near each other that are weak for one reason, in the order of their ids."""
+
+    reason: Reason
+    nodes: list[NodeQuality]
+
+    @property
+    def centre(self) -> Float[np.ndarray, "3"]:
+        """Metres, world: of the node nearest to the middle, for a way may bend."""
+        positions = np.array([node.world_from_cam.translation for node in self.nodes])
+        return positions[int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmin())]
+
+    def to_json(self) -> dict[str, Any]:
+        ids = [node.node_id for node in self.nodes]
+        return {"reason": self.reason, "centre": self.centre.round(3).tolist(), "node_ids": ids}
+
+
+@dataclass(frozen=True, eq=False)
+class WeakRegions:
+    """How every node is held, in the map's order, and the weak parts: the worst reason first, of
+    each the largest part first."""
+
+    nodes: list[NodeQuality]
+    parts: list[WeakRegion]
+    session_names: dict[int, str]
+
+    def count(self, reason: Reason) -> int:
+        """Nodes that are weak for this reason."""
+        return sum(reason in node.reasons for node in self.nodes)
+
+    @property
+    def weakest(self) -> list[NodeQuality]:
+        """The nodes that were asked, the one that the rest of the map holds least first."""
+        return sorted(
+            self.queried_nodes,
+            key=lambda node: node.answer.num_inliers if node.answer is not None else 0,
+        )
+
+    @property
+    def queried_nodes(self) -> list[NodeQuality]:
+        """The nodes that were asked of the rest of the map."""
+        return [node for node in self.nodes if node.answer is not None]
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "num_nodes": len(self.nodes),
+            "num_sessions": len(self.session_names),
+            "num_asked": len(self.queried_nodes),
+            "num_localized": sum(
+                node.answer is not None and node.answer.is_localized for node in self.nodes
+            ),
+            "weak": {reason: self.count(reason) for reason in REASONS},
+            "where_next": self.suggest_next_recording(),
+            "parts": [part.to_json() for part in self.parts],
+            "nodes": [node.to_json() for node in self.nodes],
+        }
+
+    def suggest_next_recording(self) -> str:
+        """Where to walk next, in one or two sentences."""
+        sentences = list[str]()
+        of_reason = {
+            reason: [part for part in self.parts if part.reason == reason] for reason in REASONS
+        }
+        poor = sorted(
+            of_reason["not_held"] + of_reason["few_landmarks"], key=lambda part: -len(part.nodes)
+        )
+        if poor:
+            is_one, is_not_held = len(poor[0].nodes) == 1, poor[0].reason == "not_held"
+            why = (
+                f"the rest of the map does not hold {'it' if is_one else 'them'}"
+                if is_not_held
+                else "few landmarks are known there"
+            )
+            sentences.append(f"Walk again past {self._describe_region(poor[0])}: {why}.")
+        if one_way := of_reason["one_direction"]:
+            num, of = self.count("one_direction"), len(self.nodes)
+            where = (
+                "all of it the other way"
+                if num == of
+                else f"the other way past {self._describe_region(one_way[0])}"
+            )
+            sentences.append(f"Walk {where}: {num} of {of} nodes look where nobody looks back.")
+        if len(sentences) < 2 and len(self.session_names) < 2:
+            sentences.append(
+                "All of it is of one session: a walk on another day, or in another light, tells"
+                " what lasts."
+            )
+        elif len(sentences) < 2 and of_reason["single_session"]:
+            sentences.append(
+                f"Walk again past {self._describe_region(of_reason['single_session'][0])}: seen by"
+                " one session alone."
+            )
+        return " ".join(sentences[:2]) or "No part is weak."
+
+    def _describe_region(self, part: WeakRegion) -> str:
+        first, last = part.nodes[0], part.nodes[-1]
+        place = "({:.1f}, {:.1f}, {:.1f}) m".format(*(part.centre.round(1) + 0.0))  # no -0.0
+        if first is last:
+            return (
+                f"{place}, node {first.node_id} ({first.name} of"
+                f" {self.session_names.get(first.session_id, '?')})"
+            )
+        sessions = sorted({self.session_names.get(node.session_id, "?") for node in part.nodes})
+        return (
+            f"{place}, {len(part.nodes)} nodes ({first.name} to {last.name} of"
+            f" {', '.join(sessions)})"
+        )
+
+
+def find_weak_regions(
+    localizer: Localizer,
+    config: WeakRegionsConfig | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> WeakRegions:
+    """How each node of a map is held by the rest of it.
+
+    Raises:
+        ConfigError: a setting is out of its bounds.
+        MapError: from reading the map.
+    """
+    config = config or WeakRegionsConfig()
+    check_bounds(config)
+    topomap, rows = (
+        localizer.topomap,
+        sample_evenly(range(len(localizer.topomap.summaries)), config.max_asked),
+    )
+
+    def report_progress(done: int, total: int) -> None:
+        if progress is not None:
+            progress("asking the map without the node", done, total)
+
+    answers = localize_left_out(localizer, topomap, rows, config.beside, report_progress)
+    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    has_opposite_view = _has_opposite_view(
+        poses, config.reach * topomap.config.d_thresh, config.min_turn_deg
+    )
+    nodes = [
+        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), poses, config)
+        for row in range(len(topomap.summaries))
+    ]
+    names = {session.session_id: session.name for session in topomap.sessions}
+    names |= {
+        summary.session_id: summary.recording
+        for summary in topomap.summaries
+        if summary.session_id not in names
+    }
+    return WeakRegions(nodes, _group_regions(nodes, config.apart * topomap.config.d_thresh), names)
+
+
+def _assess_node(
+    topomap: TopoMetricMap,
+    row: int,
+    answer: LeaveOneOutResult | None,
+    has_opposite_view: bool,
+    poses: NodePoses,
+    config: WeakRegionsConfig,
+) -> NodeQuality:
+    node, summary = topomap.nodes[row], topomap.summaries[row]
+    seen_share, reasons = _seen_share(node), list[Reason]()
+    if answer is not None and answer.num_inliers < config.min_inliers:
+        reasons.append("not_held")
+    if summary.num_points < config.min_landmarks:
+        reasons.append("few_landmarks")
+    if not has_opposite_view:
+        reasons.append("one_direction")
+    if seen_share < config.min_seen_share and not _has_other_session(
+        topomap, row, poses, config.stood_by
+    ):
+        reasons.append("single_session")
+    return NodeQuality(
+        summary.node_id,
+        summary.name,
+        summary.session_id,
+        summary.world_from_cam,
+        summary.num_points,
+        seen_share,
+        answer,
+        tuple(reasons),
+    )
+
+
+def _seen_share(node: TopoNode) -> float:
+    """The share of a node's landmarks that sessions other than its own saw."""
+    seen = np.zeros(len(node.features), bool)
+    for session_statistics in node.session_statistics:
+        if session_statistics.session_id != node.summary.session_id:
+            seen[session_statistics.rows[session_statistics.seen > 0]] = True
+    return float(seen.mean()) if len(seen) else 0.0
+
+
+def _has_other_session(
+    topomap: TopoMetricMap, row: int, poses: NodePoses, num_d_thresh: float
+) -> bool:
+    """Does a node of another session stand beside this one?"""
+    summary = topomap.summaries[row]
+    near = np.flatnonzero(
+        node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
+        <= num_d_thresh * topomap.config.d_thresh
+    )
+    return any(topomap.summaries[int(other)].session_id != summary.session_id for other in near)
+
+
+def _has_opposite_view(
+    poses: NodePoses, reach_m: float, min_turn_deg: float
+) -> Bool[np.ndarray, " nodes"]:
+    """Of each node, whether another one within reach looks the other way."""
+    axes, found = poses.rotations[:, :, 2], np.zeros(len(poses.centres), bool)
+    for start in range(0, len(axes), _BATCH_SIZE):
+        some = slice(start, start + _BATCH_SIZE)
+        away = np.linalg.norm(poses.centres[some, None] - poses.centres[None], axis=2)
+        found[some] = (
+            (away <= reach_m) & (axes[some] @ axes.T <= np.cos(np.deg2rad(min_turn_deg)))
+        ).any(axis=1)
+    return found
+
+
+def _group_regions(nodes: Sequence[NodeQuality], apart_m: float) -> list[WeakRegion]:
+    parts = list[WeakRegion]()
+    for reason in REASONS:
+        weak = [node for node in nodes if reason in node.reasons]
+        of_reason = [WeakRegion(reason, group) for group in _cluster_nodes(weak, apart_m)]
+        parts += sorted(of_reason, key=lambda part: -len(part.nodes))
+    return parts
+
+
+def _cluster_nodes(nodes: Sequence[NodeQuality], apart_m: float) -> list[list[NodeQuality]]:
+    """Nodes that stand within `apart_m` (metres) of each other, or of others between them."""
+    positions = np.array([node.world_from_cam.translation for node in nodes]).reshape(-1, 3)
+    left, groups = np.ones(len(nodes), bool), list[list[NodeQuality]]()
+    while left.any():
+        waiting, group = [int(np.flatnonzero(left)[0])], list[int]()
+        left[waiting[0]] = False
+        while waiting:
+            group.append(waiting.pop())
+            near = np.flatnonzero(
+                left & (np.linalg.norm(positions - positions[group[-1]], axis=1) <= apart_m)
+            ).tolist()
+            left[near] = False
+            waiting += near
+        groups.append([nodes[k] for k in sorted(group)])
+    return groups

@@ -1,0 +1,266 @@
+"""What is answered, of what is believed: a pose, "it is one of these", or why there is none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.geometry.clustered_errors import compute_variance_inflation
+from topoloc.geometry.rigid import inverse_covariance
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.belief import MIN_LOG_ODDS_MARGIN, Hypothesis, log_odds_margin
+from topoloc.localization.evidence import (
+    compute_normalized_uncertainty,
+    compute_precision_probability,
+    is_only_imprecise,
+    probability_within_tolerance,
+)
+from topoloc.localization.image_calibration_check import check_image_calibration
+from topoloc.localization.pose_fit import PointObservations
+from topoloc.localization.provenance import Provenance
+from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
+from topoloc.localization.search import Search
+
+_MIN_DISTANT_ANGLE_DEG = 10.0
+_MIN_ALTERNATIVE_RATIO = 0.01  # ones that are less probable beside the best one are not named
+
+
+LocalizationWithInliers = tuple[Localization, PointObservations]
+"""A pose, and the points that it stands on, in pixels of the image as it came."""
+ResultWithInliers = tuple[Localization | NotLocalized, list[LocalizationWithInliers]]
+"""A result, and each pose that it names: its own, or its alternatives, in their order."""
+
+
+def decide_result(search: Search) -> ResultWithInliers:
+    """What follows from what is believed."""
+    ranked = search.belief.ranked(search.weights.rivals)
+    min_probability = search.config.evidence.min_probability
+    if not ranked or ranked[0].probability < min_probability:
+        return _explain_not_localized(search, ranked), []
+    best, log_odds_margins = (
+        ranked[0],
+        [_log_odds_margin(search, ranked[0], other) for other in ranked[1:]],
+    )
+    others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in log_odds_margins)
+    probability = compute_precision_probability(best.evidence) / (1.0 + others)
+    is_leading = all(
+        by >= _min_log_odds_margin(search, best, other)
+        for by, other in zip(log_odds_margins, ranked[1:], strict=True)
+    )
+    if is_leading and probability >= min_probability:
+        named = _build_localization(search, best, probability)
+        return named[0], [named]
+    return _ambiguous_result(search, ranked, log_odds_margins, others)
+
+
+def decide_final_result(search: Search) -> ResultWithInliers:
+    """`decide_result`, where no other features are asked any more: held against its calibration,
+    which the picture may contradict. That costs it precision, which may be all that it has."""
+    result, named = decide_result(search)
+    if isinstance(result, NotLocalized):
+        return result, named
+    best = search.belief.ranked(search.weights.rivals)[0]
+    with search.query.clock.stage("calibration"):
+        seen, doubt = check_image_calibration(search, best.fit)
+    if doubt is None:
+        result = replace(result, seen_camera=seen, times_ms=search.query.clock.times_ms())
+        return result, [(result, points) for _, points in named]
+    covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
+    evidence = replace(
+        best.evidence,
+        doubt=max(best.evidence.doubt, _uncertainty_with_covariance(search, best, covariance)),
+    )
+    penalized = replace(best, covariance=covariance, evidence=evidence)
+    probability = result.probability * probability_within_tolerance(evidence.doubt)
+    if probability < search.config.evidence.min_probability:
+        refusal = _build_not_localized(
+            search, "too_few_inliers", penalized, f"the calibration is doubtful: {doubt}"
+        )
+        return replace(refusal, seen_camera=seen), []
+    localization, points = _build_localization(search, penalized, probability)
+    localization = replace(localization, calibration_doubt=doubt, seen_camera=seen)
+    return localization, [(localization, points)]
+
+
+def _uncertainty_with_covariance(
+    search: Search, best: Hypothesis, covariance: Float[np.ndarray, "6 6"]
+) -> float:
+    """`Evidence.doubt` of the hypothesis, were its covariance this one."""
+    assert best.fit.pose is not None
+    seen = best.fit.inlier_observations(1.0)
+    depth = float(np.median(best.fit.pose.cam_from_world.apply(seen.points_world)[:, 2]))
+    return compute_normalized_uncertainty(covariance, depth, search.config.evidence)
+
+
+def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
+    """By how much the best hypothesis leads. One that is not clear must lead those elsewhere by its
+    odds, too: where a wrong place of the map has nearly as much for it, a place that is not in the
+    map may as well."""
+    by_all = log_odds_margin(best, other, search.weights.rivals)
+    return (
+        min(by_all, best.log_odds - other.log_odds)
+        if _is_unclear_and_distant(search, best, other)
+        else by_all
+    )
+
+
+def _min_log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
+    return (
+        search.weights.rivals.unclear_lead
+        if _is_unclear_and_distant(search, best, other)
+        else MIN_LOG_ODDS_MARGIN
+    )
+
+
+def _is_unclear_and_distant(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
+    """Is the best hypothesis not clear, and the other one elsewhere? Evidence of walls is held
+    against all other walls already."""
+    if best.is_from_virtual_views:
+        return False
+    apart, config = best.world_from_cam.inverse() @ other.world_from_cam, search.config.evidence
+    is_elsewhere = np.linalg.norm(
+        apart.translation
+    ) > 2.0 * config.max_translation or apart.angle() > math.radians(_MIN_DISTANT_ANGLE_DEG)
+    return bool(is_elsewhere) and best.log_odds <= search.weights.evidence.clear_log_odds
+
+
+def _build_localization(
+    search: Search, hypothesis: Hypothesis, probability: float
+) -> LocalizationWithInliers:
+    best = _with_clustered_errors(search, hypothesis)
+    assert best.fit.pose is not None
+    is_rough = isinstance(best.fit.input_camera, UncalibratedCamera)
+    localization = Localization(
+        world_from_cam=best.world_from_cam,
+        covariance=inverse_covariance(best.fit.pose.cam_from_world, best.covariance),
+        probability=probability,
+        node_id=best.fit.node_id,
+        candidates=search.named,
+        num_matches=len(best.fit.matches),
+        num_inliers=best.fit.num_inliers,
+        times_ms=search.query.clock.times_ms(),
+        evidence=best.evidence,
+        focal_length_px=best.fit.camera.fx * search.query.scale if is_rough else None,
+        noise_share=best.noise_share,
+        calibrated=search.weights.is_calibrated,
+        provenance=_provenance(search),
+    )
+    return localization, best.fit.inlier_observations(search.query.scale)
+
+
+def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
+    """With a covariance that also counts what the inliers are wrong by together in parts of the
+    picture. What they have in common all over it and what they have there add up: n rho +
+    coherence^2, times that of independent errors. Walls have an inflation of their own."""
+    if best.is_from_virtual_views or best.fit.pose is None:
+        return best
+    seen = best.fit.inlier_observations(1.0)
+    parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
+    squared = (
+        compute_variance_inflation(
+            *parts, best.fit.camera, best.fit.pose.cam_from_world, search.config.pose
+        )
+        ** 2
+    )
+    wider = 1.0 + (squared - 1.0) * best.noise_share
+    return replace(best, covariance=wider * best.covariance, noise_share=best.noise_share / wider)
+
+
+def _ambiguous_result(
+    search: Search, ranked: list[Hypothesis], log_odds_margins: list[float], others: float
+) -> ResultWithInliers:
+    """It is one of these; how probable each is, beside "nowhere"."""
+    best = ranked[0]
+    shares = [1.0 / (1.0 + others), *(math.exp(-one) / (1.0 + others) for one in log_odds_margins)]
+    probable = [
+        pair
+        for pair in zip(ranked, shares, strict=True)
+        if pair[1] >= _MIN_ALTERNATIVE_RATIO * shares[0]
+    ]
+    named = [
+        _build_localization(search, one, share)
+        for one, share in sorted(probable, key=lambda pair: -pair[1])
+    ]
+    alternatives = tuple(
+        Alternative(one.world_from_cam, one.probability, one.node_id) for one, _ in named
+    )
+    if len(alternatives) > 1:
+        detail = (
+            f"as much like node {alternatives[1].node_id} as like node {alternatives[0].node_id}"
+        )
+    else:
+        metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
+        detail = f"in the map, but where is known to {metres:.2f} m only"
+    return _build_not_localized(
+        search,
+        "ambiguous" if len(alternatives) > 1 else "too_few_inliers",
+        best,
+        detail,
+        alternatives,
+    ), named
+
+
+def _explain_not_localized(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
+    if not ranked:
+        first = search.first
+        num_matches, num_inliers = (
+            (len(first.matches), first.num_inliers) if first is not None else (0, 0)
+        )
+        reason: Reason = (
+            "too_few_matches" if num_matches < search.config.min_matches else "too_few_inliers"
+        )
+        return NotLocalized(
+            reason,
+            search.named,
+            num_matches,
+            num_inliers,
+            search.query.clock.times_ms(),
+            _timeout_detail(search),
+            (),
+            _provenance(search),
+        )
+    best = ranked[0]
+    if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
+        metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
+        return _build_not_localized(
+            search,
+            "too_few_inliers",
+            best,
+            f"in the map, but where is known to {metres:.2f} m only",
+        )
+    return _build_not_localized(search, "not_in_map", best, "")
+
+
+def _build_not_localized(
+    search: Search,
+    reason: Reason,
+    best: Hypothesis,
+    detail: str,
+    alternatives: tuple[Alternative, ...] = (),
+) -> NotLocalized:
+    times_ms, detail = (
+        search.query.clock.times_ms(),
+        "; ".join(text for text in (detail, _timeout_detail(search)) if text),
+    )
+    return NotLocalized(
+        reason,
+        search.named,
+        len(best.fit.matches),
+        best.fit.num_inliers,
+        times_ms,
+        detail,
+        alternatives,
+        _provenance(search),
+    )
+
+
+def _provenance(search: Search) -> Provenance:
+    """By which features the answer was come by; the localizer knows the rest."""
+    return Provenance(features=search.map.kind.name)
+
+
+def _timeout_detail(search: Search) -> str:
+    return "time was up before everything was tried" if search.is_stopped else ""

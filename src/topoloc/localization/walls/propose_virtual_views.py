@@ -1,0 +1,385 @@
+"""First poses from the walls along the way: the last resort, for who comes back along a way that
+was mapped in one direction only.
+
+The image's views to the left and to the right (`features/side_views.py`) are compared with the side
+nodes that must show the same from the places that both look like (`candidate_places.py`); what the
+matches of both agree on (`upright_pose.py`) is followed up in both together
+(`virtual_view_matching.py`). Walls repeat themselves, doors above all: so it also counts how many
+of the key points found look more like the map's point here than like any that the side nodes show
+elsewhere. Where the map has nodes that look the same way, they would have been recognised, so poses
+there are not considered.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+from jaxtyping import UInt8
+
+from topoloc.features.extraction import extract_from_normalized, normalize_image
+from topoloc.features.feature_types import FeatureConfig
+from topoloc.features.features import Features
+from topoloc.features.matching import MatchingConfig, match_features, match_pooled
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.belief import Hypothesis
+from topoloc.localization.evidence import (
+    Evidence,
+    compute_inlier_spread,
+    compute_log_odds,
+    compute_normalized_uncertainty,
+    compute_uniform_inlier_ratio,
+)
+from topoloc.localization.guided import GuidedConfig
+from topoloc.localization.local_map import LocalMap
+from topoloc.localization.map_facts.correlated_errors import covariance_inflation
+from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.search import Proposal, Search
+from topoloc.localization.walls.candidate_places import CandidatePlaces, select_likeliest_places
+from topoloc.localization.walls.upright_pose import estimate_upright_pose
+from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
+from topoloc.localization.walls.virtual_view_matching import (
+    QueryVirtualView,
+    VirtualViewMatches,
+    count_virtual_views,
+    estimate_pose,
+    match_virtual_views,
+    merge_matches,
+    select_nearest_virtual_nodes,
+)
+
+_NEAREST_NEIGHBOR = MatchingConfig(ratio=0.0, mutual=False)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VirtualViewProposal(Proposal):
+    """A first pose on which `num_agreeing` of the matches of both views with the walls of one place
+    agree."""
+
+    num_agreeing: int
+    cam_from_world: Rigid3
+    walls: VirtualViewSearch
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualViewSearch:
+    """Both sides of a query image, and the places that both look like (world_from_cam), the
+    likeliest first."""
+
+    search: Search
+    index: VirtualViewIndex
+    seen: list[QueryVirtualView]
+    places: list[Rigid3]
+
+    @staticmethod
+    def of(search: Search, index: VirtualViewIndex) -> VirtualViewSearch:
+        query, seen, named = search.query, list[QueryVirtualView](), list[CandidatePlaces]()
+        assert isinstance(query.input_camera, Camera)
+        for view in make_virtual_views(query.input_camera, index.view_config):
+            picture = view.picture(query.grey)
+            seen_by = (view.name, index.view_config, index.feature_config)
+            features = query.shared.get_or_extract(
+                query, seen_by, partial(_extract_view_features, index.feature_config, view, picture)
+            )
+            seen.append(
+                QueryVirtualView(view, features, view.to_image_pixels(features, query.input_camera))
+            )
+            named.append(CandidatePlaces.of(view, index, index.similarity(picture, features)))
+        apart = search.config.walls.apart * search.map.d_thresh
+        return VirtualViewSearch(
+            search,
+            index,
+            seen,
+            select_likeliest_places(named, search.config.walls.num_places, apart),
+        )
+
+    @property
+    def camera(self) -> Camera:
+        return self.search.query.camera
+
+    def virtual_nodes_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[int]:
+        """The side nodes that show what a side must show from a pose."""
+        return select_nearest_virtual_nodes(
+            side.view,
+            cam_from_world,
+            self.index.centres,
+            self.index.axes,
+            self.search.config.walls.num_nodes,
+        )
+
+    @cached_property
+    def local_map_of_places(self) -> LocalMap:
+        """All that must be seen of the walls from any of the places."""
+        rows = sorted(
+            {
+                row
+                for place in self.places
+                for side in self.seen
+                for row in self.virtual_nodes_around(side, place.inverse())
+            }
+        )
+        return LocalMap.concatenate([self.index.local_map(row) for row in rows])
+
+
+def _extract_view_features(
+    config: FeatureConfig, view: VirtualView, picture: UInt8[np.ndarray, "a b"]
+) -> Features:
+    """Those of what a view shows."""
+    return view.select_inside(extract_from_normalized(normalize_image(picture, config), config))
+
+
+def propose_virtual_views(search: Search) -> Iterator[Proposal]:
+    """The first poses that most matches of a view agree with, some for each view."""
+    config, best = search.config.walls, search.best
+    is_settled = (
+        best is not None
+        and best.probability >= search.config.evidence.min_probability
+        and best.log_odds > config.clear_log_odds
+    )
+    if (
+        is_settled
+        or search.is_repetitive
+        or config.num_places == 0
+        or isinstance(search.query.input_camera, UncalibratedCamera)
+        or (index := search.map.walls) is None
+    ):
+        return
+    with search.query.clock.stage("walls"):
+        walls = VirtualViewSearch.of(search, index)
+        found = [
+            proposal
+            for place in walls.places
+            if (proposal := _compare_views(walls, place)) is not None
+        ]
+        chosen = _select_best([_compare_again(proposal) for proposal in _select_best(found)])
+    yield from chosen
+
+
+def _select_best(found: list[VirtualViewProposal]) -> list[VirtualViewProposal]:
+    """Those on which most matches agree, apart from each other."""
+    kept: list[VirtualViewProposal] = []
+    for proposal in sorted(found, key=lambda one: -one.num_agreeing):
+        search = proposal.walls.search
+        if len(kept) == search.config.walls.num_hypotheses:
+            break
+        if not any(
+            _are_near(search, proposal.cam_from_world, other.cam_from_world) for other in kept
+        ):
+            kept.append(proposal)
+    return kept
+
+
+def _compare_again(proposal: VirtualViewProposal) -> VirtualViewProposal:
+    """Compared with what must be seen from the pose itself, where more agrees then: the place that
+    named it was only near."""
+    again = _compare_views(proposal.walls, proposal.cam_from_world.inverse())
+    return again if again is not None and again.num_agreeing > proposal.num_agreeing else proposal
+
+
+def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewProposal | None:
+    """Both views compared with what they must show from a place."""
+    config, cam_from_place = walls.search.config.walls, place.inverse()
+    sides = _views_around(walls, cam_from_place)
+    matches = [
+        match_pooled(
+            side.features.descriptors, m.descriptors, m.points_world, m.radii, config.matching
+        )
+        for side, m in sides
+    ]
+    found = merge_matches(sides, matches)
+    if found is None:
+        return None
+    seen = walls.camera.normalized_from_img(
+        found.features.points_img[found.matches.query_idx].astype(np.float64)
+    )
+    agreeing = estimate_upright_pose(
+        seen, cam_from_place.apply(found.local_map.points_world[found.matches.train_idx])
+    )
+    if agreeing is None or agreeing[0] < config.min_agreeing:
+        return None
+    fit = PoseFit(found.features, walls.camera, walls.camera, found.local_map, found.matches, None)
+    return VirtualViewProposal(
+        "walls",
+        fit,
+        is_guided=True,
+        num_agreeing=agreeing[0],
+        cam_from_world=agreeing[1] @ cam_from_place,
+        walls=walls,
+    )
+
+
+def refine_virtual_view_pose(proposal: VirtualViewProposal) -> PoseFit | None:
+    """What both sides show around the first pose, and the pose that follows; None where too little
+    does, or the map's nodes see it."""
+    walls, config = proposal.walls, proposal.walls.search.config
+    cam_from_world, found, pose = proposal.cam_from_world, None, None
+    for radius_px, max_error_px in config.walls.rounds:
+        if _is_seen_by_nodes(walls.search, cam_from_world):
+            return None
+        found = _match_views(proposal, cam_from_world, radius_px)
+        pose = _estimate(walls, found, cam_from_world, max_error_px) if found is not None else None
+        if pose is None or np.count_nonzero(pose.inliers) < config.evidence.min_inliers:
+            return None
+        cam_from_world = pose.cam_from_world
+    if found is None or pose is None or _is_seen_by_nodes(walls.search, cam_from_world):
+        return None
+    return PoseFit(found.features, walls.camera, walls.camera, found.local_map, found.matches, pose)
+
+
+def score_virtual_view_pose(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis | None:
+    """The hypothesis with its evidence; None where too little was found for any."""
+    walls, search, pose, camera = proposal.walls, proposal.walls.search, final.pose, final.camera
+    if pose is None or final.num_inliers < search.config.walls.min_found:
+        return None
+    counts = count_virtual_views(
+        _views_around(walls, pose.cam_from_world),
+        pose.cam_from_world,
+        _guided_config(walls, search.config.walls.rounds[-1][0]),
+    )
+    inflated = (
+        covariance_inflation(final.num_inliers, search.correlated_error_share)
+        + search.weights.walls.few_points / final.num_inliers
+    )
+    covariance = inflated * pose.covariance
+    depths = pose.cam_from_world.apply(
+        final.local_map.points_world[final.matches.train_idx[pose.inliers]]
+    )[:, 2]
+    points_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
+    num_left = int(np.count_nonzero(points_img[:, 0] < camera.cx))
+    agreeing_img = points_img if counts.agreeing_img is None else counts.agreeing_img
+    evidence = Evidence(
+        num_matches=len(proposal.fit.matches),
+        num_inliers=proposal.num_agreeing,
+        num_found=final.num_inliers,
+        num_visible=counts.num_visible,
+        num_by_chance=counts.num_by_chance,
+        spread=compute_inlier_spread(points_img, camera.width, camera.height),
+        doubt=compute_normalized_uncertainty(
+            covariance, float(np.median(depths)), search.config.evidence
+        ),
+        even_share=compute_uniform_inlier_ratio(
+            agreeing_img, counts.visible_img, camera.width, camera.height
+        ),
+        num_distinct=_num_distinct(walls, final),
+        num_lesser_side=min(num_left, len(points_img) - num_left),
+    )
+    return Hypothesis(
+        "walls",
+        final,
+        evidence,
+        covariance,
+        1.0 / inflated,
+        compute_log_odds(evidence, search.weights),
+    )
+
+
+def _match_views(
+    proposal: VirtualViewProposal, cam_from_world: Rigid3, radius_px: float
+) -> VirtualViewMatches | None:
+    """The matches of the proposal itself, or, with a radius, those of both sides around the
+    pose."""
+    if radius_px == 0.0:
+        return VirtualViewMatches(
+            proposal.fit.features, proposal.fit.local_map, proposal.fit.matches
+        )
+    return match_virtual_views(
+        _views_around(proposal.walls, cam_from_world),
+        cam_from_world,
+        _guided_config(proposal.walls, radius_px),
+    )
+
+
+def _guided_config(walls: VirtualViewSearch, radius_px: float) -> GuidedConfig:
+    return replace(walls.search.config.walls.guided, radius_px=radius_px)
+
+
+def _views_around(
+    walls: VirtualViewSearch, cam_from_world: Rigid3
+) -> list[tuple[QueryVirtualView, LocalMap]]:
+    """Each side with the points of the side nodes that show what it must show."""
+    return [
+        (side, local_map)
+        for side in walls.seen
+        if (local_map := _local_map_around(walls, side, cam_from_world)) is not None
+    ]
+
+
+def _local_map_around(
+    walls: VirtualViewSearch, side: QueryVirtualView, cam_from_world: Rigid3
+) -> LocalMap | None:
+    rows = walls.virtual_nodes_around(side, cam_from_world)
+    return (
+        LocalMap.concatenate([walls.index.local_map(row) for row in rows])
+        if rows and len(side.features)
+        else None
+    )
+
+
+def _estimate(
+    walls: VirtualViewSearch, found: VirtualViewMatches, near: Rigid3, max_error_px: float
+) -> AbsolutePose | None:
+    """The pose refined, or sought anew where that has more inliers and is near: a wall has a second
+    pose."""
+    sigma_px = walls.search.weights.walls.sigma_px
+    config = AbsolutePoseConfig(
+        max_reprojection_error_px=max_error_px, sigma_px=sigma_px, max_iterations=400
+    )
+    refined, anew = (
+        estimate_pose(found, walls.camera, config, near),
+        estimate_pose(found, walls.camera, config, None),
+    )
+    if anew is None or not _are_near(walls.search, anew.cam_from_world, near):
+        return refined
+    return (
+        anew
+        if refined is None or np.count_nonzero(anew.inliers) > np.count_nonzero(refined.inliers)
+        else refined
+    )
+
+
+def _num_distinct(walls: VirtualViewSearch, final: PoseFit) -> int:
+    """How many inliers look more like the map's point here than like any point that the side nodes
+    of the other places show elsewhere."""
+    assert final.pose is not None
+    rows, columns = (
+        index[final.pose.inliers] for index in (final.matches.query_idx, final.matches.train_idx)
+    )
+    descriptors, points_world = (
+        final.features.descriptors[rows],
+        final.local_map.points_world[columns],
+    )
+    products = np.sum(descriptors * final.local_map.descriptors[columns], axis=1)
+    distances = np.sqrt(np.maximum(2.0 - 2.0 * products, 0.0))
+    away = 1.5 * walls.search.config.walls.min_distance * walls.search.map.d_thresh
+    is_far = (
+        np.linalg.norm(walls.local_map_of_places.points_world - points_world.mean(axis=0), axis=1)
+        > away
+    )
+    distant_matches = match_features(
+        descriptors, walls.local_map_of_places.descriptors[is_far], _NEAREST_NEIGHBOR
+    )
+    rivals = np.full(len(rows), np.inf)
+    rivals[distant_matches.query_idx] = distant_matches.distances
+    return int(np.count_nonzero(distances < rivals))
+
+
+def _is_seen_by_nodes(search: Search, cam_from_world: Rigid3) -> bool:
+    """Do nodes of the map look this way from here?"""
+    distances = search.map.distances(cam_from_world.inverse())
+    return bool(distances.min() < search.config.walls.min_distance * search.map.d_thresh)
+
+
+def _are_near(search: Search, a_from_world: Rigid3, b_from_world: Rigid3) -> bool:
+    """Are two first poses, neither of them precise, worth looking into but once?"""
+    apart = a_from_world @ b_from_world.inverse()
+    distance = float(
+        np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation)
+    )
+    return distance < 1.5 * search.map.d_thresh and math.degrees(apart.angle()) < 20.0

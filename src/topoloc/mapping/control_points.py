@@ -1,0 +1,175 @@
+"""Places that are known on earth, from text files: of pictures by their names or times (GNSS), and
+of points of the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import GeoreferenceError
+from topoloc.geometry.geodesy import GeoPoint
+from topoloc.mapping.contents import MapContents
+from topoloc.recordings.text_files import parse_times, read_rows
+
+_MAX_GAP_NS = 2_000_000_000
+"""Between two fixes further apart in time nobody knows where the camera was."""
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Point k of the world (metres) is at `places[k]`; `names` are for people."""
+
+    points_world: Float[np.ndarray, "n 3"]
+    places: Sequence[GeoPoint]
+    names: list[str]
+
+
+def read_control_points(path: Path) -> ControlPoints:
+    """Lines of ``x, y, z, lat, lon, h``: metres of the map's world, degrees, metres above the
+    ellipsoid. A line of titles may come first.
+
+    Raises:
+        GeoreferenceError: missing, empty, columns missing, no numbers, no place on earth; with the
+            line.
+    """
+    rows = _read_table(path, 6, 0, "x, y, z, lat, lon, h")
+    numbers = [_parse_numbers(path, line, columns[:6]) for line, columns in rows]
+    places = [
+        _parse_geo_point(path, line, values[3:])
+        for (line, _), values in zip(rows, numbers, strict=True)
+    ]
+    return ControlPoints(
+        np.array([values[:3] for values in numbers]), places, [f"line {line}" for line, _ in rows]
+    )
+
+
+def read_gnss(path: Path, topomap: MapContents) -> ControlPoints:
+    """Lines of ``name, lat, lon, h`` or ``time, lat, lon, h``: where mapping pictures of that name,
+    or the camera at that time, were.
+
+    Times are seconds, or nanoseconds by their size, of the recordings' clock; between two fixes a
+    place is interpolated.
+
+    Raises:
+        GeoreferenceError: missing, empty, columns missing, no numbers, no place on earth, or
+            nothing of it is of the map; with the line.
+    """
+    rows = _read_table(path, 4, 1, "time or name, lat, lon, h")
+    places = [
+        _parse_geo_point(path, line, _parse_numbers(path, line, columns[1:4]))
+        for line, columns in rows
+    ]
+    positions = _find_positions_by_name(topomap)
+    named = [
+        (columns[0], place)
+        for (_, columns), place in zip(rows, places, strict=True)
+        if columns[0] in positions
+    ]
+    if named:
+        return ControlPoints(
+            np.array([positions[name] for name, _ in named]),
+            [place for _, place in named],
+            [name for name, _ in named],
+        )
+    if not all(_is_number(columns[0]) for _, columns in rows):
+        example = next(iter(positions), "none")
+        raise GeoreferenceError(
+            f"{path}: no line begins with a time, or the name of a mapping picture, such as"
+            f" {example}"
+        )
+    return _interpolate_at_times(path, topomap, parse_times(rows, path, GeoreferenceError), places)
+
+
+def _interpolate_at_times(
+    path: Path, topomap: MapContents, t_ns: Sequence[int], places: Sequence[GeoPoint]
+) -> ControlPoints:
+    """The nodes' places at their times."""
+    origin = places[0].ecef_from_enu()
+    points_enu = np.array([origin.inverse().apply(place.ecef()) for place in places])
+    found: list[tuple[np.ndarray, GeoPoint, str]] = []
+    for summary in topomap.summaries:
+        after = int(np.searchsorted(t_ns, summary.t_ns))
+        if after < len(t_ns) and t_ns[after] == summary.t_ns:
+            point_enu = points_enu[after]
+        elif 0 < after < len(t_ns) and t_ns[after] - t_ns[after - 1] <= _MAX_GAP_NS:
+            share = (summary.t_ns - t_ns[after - 1]) / (t_ns[after] - t_ns[after - 1])
+            point_enu = (1.0 - share) * points_enu[after - 1] + share * points_enu[after]
+        else:
+            continue
+        found.append(
+            (
+                summary.world_from_cam.translation,
+                GeoPoint.from_ecef(origin.apply(point_enu)),
+                summary.name,
+            )
+        )
+    if not found:
+        times = [summary.t_ns for summary in topomap.summaries]
+        spans = " and ".join(
+            f"{min(span) / 1e9:.3f} to {max(span) / 1e9:.3f} s" for span in (t_ns, times)
+        )
+        raise GeoreferenceError(f"{path}: no fix is of a time of the map ({spans})")
+    return ControlPoints(
+        np.array([point for point, _, _ in found]),
+        [place for _, place, _ in found],
+        [name for _, _, name in found],
+    )
+
+
+def _find_positions_by_name(topomap: MapContents) -> dict[str, Float[np.ndarray, "3"]]:
+    """Of mapping pictures by their names, whole or the file's alone, with their recording's before
+    where they are of several."""
+    positions, twice = dict[str, np.ndarray](), set[str]()
+    for image in (*topomap.place_images, *topomap.summaries):
+        for name in {image.name, Path(image.name).name, f"{image.recording}/{image.name}"}:
+            position = image.world_from_cam.translation
+            if name in positions and not np.allclose(positions[name], position, atol=0.05):
+                twice.add(name)
+            positions[name] = position
+    return {name: position for name, position in positions.items() if name not in twice}
+
+
+def _read_table(
+    path: Path, num_columns: int, first_numeric_column: int, wanted: str
+) -> list[tuple[int, list[str]]]:
+    """Line numbers and columns, without a line of titles at the top."""
+    if path.exists() and not path.is_file():
+        raise GeoreferenceError(f"{path}: no file")
+    rows = read_rows(path, GeoreferenceError)
+    if not all(_is_number(text) for text in rows[0][1][first_numeric_column:num_columns]):
+        rows = rows[1:]
+    for line, columns in rows:
+        if len(columns) < num_columns:
+            raise GeoreferenceError(
+                f"{path}, line {line}: {len(columns)} columns; {wanted} are needed"
+            )
+    if not rows:
+        raise GeoreferenceError(f"{path}: nothing in this file but titles")
+    return rows
+
+
+def _parse_numbers(path: Path, line: int, columns: Sequence[str]) -> list[float]:
+    for text in columns:
+        if not _is_number(text):
+            raise GeoreferenceError(f"{path}, line {line}: {text[:40]!r} is not a number")
+    return [float(text) for text in columns]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        number = Decimal(text)
+    except InvalidOperation:
+        return False
+    return number.is_finite() and abs(number.adjusted()) < 300
+
+
+def _parse_geo_point(path: Path, line: int, values: Sequence[float]) -> GeoPoint:
+    try:
+        return GeoPoint(*values)
+    except GeoreferenceError as error:
+        raise GeoreferenceError(f"{path}, line {line}: {error}") from None

@@ -1,0 +1,213 @@
+"""What each session knows of a node's points, as sums that later sessions add to and that can be
+taken away again.
+
+A point's position is the least squares of all that was ever measured of it. Around the position p
+that the node keeps, every session contributes information A = sum of J' W J and a pull g = sum of
+J' W r (normal equations, in the node's camera frame; W holds the inverse variances and the robust
+weights). Over all sessions the pulls cancel, for p is where they do; without one session the point
+moves by -A^-1 g of what is left, and its covariance is A^-1. In terms of an information vector: b =
+A p - g.
+
+`expected` counts the session's images that should have shown the point (it lies in their view),
+`seen` those that did, which is also the number of its observations: points that are gone are
+expected and no longer seen.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float16, Int, Int16, UInt16
+
+from topoloc.mapping.validation import CorruptDataError, array_from_bytes, decompress_bytes
+
+PULL_SCALE = 1024.0
+"""Pulls are kept as L^-1 g with A = L L', which has no unit and is about 1, in steps of one part in
+so many."""
+MAX_COUNT = 65535
+_MIN_INFORMATION = (
+    1e-6  # 1 / square metres: on the diagonal, so that the root of no information is defined
+)
+_MAX_EMPTY_ROOT = 1.01 * _MIN_INFORMATION**0.5
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkStatistics:
+    """One session's sums for the points `rows` of a node, as the file keeps them.
+
+    `roots` are the lower triangles (xx, yx, yy, zx, zy, zz; 1 / metres) of the Cholesky roots L of
+    the information, `pulls` are L^-1 g times `PULL_SCALE`.
+    """
+
+    session_id: int
+    rows: Int[np.ndarray, " m"]
+    roots: Float16[np.ndarray, "m 6"]
+    pulls: Int16[np.ndarray, "m 3"]
+    expected: UInt16[np.ndarray, " m"]
+    seen: UInt16[np.ndarray, " m"]
+
+    @staticmethod
+    def of(
+        session_id: int,
+        rows: Int[np.ndarray, " m"],
+        information: Float[np.ndarray, "m 3 3"],
+        pulls: Float[np.ndarray, "m 3"],
+        expected: Int[np.ndarray, " m"],
+        seen: Int[np.ndarray, " m"],
+    ) -> LandmarkStatistics:
+        """From information (1 / square metres) and pulls (1 / metres). Points of which the session
+        knows nothing have information 0."""
+        # what three pixels of noise leave unknown is no information: a little on the diagonal keeps
+        # the root defined
+        scale = np.einsum("mii->m", information) / 3.0
+        lower = np.linalg.cholesky(
+            information + (1e-9 * scale + _MIN_INFORMATION)[:, None, None] * np.eye(3)
+        )
+        whitened = np.linalg.solve(lower, pulls[:, :, None])[:, :, 0]
+        return LandmarkStatistics(
+            session_id,
+            rows,
+            np.clip(lower[:, *np.tril_indices(3)], -6e4, 6e4).astype(np.float16),
+            np.clip(np.rint(whitened * PULL_SCALE), -32767, 32767).astype(np.int16),
+            np.minimum(expected, MAX_COUNT).astype(np.uint16),
+            np.minimum(seen, MAX_COUNT).astype(np.uint16),
+        )
+
+    @property
+    def is_count_only(self) -> bool:
+        """Whether the session says nothing of where the points are."""
+        return (
+            len(self.rows) > 0
+            and not self.pulls.any()
+            and float(np.abs(self.roots).max()) <= _MAX_EMPTY_ROOT
+        )
+
+    def is_reobserved(self, min_seen_share: float) -> bool:
+        """Whether the session saw at least this share of what it should have seen."""
+        return bool(
+            self.seen.sum(dtype=np.int64) >= min_seen_share * self.expected.sum(dtype=np.int64)
+        )
+
+    def information(self) -> Float[np.ndarray, "m 3 3"]:
+        """A of each point, 1 / square metres."""
+        lower = self._lower()
+        return lower @ lower.transpose(0, 2, 1)
+
+    def pull(self) -> Float[np.ndarray, "m 3"]:
+        """g of each point, 1 / metres."""
+        return (self._lower() @ (self.pulls.astype(np.float64) / PULL_SCALE)[:, :, None])[:, :, 0]
+
+    def _lower(self) -> Float[np.ndarray, "m 3 3"]:
+        lower = np.zeros((len(self.rows), 3, 3))
+        lower[:, *np.tril_indices(3)] = self.roots
+        return lower
+
+
+@dataclass(frozen=True, eq=False)
+class AccumulatedStatistics:
+    """Sums of all points of a node over some sessions; `first_session` and `last_session` are -1
+    where none saw the point."""
+
+    information: Float[np.ndarray, "n 3 3"]
+    pulls: Float[np.ndarray, "n 3"]
+    expected: Int[np.ndarray, " n"]
+    seen: Int[np.ndarray, " n"]
+    first_session: Int[np.ndarray, " n"]
+    last_session: Int[np.ndarray, " n"]
+
+    @staticmethod
+    def accumulate(
+        statistics: Sequence[LandmarkStatistics], num_points: int
+    ) -> AccumulatedStatistics:
+        """Added up in the order of the sessions."""
+        information, pulls = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
+        expected, seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
+        first, last = np.full(num_points, -1), np.full(num_points, -1)
+        for of_session in sorted(statistics, key=lambda part: part.session_id):
+            rows = of_session.rows
+            information[rows] += of_session.information()
+            pulls[rows] += of_session.pull()
+            expected[rows] += of_session.expected
+            seen[rows] += of_session.seen
+            saw = rows[of_session.seen > 0]
+            last[saw] = of_session.session_id
+            first[saw] = np.where(first[saw] < 0, of_session.session_id, first[saw])
+        return AccumulatedStatistics(information, pulls, expected, seen, first, last)
+
+    def solve(
+        self, points_cam: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+        """Positions (metres) and covariances of points kept at `points_cam`, as these sums have
+        them."""
+        covariances = np.linalg.inv(self.information)
+        return points_cam - (covariances @ self.pulls[:, :, None])[:, :, 0], covariances
+
+
+def merge_count_statistics(
+    statistics: Iterable[LandmarkStatistics], min_seen_share: float
+) -> list[LandmarkStatistics]:
+    """The same with the sessions that only counted as two at most, under the ids of the last of
+    each: those that saw at least this share of what they should have seen, and the others (another
+    light). A node then takes the same room however many sessions passed by it."""
+    kept, counted = list[LandmarkStatistics](), dict[bool, list[LandmarkStatistics]]()
+    for of_session in statistics:
+        if of_session.is_count_only:
+            counted.setdefault(of_session.is_reobserved(min_seen_share), []).append(of_session)
+        else:
+            kept.append(of_session)
+    return sorted([*kept, *map(_add_counts, counted.values())], key=lambda part: part.session_id)
+
+
+def _add_counts(parts: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
+    """Counts of several sessions as those of the last one."""
+    last = max(parts, key=lambda part: part.session_id)
+    if len(parts) == 1:
+        return last
+    num = 1 + max(int(part.rows[-1]) for part in parts)
+    expected, seen = np.zeros(num, np.int64), np.zeros(num, np.int64)
+    for part in parts:
+        expected[part.rows] += part.expected
+        seen[part.rows] += part.seen
+    rows = np.flatnonzero(expected > 0)
+    nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
+    return LandmarkStatistics.of(last.session_id, rows, *nothing, expected[rows], seen[rows])
+
+
+def encode_statistics(statistics: LandmarkStatistics) -> bytes:
+    """Rows, roots, pulls and counts as 16-bit words, all low bytes before all high ones, packed by
+    zlib."""
+    parts = (
+        (statistics.rows, "<u2"),
+        (statistics.roots, "<f2"),
+        (statistics.pulls, "<i2"),
+        (statistics.expected, "<u2"),
+        (statistics.seen, "<u2"),
+    )
+    words = np.frombuffer(b"".join(part.astype(dtype).tobytes() for part, dtype in parts), np.uint8)
+    return zlib.compress(np.ascontiguousarray(words.reshape(-1, 2).T).tobytes(), 6)
+
+
+def decode_statistics(
+    session_id: int, data: bytes, num_rows: int, num_points: int
+) -> LandmarkStatistics:
+    """Sums as `encode_statistics` packed them."""
+    what = f"sums of session {session_id}"
+    planes = array_from_bytes(
+        decompress_bytes(data, 24 * num_rows, what), "u1", (2, 12 * num_rows), what
+    )
+    words = np.ascontiguousarray(planes.T).tobytes()
+    m, parts, start = num_rows, [], 0
+    for dtype, width in (("<u2", 1), ("<f2", 6), ("<i2", 3), ("<u2", 1), ("<u2", 1)):
+        parts.append(
+            array_from_bytes(
+                words[start : start + 2 * m * width], dtype, (m, width) if width > 1 else (m,), what
+            )
+        )
+        start += 2 * m * width
+    rows = parts[0].astype(np.int64)
+    if m and (int(rows[-1]) >= num_points or (np.diff(rows) <= 0).any()):
+        raise CorruptDataError(f"{what}: of points that are not there")
+    return LandmarkStatistics(session_id, rows, *parts[1:])

@@ -1,0 +1,324 @@
+"""The map file opened: rows of its tables, each checked before anybody sees it.
+
+The file may come from anywhere. Its tables must be ours to the letter, so that no view, trigger or
+virtual table runs; the lengths of a row are looked at before its bytes are read, its types and its
+checksum after; SQLite itself runs within limits of time and size.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+from topoloc.errors import (
+    CalibrationError,
+    ConfigError,
+    FeatureTypeError,
+    GeoreferenceError,
+    MapError,
+    MapVersionError,
+)
+from topoloc.mapping.schema import (
+    APPLICATION_ID,
+    SCHEMA_1,
+    SCHEMA_2_VIEWS,
+    SCHEMA_VERSION,
+    SORT_COLUMNS,
+    TABLES,
+    VIRTUAL_PREFIX,
+    Columns,
+    compute_checksum,
+    create_table_statement,
+)
+from topoloc.mapping.validation import CorruptDataError, parse_counts
+
+MAX_SECONDS = 5.0
+"""What one reading may take: the slowest honest one, all node summaries of a large map, takes a
+tenth of a second."""
+MAX_ROWS = 1_000_000
+MAX_BYTES = 50_000_000
+MAX_ARRAYS_BYTES = 800_000_000
+"""Of one value: a picture, a node's points, a text; and of a coarse localizer's arrays (VGG-11
+whole has 258 MB)."""
+_PYTHON_TYPES = {"INTEGER": int, "TEXT": str, "BLOB": bytes}
+_LIMITS = {
+    sqlite3.SQLITE_LIMIT_LENGTH: MAX_ARRAYS_BYTES + 1_000_000,
+    sqlite3.SQLITE_LIMIT_SQL_LENGTH: 20_000,
+    sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 20,
+    sqlite3.SQLITE_LIMIT_COMPOUND_SELECT: 3,
+    sqlite3.SQLITE_LIMIT_VDBE_OP: 10_000,
+    sqlite3.SQLITE_LIMIT_ATTACHED: 0,
+    sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 1,
+}
+
+
+class MapFile:
+    """The open database; one reader at a time, since a query server may call from several threads.
+
+    What was opened stays what it is when another file is renamed over it.
+
+    Raises:
+        MapError: missing, no topoloc map, truncated, or of other tables than a map has.
+        MapVersionError: written with a schema that this version does not know.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.RLock()
+        self._deadline, self._database = 0.0, None
+        self.counts: dict[str, int] | None = None
+        self._cache: dict[str, Any] = {}
+        self.version = check_header(path)
+        with self._guarded_read():
+            # The file is never changed in place, so SQLite needs no locks on it (and works on
+            # read-only media).
+            address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+            self._database = sqlite3.connect(
+                address, uri=True, check_same_thread=False, isolation_level=None
+            )
+            for category, limit in _LIMITS.items():
+                self._database.setlimit(category, limit)
+            self._database.set_progress_handler(lambda: time.monotonic() > self._deadline, 20_000)
+        try:
+            with self.read_connection() as database:
+                for pragma in (
+                    "trusted_schema = OFF",
+                    "cell_size_check = ON",
+                    "mmap_size = 0",
+                    "temp_store = MEMORY",
+                ):
+                    database.execute(f"PRAGMA {pragma}")
+                tables = self._check_tables(database)
+                if self.version == 1:
+                    database.executescript(SCHEMA_2_VIEWS[f"{VIRTUAL_PREFIX}nodes" in tables])
+                self.facts: dict[str, str] = {row["key"]: row["value"] for row in self.rows("map")}
+                if self.version > 1:
+                    self.counts = parse_counts(self.facts.get("counts"), TABLES)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the file; every reading afterwards is a MapError."""
+        with self._lock:
+            if self._database is not None:
+                self._database.close()
+            self._database = None
+
+    def __reduce__(self) -> Any:
+        return _reopen, (str(self.path.absolute()), self.digest)
+
+    @contextmanager
+    def read_connection(self) -> Iterator[sqlite3.Connection]:
+        """The database, for one reading; what is wrong with the file becomes a MapError. Our own
+        mistakes do not."""
+        with self._guarded_read():
+            if self._database is None:
+                raise MapError(f"map {self.path} is closed")
+            self._deadline = time.monotonic() + MAX_SECONDS
+            yield self._database
+
+    @contextmanager
+    def _guarded_read(self) -> Iterator[None]:
+        try:
+            with self._lock:
+                yield
+        except (sqlite3.ProgrammingError, sqlite3.InterfaceError):  # a call of ours that is wrong
+            raise
+        except (
+            sqlite3.Error,
+            zlib.error,
+            CorruptDataError,
+            ConfigError,
+            FeatureTypeError,
+            CalibrationError,
+            GeoreferenceError,
+        ) as error:
+            raise MapError(
+                f"map {self.path} is damaged: {' '.join(str(error).split())[:300]}"
+            ) from error
+
+    def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
+        """All rows of a table of small ones, in its order. With `columns` only these, without their
+        checksum."""
+        wanted = (
+            TABLES[table] if columns is None else {name: TABLES[table][name] for name in columns}
+        )
+        with self.read_connection() as database:
+            self._check_count(table)
+            if columns is not None:
+                query = f"SELECT {', '.join(wanted)} FROM {table} ORDER BY {SORT_COLUMNS[table]}"
+                return [_check_types(table, wanted, row) for row in database.execute(query)]
+            query = (
+                f"SELECT {', '.join(wanted)}, checksum FROM {table} ORDER BY {SORT_COLUMNS[table]}"
+            )
+            return [self._verify_checksum(table, row) for row in database.execute(query)]
+
+    def row(self, table: str, **key: int | str) -> dict[str, Any] | None:
+        """One row, with its lengths looked at before it is read, and its checksum; None where there
+        is none."""
+        wanted, where = TABLES[table], " AND ".join(f"{name} = ?" for name in key)
+        with self.read_connection() as database:
+            lengths = ", ".join(f"length({name})" for name in wanted)
+            found = database.execute(
+                f"SELECT {lengths} FROM {table} WHERE {where}", tuple(key.values())
+            ).fetchone()
+            if found is None:
+                return None
+            for name, length in zip(wanted, found, strict=True):
+                if length is None or length > (MAX_ARRAYS_BYTES if name == "arrays" else MAX_BYTES):
+                    raise CorruptDataError(f"{table}.{name} is empty or too large")
+            query = f"SELECT {', '.join(wanted)}, checksum FROM {table} WHERE {where}"
+            return self._verify_checksum(
+                table, database.execute(query, tuple(key.values())).fetchone()
+            )
+
+    def checksums(self, table: str) -> list[bytes]:
+        """Those of all rows in their order, but for that of the digest itself."""
+        with self.read_connection() as database:
+            where = " WHERE key != 'digest'" if table == "map" else ""
+            found = database.execute(
+                f"SELECT checksum FROM {table}{where} ORDER BY {SORT_COLUMNS[table]} LIMIT"
+                f" {MAX_ROWS}"
+            ).fetchall()
+            if not all(type(checksum) is bytes for (checksum,) in found):
+                raise CorruptDataError(f"a checksum of {table} is missing")
+            return [checksum for (checksum,) in found]
+
+    def cached(self, name: str, make: Callable[[], Any]) -> Any:
+        """What `make` gave when it was first asked for under this name. The lock is that of
+        reading: with two, threads could wait for each other."""
+        with self._lock:
+            if name not in self._cache:
+                self._cache[name] = make()
+            return self._cache[name]
+
+    def count(self, table: str) -> int:
+        """Rows of a table, as the file says of itself; schema 1 said nothing, so they are
+        counted."""
+        if self.counts is not None:
+            return self.counts[table]
+        with self.read_connection() as database:
+            return int(database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+
+    def _check_count(self, table: str) -> None:
+        with self.read_connection() as database:
+            (found,) = database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
+            expected = found if table == "map" or self.counts is None else self.counts[table]
+            if found != expected or found > MAX_ROWS:
+                raise CorruptDataError(
+                    f"table {table} has {found} rows, not {min(expected, MAX_ROWS)}"
+                )
+
+    @property
+    def digest(self) -> str:
+        """What tells this map's content from every other's."""
+        if self.version == 1:
+            return blake2b(self.path.read_bytes(), digest_size=16).hexdigest()
+        if "digest" not in self.facts:
+            raise MapError(f"map {self.path} is damaged: the digest is missing")
+        return self.facts["digest"]
+
+    def _verify_checksum(self, table: str, row: tuple[Any, ...]) -> dict[str, Any]:
+        *values, checksum = row
+        typed = _check_types(table, TABLES[table], values)
+        if self.version > 1 and checksum != compute_checksum(table, values):
+            raise CorruptDataError(
+                f"the checksum of a row of {table} is wrong ({_format_key(table, typed)})"
+            )
+        return typed
+
+    def _check_tables(self, database: sqlite3.Connection) -> set[str]:
+        """Hold that the file has our tables and nothing else that SQLite would run. Their names."""
+        wanted = (
+            SCHEMA_1
+            if self.version == 1
+            else {table: create_table_statement(table) for table in TABLES}
+        )
+        entries = database.execute(
+            "SELECT type, name, tbl_name, sql FROM sqlite_master LIMIT 100"
+        ).fetchall()
+        found = set()
+        for kind, name, of_table, sql in entries:
+            if (
+                kind == "index"
+                and sql is None
+                and str(name).startswith("sqlite_autoindex_")
+                and of_table in wanted
+            ):
+                continue
+            if kind != "table" or name not in wanted or sql != wanted[name]:
+                raise CorruptDataError(
+                    f"{str(kind)[:20]} {str(name)[:60]!r} is none of a map of schema {self.version}"
+                )
+            found.add(name)
+        optional = (
+            {name for name in wanted if name.startswith(VIRTUAL_PREFIX)}
+            if self.version == 1
+            else set()
+        )
+        missing = set(wanted) - found - (optional if not found & optional else set())
+        if missing:
+            raise CorruptDataError(f"table {min(missing)} is missing")
+        return found
+
+
+def check_header(path: Path) -> int:
+    """The 100 bytes that every SQLite file begins with: is it one, is it ours, is it whole, is it
+    of a schema that we know? Which one?"""
+    try:
+        with path.open("rb") as file:
+            header = file.read(100)
+            num_bytes = file.seek(0, os.SEEK_END)
+    except IsADirectoryError:
+        hint = "an atlas" if (path / "atlas.json").is_file() else "a folder"
+        raise MapError(f"{path} is no map but {hint}") from None
+    except (OSError, ValueError) as error:  # ValueError: a name with a null character
+        raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from error
+    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
+        raise MapError(
+            f"{path} is not a topoloc map" + (" (the file is empty)" if num_bytes == 0 else "")
+        )
+    if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
+        raise MapError(f"{path} is an SQLite database but not a topoloc map")
+    version = int.from_bytes(header[60:64], "big")
+    if not 1 <= version <= SCHEMA_VERSION:
+        newer = (
+            "a newer topoloc" if version > SCHEMA_VERSION else "an older topoloc; build it again"
+        )
+        raise MapVersionError(
+            f"map {path} has schema {version}, this topoloc reads schemas 1 to {SCHEMA_VERSION}:"
+            f" written by {newer}"
+        )
+    page_size = int.from_bytes(header[16:18], "big")
+    expected = int.from_bytes(header[28:32], "big") * (65536 if page_size == 1 else page_size)
+    if num_bytes < expected:
+        raise MapError(f"map {path} is truncated: {num_bytes} of {expected} bytes")
+    return version
+
+
+def _check_types(table: str, columns: Columns, row: Sequence[Any]) -> dict[str, Any]:
+    for (name, declared), value in zip(columns.items(), row, strict=True):
+        if type(value) is not _PYTHON_TYPES[declared.split()[0]]:
+            raise CorruptDataError(f"{table}.{name} is no {declared.split()[0].lower()} in one row")
+    return dict(zip(columns, row, strict=True))
+
+
+def _format_key(table: str, row: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {str(row[name])[:40]}" for name in SORT_COLUMNS[table].split(", "))
+
+
+def _reopen(path: str, digest: str) -> MapFile:
+    file = MapFile(Path(path))
+    if file.digest != digest:
+        file.close()
+        raise MapError(f"map {path} is not the one that was pickled: it was replaced since")
+    return file

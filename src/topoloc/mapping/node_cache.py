@@ -1,0 +1,106 @@
+"""Nodes read from maps and made ready to be matched with, kept while there is room: one budget for
+all open maps of a process."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from topoloc.disk_list import bytes_of
+
+T = TypeVar("T")
+
+DEFAULT_MAX_BYTES = 256_000_000
+
+
+class NodeCache:
+    """The entries used last, of several owners, up to a number of bytes in all. Threads may share
+    it."""
+
+    def __init__(self, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
+        self._lock = threading.Lock()
+        self._removed_owners: list[int] = []
+        self._entries: OrderedDict[tuple[int, int], tuple[Any, int]] = OrderedDict()
+        self._max_bytes, self._num_bytes = max_bytes, 0
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes kept now."""
+        return self._num_bytes
+
+    def resize(self, max_bytes: int) -> None:
+        """Another budget from now on; what is beyond it is let go at once."""
+        with self._lock:
+            self._max_bytes = max_bytes
+            self._shrink()
+
+    def get(self, owner: int, row: int) -> Any:
+        """An entry, which becomes the one used last; None where it is not kept."""
+        with self._lock:
+            entry = self._entries.get((owner, row))
+            if entry is None:
+                return None
+            self._entries.move_to_end((owner, row))
+            return entry[0]
+
+    def put(self, owner: int, row: int, value: Any, num_bytes: int) -> None:
+        """Keep an entry, and let go of those used longest ago where that is too much; one beyond
+        the whole budget is not kept."""
+        with self._lock:
+            _, before = self._entries.pop((owner, row), (None, 0))
+            self._entries[owner, row] = value, num_bytes
+            self._num_bytes += num_bytes - before
+            self._shrink()
+
+    def remove_owner(self, owner: int) -> None:
+        """Let go of all entries of an owner. Garbage collection may call this anywhere, also while
+        this thread holds the lock."""
+        self._removed_owners.append(owner)
+        if self._lock.acquire(blocking=False):
+            try:
+                self._shrink()
+            finally:
+                self._lock.release()
+
+    def _shrink(self) -> None:
+        if self._removed_owners:
+            removed = {self._removed_owners.pop() for _ in range(len(self._removed_owners))}
+            for key in [key for key in self._entries if key[0] in removed]:
+                self._num_bytes -= self._entries.pop(key)[1]
+        while self._num_bytes > self._max_bytes and self._entries:
+            self._num_bytes -= self._entries.popitem(last=False)[1][1]
+
+
+NODE_CACHE = NodeCache()
+"""That of the process."""
+
+
+def set_node_cache_size(max_bytes: int) -> None:
+    """How many bytes of nodes all open maps of this process keep in memory together (256 MB where
+    nobody says)."""
+    NODE_CACHE.resize(max_bytes)
+
+
+class CachedNodes(Generic[T]):
+    """Calls `read` for a row of a map, or gives what it gave before where that is still in
+    memory."""
+
+    _next_owner = 0
+    _owner_lock = threading.Lock()
+
+    def __init__(self, read: Callable[[int], T], cache: NodeCache = NODE_CACHE) -> None:
+        with CachedNodes._owner_lock:
+            CachedNodes._next_owner += 1
+            self._owner = CachedNodes._next_owner
+        self._read, self._cache = read, cache
+        weakref.finalize(self, cache.remove_owner, self._owner)
+
+    def __call__(self, row: int) -> T:
+        value = self._cache.get(self._owner, row)
+        if value is None:
+            value = self._read(row)
+            self._cache.put(self._owner, row, value, bytes_of(value))
+        return value

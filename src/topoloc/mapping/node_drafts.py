@@ -1,0 +1,190 @@
+"""Nodes in the making: points as first measured, what other mapping images saw of them since, and
+the node that comes of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from topoloc.disk_list import DiskList
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.entries import NodeSummary, TopoNode
+from topoloc.mapping.landmarks import (
+    Observations,
+    compute_session_statistics,
+    observe_points,
+    refine_points,
+)
+from topoloc.mapping.mapping_frames import (
+    MappingFrame,
+    MappingImage,
+    PointLocator,
+    encode_thumbnail,
+)
+from topoloc.mapping.virtual_nodes import create_virtual_nodes
+from topoloc.points.metric_points import keypoint_sigmas
+from topoloc.recordings.frame_preparation import PreparedFrame
+from topoloc.retrieval.vlad import append_positions
+
+
+@dataclass(frozen=True, eq=False)
+class DraftPoints:
+    """Points of a node in the making as first measured, and what other images saw of them so
+    far."""
+
+    features: Features
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    observations: list[Observations]
+
+
+@dataclass(frozen=True, eq=False)
+class NodeDraft:
+    """A node in the making, its points by their kinds of features; `sources` are the frames that
+    these were first measured in."""
+
+    frame: MappingFrame
+    image: MappingImage
+    template_jpeg: bytes
+    points: dict[str, DraftPoints]
+    sides: list[TopoNode]
+    sources: list[MappingFrame]
+
+    def add(self, observed: dict[str, Observations]) -> None:
+        """What one more image saw of the points (`observe_draft`)."""
+        for kind, observations in observed.items():
+            self.points[kind].observations.append(observations)
+
+    def vlad_descriptors(self, kind: str, config: MapConfig) -> Float32[np.ndarray, "n d"]:
+        """The descriptors of its points of a kind, as the coarse localizer takes them
+        (`append_positions`)."""
+        return append_positions(
+            self.points[kind].features,
+            self.image.camera.width,
+            self.image.camera.height,
+            config.vlad_config_for(kind),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class NodeDrafts:
+    """The nodes of a map in the making, by their rows; most of them lie on disk (`disk_list`).
+    `rows` are those of the frames that they come from, `cameras` the first one of each session, and
+    `num_points` how many points each has, by kind."""
+
+    disk_list: DiskList[NodeDraft]
+    world_from_nodes: list[Rigid3] = field(default_factory=list)
+    rows: dict[MappingFrame, int] = field(default_factory=dict)
+    cameras: dict[int, Camera] = field(default_factory=dict)
+    num_points: dict[str, list[int]] = field(default_factory=dict)
+
+    def append(self, draft: NodeDraft) -> None:
+        self.rows[draft.frame] = len(self.disk_list)
+        self.world_from_nodes.append(draft.image.world_from_cam)
+        self.cameras.setdefault(draft.frame.session_id, draft.image.camera)
+        for kind, points in draft.points.items():
+            self.num_points.setdefault(kind, []).append(len(points.features))
+        self.disk_list.append(draft)
+
+    def image(self, frame: MappingFrame) -> MappingImage:
+        """What was found in a frame that became a node. Raises KeyError of any other."""
+        return self.disk_list[self.rows[frame]].image
+
+
+def create_node_draft(
+    frame: MappingFrame,
+    view: PreparedFrame,
+    locator: PointLocator,
+    has_virtual_views: bool,
+    config: MapConfig,
+) -> NodeDraft:
+    """A node of this frame, of which `view` is what was read."""
+    image = locator.image(frame, view)
+    located, sources = locator.locate(frame, view, image)
+    points = {}
+    for kind, features in image.features.items():
+        rows = np.flatnonzero(located[kind].valid)
+        points[kind] = DraftPoints(
+            features.select(rows),
+            located[kind].points_cam[rows],
+            located[kind].covariances[rows],
+            [],
+        )
+    template_jpeg = encode_thumbnail(view.picture, config.template_side_px, quality=75)
+    summary = NodeSummary(
+        -1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id
+    )
+    sides = (
+        create_virtual_nodes(
+            summary,
+            view,
+            config.feature_config_for(config.virtual_view_type),
+            config.points,
+            config.sides,
+        )
+        if has_virtual_views and not sources
+        else []
+    )
+    return NodeDraft(frame, image, template_jpeg, points, sides, [frame, *sources])
+
+
+def observe_draft(
+    draft: NodeDraft, image: MappingImage, session_id: int, config: MapConfig
+) -> dict[str, Observations]:
+    """What an image sees of a draft's points, by their kinds."""
+    cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
+    observed = {}
+    for kind, features in image.features.items():
+        points, sigmas_px = draft.points[kind], keypoint_sigmas(features, config.points)
+        known, seen_by = (
+            (points.features, points.points_cam, points.covariances),
+            (features, sigmas_px, image.camera, cam_from_node),
+        )
+        observed[kind] = observe_points(*known, *seen_by, config.landmarks, session_id)
+    return observed
+
+
+def finish_node(node_id: int, draft: NodeDraft, kind: str, config: MapConfig) -> TopoNode:
+    """Refine the points of a kind by what was observed; keep those seen again first, the strongest
+    among them."""
+    points, frame, image = draft.points[kind], draft.frame, draft.image
+    refined = refine_points(
+        points.points_cam, points.covariances, points.observations, config.landmarks
+    )
+    rows = np.flatnonzero(refined.is_consistent)
+    rows = np.sort(
+        rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][
+            : config.max_node_points
+        ]
+    )
+    sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
+    session_statistics = compute_session_statistics(
+        refined.points_cam,
+        points.points_cam,
+        points.covariances,
+        points.observations,
+        rows,
+        frame.session_id,
+    )
+    return TopoNode(
+        NodeSummary(
+            node_id,
+            frame.sequence.name,
+            frame.name,
+            frame.t_ns,
+            image.world_from_cam,
+            len(rows),
+            frame.session_id,
+        ),
+        image.camera,
+        points.features.select(rows),
+        refined.points_cam[rows].astype(np.float32),
+        sqrt_covs.astype(np.float32),
+        draft.template_jpeg,
+        session_statistics,
+    )

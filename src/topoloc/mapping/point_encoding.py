@@ -1,0 +1,120 @@
+"""A node's points as the map file keeps them: descriptors as signed bytes, roots of covariances as
+half floats, all else as single floats; each array packed without loss.
+
+Exponents and signs of neighbouring numbers are alike, their last digits are noise: packed by zlib,
+the bytes of one significance of one column stand together. Descriptors are noise around nothing,
+for which zlib's search for repetitions is of no use (`Z_FILTERED`).
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int8
+
+from topoloc.features.feature_types import find_feature_type
+from topoloc.features.features import Features
+from topoloc.mapping.entries import TopoNode
+from topoloc.mapping.validation import (
+    MAX_POINTS,
+    CorruptDataError,
+    array_from_bytes,
+    check_count,
+    decompress_bytes,
+)
+
+FIRST_COMPRESSED_SCHEMA = 3
+"""The schema from which on arrays are packed; before, they stand as they are."""
+
+StoredPoints = tuple[
+    Features, Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 6"], Int8[np.ndarray, "n d"]
+]
+"""Features, positions in the node's camera (metres), roots of their covariances, and descriptors as
+the file has them."""
+
+
+def node_to_arrays(node: TopoNode, kind: str) -> list[np.ndarray]:
+    """The node's arrays as they are kept, in the order of the table's columns."""
+    f = node.features
+    shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
+    descriptors = _quantize_descriptors(node, find_feature_type(kind).descriptor_scale)
+    return [
+        f.points_img.astype("<f4"),
+        shapes,
+        descriptors,
+        node.points_cam.astype("<f4"),
+        node.point_sqrt_covs.astype("<f2"),
+    ]
+
+
+def points_from_row(row: Mapping[str, Any], kind: str, schema: int, what: str) -> StoredPoints:
+    """The points of a row of `node_points`, written in this schema. Raises Damage."""
+    n, size = (
+        check_count(row["num_points"], 0, MAX_POINTS, f"the points of {what}"),
+        find_feature_type(kind).descriptor_size,
+    )
+    if row["descriptor_size"] != size:
+        raise CorruptDataError(f"the points of {what} are not described as {kind} is")
+    shapes = {
+        "points_img": ("<f4", 2),
+        "shapes": ("<f4", 3),
+        "descriptors": ("i1", size),
+        "points_cam": ("<f4", 3),
+        "sqrt_covs": ("<f2", 6),
+    }
+    read = decompress_array if schema >= FIRST_COMPRESSED_SCHEMA else array_from_bytes
+    arrays = {
+        name: read(row[name], dtype, (n, width), what) for name, (dtype, width) in shapes.items()
+    }
+    sizes, angles, responses = np.ascontiguousarray(arrays["shapes"].T)
+    stored = arrays["descriptors"]
+    features = Features(
+        arrays["points_img"], sizes, angles, responses, dequantize_descriptors(stored)
+    )
+    return features, arrays["points_cam"], arrays["sqrt_covs"].astype(np.float32), stored
+
+
+def compress_array(array: np.ndarray) -> bytes:
+    """An array (n, columns): for each column all first bytes of its numbers, then all second ones
+    ..., packed by zlib."""
+    n, width = array.shape
+    planes = (
+        np.frombuffer(array.tobytes(), np.uint8)
+        .reshape(n, width, array.itemsize)
+        .transpose(1, 2, 0)
+    )
+    packer = zlib.compressobj(6, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_FILTERED)
+    return packer.compress(planes.tobytes()) + packer.flush()
+
+
+def decompress_array(data: bytes, dtype: str, shape: tuple[int, int], what: str) -> np.ndarray:
+    """The inverse of `compress_array`, checked as `array_from_bytes` does. Raises Damage."""
+    (n, width), num_bytes = shape, np.dtype(dtype).itemsize
+    planes = np.frombuffer(
+        decompress_bytes(data, math.prod(shape) * num_bytes, what), np.uint8
+    ).reshape(width, num_bytes, n)
+    return array_from_bytes(planes.transpose(2, 0, 1).tobytes(), dtype, shape, what)
+
+
+def dequantize_descriptors(stored: Int8[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
+    """Descriptors of length 1 from the file's signed bytes."""
+    descriptors = stored.astype(np.float32)
+    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-6)
+    return descriptors
+
+
+def _quantize_descriptors(node: TopoNode, scale: float) -> Int8[np.ndarray, "n d"]:
+    """The descriptors as signed bytes; of a node that was read from a file, those that it was read
+    from."""
+    descriptors, stored = node.features.descriptors, node.stored_descriptors
+    if (
+        stored is not None
+        and stored.shape == descriptors.shape
+        and np.array_equal(dequantize_descriptors(stored), descriptors)
+    ):
+        return stored
+    return np.clip(np.rint(descriptors * scale), -127, 127).astype(np.int8)

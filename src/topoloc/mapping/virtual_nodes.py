@@ -1,0 +1,172 @@
+"""Side nodes: what the mapping cameras saw of the walls along their way, for those who come the
+other way.
+
+A node's points are known from where the mapping camera looked, and found again from there. Its
+picture also holds the walls to the left and to the right, slanted; `features/side_views.py` shows
+them as from before them. Some of the nodes are therefore described once more as two cameras in the
+same place that look to the sides, with features and points of their own. They are no nodes of Eq.
+1: the localizer asks them only where nothing else gave a pose (`localization/walls/`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from topoloc.bounds import AtLeast, Between
+from topoloc.disk_list import DiskList
+from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_virtual_views
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.entries import NodeSummary, TopoNode, VirtualNodes
+from topoloc.mapping.nodes import NodeConfig, select_node_frames
+from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.recordings.frame_preparation import PreparedFrame
+from topoloc.retrieval.vlad import (
+    SurfVlad,
+    VladConfig,
+    append_positions,
+    learn_words_from_parts,
+    vlad,
+)
+
+
+@dataclass(frozen=True)
+class VirtualNodesConfig:
+    """Which nodes have side nodes, and what these keep."""
+
+    spacing: Annotated[float, AtLeast(0)] = 3.0
+    """Eq. 1 with so many times the map's D_thresh chooses among the nodes, a turn counting half; 0
+    makes no side nodes."""
+    opposite: Annotated[float, AtLeast(0)] = 10.0
+    """Nodes that have another one looking the other way within so many D_thresh need no side
+    nodes."""
+    views: VirtualViewConfig = field(default_factory=VirtualViewConfig)
+    max_points: Annotated[int, Between(1, 100_000)] = 400
+    """Features that a side node keeps, the strongest ones."""
+    min_points: Annotated[int, Between(1, 100_000)] = 20
+    """With fewer a side view becomes no side node."""
+    vlad: VladConfig = field(default_factory=lambda: VladConfig(position_weight=0.0))
+    """Where on a wall things are seen depends on where the camera stands, so places in the picture
+    do not count."""
+
+
+def select_virtual_view_nodes(
+    world_from_nodes: list[Rigid3], node_config: NodeConfig, config: VirtualNodesConfig
+) -> set[int]:
+    """Which of the nodes with these poses are seen to the sides, too. `node_config` (of the map)
+    must be resolved."""
+    if config.spacing == 0.0:
+        return set()
+    assert node_config.d_thresh is not None, "resolve the configuration first"
+    assert node_config.lambda_rot is not None, "resolve the configuration first"
+    reach = config.opposite * node_config.d_thresh
+    spaced = NodeConfig(config.spacing * node_config.d_thresh, node_config.lambda_rot / 2.0)
+    centres = np.array([pose.translation for pose in world_from_nodes])
+    axes = np.array([pose.rotation[:, 2] for pose in world_from_nodes])
+
+    def has_opposite_node(k: int) -> bool:
+        near = np.linalg.norm(centres - centres[k], axis=1) < reach
+        return bool((near & (axes @ axes[k] < -0.7)).any())
+
+    return {
+        int(k)
+        for k in select_node_frames(world_from_nodes, spaced)
+        if not has_opposite_node(int(k))
+    }
+
+
+def create_virtual_nodes(
+    of_node: NodeSummary,
+    view: PreparedFrame,
+    features: FeatureConfig,
+    points: MetricPointsConfig,
+    config: VirtualNodesConfig,
+) -> list[TopoNode]:
+    """The side nodes of a node's picture, none to two of them, not numbered yet."""
+    sides = (
+        _create_virtual_node(of_node, view, virtual_view, features, points, config)
+        for virtual_view in make_virtual_views(view.camera, config.views)
+    )
+    return [node for node in sides if node is not None]
+
+
+def collect_virtual_nodes(
+    described: Sequence[TopoNode], kind: str, config: VirtualNodesConfig
+) -> VirtualNodes | None:
+    """All side nodes of a map, by features of one kind, numbered, with what ranks them by looks;
+    None without any. Each knows the node that it is of."""
+    if len(described) == 0:
+        return None
+    nodes = DiskList(
+        replace(node, summary=replace(node.summary, node_id=k)) for k, node in enumerate(described)
+    )
+    model = _fit_vlad(nodes, config.vlad).to_model()
+    model = replace(
+        model,
+        arrays={**model.arrays, "centres": np.array([_median_point_world(node) for node in nodes])},
+    )
+    return VirtualNodes([node.summary for node in nodes], nodes, {model.name: model}, kind)
+
+
+def _create_virtual_node(
+    of_node: NodeSummary,
+    view: PreparedFrame,
+    virtual_view: VirtualView,
+    feature_config: FeatureConfig,
+    points: MetricPointsConfig,
+    config: VirtualNodesConfig,
+) -> TopoNode | None:
+    features = virtual_view.select_inside(
+        extract_features(virtual_view.picture(view.grey), feature_config)
+    )
+    located = locate_points(virtual_view.to_image_pixels(features, view.camera), view, points)
+    # seen from the side camera's place at such a slant, a point says nothing of the wall before it
+    side_from_cam = virtual_view.cam_from_virtual.inverse()
+    points_side = side_from_cam.apply(located.points_cam)
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero(located.valid & (points_side[:, 2] > 0.1 * located.points_cam[:, 2]))[
+            : config.max_points
+        ]
+    if len(rows) < config.min_points:
+        return None
+    turn = side_from_cam.rotation
+    roots = np.linalg.cholesky(turn @ located.covariances[rows] @ turn.T)
+    return TopoNode(
+        replace(
+            of_node,
+            world_from_cam=of_node.world_from_cam @ virtual_view.cam_from_virtual,
+            num_points=len(rows),
+        ),
+        virtual_view.camera,
+        features.select(rows),
+        points_side[rows].astype(np.float32),
+        roots[:, *np.tril_indices(3)].astype(np.float32),
+        b"",
+    )
+
+
+def _median_point_world(node: TopoNode) -> Float[np.ndarray, " 3"]:
+    """The world point in the middle of what the node shows."""
+    return node.summary.world_from_cam.apply(
+        np.median(node.points_cam.astype(np.float64), axis=0)[None]
+    )[0]
+
+
+def _fit_vlad(nodes: Sequence[TopoNode], config: VladConfig) -> SurfVlad:
+    def described(row: int) -> Float32[np.ndarray, "n d"]:
+        return append_positions(
+            nodes[row].features, nodes[row].camera.width, nodes[row].camera.height, config
+        )
+
+    words = learn_words_from_parts([len(node.features) for node in nodes], described, config)
+    return SurfVlad.fit(
+        words,
+        DiskList(vlad(described(row), words) for row in range(len(nodes))),
+        np.arange(len(nodes)),
+        config,
+    )

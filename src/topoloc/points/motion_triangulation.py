@@ -1,0 +1,199 @@
+"""3-D positions of a single picture's features from other pictures whose poses are known: structure
+from known motion.
+
+Each other picture gives every matched feature a depth along its ray, where the match lies on the
+epipolar line; the depths of a feature that agree are joined, weighted by how certain they are. A
+lone match may lie on its line by chance, so one picture alone is not believed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.features.features import Features
+from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.stereo import points_from_depth, ray_covariances
+from topoloc.points.metric_points import MetricPoints
+
+
+@dataclass(frozen=True)
+class MotionTriangulationConfig:
+    """How features of single pictures with poses get their 3-D position."""
+
+    steps: Annotated[tuple[float, ...], Above(0)] = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
+    """Distances of the other pictures, in those of consecutive ones (median)."""
+    max_turn: Annotated[float, Between(0, 3.2)] = 0.6
+    """Angle between the views of two pictures, radians; beyond it hardly anything matches."""
+    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
+    gate: Annotated[float, Above(0)] = 3.0
+    """A match further off its epipolar line, and a depth further off another one, than so many
+    standard deviations is another point."""
+    pose_sigma_px: Annotated[float, AtLeast(0)] = 0.5
+    """What the errors of the poses add to a key point's own uncertainty, pixels."""
+    min_pictures: Annotated[int, Between(1, 100)] = 2
+    """Other pictures whose depths of a point must agree."""
+
+
+@dataclass(frozen=True, eq=False)
+class SourceImage:
+    """Another picture of the place: its features with the standard deviation (pixels) of each, its
+    camera, and where that was."""
+
+    features: Features
+    sigmas_px: Float[np.ndarray, " m"]
+    camera: Camera
+    other_from_cam: Rigid3
+
+
+def triangulate_from_motion(
+    features: Features,
+    sigmas_px: Float[np.ndarray, " n"],
+    camera: Camera,
+    others: Sequence[SourceImage],
+    max_relative_sigma: float,
+    config: MotionTriangulationConfig,
+) -> MetricPoints:
+    """The 3-D positions (camera frame, metres) of the features of a picture, seen by `camera`, with
+    standard deviations `sigmas_px`.
+
+    Points whose depth is uncertain (one sigma) by more than `max_relative_sigma` of it are dropped.
+    """
+    normalized = camera.normalized_from_img(features.points_img.astype(np.float64))
+    own_sigma = sigmas_px / camera.fx
+    seen = [
+        _estimate_inverse_depths(features, normalized, own_sigma, other, config) for other in others
+    ]
+    inverse, sigma, per_sigma = (
+        np.stack([row[k] for row in seen]) if seen else np.zeros((0, len(features)))
+        for k in range(3)
+    )
+    joined, sigma_joined = _fuse_depths(
+        inverse, sigma, own_sigma * _column_minimum(per_sigma), config
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = 1.0 / joined
+        sigma_z = depth**2 * sigma_joined
+        points_cam = points_from_depth(features.points_img.astype(np.float64), depth, camera)
+        valid = np.isfinite(points_cam).all(axis=1) & (sigma_z < max_relative_sigma * depth)
+    covariances = np.full((len(features), 3, 3), np.nan)
+    covariances[valid] = ray_covariances(
+        points_cam[valid], sigma_z[valid], camera, sigmas_px[valid]
+    )
+    return MetricPoints(np.where(valid[:, None], points_cam, np.nan), covariances, valid)
+
+
+def _estimate_inverse_depths(
+    features: Features,
+    normalized: Float[np.ndarray, "n 2"],
+    own_sigma: Float[np.ndarray, " n"],
+    other: SourceImage,
+    config: MotionTriangulationConfig,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Of each feature, by one other picture: inverse depth (1/m), its standard deviation without
+    that of the feature's own place (`own`, plane z = 1), and by how much that place adds to it; NaN
+    where there is no match on the epipolar line.
+    """
+    inverse, sigma, per_sigma = (np.full(len(features), np.nan) for _ in range(3))
+    matches = match_features(features.descriptors, other.features.descriptors, config.matching)
+    rows, columns = matches.query_idx.astype(np.int64), matches.train_idx
+    found = other.camera.normalized_from_img(other.features.points_img[columns].astype(np.float64))
+    rays = np.column_stack([normalized[rows], np.ones(len(rows))]) @ other.other_from_cam.rotation.T
+    t = other.other_from_cam.translation
+    # A point at depth 1/w is seen at (rays + w t)[:2] / (rays + w t)[2]; w from the least squares
+    # of that, multiplied out.
+    along = found * t[2] - t[:2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w = np.sum(along * (rays[:, :2] - found * rays[:, 2:]), axis=1) / np.sum(along**2, axis=1)
+        depth_ratio = rays[:, 2] + w * t[2]
+        projected = (rays[:, :2] + w[:, None] * t[:2]) / depth_ratio[:, None]
+        slope = np.linalg.norm(t[:2] - projected * t[2], axis=1) / np.abs(depth_ratio)
+        noise = np.hypot(other.sigmas_px[columns], config.pose_sigma_px) / other.camera.fx
+        off_line = np.linalg.norm(projected - found, axis=1)
+        good = (
+            (w > 0.0)
+            & (depth_ratio > 0.0)
+            & (off_line < config.gate * np.hypot(noise, own_sigma[rows]))
+            & (slope > 0.0)
+        )
+        inverse[rows[good]] = w[good]
+        sigma[rows[good]] = (noise / slope)[good]
+        per_sigma[rows[good]] = (1.0 / slope)[good]
+    return inverse, sigma, per_sigma
+
+
+def _fuse_depths(
+    inverse: Float[np.ndarray, "k n"],
+    sigma: Float[np.ndarray, "k n"],
+    own_sigma: Float[np.ndarray, " n"],
+    config: MotionTriangulationConfig,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """One inverse depth a feature with its standard deviation: of those that the most others agree
+    with; NaN where too few do.
+
+    What the feature's own place makes of it (`own`) is common to all, so that joining does not
+    lessen it.
+    """
+    num, columns = len(inverse), np.arange(inverse.shape[1])
+    if num < config.min_pictures:
+        return np.full(len(columns), np.nan), np.full(len(columns), np.nan)
+    spread = config.gate * np.sqrt(sigma[:, None] ** 2 + sigma[None] ** 2 + own_sigma**2)
+    with np.errstate(invalid="ignore"):
+        agrees = (
+            np.abs(inverse[:, None] - inverse[None]) <= spread
+        )  # a depth that is not known agrees with none
+    support = agrees.sum(axis=1)
+    best = np.lexsort((np.nan_to_num(sigma, nan=np.inf), -support), axis=0)[0]
+    chosen = agrees[best, :, columns].T
+    weights = np.where(chosen, 1.0 / np.where(chosen, sigma, 1.0) ** 2, 0.0)
+    total = weights.sum(axis=0)
+    enough = support[best, columns] >= config.min_pictures
+    with np.errstate(divide="ignore", invalid="ignore"):
+        joined = (weights * np.where(chosen, inverse, 0.0)).sum(axis=0) / total
+        sigma_joined = np.sqrt(1.0 / total + own_sigma**2)
+    return np.where(enough, joined, np.nan), np.where(enough, sigma_joined, np.nan)
+
+
+def _column_minimum(values: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]:
+    """The least of each column's numbers; 0 where it has none."""
+    least = np.nan_to_num(values, nan=np.inf).min(axis=0, initial=np.inf)
+    return np.where(np.isfinite(least), least, 0.0)
+
+
+def select_source_images(
+    world_from_cams: Sequence[Rigid3], index: int, step: float, config: MotionTriangulationConfig
+) -> list[int]:
+    """Which of the pictures with these poses locate the features of picture `index`: at several
+    distances, looking about the same way.
+
+    Args:
+        step: the usual distance from one picture to the next, metres.
+    """
+    centres = np.array([pose.translation for pose in world_from_cams])
+    axes = np.array([pose.rotation[:, 2] for pose in world_from_cams])
+    distances = np.linalg.norm(centres - centres[index], axis=1)
+    usable = np.flatnonzero(
+        (axes @ axes[index] > np.cos(config.max_turn)) & (distances > 0.5 * step)
+    )
+    chosen: list[int] = []
+    for factor in config.steps:
+        order = usable[np.argsort(np.abs(distances[usable] - factor * step), kind="stable")]
+        off = next((int(k) for k in order if k not in chosen), None)
+        if off is not None and abs(distances[off] - factor * step) <= 0.5 * factor * step:
+            chosen.append(off)
+    return chosen
+
+
+def compute_median_step(world_from_cams: Sequence[Rigid3]) -> float:
+    """The median distance (m) of consecutive pictures that were not taken in one place."""
+    centres = np.array([pose.translation for pose in world_from_cams]).reshape(-1, 3)
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    moved = steps[steps > 1e-6]
+    return float(np.median(moved)) if len(moved) else 0.0

@@ -1,0 +1,124 @@
+"""Points followed from picture to picture: corners spread over a grid, pyramidal Lucas-Kanade, then
+the key frame's own patch.
+
+Bouguet, *Pyramidal implementation of the Lucas Kanade feature tracker*, 2000, as in OpenCV, finds a
+point again across a step of motion; alignment with the patch of the last key frame takes the drift
+of many such steps away and says whether it is still the same point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.features.parallel import parallel_for_rows
+from topoloc.points.point_tracking_kernels import refine_tracks, select_cell_corners
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """What is followed, and how."""
+
+    num_corners: Annotated[int, Between(1, 100_000)] = 450
+    """Cells of the grid; each holds a point where the picture has one."""
+    min_quality: Annotated[float, Between(0, 1)] = 0.002
+    """Least corner strength (smaller eigenvalue), as a share of the strongest in the picture."""
+    min_eigenvalue: Annotated[float, AtLeast(0)] = 2e-4
+    """Least corner strength at all: weaker ones are noise."""
+    window_px: Annotated[int, Between(3, 101)] = 15
+    """Side of the window that optical flow (Lucas and Kanade) compares."""
+    levels: Annotated[int, Between(0, 10)] = 3
+    """Half-sized pictures above the full one that optical flow begins with."""
+    patch_half_px: Annotated[int, Between(1, 50)] = 5
+    """Half side of the patch by which a point is compared with what it looked like first."""
+    min_correlation: Annotated[float, Between(-1, 1)] = 0.7
+    """Least normalised correlation of the two patches."""
+    max_shift_px: Annotated[float, Above(0)] = 2.5
+    """A point whose patch wants it further away than this has been lost."""
+
+
+def track_points(
+    previous: UInt8[np.ndarray, "h w"],
+    current: UInt8[np.ndarray, "h w"],
+    points_img: Float32[np.ndarray, "n 2"],
+    guesses_img: Float32[np.ndarray, "n 2"],
+    config: TrackingConfig,
+) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Where the points of the previous picture are in the current one, sought from `guesses_img`;
+    and which were found."""
+    if len(points_img) == 0:
+        return guesses_img.copy(), np.zeros(0, np.bool_)
+    window = (config.window_px, config.window_px)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.03)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        previous, current, points_img[:, None], guesses_img[:, None].copy(),
+        winSize=window, maxLevel=config.levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,  # noqa: E501
+    )  # pyright: ignore[reportCallIssue, reportArgumentType]  # fmt: skip
+    found = np.ascontiguousarray(found[:, 0], np.float32)
+    return found, (status[:, 0] > 0) & np.isfinite(found).all(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedPoints:
+    """Where points are found, which look like the reference there, and how uncertain their places
+    are by what does not fit (pixels)."""
+
+    points_img: Float32[np.ndarray, "n 2"]
+    is_matched: Bool[np.ndarray, " n"]
+    sigmas_px: Float32[np.ndarray, " n"]
+
+
+def align_with_reference(
+    reference: Float32[np.ndarray, "h w"],
+    image: Float32[np.ndarray, "h w"],
+    points_ref: Float32[np.ndarray, "n 2"],
+    points_img: Float32[np.ndarray, "n 2"],
+    scales: Float32[np.ndarray, " n"],
+    config: TrackingConfig,
+) -> AlignedPoints:
+    """Points of `image` moved to where they look most like `points_ref` of the reference enlarged
+    by `scales`."""
+    refined, (scores, sigmas) = (
+        np.empty_like(points_img),
+        np.empty((2, len(points_img)), np.float32),
+    )
+
+    def run(first: int, last: int) -> None:
+        refine_tracks(
+            reference, image, points_ref, points_img, scales, config.patch_half_px, 8, config.max_shift_px, first, last,  # noqa: E501
+            refined, scores, sigmas,
+        )  # fmt: skip
+
+    parallel_for_rows(run, len(points_img))
+    return AlignedPoints(refined, scores >= config.min_correlation, sigmas)
+
+
+def find_corners(
+    grey: UInt8[np.ndarray, "h w"],
+    existing_img: Float[np.ndarray, "n 2"] | Float32[np.ndarray, "n 2"],
+    config: TrackingConfig,
+) -> Float32[np.ndarray, "m 2"]:
+    """The strongest corner of each cell of a grid that holds no point yet (Shi and Tomasi, 1994),
+    row by row."""
+    height, width = grey.shape
+    side = max(8, round(np.sqrt(height * width / config.num_corners)))
+    rows, columns = height // side, width // side
+    strength = cv2.cornerMinEigenVal(grey, 3)
+    threshold = max(config.min_quality * float(strength.max()), config.min_eigenvalue)
+    top, left = (height - rows * side) // 2, (width - columns * side) // 2
+    cell_of = np.floor((existing_img - [left, top]) / side).astype(np.int64)
+    inside = ((cell_of >= 0) & (cell_of < [columns, rows])).all(axis=1)
+    is_free = np.ones((rows, columns), np.bool_)
+    is_free[cell_of[inside, 1], cell_of[inside, 0]] = False
+    corners = np.empty((rows * columns, 2), np.float32)
+    border = config.patch_half_px + 3
+    return corners[
+        : select_cell_corners(
+            strength, is_free, side, top, left, border, np.float32(threshold), corners
+        )
+    ]

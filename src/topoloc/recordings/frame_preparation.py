@@ -1,0 +1,170 @@
+"""A frame made ready for measuring: the picture that features are taken from, its camera, and where
+depth comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from topoloc.errors import CalibrationError, RecordingError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import Rectification, StereoRig, rectify
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.frame import DepthImage, Image, StereoFrame
+from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.registration_kernels import (
+    back_project,
+    register_undistorted,
+    update_z_buffer,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFrame:
+    """`picture` is what a person would look at, `grey` what features are taken from; both seen by
+    `camera`.
+
+    Stereo pairs are rectified: `right_grey` and the rectified `rig` are there. RGB-D frames have
+    `depth`, in metres and pixels of `camera`, NaN where unknown. `view_from_cam` is how
+    rectification turned the frame's camera.
+    """
+
+    picture: Image
+    grey: UInt8[np.ndarray, "h w"]
+    camera: Camera
+    view_from_cam: Rigid3
+    right_grey: UInt8[np.ndarray, "h w"] | None = None
+    rig: StereoRig | None = None
+    depth: Float32[np.ndarray, "h w"] | None = None
+
+
+def prepare_frame(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
+    """Rectify a stereo pair, or bring depth into the picture's camera.
+
+    Without `with_depth` only the picture itself is made ready; what was read without its right
+    picture (`read_left_frame`) is rectified, too.
+
+    Raises:
+        CalibrationError: the frame has no camera.
+        RecordingError: the frame has neither a right picture nor depth, which are asked for.
+    """
+    if frame.camera is None:
+        raise CalibrationError(
+            f"{frame.name}: no calibration; put a camera.json into the recording's folder"
+        )
+    if frame.rig is not None and (frame.right is not None or not with_depth):
+        return _prepare_stereo(frame.image, frame.right if with_depth else None, frame.rig)
+    if frame.depth is not None or not with_depth:
+        depth = (
+            register_depth(frame.depth, frame.camera)
+            if with_depth and frame.depth is not None
+            else None
+        )
+        return PreparedFrame(
+            frame.image, to_grey(frame.image), frame.camera, Rigid3.identity(), depth=depth
+        )
+    raise RecordingError(
+        f"{frame.name}: stereo pairs or depth images are needed, this recording has single pictures"
+        " only"
+    )
+
+
+def undistort_frame(frame: StereoFrame, max_side_px: int) -> PreparedFrame:
+    """The frame's own picture without distortion, smaller where a side is longer than
+    `max_side_px`.
+
+    Raises:
+        CalibrationError: the frame has no camera.
+    """
+    view = prepare_frame(frame, with_depth=False)
+    camera, grey = view.camera, view.grey
+    scale = max_side_px / max(grey.shape)
+    if scale < 1.0:
+        width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+        grey, camera = (
+            cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA),
+            camera.rescaled(width, height),
+        )
+    if camera.is_distorted:
+        grey, camera = _remap(grey, _undistortion_map(camera)), camera.undistorted()
+    return PreparedFrame(grey, grey, camera, view.view_from_cam)
+
+
+@lru_cache(maxsize=4)
+def _undistortion_map(camera: Camera) -> Float32[np.ndarray, "h w 2"]:
+    pinhole = camera.undistorted()
+    normalized = _normalized_pixels(pinhole, camera.width, camera.height)
+    points_img = camera.img_from_cam(np.column_stack([normalized, np.ones(len(normalized))]))
+    return (
+        np.nan_to_num(points_img, nan=-1.0)
+        .astype(np.float32)
+        .reshape(camera.height, camera.width, 2)
+    )
+
+
+def _prepare_stereo(image: Image, right: Image | None, rig: StereoRig) -> PreparedFrame:
+    right_grey = None if right is None else to_grey(right)
+    if rig.is_rectified:
+        return PreparedFrame(image, to_grey(image), rig.left, Rigid3.identity(), right_grey, rig)
+    r = _rectification(rig)
+    picture = _remap(image, r.left_map)
+    if right_grey is not None:
+        right_grey = _remap(right_grey, r.right_map)
+    return PreparedFrame(
+        picture, to_grey(picture), r.rig.left, r.rectified_from_left, right_grey, r.rig
+    )
+
+
+def _remap(picture: Image, pixel_map: Float32[np.ndarray, "h w 2"]) -> Image:
+    # None is right here, whatever the stubs say: OpenCV 5 takes an empty second map for a map.
+    return cv2.remap(picture, pixel_map, None, cv2.INTER_LINEAR)  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+
+@lru_cache(maxsize=4)
+def _rectification(rig: StereoRig) -> Rectification:
+    return rectify(rig)
+
+
+def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarray, "h w"]:
+    """Depth as `camera` sees it: every pixel moved to where `camera` images it, the nearest surface
+    winning."""
+    identity = np.allclose(depth_image.cam_from_depth.matrix(), np.eye(4), atol=1e-9)
+    if identity and depth_image.camera == camera:
+        return depth_image.depth
+    height, width = depth_image.depth.shape
+    pose, normalized = (
+        depth_image.cam_from_depth,
+        _normalized_pixels(depth_image.camera, width, height),
+    )
+    registered = np.full((camera.height, camera.width), np.nan, np.float32)
+    if not camera.is_distorted:
+        focal, centre = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        register_undistorted(
+            depth_image.depth,
+            normalized,
+            pose.rotation,
+            pose.translation,
+            focal,
+            centre,
+            registered,
+        )
+        return registered
+    points = np.empty((height * width, 3))
+    points = points[
+        : back_project(depth_image.depth, normalized, pose.rotation, pose.translation, points)
+    ]
+    update_z_buffer(camera.img_from_cam(points), points, registered)
+    return registered
+
+
+@lru_cache(maxsize=4)
+def _normalized_pixels(camera: Camera, width: int, height: int) -> Float[np.ndarray, "n 2"]:
+    """Every pixel of a picture, row by row, on the plane z = 1."""
+    columns, rows = np.meshgrid(
+        np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)
+    )
+    return camera.normalized_from_img(np.column_stack([columns.ravel(), rows.ravel()]))

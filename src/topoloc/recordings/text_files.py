@@ -1,0 +1,163 @@
+"""Text files of one record a line: the lists, times and poses of recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path, PurePath
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import TopolocError
+
+NANOSECONDS_PER_SECOND = 1_000_000_000
+# Above this a time is taken for nanoseconds (ORB-SLAM3 writes EuRoC's so): as seconds it would be
+# 30 000 years.
+_MAX_SECONDS = 10**12
+# before the decimal point; no clock counts further, and an integer of a million digits takes
+# minutes
+_MAX_DIGITS = 25
+
+
+def read_text(path: Path, error: type[TopolocError], missing: str = "no such file") -> str:
+    """The text of a file. Raises `error`, which names it."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise error(f"{path}: {missing}") from None
+    except UnicodeDecodeError:
+        raise error(f"{path}: not a text file") from None
+    except OSError as failure:
+        raise error(f"{path}: {failure.strerror}") from None
+
+
+def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str]]]:
+    """Line number and columns (split at spaces and commas) of each line; blank lines and comments
+    (``#``) are left out.
+
+    Raises:
+        error: the file is missing, no text, or holds no row; names it.
+    """
+    rows = [
+        (number, columns)
+        for number, line in enumerate(_read_lines(path, error), start=1)
+        if (columns := line.split())
+    ]
+    if not rows:
+        raise error(f"{path}: nothing in this file")
+    return rows
+
+
+def _read_lines(path: Path, error: type[TopolocError]) -> list[str]:
+    """The file's lines without comments, commas as spaces."""
+    text = read_text(path, error).replace(",", " ")
+    return (
+        text.splitlines()
+        if "#" not in text
+        else [line.partition("#")[0] for line in text.splitlines()]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class NumericTable:
+    """Numbers of lines that have equally many of them, and the lines."""
+
+    numbers: Float[np.ndarray, "n c"]
+    lines: list[str]
+
+
+def read_numeric_table(path: Path, error: type[TopolocError]) -> NumericTable | None:
+    """A file of finite numbers alone, equally many a line (comments are left out), read at once;
+    None where it is another.
+
+    Raises:
+        error: the file is missing or no text.
+    """
+    lines = [line for line in _read_lines(path, error) if line and not line.isspace()]
+    if not lines:
+        return None
+    try:
+        numbers = np.loadtxt(lines, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return (
+        NumericTable(numbers, lines)
+        if len(numbers) == len(lines) and np.isfinite(numbers).all()
+        else None
+    )
+
+
+def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
+    """As `parse_times`, of lines whose times are all written alike, such as
+    ``1403636579.763555584``; None of any other."""
+    width = len(lines[0].split(None, 1)[0])
+    try:
+        characters = np.frombuffer(
+            "".join([line[: width + 1] for line in lines]).encode("ascii"), np.uint8
+        )
+    except UnicodeEncodeError:
+        return None
+    if characters.size != len(lines) * (width + 1):
+        return None
+    *columns, last = np.ascontiguousarray(characters.reshape(len(lines), -1).T)
+    if not ((last == ord(" ")) | (last == ord("\t"))).all():
+        return None
+    dots = [number for number, column in enumerate(columns) if column[0] == ord(".")]
+    at = dots[0] if dots else width
+    digits = columns[:at] + columns[at + 1 :]
+    if (
+        (dots and (columns[at] != ord(".")).any()) or not 1 <= at <= 10 or len(digits) - at > 9
+    ):  # ten digits: seconds, no nanoseconds
+        return None
+    t_ns = np.zeros(len(lines), dtype=np.int64)
+    for column in digits:
+        if column.min() < ord("0") or column.max() > ord("9"):
+            return None
+        t_ns = 10 * t_ns + (column - ord("0"))
+    t_ns *= 10 ** (9 - (len(digits) - at))
+    return t_ns.tolist() if (np.diff(t_ns) > 0).all() else None
+
+
+def parse_times(
+    rows: Sequence[tuple[int, list[str]]], path: Path, error: type[TopolocError]
+) -> list[int]:
+    """Integer nanoseconds of the first column, exact to the last decimal; it is in seconds, or
+    nanoseconds where one is above 1e12.
+
+    Raises:
+        error: not a finite number, or the times do not increase strictly; names file and line.
+    """
+    times: list[Decimal] = []
+    for line, columns in rows:
+        try:
+            time = Decimal(columns[0])
+        except InvalidOperation:
+            time = Decimal("nan")
+        if not time.is_finite() or time.adjusted() > _MAX_DIGITS:
+            raise error(f"{path}, line {line}: {columns[0][:40]!r} is not a time")
+        times.append(time)
+    in_nanoseconds = max(times) > _MAX_SECONDS
+    t_ns = [int((time if in_nanoseconds else time.scaleb(9)).to_integral_value()) for time in times]
+    for (line, columns), before, after in zip(rows[1:], t_ns[:-1], t_ns[1:], strict=True):
+        if after <= before:
+            raise error(f"{path}, line {line}: time {columns[0][:40]} is not after the one before")
+    return t_ns
+
+
+def read_file_list(path: Path, error: type[TopolocError]) -> tuple[list[int], list[str]]:
+    """Times in nanoseconds and file names of a list of pictures, which lie below the list's folder.
+
+    Raises:
+        error: as `read_rows` and `parse_times`, a line has no second column, or a name leads out of
+            the folder.
+    """
+    rows = read_rows(path, error)
+    for line, columns in rows:
+        if len(columns) < 2:
+            raise error(f"{path}, line {line}: not a time and a file name")
+        name = PurePath(columns[1])
+        if name.is_absolute() or ".." in name.parts or "\0" in columns[1]:
+            raise error(f"{path}, line {line}: {columns[1][:80]!r} is no picture below this folder")
+    return parse_times(rows, path, error), [columns[1] for _, columns in rows]

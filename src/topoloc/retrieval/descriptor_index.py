@@ -1,0 +1,197 @@
+"""Place vectors: whitened (PCA, Jegou & Chum 2012), their nearest neighbours, and the nodes that
+these vote for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import faiss
+import numpy as np
+from jaxtyping import Float32, Int
+
+from topoloc.retrieval.coarse import NodeScore
+from topoloc.retrieval.descriptor_kernels import multiply_rows
+
+# Up to here every vector is compared, in 1 to 3 ms; beyond it an inverted file finds the same
+# neighbour nearly always.
+MAX_EXACT_VECTORS = 8_000
+# Then so many of the nearest are compared by more than their vectors.
+NUM_RERANKED_IMAGES = 2_000
+# Of an inverted file: cells that a query looks into, images that its cells are learnt from, of
+# each.
+NUM_PROBES, IMAGES_PER_CELL = 24, 48
+# The axes of this many images are those of all; beyond it only memory and time grow (200 MB and 7 s
+# with 2,000).
+MAX_WHITENING_IMAGES = 1_000
+
+
+class DescriptorIndex:
+    """Inner-product search over the unit vectors of the mapping images: exact, or by cells (FAISS's
+    inverted file) where they are many.
+
+    Args:
+        vectors: (n, d) unit vectors, one a mapping image.
+        node_ids: (n,) the node of each.
+        max_exact: with more vectors than this the search is by cells.
+    """
+
+    def __init__(
+        self,
+        vectors: Float32[np.ndarray, "n d"],
+        node_ids: Int[np.ndarray, " n"],
+        max_exact: int = MAX_EXACT_VECTORS,
+    ) -> None:
+        self._node_ids = node_ids
+        self._vectors = np.ascontiguousarray(vectors) if len(vectors) <= max_exact else None
+        self._cells = (
+            None
+            if len(vectors) <= max_exact
+            else _build_inverted_file(np.ascontiguousarray(vectors))
+        )
+
+    def rank_nodes(self, vector: Float32[np.ndarray, " d"], num_candidates: int) -> list[NodeScore]:
+        """The nodes of the nearest images, each once, with the similarity of its best image; of
+        equal ones the earlier image's."""
+        if self._vectors is not None:
+            return self.rank_images(*self.nearest(vector), num_candidates)
+        num_images = 16 * num_candidates
+        while True:
+            rows, similarities = self._search_inverted_file(vector, num_images)
+            ranking = self._best_image_per_node(rows, similarities, num_candidates)
+            if (
+                len(ranking) == num_candidates or len(rows) < num_images
+            ):  # enough, or no more in the cells looked into
+                return ranking
+            num_images *= 8
+
+    def nearest(
+        self, vector: Float32[np.ndarray, " d"]
+    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+        """All images with their similarities to a vector; where these are many, only the
+        nearest."""
+        if self._vectors is None:
+            return self._search_inverted_file(vector, NUM_RERANKED_IMAGES)
+        similarities = np.empty(len(self._vectors), np.float32)
+        multiply_rows(self._vectors, np.ascontiguousarray(vector), similarities)
+        return np.arange(len(self._vectors)), similarities
+
+    def rank_images(
+        self,
+        images: Int[np.ndarray, " k"],
+        similarities: Float32[np.ndarray, " k"],
+        num_candidates: int,
+    ) -> list[NodeScore]:
+        """The nodes of the most similar of these images, as `rank_nodes`."""
+        order = np.argsort(-similarities, kind="stable")
+        return self._best_image_per_node(images[order], similarities[order], num_candidates)
+
+    def _search_inverted_file(
+        self, vector: Float32[np.ndarray, " d"], num_images: int
+    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+        assert self._cells is not None
+        similarities, rows = self._cells.search(
+            np.ascontiguousarray(vector[None]), min(num_images, len(self._node_ids))
+        )
+        found = rows[0] >= 0
+        return rows[0][found], similarities[0][found]
+
+    def _best_image_per_node(
+        self,
+        rows: Int[np.ndarray, " k"],
+        similarities: Float32[np.ndarray, " k"],
+        num_candidates: int,
+    ) -> list[NodeScore]:
+        _, first = np.unique(self._node_ids[rows], return_index=True)
+        best = np.sort(first)[:num_candidates]
+        return [NodeScore(int(self._node_ids[rows[i]]), float(similarities[i])) for i in best]
+
+
+def _build_inverted_file(vectors: Float32[np.ndarray, "n d"]) -> Any:
+    """Cells about the k-means centres of some of the vectors; the vectors in them as half floats,
+    half a kilobyte at 256 dimensions."""
+    num_cells = max(1, min(round(math.sqrt(len(vectors))), len(vectors) // 40))
+    dimension = vectors.shape[1]
+    index = faiss.IndexIVFScalarQuantizer(
+        faiss.IndexFlatIP(dimension),
+        dimension,
+        num_cells,
+        faiss.ScalarQuantizer.QT_fp16,
+        faiss.METRIC_INNER_PRODUCT,
+        False,
+    )
+    index.cp.niter, index.cp.seed, index.cp.max_points_per_centroid = 8, 1, IMAGES_PER_CELL
+    index.train(vectors)  # pyright: ignore[reportCallIssue]
+    index.add(vectors)  # pyright: ignore[reportCallIssue]
+    index.nprobe = NUM_PROBES
+    return index
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """``projection @ (vector - mean)``, then brought to unit length."""
+
+    mean: Float32[np.ndarray, " d"]
+    projection: Float32[np.ndarray, "p d"]
+
+    def apply(self, raw: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n p"]:
+        """Unit vectors."""
+        projected = (raw - self.mean) @ self.projection.T
+        return np.ascontiguousarray(
+            projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6),
+            np.float32,
+        )
+
+
+def learn_whitening(
+    raw: Float32[np.ndarray, "n d"] | Sequence[Float32[np.ndarray, " d"]], dimension: int
+) -> Whitening:
+    """Mean and projection to at most `dimension` whitened components, from unit vectors of images.
+
+    The variances are softened by the mean one, since the trailing components of few images are
+    noise, which plain whitening would blow up.
+    """
+    rows = np.unique(np.linspace(0, len(raw) - 1, MAX_WHITENING_IMAGES).astype(int)).tolist()
+    centred = np.stack([raw[k] for k in rows])
+    mean = centred.mean(axis=0)
+    centred -= mean
+    by_image = (
+        len(centred) < centred.shape[1]
+    )  # whichever is smaller: the products of images, or those of dimensions
+    products = centred @ centred.T if by_image else centred.T @ centred
+    eigenvalues, vectors = np.linalg.eigh(products)
+    order = np.argsort(-eigenvalues, kind="stable")[:dimension]
+    # Vectors are of unit length: below a millionth of that is rounding.
+    keep = order[eigenvalues[order] > 1e-6 * max(float(eigenvalues.max()), len(centred) * 1e-6)]
+    if len(keep) == 0:  # one image, or all alike
+        direction = mean / max(float(np.linalg.norm(mean)), 1e-6)
+        return Whitening(np.zeros_like(mean), direction[None].astype(np.float32))
+    axes = (
+        centred.T @ vectors[:, keep] / np.sqrt(eigenvalues[keep]) if by_image else vectors[:, keep]
+    )
+    regularized = np.sqrt(eigenvalues[keep] + eigenvalues[keep].mean())
+    return Whitening(
+        mean.astype(np.float32), np.ascontiguousarray((axes / regularized).T, np.float32)
+    )
+
+
+def learn_visual_words(
+    descriptors: Float32[np.ndarray, "n d"], num_words: int, seed: int
+) -> Float32[np.ndarray, "k d"]:
+    """The k-means centres of descriptors, fewer where there are few of them."""
+    num_words = max(1, min(num_words, len(descriptors) // 40))
+    kmeans = faiss.Kmeans(
+        descriptors.shape[1], num_words, niter=20, seed=seed + 1, min_points_per_centroid=1
+    )
+    # A tenth of a second for one thread; several wait for each other by spinning, at two hundred
+    # places, for longer than that.
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)
+    try:
+        kmeans.train(np.ascontiguousarray(descriptors))
+    finally:
+        faiss.omp_set_num_threads(before)
+    assert kmeans.centroids is not None
+    return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)

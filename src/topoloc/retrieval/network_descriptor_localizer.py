@@ -1,0 +1,84 @@
+"""cnn-nn and vlad-nn as they answer: a network turns a picture into a vector; the nodes of the
+nearest mapping images answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float32, Int
+from torch import nn
+
+from topoloc.errors import MapError
+from topoloc.features.features import Features
+from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, read_setting
+from topoloc.retrieval.descriptor_index import DescriptorIndex, Whitening
+from topoloc.retrieval.inference import Predictor, load_network_weights
+from topoloc.retrieval.network_config import NetworkInputConfig
+from topoloc.retrieval.network_images import ImageShape, prepare_network_images
+
+_CHUNK = 64  # pictures that go through the network together
+
+
+class NetworkDescriptorLocalizer:
+    """The coarse localizers `cnn-nn` and `vlad-nn`.
+
+    Raises:
+        MapError: the model's arrays do not belong together.
+    """
+
+    def __init__(
+        self, model: CoarseModel, network: nn.Module, input_config: NetworkInputConfig
+    ) -> None:
+        try:
+            self._input_config, self._shape = (
+                input_config,
+                ImageShape(*read_setting(model, "picture_shape", tuple[int, int])),
+            )
+            self._predict = Predictor(load_network_weights(network, model.arrays))
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise MapError(
+                f"the map's coarse localizer {model.name!r} is damaged:"
+                f" {' '.join(str(error).split())[:200]}"
+            ) from error
+        self._model, mean = (
+            model,
+            model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False),
+        )
+        projection = model_array(model, "projection", "f", (None, len(mean))).astype(np.float32)
+        vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
+        self._whitening = Whitening(mean, projection)
+        self._index = DescriptorIndex(
+            vectors, model_array(model, "node_ids", "iu", (len(vectors),))
+        )
+
+    def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
+        """See `CoarseLocalizer.rank`; scores are cosines. The local features are not looked at."""
+        return self._index.rank_nodes(self.vectors([image])[0], num_candidates)
+
+    def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
+        """`rank` of many images, which go through the network together."""
+        return [self._index.rank_nodes(vector, num_candidates) for vector in self.vectors(images)]
+
+    def extend_with_images(
+        self, images: Sequence[Image], node_ids: Int[np.ndarray, " n"]
+    ) -> CoarseModel:
+        """See `ExtendableLocalizer`: their vectors join, under the whitening that is there."""
+        known = self._model.arrays
+        parts = [self.vectors(images[k : k + _CHUNK]) for k in range(0, len(images), _CHUNK)]
+        vectors = np.concatenate(
+            [known["vectors"], *(part.astype(known["vectors"].dtype) for part in parts)]
+        )
+        of_nodes = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
+        return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": of_nodes})
+
+    def vectors(self, images: Sequence[Image]) -> Float32[np.ndarray, "n d"]:
+        """The images' unit vectors."""
+        raw = self._predict(prepare_network_images(images, self._shape, self._input_config))
+        if raw.shape[1] != len(self._whitening.mean):
+            raise MapError(
+                f"the map's coarse localizer {self._model.name!r} is damaged: its whitening is not"
+                " that of its network"
+            )
+        return self._whitening.apply(raw)

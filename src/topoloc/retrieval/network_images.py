@@ -1,0 +1,60 @@
+"""Pictures as the networks of learned coarse localizers take them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from topoloc.errors import MapError
+from topoloc.retrieval.coarse import Image
+from topoloc.retrieval.network_config import NetworkInputConfig
+
+RgbImage = UInt8[np.ndarray, "_ _ 3"]
+RgbImages = UInt8[np.ndarray, "_ _ _ 3"]
+
+
+@dataclass(frozen=True)
+class ImageShape:
+    """The mapping pictures' size: queries are cut and reduced to it before they are stretched to
+    the network's."""
+
+    width: int
+    height: int
+
+    def fit(self, image: Image) -> RgbImage:
+        """The middle of the image in this shape, reduced to this size where it is larger;
+        colour."""
+        height, width = image.shape[:2]
+        scale = min(width / self.width, height / self.height)
+        rows, columns = max(1, round(self.height * scale)), max(1, round(self.width * scale))
+        top, left = (height - rows) // 2, (width - columns) // 2
+        image = image[top : top + rows, left : left + columns]
+        if scale > 1.0:
+            image = cv2.resize(image, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+
+
+def decode_stored_image(jpeg: bytes) -> RgbImage:
+    """A stored picture in colour. Raises MapError where it is damaged."""
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise MapError("the map is damaged: a mapping image is no picture")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def prepare_network_images(
+    images: Sequence[Image], shape: ImageShape, config: NetworkInputConfig
+) -> RgbImages:
+    """Images as a network takes them: all in the mapping pictures' shape, stretched to the
+    network's size."""
+    size = (config.width_px, config.height_px)
+    return np.stack([_resize_image(shape.fit(image), size) for image in images])
+
+
+def _resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
+    shrinks = image.shape[1] >= size[0] and image.shape[0] >= size[1]
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)

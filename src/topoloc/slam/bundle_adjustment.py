@@ -1,0 +1,293 @@
+"""Bundle adjustment: key frames and the landmarks they see, moved to where they explain pixels and
+disparities best.
+
+Levenberg-Marquardt with the points eliminated (Triggs et al., *Bundle adjustment: a modern
+synthesis*, 2000, section 6) and Cauchy's loss. What is left of the poses is sparse
+(`block_system`), and observations are gone through part by part (`bundle_parts`): the window of the
+odometry and a walk of kilometres are one problem, whose time and memory grow with its length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.geometry.rigid import Rigid3
+from topoloc.slam.block_system import BlockPattern, solve_blocks
+from topoloc.slam.bundle_kernels import (
+    count_covisible_pairs,
+    eliminate_points,
+    find_covisible_pairs,
+    robust_cost,
+    squared_residuals,
+    update_points,
+)
+from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
+from topoloc.slam.observation_chunks import ObservationChunk, ObservationChunks
+
+
+@dataclass(frozen=True)
+class BundleConfig:
+    """How long and how robustly to optimise; residuals are in standard deviations of the
+    measurements."""
+
+    max_steps: Annotated[int, Between(0, 1000)] = 6
+    """Steps of Levenberg and Marquardt, at most."""
+    cauchy_scale: Annotated[float, Above(0)] = 2.0
+    """Residuals beyond this count less and less."""
+    min_decrease: Annotated[float, Between(0, 1)] = 1e-3
+    """A step that lowers the cost by less than this share of it is the last one."""
+    outlier_square: Annotated[float, Above(0)] = 25.0
+    """Squared residual, summed over x, y and disparity, from which on an observation is wrong and
+    used no more."""
+    part_observations: Annotated[int, AtLeast(1)] = 100_000
+    """Observations that are laid side by side at once, about; of longer walks one part after the
+    other."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """What is known of a key frame's pose from elsewhere; `information` (6, 6) is that of its left
+    perturbation (metres, radians)."""
+
+    keyframe: KeyFrame
+    cam_from_world: Rigid3
+    information: Float[np.ndarray, "6 6"]
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What is moved. A camera is (fx, fy, cx, cy, bf, bias of the disparities)."""
+
+    rotations: Float[np.ndarray, "k 3 3"]
+    translations: Float[np.ndarray, "k 3"]
+    cameras: Float[np.ndarray, "k 6"]
+    points: Float[np.ndarray, "n 3"]
+
+    def squares(self, chunk: ObservationChunk) -> Float[np.ndarray, " m"]:
+        """Squared residuals of the part's observations."""
+        squares = np.empty(len(chunk.keyframe_idx))
+        points = self.points[chunk.first : chunk.last]
+        squared_residuals(
+            self.rotations, self.translations, self.cameras, points, chunk.keyframe_idx, chunk.rows, chunk.measured, chunk.weights, squares  # noqa: E501
+        )  # fmt: skip
+        return squares
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What does not move: the observations, which poses are free (`slots`, by the order of
+    elimination; -1: held), and whose bias is."""
+
+    chunks: ObservationChunks
+    pattern: BlockPattern
+    slots: Int[np.ndarray, " k"]
+    columns: Int[np.ndarray, " k"]
+    biases: list[DisparityBias]
+    pose_priors: list[tuple[int, PosePrior]]
+
+    def prior_cost(self, state: _State, scale_squared: float) -> float:
+        """Of biases other than expected, and of poses other than the anchors say."""
+        of_biases = sum(
+            bias.information * (state.cameras[k, 5] - bias.value_px) ** 2
+            for bias, k in self.find_bias_keyframes()
+        )
+        return float(
+            of_biases
+            + sum(
+                scale_squared * np.log1p(square / scale_squared)
+                for *_, square in self.compute_prior_residuals(state)
+            )
+        )
+
+    def compute_prior_residuals(
+        self, state: _State
+    ) -> Iterator[tuple[int, PosePrior, Float[np.ndarray, "6"], float]]:
+        """Of each anchor: its key frame, how far that one is off, and the square of that in
+        sigma."""
+        for k, pose_prior in self.pose_priors:
+            off = (
+                Rigid3(state.rotations[k], state.translations[k])
+                @ pose_prior.cam_from_world.inverse()
+            ).log()
+            yield k, pose_prior, off, float(off @ pose_prior.information @ off)
+
+    def find_bias_keyframes(self) -> list[tuple[DisparityBias, int]]:
+        return [(bias, int(np.argmax(self.columns == i))) for i, bias in enumerate(self.biases)]
+
+
+def adjust_bundle(
+    free: Sequence[KeyFrame],
+    fixed: Sequence[KeyFrame],
+    landmarks: Landmarks,
+    config: BundleConfig,
+    pose_priors: Sequence[PosePrior] = (),
+) -> None:
+    """Move the poses of `free` and the landmarks that they see; `fixed` key frames see some of
+    these too, and stay.
+
+    With nothing held, and no anchors of key frames of `free`, the first of `free` stays.
+    Observations found to be wrong become inactive in all of these key frames.
+    """
+    if not fixed and not pose_priors:
+        free, fixed = free[1:], free[:1]
+    if not free:
+        return
+    keyframes = [*free, *fixed]
+    ids = _collect_landmark_ids(free if len(free) > 1 else keyframes)
+    chunks = ObservationChunks(keyframes, ids, config.part_observations)
+    if chunks.num_observations == 0:
+        return
+    number_of = {id(keyframe): k for k, keyframe in enumerate(keyframes)}
+    problem = _build_problem(
+        chunks,
+        keyframes,
+        len(free),
+        [(number_of[id(pose_prior.keyframe)], pose_prior) for pose_prior in pose_priors],
+    )
+    state = _State(
+        rotations=np.array([k.cam_from_world.rotation for k in keyframes]),
+        translations=np.array([k.cam_from_world.translation for k in keyframes]),
+        cameras=np.array([_to_camera_row(k) for k in keyframes]),
+        points=landmarks.positions[ids],
+    )
+    state = _optimize(problem, state, config)
+    for k, keyframe in enumerate(free):
+        keyframe.cam_from_world = Rigid3(state.rotations[k].copy(), state.translations[k].copy())
+    landmarks.positions[ids] = state.points
+    for bias, k in problem.find_bias_keyframes():
+        bias.value_px = float(state.cameras[k, 5])
+    for chunk in chunks:
+        wrong = np.flatnonzero(state.squares(chunk) > config.outlier_square)
+        for k, row in zip(
+            chunk.keyframe_idx[wrong].tolist(), chunk.sources[wrong].tolist(), strict=True
+        ):
+            keyframes[k].observations.active[row] = False
+
+
+def _collect_landmark_ids(keyframes: Sequence[KeyFrame]) -> Int[np.ndarray, " n"]:
+    """Ascending. All of a long walk's observations are never side by side."""
+    of_each = [k.observations.landmark_ids[k.observations.active] for k in keyframes]
+    first = min((int(ids.min()) for ids in of_each if len(ids)), default=0)
+    is_seen = np.zeros(
+        max((int(ids.max()) + 1 - first for ids in of_each if len(ids)), default=0), np.bool_
+    )
+    for ids in of_each:
+        is_seen[ids - first] = True
+    return np.flatnonzero(is_seen) + first
+
+
+def _to_camera_row(keyframe: KeyFrame) -> list[float]:
+    camera = keyframe.stereo.camera
+    return [camera.fx, camera.fy, camera.cx, camera.cy, keyframe.stereo.bf, keyframe.bias.value_px]
+
+
+def _build_problem(
+    chunks: ObservationChunks,
+    keyframes: Sequence[KeyFrame],
+    num_free: int,
+    pose_priors: list[tuple[int, PosePrior]],
+) -> _Problem:
+    slots = np.arange(len(keyframes))
+    slots[num_free:] = -1
+    ties = np.zeros(0, np.int64)
+    for chunk in chunks:
+        keys = np.empty(count_covisible_pairs(chunk.starts, chunk.keyframe_idx, slots), np.int64)
+        find_covisible_pairs(chunk.starts, chunk.keyframe_idx, slots, num_free, keys)
+        ties = np.union1d(ties, keys)
+    pattern = BlockPattern.from_pairs(
+        num_free, zip((ties // num_free).tolist(), (ties % num_free).tolist(), strict=True)
+    )
+    slots[:num_free] = pattern.elimination_idx
+    biases = list(dict.fromkeys(k.bias for k in keyframes if np.isfinite(k.bias.information)))
+    columns = np.array([biases.index(k.bias) if k.bias in biases else -1 for k in keyframes])
+    return _Problem(chunks, pattern, slots, columns, biases, pose_priors)
+
+
+def _optimize(problem: _Problem, state: _State, config: BundleConfig) -> _State:
+    scale = config.cauchy_scale**2
+    cost = problem.prior_cost(state, scale) + sum(
+        float(robust_cost(state.squares(chunk), scale)) for chunk in problem.chunks
+    )
+    damping = 1e-4
+    for _ in range(config.max_steps):
+        steps, bias_steps = _solve_steps(problem, state, scale, damping)
+        moved, new_cost = _apply_steps(problem, state, (steps, bias_steps), scale, damping)
+        if not new_cost < cost:
+            damping *= 10.0
+            continue
+        state, finished = moved, cost - new_cost < config.min_decrease * cost
+        cost, damping = new_cost, max(damping / 5.0, 1e-7)
+        if finished:
+            break
+    return state
+
+
+def _solve_steps(
+    problem: _Problem, state: _State, scale: float, damping: float
+) -> tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]]:
+    """Of the free poses in the order of elimination, and of the biases: the reduced system made and
+    solved."""
+    p, pattern = problem, problem.pattern
+    blocks, vector = pattern.empty(), np.zeros((len(pattern.elimination_idx), 6))
+    border, corner = np.zeros((len(p.biases), *vector.shape)), np.zeros((len(p.biases), 2))
+    for chunk in p.chunks:
+        eliminate_points(
+            state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[chunk.first : chunk.last],  # noqa: E501
+            chunk.starts, chunk.keyframe_idx, chunk.measured, chunk.weights, scale, damping,
+            pattern.starts, pattern.rows, blocks, vector, border, corner,
+        )  # fmt: skip
+    for k, pose_prior, off, square in p.compute_prior_residuals(state):
+        pull = pose_prior.information / (1.0 + square / scale)
+        blocks[pattern.diagonal[p.slots[k]]] += pull
+        vector[p.slots[k]] -= pull @ off
+    for row, (bias, k) in enumerate(p.find_bias_keyframes()):  # what is known of the biases already
+        corner[row] += [bias.information, bias.information * (bias.value_px - state.cameras[k, 5])]
+    along = np.arange(6)
+    blocks[pattern.diagonal[:, None], along, along] *= 1.0 + damping
+    blocks[pattern.diagonal[:, None], along, along] += 1e-9
+    own = np.diag((1.0 + damping) * corner[:, 0] + 1e-9)
+    solved = solve_blocks(pattern, blocks, np.concatenate([vector[None], border]))
+    flat, of_border = (
+        border.reshape(len(border), vector.size),
+        solved[1:].reshape(len(border), vector.size),
+    )
+    bias_steps = np.linalg.solve(own - flat @ of_border.T, corner[:, 1] - flat @ solved[0].ravel())
+    return solved[0] - np.tensordot(bias_steps, solved[1:], 1), bias_steps
+
+
+def _apply_steps(
+    problem: _Problem,
+    state: _State,
+    steps: tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]],
+    scale: float,
+    damping: float,
+) -> tuple[_State, float]:
+    """All after these steps, and what it costs."""
+    p, (of_poses, of_biases) = problem, steps
+    rotations, translations, cameras = (
+        state.rotations.copy(),
+        state.translations.copy(),
+        state.cameras.copy(),
+    )
+    for k in np.flatnonzero(p.slots >= 0).tolist():
+        new = Rigid3.exp(of_poses[p.slots[k]]) @ Rigid3(rotations[k], translations[k])
+        rotations[k], translations[k] = new.rotation, new.translation
+    cameras[p.columns >= 0, 5] += of_biases[p.columns[p.columns >= 0]]
+    moved = _State(rotations, translations, cameras, np.empty_like(state.points))
+    cost = p.prior_cost(moved, scale)
+    nothing = np.empty((0, 6, 6)), np.empty((0, *of_poses.shape)), np.empty((0, 2))
+    for chunk in p.chunks:
+        rows = slice(chunk.first, chunk.last)
+        update_points(
+            state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[rows],  # noqa: E501
+            chunk.starts, chunk.keyframe_idx, chunk.measured, chunk.weights, scale, damping,
+            p.pattern.starts, *nothing, of_poses, of_biases, moved.points[rows],
+        )  # fmt: skip
+        cost += float(robust_cost(moved.squares(chunk), scale))
+    return moved, cost

@@ -1,0 +1,218 @@
+"""The whole map brought to agree: sub-maps joined by links, the pose graph, then all key frames and
+landmarks together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Int
+
+from topoloc.bounds import Above
+from topoloc.geometry.rigid import Rigid3
+from topoloc.slam.bundle_adjustment import BundleConfig, adjust_bundle
+from topoloc.slam.keyframes import KeyFrame, Landmarks, Observations
+from topoloc.slam.loop_closure import Link
+from topoloc.slam.pose_graph import (
+    Edge,
+    PoseGraphConfig,
+    compute_normalized_residuals,
+    optimize_pose_graph,
+)
+
+
+@dataclass(frozen=True)
+class GlobalMapConfig:
+    """How the map is brought to agree."""
+
+    graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
+    bundle: BundleConfig = field(
+        default_factory=lambda: BundleConfig(max_steps=12, min_decrease=1e-4)
+    )
+    motion_sigma: Annotated[float, Above(0)] = 0.004
+    """Uncertainty of a motion between two key frames: this share of its length ..."""
+    motion_sigma_deg: Annotated[float, Above(0)] = 0.02
+    """... and this angle, besides what tracking says."""
+    link_sigma: Annotated[float, Above(0)] = 0.01
+    """Metres; of a link, besides what PnP says."""
+    link_sigma_deg: Annotated[float, Above(0)] = 0.1
+    """The same, in degrees."""
+    link_covariance_scale: Annotated[float, Above(0)] = 4.0
+    """Matched features of one view share their errors: more than independent ones would be wrong
+    by."""
+    sigma_feature_px: Annotated[float, Above(0)] = 0.8
+    """Standard deviation of a feature's place in the picture, in the adjustment of all."""
+
+
+def join_submaps(
+    keyframes: Sequence[KeyFrame], links: Sequence[Link], landmarks: Landmarks, first: int
+) -> list[int]:
+    """Bring every sub-map that a link reaches into the world of sub-map `first`; the sub-maps that
+    are joined, `first` among them."""
+    joined = [first]
+    remaining = list(links)
+    while True:
+        crossing = next(
+            (
+                k
+                for k in remaining
+                if (keyframes[k.source].submap in joined) != (keyframes[k.target].submap in joined)
+            ),
+            None,
+        )
+        if crossing is None:
+            return joined
+        source, target = keyframes[crossing.source], keyframes[crossing.target]
+        target_from_source = crossing.match.target_from_source
+        if source.submap in joined:
+            world_from_new = (
+                source.cam_from_world.inverse()
+                @ target_from_source.inverse()
+                @ target.cam_from_world
+            )
+            new = target.submap
+        else:
+            world_from_new = (
+                target.cam_from_world.inverse() @ target_from_source @ source.cam_from_world
+            )
+            new = source.submap
+        _move_submap([k for k in keyframes if k.submap == new], world_from_new, landmarks)
+        joined.append(new)
+
+
+def _move_submap(
+    keyframes: Sequence[KeyFrame], world_from_new: Rigid3, landmarks: Landmarks
+) -> None:
+    ids = np.unique(np.concatenate([k.observations.landmark_ids for k in keyframes]))
+    landmarks.positions[ids] = world_from_new.apply(landmarks.positions[ids])
+    for keyframe in keyframes:
+        keyframe.cam_from_world = keyframe.cam_from_world @ world_from_new.inverse()
+
+
+def close_loops(
+    keyframes: Sequence[KeyFrame],
+    links: Sequence[Link],
+    landmarks: Landmarks,
+    config: GlobalMapConfig,
+) -> list[Link]:
+    """Optimise the pose graph of joined key frames, and move the landmarks along; the links that
+    agree with it in the end."""
+    if not links:
+        return []
+    index = {id(keyframe): i for i, keyframe in enumerate(keyframes)}
+    motions = [
+        _motion_edge(keyframe, index, config)
+        for keyframe in keyframes
+        if keyframe.motion is not None
+    ]
+    kept, poses = list(links), [keyframe.cam_from_world for keyframe in keyframes]
+    for _ in range(2):  # the second time without the links that the first found wrong
+        edges = motions + [_link_edge(link, config) for link in kept]
+        poses = optimize_pose_graph(
+            [keyframe.cam_from_world for keyframe in keyframes], edges, config.graph
+        )
+        lengths = compute_normalized_residuals(poses, edges)[len(motions) :]
+        agreeing = [
+            link
+            for link, length in zip(kept, lengths, strict=True)
+            if length <= config.graph.max_residual
+        ]
+        if len(agreeing) == len(kept):
+            break
+        kept = agreeing
+    _move_keyframes(keyframes, poses, landmarks)
+    return kept
+
+
+def _motion_edge(keyframe: KeyFrame, index: dict[int, int], config: GlobalMapConfig) -> Edge:
+    assert keyframe.motion is not None
+    source = keyframe.motion.source
+    motion = keyframe.cam_from_world @ source.cam_from_world.inverse()
+    metres = config.motion_sigma * float(np.linalg.norm(motion.translation)) + 1e-3
+    covariance = keyframe.motion.covariance + _diagonal_covariance(metres, config.motion_sigma_deg)
+    return Edge(index[id(source)], index[id(keyframe)], motion, covariance, is_loop=False)
+
+
+def _link_edge(link: Link, config: GlobalMapConfig) -> Edge:
+    covariance = config.link_covariance_scale * link.match.covariance + _diagonal_covariance(
+        config.link_sigma, config.link_sigma_deg
+    )
+    return Edge(link.source, link.target, link.match.target_from_source, covariance, is_loop=True)
+
+
+def _diagonal_covariance(metres: float, degrees: float) -> np.ndarray:
+    return np.diag(np.square([metres] * 3 + [np.deg2rad(degrees)] * 3))
+
+
+def _move_keyframes(
+    keyframes: Sequence[KeyFrame], poses: Sequence[Rigid3], landmarks: Landmarks
+) -> None:
+    """New poses; each landmark goes with the first key frame that sees it."""
+    moved = np.zeros(landmarks.num, np.bool_)
+    for keyframe, pose in zip(keyframes, poses, strict=True):
+        ids = keyframe.observations.landmark_ids
+        ids = ids[~moved[ids]]
+        moved[ids] = True
+        landmarks.positions[ids] = (pose.inverse() @ keyframe.cam_from_world).apply(
+            landmarks.positions[ids]
+        )
+        keyframe.cam_from_world = pose
+
+
+def adjust_global_bundle(
+    keyframes: Sequence[KeyFrame],
+    links: Sequence[Link],
+    landmarks: Landmarks,
+    config: GlobalMapConfig,
+) -> None:
+    """Bundle adjustment of everything, links included as landmarks that both of their key frames
+    see."""
+    landmark_of: dict[tuple[int, int], int] = {}
+    for link in links:
+        _add_link_landmarks(link, keyframes, landmarks, landmark_of, config)
+    adjust_bundle(keyframes, [], landmarks, config.bundle)
+
+
+def _add_link_landmarks(
+    link: Link,
+    keyframes: Sequence[KeyFrame],
+    landmarks: Landmarks,
+    landmark_of: dict[tuple[int, int], int],
+    config: GlobalMapConfig,
+) -> None:
+    source = keyframes[link.source]
+    place = source.place
+    assert place is not None
+    for source_row, target_row in zip(
+        link.match.source_rows.tolist(), link.match.target_rows.tolist(), strict=True
+    ):
+        known = landmark_of.get((link.source, source_row))
+        if known is None:
+            point = source.cam_from_world.inverse().apply(place.points.points_cam[source_row][None])
+            known = int(landmarks.add(point)[0])
+            landmark_of[link.source, source_row] = known
+            source.observations.append(_feature_observation(source, source_row, known, config))
+        if (link.target, target_row) not in landmark_of:
+            landmark_of[link.target, target_row] = known
+            keyframes[link.target].observations.append(
+                _feature_observation(keyframes[link.target], target_row, known, config)
+            )
+
+
+def _feature_observation(
+    keyframe: KeyFrame, row: int, landmark_id: int, config: GlobalMapConfig
+) -> Observations:
+    """A local feature as an observation: its pixel, and its disparity where it has one."""
+    place, stereo = keyframe.place, keyframe.stereo
+    assert place is not None
+    measured = np.array([[*place.features.points_img[row].astype(np.float64), np.nan]])
+    weights = np.full((1, 3), 1.0 / config.sigma_feature_px)
+    weights[0, 2] = 0.0
+    if place.points.valid[row]:
+        depth = place.points.points_cam[row, 2]
+        measured[0, 2] = stereo.bf / depth
+        weights[0, 2] = depth**2 / (stereo.bf * np.sqrt(place.points.covariances[row, 2, 2]))
+    ids: Int[np.ndarray, "1"] = np.array([landmark_id])
+    return Observations(ids, measured, weights, np.ones(1, np.bool_))

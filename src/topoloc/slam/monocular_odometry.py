@@ -1,0 +1,422 @@
+"""Odometry of a single camera: its motion in a unit of its own, stretch by stretch.
+
+Read from `MonocularOdometry.process`. Two pictures with enough parallax begin a stretch
+(five-point method), and their distance is its unit. From there on points are followed and give each
+frame's pose as in the odometry of stereo (`step_estimation.py`); what has not shown its depth yet
+is followed beside them, and becomes a landmark as soon as its rays meet at an angle. The last key
+frames are adjusted together. Where too few points are left a stretch ends, and another one begins
+with a unit of its own: nothing is guessed in between. What a unit is in metres is not known here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from topoloc.geometry.relative_pose import estimate_relative_pose
+from topoloc.geometry.rigid import Rigid3
+from topoloc.points.disparity import MeasuredView, StereoCamera
+from topoloc.points.point_tracking import find_corners, track_points
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.frame_preparation import undistort_frame
+from topoloc.slam.bundle_adjustment import adjust_bundle
+from topoloc.slam.keyframes import (
+    DisparityBias,
+    FramePose,
+    KeyFrame,
+    Landmarks,
+    Motion,
+    Observations,
+)
+from topoloc.slam.monocular_config import MonocularOdometryConfig
+from topoloc.slam.motion_prediction import MotionHistory
+from topoloc.slam.step_estimation import LastFrame, Step, StepEstimator, Tracks
+from topoloc.slam.triangulation import is_well_triangulated, triangulate_points
+
+_SIGMA_SCALE_RANGE = 0.5, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class MonocularSubmap:
+    """A motion without a break, in a world and a unit of its own: where its frames are, relative to
+    key frames, and what these see."""
+
+    landmarks: Landmarks
+    frames: list[FramePose] = field(default_factory=list)
+    keyframes: list[KeyFrame] = field(default_factory=list)
+
+    def submap_from_cams(self) -> dict[int, Rigid3]:
+        """world_from_cam of its frames in its own world and unit, by their numbers."""
+        return {pose.frame_idx: pose.world_from_cam() for pose in self.frames}
+
+
+@dataclass(eq=False)
+class _Initialization:
+    """The first picture of a stretch that has not begun yet, the points still followed from it, and
+    the frames since, with their points."""
+
+    frames: list[tuple[int, StereoFrame, MeasuredView, Tracks]]
+    tracks: Tracks
+
+
+class MonocularOdometry:
+    """The state of one recording's odometry. `submaps` are those so far."""
+
+    def __init__(self, config: MonocularOdometryConfig) -> None:
+        self._config = config
+        self._landmarks, self._bias = Landmarks(), DisparityBias()
+        self._history = MotionHistory(config.odometry.prediction)
+        self.submaps: list[MonocularSubmap] = []
+        self._initialization: _Initialization | None = None
+        self._reference: KeyFrame | None = None
+        self._reference_image: Float32[np.ndarray, "h w"] = np.zeros((0, 0), np.float32)
+        self._last_frame: LastFrame | None = None
+        self._tracks, self._untriangulated = _empty_tracks(), _empty_tracks()
+        self._recent_keyframes: list[KeyFrame] = []
+        self._num_lost = 0
+
+    def process(self, frame_idx: int, frame: StereoFrame) -> None:
+        """The next frame."""
+        measured = _make_view(frame, self._config.max_side_px)
+        if self._reference is None:
+            self._initialize(frame_idx, frame, measured)
+        elif self._track_frame(frame_idx, frame, measured):
+            self._num_lost = 0
+        else:
+            self._num_lost += 1
+            if self._num_lost > self._config.odometry.max_lost_tracked:
+                self._reference, self._last_frame, self._num_lost = None, None, 0
+                self._history.reset()
+                self._initialize(frame_idx, frame, measured)
+
+    def _initialize(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> None:
+        """Follow the corners of a first picture until two pictures show a motion."""
+        if self._initialization is not None:
+            tracks = self._track_bidirectional(self._initialization, measured)
+            left = len(tracks.landmark_ids) / max(len(self._initialization.tracks.landmark_ids), 1)
+            self._initialization.frames.append((frame_idx, frame, measured, tracks))
+            if (
+                left >= self._config.start_share
+                and len(self._initialization.frames) <= self._config.max_beginning
+            ):
+                moved = (
+                    np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
+                    if len(tracks.landmark_ids)
+                    else 0.0
+                )
+                if moved > self._config.start_motion * measured.view.camera.width:
+                    self._start_submap(self._initialization)
+                return
+        corners = find_corners(measured.view.grey, np.zeros((0, 2)), self._config.odometry.tracking)
+        tracks = Tracks.from_points(np.arange(len(corners)), corners)
+        self._initialization = _Initialization([(frame_idx, frame, measured, tracks)], tracks)
+
+    def _track_bidirectional(
+        self, initialization: _Initialization, measured: MeasuredView
+    ) -> Tracks:
+        """The points that are found in the next picture, and from there again where they were."""
+        _, _, before, tracks = initialization.frames[-1]
+        config = self._config.odometry.tracking
+        found, there = track_points(
+            before.view.grey, measured.view.grey, tracks.points_img, tracks.points_img, config
+        )
+        back, again = track_points(
+            measured.view.grey, before.view.grey, found, tracks.points_img, config
+        )
+        returned = np.linalg.norm(back - tracks.points_img, axis=1) < self._config.max_return_px
+        return replace(tracks, points_img=found).select(np.flatnonzero(there & again & returned))
+
+    def _start_submap(self, initialization: _Initialization) -> None:
+        """A stretch begins if the first picture and the last one show a motion."""
+        config, (_, _, first, all_tracks), (_, _, last, tracks) = (
+            self._config,
+            initialization.frames[0],
+            initialization.frames[-1],
+        )
+        motion = estimate_relative_pose(
+            tracks.points_ref.astype(np.float64),
+            first.view.camera,
+            tracks.points_img.astype(np.float64),
+            last.view.camera,
+        )
+        if motion is None or np.count_nonzero(motion.inliers) < config.start_points:
+            return
+        self._recent_keyframes, self._landmarks = [], Landmarks()
+        self._landmarks.add(np.full((len(all_tracks.landmark_ids), 3), np.nan))
+        agreeing = tracks.select(motion.inliers)
+        poses = (Rigid3.identity(), motion.second_from_first)
+        for row, cam_from_world, points_img in (
+            (0, poses[0], agreeing.points_ref),
+            (-1, poses[1], agreeing.points_img),
+        ):
+            frame_idx, frame, measured, _ = initialization.frames[row]
+            seen = self._make_observations(Tracks.from_points(agreeing.landmark_ids, points_img), 0)
+            self._recent_keyframes.append(
+                self._make_keyframe(frame_idx, frame.t_ns, measured, cam_from_world, seen)
+            )
+        known = self._triangulate_tracks(agreeing.landmark_ids, 2)
+        if len(known) < config.start_points:
+            self._recent_keyframes = []
+            return
+        adjust_bundle(self._recent_keyframes, [], self._landmarks, config.odometry.bundle)
+        self.submaps.append(
+            MonocularSubmap(self._landmarks, keyframes=list(self._recent_keyframes))
+        )
+        self._initialization, self._last_frame = None, None
+        self._history.reset()
+        for frame_idx, frame, measured, of_frame in initialization.frames[:-1]:
+            self._register_frame(frame_idx, frame, measured, of_frame, known)
+        frame_idx, frame, measured, _ = initialization.frames[-1]
+        self._set_reference_keyframe(
+            self._recent_keyframes[-1],
+            measured,
+            agreeing.select(~np.isin(agreeing.landmark_ids, known)),
+        )
+        self._update_last_frame(frame.t_ns, measured, self._recent_keyframes[-1].cam_from_world)
+        self.submaps[-1].frames.append(
+            FramePose(
+                frame_idx,
+                self._recent_keyframes[-1],
+                Rigid3.identity(),
+                measured.view.view_from_cam,
+            )
+        )
+
+    def _register_frame(
+        self,
+        frame_idx: int,
+        frame: StereoFrame,
+        measured: MeasuredView,
+        tracks: Tracks,
+        known: Int[np.ndarray, " n"],
+    ) -> None:
+        """Where a frame of the beginning was, now that its points are known."""
+        first = self._recent_keyframes[0]
+        if frame_idx == first.frame_idx:
+            pose = Rigid3.identity()
+        else:
+            of_it = tracks.select(np.isin(tracks.landmark_ids, known))
+            found = self._make_step_estimator(
+                LastFrame(measured, first.cam_from_world), first, of_it, measured
+            ).estimate_pose(of_it)
+            if found is None:
+                return
+            pose = found.cam_from_world
+        self._update_last_frame(frame.t_ns, measured, pose)
+        self.submaps[-1].frames.append(
+            FramePose(
+                frame_idx, first, pose @ first.cam_from_world.inverse(), measured.view.view_from_cam
+            )
+        )
+
+    def _track_frame(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> bool:
+        """Where the frame is, by its step from the last one."""
+        step = self._estimate_step(frame, measured)
+        if step is None or self._last_frame is None or self._reference is None:
+            return False
+        untriangulated = self._make_step_estimator(
+            self._last_frame, self._reference, self._untriangulated, measured
+        ).track_points(step.cam_from_world)
+        self._tracks, self._untriangulated = step.tracks, untriangulated
+        self._update_last_frame(frame.t_ns, measured, step.cam_from_world)
+        if self._is_keyframe_due(measured):
+            self._add_keyframe(frame_idx, frame, measured, step)
+        relative = self._last_frame.cam_from_world @ self._reference.cam_from_world.inverse()
+        self.submaps[-1].frames.append(
+            FramePose(frame_idx, self._reference, relative, measured.view.view_from_cam)
+        )
+        return True
+
+    def _estimate_step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
+        prediction = self._history.predict(frame.t_ns)
+        assert self._last_frame is not None
+        assert self._reference is not None
+        step_estimator = self._make_step_estimator(
+            self._last_frame, self._reference, self._tracks, measured
+        )
+        predicted = (
+            prediction.cam_from_world if prediction is not None else self._last_frame.cam_from_world
+        )
+        return step_estimator.estimate_step(predicted) or step_estimator.estimate_step(
+            self._last_frame.cam_from_world
+        )
+
+    def _make_step_estimator(
+        self, last: LastFrame, reference: KeyFrame, tracks: Tracks, measured: MeasuredView
+    ) -> StepEstimator:
+        return StepEstimator(
+            last,
+            reference,
+            self._reference_image,
+            tracks,
+            self._landmarks,
+            measured,
+            self._config.odometry,
+        )
+
+    def _update_last_frame(self, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3) -> None:
+        moved = (
+            cam_from_world @ self._last_frame.cam_from_world.inverse()
+            if self._last_frame is not None
+            else None
+        )
+        self._history.add_pose(t_ns, cam_from_world, moved)
+        self._last_frame = LastFrame(measured, cam_from_world)
+
+    def _is_keyframe_due(self, measured: MeasuredView) -> bool:
+        assert self._reference is not None
+        tracks, config = self._tracks, self._config.odometry
+        if len(tracks.landmark_ids) < config.keyframe_share * np.count_nonzero(
+            self._reference.observations.active
+        ):
+            return True
+        motion = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
+        return bool(motion > config.keyframe_motion * measured.view.camera.width)
+
+    def _add_keyframe(
+        self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, step: Step
+    ) -> None:
+        """Make the frame a key frame: what has shown its depth becomes a landmark, new corners wait
+        for theirs, the window is adjusted."""
+        config, tracks, untriangulated = self._config.odometry, self._tracks, self._untriangulated
+        occupied = np.concatenate([tracks.points_img, untriangulated.points_img])
+        corners = find_corners(measured.view.grey, occupied, config.tracking)
+        fresh = Tracks.from_points(
+            self._landmarks.add(self._predict_positions(corners, measured, step.cam_from_world)),
+            corners,
+        )
+        seen = self._make_observations(
+            _concatenate_tracks(tracks, untriangulated, fresh), len(tracks.landmark_ids)
+        )
+        motion = Motion(self._reference, step.covariance) if self._reference is not None else None
+        keyframe = self._make_keyframe(
+            frame_idx, frame.t_ns, measured, step.cam_from_world, seen, motion
+        )
+        self._recent_keyframes.append(keyframe)
+        self.submaps[-1].keyframes.append(keyframe)
+        known = self._triangulate_tracks(
+            np.sort(untriangulated.landmark_ids), self._config.min_rays
+        )
+        free, held = (
+            self._recent_keyframes[-config.window :],
+            self._recent_keyframes[: -config.window][-config.held :],
+        )
+        adjust_bundle(free, held, self._landmarks, config.bundle)
+        del self._recent_keyframes[: -(config.window + config.held)]
+        still = untriangulated.select(~np.isin(untriangulated.landmark_ids, known))
+        still = still.select(
+            np.flatnonzero(np.isfinite(self._landmarks.positions[still.landmark_ids]).all(axis=1))
+        )
+        self._set_reference_keyframe(keyframe, measured, _concatenate_tracks(still, fresh))
+
+    def _triangulate_tracks(
+        self, ids: Int[np.ndarray, " n"], min_rays: int
+    ) -> Int[np.ndarray, " k"]:
+        """Those of the points with these ids (ascending) that have shown their depth, and are
+        landmarks now. One whose rays do not meet is no point: it has no place any more."""
+        if len(ids) == 0:
+            return ids
+        config, found = self._config, triangulate_points(self._recent_keyframes, ids)
+        clear = is_well_triangulated(
+            found, min_rays, np.deg2rad(config.min_parallax_deg), config.max_triangulation_px
+        )
+        self._landmarks.positions[ids[clear]] = found.points[clear]
+        with np.errstate(invalid="ignore"):
+            wrong = (
+                (found.num_rays >= min_rays)
+                & (found.parallax >= np.deg2rad(config.min_parallax_deg))
+                & ~clear
+            )
+        self._landmarks.positions[ids[wrong]] = np.nan
+        for keyframe in self._recent_keyframes:
+            seen = keyframe.observations
+            seen.active[np.isin(seen.landmark_ids, ids[clear])] = True
+        return ids[clear]
+
+    def _predict_positions(
+        self, corners: Float32[np.ndarray, "n 2"], measured: MeasuredView, cam_from_world: Rigid3
+    ) -> Float[np.ndarray, "n 3"]:
+        """Where corners may be, as far away as the landmarks next to them in the picture: good
+        enough to follow them."""
+        nearest = 5
+        depths = cam_from_world.apply(self._landmarks.positions[self._tracks.landmark_ids])[:, 2]
+        apart = np.linalg.norm(corners[:, None] - self._tracks.points_img[None], axis=2)
+        rows = np.argsort(apart, axis=1, kind="stable")[:, :nearest]
+        z = np.median(depths[rows], axis=1) if len(corners) else np.zeros(0)
+        normalized = measured.view.camera.normalized_from_img(corners.astype(np.float64))
+        return cam_from_world.inverse().apply(np.column_stack([normalized * z[:, None], z]))
+
+    def _make_observations(self, tracks: Tracks, num_active: int) -> Observations:
+        """What a key frame sees; only the first of the points are landmarks yet."""
+        num = len(tracks.landmark_ids)
+        weights = np.zeros((num, 3))
+        weights[:, :2] = 1.0 / self._compute_sigmas(tracks)[:, None]
+        measured = np.column_stack([tracks.points_img.astype(np.float64), np.full(num, np.nan)])
+        return Observations(tracks.landmark_ids, measured, weights, np.arange(num) < num_active)
+
+    def _compute_sigmas(self, tracks: Tracks) -> Float[np.ndarray, " n"]:
+        """Pixels; a point that is followed from here on counts as any other."""
+        unclear = np.clip(
+            (tracks.sigmas_px.astype(np.float64) / self._config.clear_px) ** 2,
+            *_SIGMA_SCALE_RANGE,
+        )
+        return self._config.odometry.sigma_px * np.where(tracks.sigmas_px > 0.0, unclear, 1.0)
+
+    def _make_keyframe(
+        self,
+        frame_idx: int,
+        t_ns: int,
+        measured: MeasuredView,
+        cam_from_world: Rigid3,
+        seen: Observations,
+        motion: Motion | None = None,
+    ) -> KeyFrame:
+        return KeyFrame(
+            0,
+            frame_idx,
+            t_ns,
+            len(self.submaps),
+            measured.stereo,
+            cam_from_world,
+            seen,
+            self._bias,
+            motion,
+        )
+
+    def _set_reference_keyframe(
+        self, keyframe: KeyFrame, measured: MeasuredView, untriangulated: Tracks
+    ) -> None:
+        seen = keyframe.observations
+        points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
+        self._tracks = Tracks.from_points(seen.landmark_ids[seen.active], points)
+        self._untriangulated = Tracks.from_points(
+            untriangulated.landmark_ids, untriangulated.points_img
+        )
+        self._reference, self._reference_image = keyframe, measured.left
+        if self._last_frame is not None:
+            self._last_frame.cam_from_world = keyframe.cam_from_world
+            self._history.update_last_pose(keyframe.cam_from_world)
+
+
+def _make_view(frame: StereoFrame, max_side_px: int) -> MeasuredView:
+    """A single picture as odometry of stereo would look at it. Its unit takes the place of the
+    baseline."""
+    view = undistort_frame(frame, max_side_px)
+    return MeasuredView(
+        view, StereoCamera(view.camera, view.camera.fx), view.grey.astype(np.float32), None
+    )
+
+
+def _concatenate_tracks(*tracks: Tracks) -> Tracks:
+    return Tracks(
+        *(
+            np.concatenate(columns)
+            for columns in zip(*(vars(each).values() for each in tracks), strict=True)
+        )
+    )
+
+
+def _empty_tracks() -> Tracks:
+    return Tracks.from_points(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))

@@ -1,0 +1,122 @@
+"""The observations of a bundle adjustment, some landmarks after the other: what is in memory at
+once has an end, however long the walk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int, Int32
+
+from topoloc.slam.keyframes import KeyFrame
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationChunk:
+    """The observations of the landmarks `first` to `last` of a bundle, sorted by landmark.
+
+    Those of landmark n are `starts[n - first]` to `starts[n - first + 1] - 1`: by which key frame
+    (`keyframe_idx`), in which row of that one's observations (`sources`), and what was measured.
+    """
+
+    first: int
+    last: int
+    starts: Int[np.ndarray, " n1"]
+    keyframe_idx: Int32[np.ndarray, " m"]
+    sources: Int32[np.ndarray, " m"]
+    measured: Float[np.ndarray, "m 3"]
+    weights: Float[np.ndarray, "m 3"]
+
+    @property
+    def rows(self) -> Int[np.ndarray, " m"]:
+        """Of each observation, its landmark, counted from `first`."""
+        return np.repeat(np.arange(self.last - self.first), np.diff(self.starts))
+
+
+class ObservationChunks:
+    """The active observations of landmarks by key frames, part by part; gone through as often as
+    one likes, and made anew each time.
+
+    Args:
+        ids: the landmarks, ascending.
+        max_observations: of a part, about.
+    """
+
+    def __init__(
+        self, keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"], max_observations: int
+    ) -> None:
+        self._keyframes, self._ids = keyframes, ids
+        self._observation_orders = [_sort_observations(keyframe, ids) for keyframe in keyframes]
+        num_parts = -(-self.num_observations // max_observations)
+        self._chunk_bounds = np.linspace(0, len(ids), num_parts + 1).astype(np.int64)
+        ends = ids[self._chunk_bounds[1:] - 1] + 1 if num_parts else ids[:0]
+        seen = [
+            k.observations.landmark_ids[order]
+            for k, order in zip(keyframes, self._observation_orders, strict=True)
+        ]
+        self._observation_offsets: Int[np.ndarray, "k p1"] = np.array(
+            [np.searchsorted(one, np.r_[0, ends]) for one in seen]
+        )
+
+    @property
+    def num_observations(self) -> int:
+        return sum(map(len, self._observation_orders))
+
+    def __iter__(self) -> Iterator[ObservationChunk]:
+        if len(self._chunk_bounds) == 2:
+            yield self._single_chunk
+            return
+        for number in range(len(self._chunk_bounds) - 1):
+            yield self._make_chunk(number)
+
+    @cached_property
+    def _single_chunk(self) -> ObservationChunk:
+        return self._make_chunk(0)
+
+    def _make_chunk(self, number: int) -> ObservationChunk:
+        first, last = self._chunk_bounds[number : number + 2].tolist()
+        seeing = np.flatnonzero(
+            self._observation_offsets[:, number + 1] > self._observation_offsets[:, number]
+        ).tolist()
+        sources = [
+            self._observation_orders[k][
+                self._observation_offsets[k, number] : self._observation_offsets[k, number + 1]
+            ]
+            for k in seeing
+        ]
+        seen = [self._keyframes[k].observations for k in seeing]
+        ids = np.concatenate(
+            [one.landmark_ids[rows] for one, rows in zip(seen, sources, strict=True)]
+        )
+        rows = np.searchsorted(self._ids[first:last], ids)
+        order = np.argsort(rows, kind="stable")
+        weights = np.concatenate(
+            [one.weights[rows] for one, rows in zip(seen, sources, strict=True)]
+        )[order]
+        measured = np.concatenate(
+            [one.measured[rows] for one, rows in zip(seen, sources, strict=True)]
+        )[order]
+        return ObservationChunk(
+            first,
+            last,
+            starts=np.searchsorted(rows[order], np.arange(last - first + 1)),
+            keyframe_idx=np.repeat(np.array(seeing, np.int32), [len(rows) for rows in sources])[
+                order
+            ],
+            sources=np.concatenate(sources)[order],
+            measured=np.where(weights > 0.0, measured, 0.0).astype(np.float64),
+            weights=weights.astype(np.float64),
+        )
+
+
+def _sort_observations(keyframe: KeyFrame, ids: Int[np.ndarray, " n"]) -> Int32[np.ndarray, " m"]:
+    """The rows of its active observations of these landmarks, by landmark."""
+    seen = keyframe.observations
+    if not len(ids):
+        return np.zeros(0, np.int32)
+    place = np.searchsorted(ids, seen.landmark_ids)
+    place[place == len(ids)] = 0
+    rows = np.flatnonzero(seen.active & (ids[place] == seen.landmark_ids))
+    return rows[np.argsort(seen.landmark_ids[rows], kind="stable")].astype(np.int32)

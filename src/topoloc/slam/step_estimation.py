@@ -1,0 +1,306 @@
+"""One step of the camera, from the last frame to the next: points followed, robust PnP. And which
+other steps would do as well.
+
+Where a wall repeats itself, the points of one panel are found on the next one just as well. That is
+not seen in the step that was found: it is seen by seeking from other places too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from topoloc.bounds import Above, AtLeast, Between
+from topoloc.features.parallel import parallel_map
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.stereo import ray_covariances
+from topoloc.points.disparity import DisparityConfig, MeasuredView, StereoCamera
+from topoloc.points.point_tracking import TrackingConfig, align_with_reference, track_points
+from topoloc.slam.bundle_adjustment import BundleConfig
+from topoloc.slam.keyframes import KeyFrame, Landmarks
+from topoloc.slam.motion_prediction import Prediction, PredictionConfig
+from topoloc.slam.place_matching import PlaceMatchingConfig
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """When a frame is tracked, and when it becomes a key frame."""
+
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    prediction: PredictionConfig = field(default_factory=PredictionConfig)
+    disparity: DisparityConfig = field(default_factory=DisparityConfig)
+    pose: AbsolutePoseConfig = field(
+        default_factory=lambda: AbsolutePoseConfig(
+            max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20
+        )
+    )
+    bundle: BundleConfig = field(default_factory=BundleConfig)
+    places: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
+    sigma_px: Annotated[float, Above(0)] = 0.3
+    """Standard deviation of a tracked point."""
+    sigma_bias_px: Annotated[float, Above(0)] = 1.0
+    """How wrong all disparities together may be before the recording has shown by how much."""
+    min_disparity_px: Annotated[float, Above(0)] = 0.5
+    """What seems further away than this becomes no landmark."""
+    sigma_landmark_px: Annotated[float, Above(0)] = 0.25
+    """Uncertainty of a landmark's depth, as a disparity."""
+    window: Annotated[int, Between(1, 1000)] = 8
+    """Key frames that are adjusted together."""
+    held: Annotated[int, Between(0, 1000)] = 5
+    """Key frames before these that hold them in place."""
+    min_tracked: Annotated[int, AtLeast(4)] = 25
+    """Points that agree on a pose; a frame with fewer is lost."""
+    min_tracked_share: Annotated[float, Between(0, 1)] = 0.35
+    """Share of the points followed that must agree; a frame with fewer is lost."""
+    keyframe_share: Annotated[float, Between(0, 1)] = 0.7
+    """A key frame is due when so few of the last one's points are left."""
+    keyframe_motion: Annotated[float, Above(0)] = 0.03
+    """... or when they have moved in the picture by this share of its width (median)."""
+    min_gap_share: Annotated[float, Between(0, 1)] = 0.5
+    """After a gap, a step that the motion does not let expect is believed where this share of the
+    points is found again."""
+    start_spacing_px: Annotated[float, Above(0)] = 25.0
+    """Whether the last picture looks alike from elsewhere is tried from places this far apart
+    (median over the points) ..."""
+    max_starts: Annotated[int, Between(0, 1000)] = 16
+    """... so many to either side along the motion at most, ..."""
+    repeat_depth: Annotated[float, AtLeast(0)] = 1.0
+    """... and as far as this share of the median depth, as the way since the last frame, or as the
+    prediction is uncertain."""
+    repeat_share: Annotated[float, Between(0, 1)] = 0.3
+    """It does where this share of the points that should be in the picture agree."""
+    max_repeats: Annotated[int, Between(0, 1000)] = 8
+    """A step may then be off by so many of these repeats."""
+    same_step: Annotated[float, Above(0)] = 0.04
+    """Steps that differ by less than this share of the median depth, and radians, are the same."""
+    max_lost_tracked: Annotated[int, AtLeast(0)] = 3
+    """The points of the last frame that was tracked are sought in so many more."""
+    max_lost_frames: Annotated[int, AtLeast(0)] = 10
+    """A camera that is lost for longer starts a new sub-map, from the first of these frames on that
+    the others follow."""
+    places_asked: Annotated[int, Between(0, 1000)] = 6
+    """The last places in which a camera that is lost is sought."""
+    place_distance: Annotated[float, AtLeast(0)] = 0.1
+    """A key frame keeps what it looks like (for loops) when it is this share of the median depth
+    from the last that did ..."""
+    place_angle_deg: Annotated[float, AtLeast(0)] = 8.0
+    """... or turned by this angle."""
+
+
+@dataclass(eq=False)
+class Tracks:
+    """The points being followed: where they are in the last frame, where in the last key frame,
+    their landmarks, and by how much the first are uncertain, by what does not look alike
+    (pixels)."""
+
+    landmark_ids: Int[np.ndarray, " n"]
+    points_img: Float32[np.ndarray, "n 2"]
+    points_ref: Float32[np.ndarray, "n 2"]
+    sigmas_px: Float32[np.ndarray, " n"]
+
+    @classmethod
+    def from_points(
+        cls, landmark_ids: Int[np.ndarray, " n"], points_img: Float32[np.ndarray, "n 2"]
+    ) -> Tracks:
+        """Points that are followed from here on."""
+        return cls(landmark_ids, points_img, points_img, np.zeros(len(points_img), np.float32))
+
+    def select(self, rows: np.ndarray) -> Tracks:
+        return Tracks(
+            self.landmark_ids[rows],
+            self.points_img[rows],
+            self.points_ref[rows],
+            self.sigmas_px[rows],
+        )
+
+
+@dataclass(eq=False)
+class LastFrame:
+    """The frame before."""
+
+    measured: MeasuredView
+    cam_from_world: Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A pose that enough points agree on. `inlier_ratio` is that of the points that should be in
+    the picture."""
+
+    cam_from_world: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    tracks: Tracks
+    inlier_ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class StepEstimator:
+    """What is followed from the last frame into the next one, `measured`."""
+
+    last: LastFrame
+    reference: KeyFrame
+    reference_image: Float32[np.ndarray, "h w"]
+    tracks: Tracks
+    landmarks: Landmarks
+    measured: MeasuredView
+    config: OdometryConfig
+
+    def estimate_step(self, predicted: Rigid3) -> Step | None:
+        """The step that is found from a predicted cam_from_world."""
+        tracks = self.track_points(predicted)
+        pose = self.estimate_pose(tracks)
+        if pose is None:
+            return None
+        should = max(int(np.count_nonzero(self._is_in_image(pose.cam_from_world))), 1)
+        inlier_ratio = min(np.count_nonzero(pose.inliers) / should, 1.0)
+        return Step(pose.cam_from_world, pose.covariance, tracks.select(pose.inliers), inlier_ratio)
+
+    def find_repeated_motions(self, prediction: Prediction) -> list[Rigid3]:
+        """What moves a camera to where the last picture would look the same; nothing where nothing
+        repeats itself."""
+        itself, last = replace(self, measured=self.last.measured), self.last.cam_from_world
+        steps = parallel_map(itself.estimate_step, self._sample_start_poses(last, prediction))
+        shifts = [
+            step.cam_from_world @ last.inverse()
+            for step in steps
+            if step is not None and step.inlier_ratio > self.config.repeat_share
+        ]
+        shifts = [shift for shift in shifts if not self.is_close(shift, Rigid3.identity())]
+        if not shifts:
+            return []
+        least = min(shifts, key=lambda shift: float(np.linalg.norm(shift.translation))).log()
+        return [
+            Rigid3.exp(k * least)
+            for k in range(-self.config.max_repeats, self.config.max_repeats + 1)
+            if k
+        ]
+
+    def _sample_start_poses(self, centre: Rigid3, prediction: Prediction) -> list[Rigid3]:
+        """Places around one along the predicted motion, as far apart as points are found again."""
+        config = self.config
+        direction = prediction.step.log()
+        way = float(np.linalg.norm(direction[:3]))
+        if way < 1e-6:
+            direction, way = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 1.0
+        direction = np.concatenate([direction[:3] / way, np.zeros(3)])
+        apart = self._compute_start_spacing(centre, direction)
+        sigma = prediction.sigma if np.isfinite(prediction.sigma) else 0.0
+        moved = float(np.linalg.norm(prediction.step.translation))
+        reach = max(
+            config.prediction.max_sigmas * sigma, moved, config.repeat_depth * self._median_depth()
+        )
+        num = min(int(np.ceil(reach / apart)), config.max_starts)
+        return [Rigid3.exp(k * apart * direction) @ centre for k in range(-num, num + 1) if k]
+
+    def _compute_start_spacing(
+        self, cam_from_world: Rigid3, direction: Float[np.ndarray, "6"]
+    ) -> float:
+        """How far along a direction the points move by what one step of tracking covers."""
+        points = self.landmarks.positions[self.tracks.landmark_ids]
+        little = 0.01 * self._median_depth()
+        poses = (cam_from_world, Rigid3.exp(little * direction) @ cam_from_world)
+        here, there = (self.measured.stereo.project(pose.apply(points))[:, :2] for pose in poses)
+        moved = np.linalg.norm(there - here, axis=1)
+        moved = moved[np.isfinite(moved)]
+        pixels = float(np.median(moved)) if len(moved) else 0.0
+        return little * self.config.start_spacing_px / max(pixels, 1e-3)
+
+    def _median_depth(self) -> float:
+        """Median depth of the points in the last frame."""
+        points = self.last.cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids])
+        return float(np.median(points[:, 2])) if len(points) else 1.0
+
+    def is_close(self, a: Rigid3, b: Rigid3) -> bool:
+        """Whether two cam_from_world are one place."""
+        away = a @ b.inverse()
+        return bool(
+            np.linalg.norm(away.translation) < self.config.same_step * self._median_depth()
+            and away.angle() < self.config.same_step
+        )
+
+    def _is_in_image(self, cam_from_world: Rigid3) -> np.ndarray:
+        camera = self.measured.stereo.camera
+        points = self.measured.stereo.project(
+            cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids])
+        )
+        with np.errstate(invalid="ignore"):
+            return np.all(
+                (points[:, :2] > 8.0) & (points[:, :2] < [camera.width - 9.0, camera.height - 9.0]),
+                axis=1,
+            )
+
+    def track_points(self, predicted: Rigid3) -> Tracks:
+        """The points found again from a predicted cam_from_world, where they look as in the last
+        key frame."""
+        config, tracks, measured = self.config.tracking, self.tracks, self.measured
+        points_world = self.landmarks.positions[tracks.landmark_ids]
+        before, after = (
+            measured.stereo.project(pose.apply(points_world))[:, :2]
+            for pose in (self.last.cam_from_world, predicted)
+        )
+        limit = np.array([measured.view.camera.width, measured.view.camera.height]) / 2.0
+        guesses = (
+            tracks.points_img + np.clip(np.nan_to_num(after - before), -limit, limit)
+        ).astype(np.float32)
+        found, is_found = track_points(
+            self.last.measured.view.grey, measured.view.grey, tracks.points_img, guesses, config
+        )
+        tracks = replace(tracks, points_img=found).select(is_found)
+        scales = self._patch_scales(tracks.landmark_ids, predicted)
+        found = align_with_reference(
+            self.reference_image,
+            measured.left,
+            tracks.points_ref,
+            tracks.points_img,
+            scales,
+            config,
+        )
+        return replace(tracks, points_img=found.points_img, sigmas_px=found.sigmas_px).select(
+            found.is_matched
+        )
+
+    def _patch_scales(
+        self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3
+    ) -> Float32[np.ndarray, " n"]:
+        """How much larger each landmark's surroundings look than in the last key frame: what is
+        approached grows."""
+        points_world = self.landmarks.positions[landmark_ids]
+        before, now = (
+            pose.apply(points_world)[:, 2] for pose in (self.reference.cam_from_world, predicted)
+        )
+        return np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32)
+
+    def estimate_pose(self, tracks: Tracks) -> AbsolutePose | None:
+        """The pose that enough of the points agree on."""
+        config, stereo = self.config, self.measured.stereo
+        if len(tracks.landmark_ids) < config.min_tracked:
+            return None
+        points_world = self.landmarks.positions[tracks.landmark_ids]
+        pose = estimate_absolute_pose(
+            tracks.points_img.astype(np.float64),
+            points_world,
+            stereo.camera,
+            config.pose,
+            point_covariances=self._landmark_covariances(points_world, stereo),
+        )
+        if pose is None:
+            return None
+        num_inliers = int(np.count_nonzero(pose.inliers))
+        enough = max(config.min_tracked, config.min_tracked_share * len(tracks.landmark_ids))
+        return pose if num_inliers >= enough else None
+
+    def _landmark_covariances(
+        self, points_world: Float[np.ndarray, "n 3"], stereo: StereoCamera
+    ) -> Float[np.ndarray, "n 3 3"]:
+        """In the world's axes, as the last key frame measured them."""
+        rotation = self.reference.cam_from_world.rotation
+        points_cam = self.reference.cam_from_world.apply(points_world)
+        sigma_z = self.config.sigma_landmark_px * points_cam[:, 2] ** 2 / stereo.bf
+        covariances = ray_covariances(
+            points_cam, sigma_z, stereo.camera, np.full(len(points_cam), 0.1)
+        )
+        return rotation.T @ covariances @ rotation

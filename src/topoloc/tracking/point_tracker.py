@@ -1,0 +1,216 @@
+"""Points of the map followed from picture to picture, between two pictures that were localized in
+full.
+
+The points that a full localization stands on are sought again by Lucas and Kanade's method and
+aligned with their patch in that picture (`slam/tracking.py`). The pose is that of the localized
+picture, moved by what the points say of the motion since. For this the points are put where that
+picture, at its pose, shows them, at the depth that the map gives: what the map is wrong by is the
+same before and after the motion, and only wrong depths are left to disturb it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from topoloc.bounds import AtLeast, Between
+from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.stereo import ray_covariances
+from topoloc.localization.pose_fit import PointObservations
+from topoloc.points.point_tracking import TrackingConfig, align_with_reference, track_points
+
+# Where a point lies beside its ray: the pixel defines the ray, so this only keeps the covariance
+# regular.
+_RAY_SIGMA_PX = 0.1
+
+
+@dataclass(frozen=True)
+class PointTrackerConfig:
+    """Which points are followed, and when they are too few."""
+
+    max_points: Annotated[int, Between(4, 100_000)] = 320
+    """Points followed, spread over the picture: more cost time and add little."""
+    min_points: Annotated[int, AtLeast(4)] = 20
+    """Points that agree on a pose; with fewer it is not believed."""
+    min_agreeing: Annotated[float, Between(0, 1)] = 0.6
+    """Share of the points found again that must agree."""
+    tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=4.0))
+    pose: AbsolutePoseConfig = field(
+        default_factory=lambda: AbsolutePoseConfig(
+            max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedMotion:
+    """Where a picture was taken, relative to the localized one; `covariance` is of the left
+    perturbation of `cam_from_ref` (m, rad)."""
+
+    cam_from_ref: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    num_tracked: int
+    num_inliers: int
+    tracked_ratio: float
+    """Of the points that there were at first, those that agree."""
+    shift_px: float
+    """How far they have moved in the picture since (median)."""
+
+
+class PointTracker:
+    """Holds the localized picture, its points, and where they were last seen."""
+
+    def __init__(
+        self,
+        grey: UInt8[np.ndarray, "h w"],
+        inlier_points: PointObservations,
+        cam_from_world: Rigid3,
+        camera: Camera,
+        config: PointTrackerConfig,
+    ):
+        self._config, self._camera, self._cam_from_world = config, camera, cam_from_world
+        inlier_points = _move_onto_rays(
+            _select_spread_points(inlier_points, camera, config.max_points), cam_from_world, camera
+        )
+        self._inlier_points = inlier_points
+        self._reference = grey.astype(np.float32)
+        self._last_grey, self._last_points_img, self._rows = (
+            grey,
+            inlier_points.points_img,
+            np.arange(len(inlier_points)),
+        )
+        self._last_from_world = cam_from_world
+
+    @property
+    def camera(self) -> Camera:
+        return self._camera
+
+    def track_points(
+        self, grey: UInt8[np.ndarray, "h w"], predicted_pose: Rigid3
+    ) -> TrackedMotion | None:
+        """The motion up to this picture, taken at about `predicted_pose` (cam_from_world); None
+        where the points are lost."""
+        for initial_pose in (predicted_pose, self._last_from_world):
+            rows, points_img = self._find_points(grey, initial_pose)
+            pose = self._estimate_pose(points_img, rows)
+            if pose is not None:
+                break
+        else:
+            return None
+        agreeing = rows[pose.inliers]
+        self._last_grey, self._last_points_img, self._rows = (
+            grey,
+            points_img[pose.inliers],
+            agreeing,
+        )
+        self._last_from_world = pose.cam_from_world
+        return TrackedMotion(
+            cam_from_ref=pose.cam_from_world @ self._cam_from_world.inverse(),
+            covariance=pose.covariance,
+            num_tracked=len(rows),
+            num_inliers=len(agreeing),
+            tracked_ratio=len(agreeing) / len(self._inlier_points),
+            shift_px=float(
+                np.median(
+                    np.linalg.norm(
+                        self._last_points_img - self._inlier_points.points_img[agreeing], axis=1
+                    )
+                )
+            ),
+        )
+
+    def _find_points(
+        self, grey: UInt8[np.ndarray, "h w"], initial_pose: Rigid3
+    ) -> tuple[np.ndarray, Float32[np.ndarray, "n 2"]]:
+        """Rows of the points found again, and where."""
+        points_world = self._inlier_points.points_world[self._rows]
+        before, after = (
+            self._camera.img_from_cam(pose.apply(points_world))
+            for pose in (self._last_from_world, initial_pose)
+        )
+        limit = np.array([self._camera.width, self._camera.height]) / 2.0
+        guesses = (
+            self._last_points_img + np.clip(np.nan_to_num(after - before), -limit, limit)
+        ).astype(np.float32)
+        found, is_found = track_points(
+            self._last_grey, grey, self._last_points_img, guesses, self._config.tracking
+        )
+        rows, found = self._rows[is_found], found[is_found]
+        depths = [
+            pose.apply(self._inlier_points.points_world[rows])[:, 2]
+            for pose in (self._cam_from_world, initial_pose)
+        ]
+        scales = np.clip(depths[0] / np.maximum(depths[1], 1e-3), 0.5, 2.0).astype(np.float32)
+        points_ref = self._inlier_points.points_img[rows]
+        aligned = align_with_reference(
+            self._reference,
+            grey.astype(np.float32),
+            points_ref,
+            found,
+            scales,
+            self._config.tracking,
+        )
+        return rows[aligned.is_matched], aligned.points_img[aligned.is_matched]
+
+    def _estimate_pose(
+        self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray
+    ) -> AbsolutePose | None:
+        """The pose that enough of the points agree on, found anew: from a prediction that is off
+        the refinement may not get there."""
+        config = self._config
+        if len(rows) < config.min_points:
+            return None
+        pose = estimate_absolute_pose(
+            points_img.astype(np.float64), self._inlier_points.points_world[rows],
+            self._camera, config.pose,
+            point_covariances=self._inlier_points.covariances[rows],
+        )  # fmt: skip
+        enough = max(config.min_points, config.min_agreeing * len(rows))
+        return pose if pose is not None and np.count_nonzero(pose.inliers) >= enough else None
+
+
+def _move_onto_rays(
+    inlier_points: PointObservations, cam_from_world: Rigid3, camera: Camera
+) -> PointObservations:
+    """The points moved onto the rays of their pixels; their covariance is that of the depth."""
+    depths = cam_from_world.apply(inlier_points.points_world)[:, 2]
+    rays = np.column_stack(
+        [
+            camera.normalized_from_img(inlier_points.points_img.astype(np.float64)),
+            np.ones(len(inlier_points)),
+        ]
+    )
+    points_cam = rays * depths[:, None]
+    axis = cam_from_world.rotation[2]
+    sigma_z = np.sqrt(
+        np.maximum(np.einsum("i,nij,j->n", axis, inlier_points.covariances, axis), 0.0)
+    )
+    covariances = ray_covariances(
+        points_cam, sigma_z, camera, np.full(len(inlier_points), _RAY_SIGMA_PX)
+    )
+    rotation = cam_from_world.rotation
+    return PointObservations(
+        inlier_points.points_img,
+        cam_from_world.inverse().apply(points_cam),
+        rotation.T @ covariances @ rotation,
+    )
+
+
+def _select_spread_points(
+    inlier_points: PointObservations, camera: Camera, max_points: int
+) -> PointObservations:
+    """At most so many of the points, taken in turn from the cells of a grid."""
+    if len(inlier_points) <= max_points:
+        return inlier_points
+    cells = np.floor(inlier_points.points_img / [camera.width / 8.0, camera.height / 6.0]).astype(
+        np.int64
+    ) @ [1, 8]
+    order = np.argsort(cells, kind="stable")
+    starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    turns = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
+    return inlier_points.select(np.sort(order[np.argsort(turns, kind="stable")[:max_points]]))

@@ -1,0 +1,198 @@
+"""Where a picture of a stream was taken, in full: the localizer's answer, weighed against what is
+believed so far."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.evidence import compute_precision_probability
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.pose_fit import PointObservations
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.tracking.pose_errors import PoseErrors, compute_pose_errors
+from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses, is_same_pose
+from topoloc.tracking.tracker_state import StreamFrame
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedPose:
+    """About where the picture was taken, and what that is wrong by beside what the filter knows of
+    (covariance, left, of cam_from_world).
+
+    Who asks around there alone finds only what is there; `is_unique` where nothing else is likely.
+    `is_from_virtual_views`: nodes around do not look this way, so that they know nothing of the
+    picture.
+    """
+
+    world_from_cam: Rigid3
+    pose_covariance: Float[np.ndarray, "6 6"]
+    is_unique: bool
+    is_tracked: bool = False
+    is_from_virtual_views: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedPose:
+    """A pose that the picture may have, with its probability, the points that it stands on, and
+    what it is wrong by."""
+
+    result: Localization
+    inlier_points: PointObservations
+    errors: PoseErrors
+    probability: float
+
+
+class StreamLocalizer:
+    """Asks the localizer and weighs what it answers."""
+
+    def __init__(
+        self, localizer: Localizer, hypotheses: PoseHypotheses, floor_share: float
+    ) -> None:
+        self._localizer, self._hypotheses, self._floor_share = localizer, hypotheses, floor_share
+        self._last_ambiguous_pose: Rigid3 | None = (
+            None  # where the last ambiguous picture was taken
+        )
+
+    def localize(
+        self, frame: StreamFrame, expected: ExpectedPose | None
+    ) -> LocalizedPose | NotLocalized:
+        """What is believed of this picture, or why nothing is: around what is expected, then in all
+        of the map."""
+        pose_covariance = np.zeros((6, 6)) if expected is None else expected.pose_covariance
+        refusal, found = None, list[LocalizedPose]()
+        if expected is not None and expected.is_unique:
+            refusal, found = self._query_localizer(frame, expected.world_from_cam)
+            if refusal is not None and expected.is_tracked:
+                if not expected.is_from_virtual_views:
+                    self._hypotheses.update_weights(frame.t_ns, [])
+                return refusal
+        if len(found) != 1 or not self._is_consistent(found[0], pose_covariance):
+            refusal, found = self._localize_globally(frame)
+        candidates = [
+            Candidate(
+                one.result.world_from_cam,
+                one.errors.total + pose_covariance,
+                one.probability,
+                one.result.node_id,
+            )
+            for one in found
+        ]
+        self._hypotheses.update_weights(
+            frame.t_ns, candidates, frame.odom_from_cam, self._compute_new_evidence(found)
+        )
+        if self._hypotheses.candidate_idx is not None:
+            return found[self._hypotheses.candidate_idx]
+        return refusal or reject_jump(found[0].result)
+
+    def _compute_new_evidence(self, found: list[LocalizedPose]) -> float:
+        """How much of what a picture says that is not sure is new since the one before that was
+        not."""
+        best, before, config = (
+            self._hypotheses.best,
+            self._last_ambiguous_pose,
+            self._hypotheses.config,
+        )
+        if not found or best is None or found[0].probability >= 1.0 - config.miss:
+            return 1.0
+        self._last_ambiguous_pose = best.world_from_cam
+        if before is None or not self._hypotheses.is_track_continued:
+            return 1.0
+        moved = before.inverse() @ best.world_from_cam
+        depth = float(np.median([one.errors.depth for one in found]))
+        way = float(np.linalg.norm(moved.translation)) / depth + moved.angle()
+        return 1.0 - math.exp(-way / (config.renewal if len(found) > 1 else config.renewal_alone))
+
+    def _localize_globally(
+        self, frame: StreamFrame
+    ) -> tuple[NotLocalized | None, list[LocalizedPose]]:
+        """As `_query_localizer` in all of the map. Where that does not settle it, also around each
+        hypothesis that the answer leaves out: of many poses that look alike a search finds some.
+        What it left out is at most as likely as the others are in the mean.
+        """
+        refusal, found = self._query_localizer(frame, None)
+        if refusal is None:
+            return refusal, found
+        missed: list[LocalizedPose] = []
+        for hypothesis in self._hypotheses.alternatives()[: self._hypotheses.config.max_asked]:
+            if not _is_known_pose(hypothesis.world_from_cam, [*found, *missed]):
+                around = self._query_localizer(frame, hypothesis.world_from_cam)[1]
+                missed += [
+                    one
+                    for one in around
+                    if not _is_known_pose(one.result.world_from_cam, [*found, *missed])
+                ]
+        total = len(found) + len(missed)
+        found = [replace(one, probability=one.probability * len(found) / total) for one in found]
+        return refusal, found + [
+            replace(one, probability=one.probability / total) for one in missed
+        ]
+
+    def _is_consistent(
+        self, found: LocalizedPose, pose_covariance: Float[np.ndarray, "6 6"]
+    ) -> bool:
+        best = self._hypotheses.best
+        return best is not None and self._hypotheses.is_consistent(
+            best, found.result.world_from_cam, found.errors.total + pose_covariance
+        )
+
+    def _query_localizer(
+        self, frame: StreamFrame, near: Rigid3 | None
+    ) -> tuple[NotLocalized | None, list[LocalizedPose]]:
+        """The poses that the picture may have: one, the alternatives of an ambiguous one, or none
+        and why."""
+        result, named = self._localizer.localize_with_inliers(frame.image, frame.camera, near)
+        if isinstance(result, NotLocalized):
+            return result, [
+                self._to_localized_pose(one, inlier_points, one.probability)
+                for one, inlier_points in named
+            ]
+        return None, [
+            self._to_localized_pose(
+                one, inlier_points, min(_place_probability(one), 1.0 - self._hypotheses.config.miss)
+            )
+            for one, inlier_points in named
+        ]
+
+    def _to_localized_pose(
+        self, result: Localization, inlier_points: PointObservations, probability: float
+    ) -> LocalizedPose:
+        depth = float(
+            np.median(result.world_from_cam.inverse().apply(inlier_points.points_world)[:, 2])
+        )
+        return LocalizedPose(
+            result,
+            inlier_points,
+            compute_pose_errors(result, depth, self._floor_share),
+            probability,
+        )
+
+
+def _place_probability(found: Localization) -> float:
+    """The probability of the place: that of the answer is also that of being precise, which says
+    nothing of other places."""
+    return (
+        found.probability
+        if found.evidence is None
+        else min(found.probability / compute_precision_probability(found.evidence), 1.0)
+    )
+
+
+def _is_known_pose(world_from_cam: Rigid3, found: list[LocalizedPose]) -> bool:
+    return any(is_same_pose(one.result.world_from_cam, world_from_cam) for one in found)
+
+
+def reject_jump(found: Localization) -> NotLocalized:
+    """A pose that the motion does not allow for."""
+    return NotLocalized(
+        "jump",
+        found.candidates,
+        found.num_matches,
+        found.num_inliers,
+        found.times_ms,
+        provenance=found.provenance,
+    )

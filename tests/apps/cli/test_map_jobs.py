@@ -1,0 +1,73 @@
+"""What decides what a map looks like, as one digest."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
+from topoloc.apps.cli.output import UsageError
+from topoloc.errors import RecordingError
+from topoloc.mapping.build import BuildConfig
+from topoloc.slam.slam import SlamConfig
+
+
+@pytest.fixture
+def making(recording: Path) -> MapJob:
+    return MapJob((str(recording),), PoseOptions(), BuildConfig(), SlamConfig())
+
+
+def test_it_stays_where_it_is_sent(making: MapJob):
+    assert (
+        pickle.loads(pickle.dumps(making)).digest() == making.digest() == replace(making).digest()
+    )
+
+
+def test_whatever_decides_changes_it(
+    making: MapJob, recording: Path, monkeypatch: pytest.MonkeyPatch
+):
+    poses = recording / "other.tum"
+    poses.write_text("0 0 0 0 0 0 0 1\n")
+    digests = [
+        making.digest(),
+        replace(making, recordings=(f"{recording}@0:5",)).digest(),
+        replace(making, build=BuildConfig(max_node_points=500)).digest(),
+        replace(making, camera="500,500,160,120").digest(),
+        replace(making, asked=PoseOptions(("slam",))).digest(),
+        replace(making, asked=PoseOptions((str(poses),))).digest(),
+    ]
+    poses.write_text("0 1 1 1 0 0 0 1\n0 0 0 0 0 0 0 1\n")
+    digests.append(replace(making, asked=PoseOptions((str(poses),))).digest())
+    picture = next((recording / "image_0").iterdir())
+    os.utime(picture, ns=(1, 1))
+    digests.append(making.digest())
+    picture.unlink()
+    digests.append(making.digest())
+    monkeypatch.setattr("topoloc.__version__", "9.9", raising=False)
+    digests.append(making.digest())
+    assert len(set(digests)) == len(digests)
+
+
+def test_no_such_recording(making: MapJob, tmp_path: Path):
+    with pytest.raises(RecordingError, match="no such file"):
+        replace(making, recordings=(str(tmp_path / "nothing@0:5"),)).digest()
+
+
+def test_one_each(making: MapJob):
+    three = replace(making, recordings=("a", "b", "c"))
+    assert [one.recordings for one in three.split_by_recording()] == [("a",), ("b",), ("c",)]
+    given = [
+        one.asked.trajectory
+        for one in replace(three, asked=PoseOptions(("x", "y", "z"))).split_by_recording()
+    ]
+    assert given == [("x",), ("y",), ("z",)]
+    assert [
+        one.asked.trajectory
+        for one in replace(three, asked=PoseOptions(("slam",))).split_by_recording()
+    ] == [("slam",)] * 3
+    with pytest.raises(UsageError, match="3 recordings but 2 trajectories"):
+        replace(three, asked=PoseOptions(("x", "y"))).split_by_recording()

@@ -1,0 +1,55 @@
+"""What the demo says of its results follows from them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from topoloc.demo.report_texts import describe_night, describe_out_of_map
+
+
+def _row(
+    name: str, num: int, localized: int, false: int = 0, num_elsewhere: int = 0
+) -> dict[str, Any]:
+    reasons = {"not_in_map": num - localized} if num > localized else {}
+    medians = {
+        "median_translation_m": 0.012 if localized else None,
+        "median_rotation_deg": 0.3 if localized else None,
+    }
+    return {
+        "name": name,
+        "num_queries": num,
+        "num_localized": localized,
+        "false_accepts": false,
+        "num_elsewhere": num_elsewhere,
+        "not_localized": reasons,
+        **medians,
+    }
+
+
+@pytest.mark.parametrize(
+    ("night", "said"),
+    [
+        (_row("night", 40, 40), "100 % get a pose, by day 100 %; the median error is 1.20 cm and 0.30 degrees instead of 1.20 cm"),  # noqa: E501
+        (_row("night", 40, 30), '75 % get a pose, by day 100 %; the median error is 1.20 cm and 0.30 degrees instead of 1.20 cm and 0.30 '  # noqa: E501
+         'degrees. 10 are answered with "not localized" (10 not in map). No pose is wrong.'),
+        (_row("night", 40, 0), '0 % get a pose, by day 100 %. 40 are answered with "not localized" (40 not in map). No pose is wrong.'),  # noqa: E501
+        (_row("night", 40, 39, false=1), '1 is answered with "not localized" (1 not in map). 1 pose is '  # noqa: E501
+         'wrong by more than 0.5 m or 10 degrees.'),
+    ],
+    ids=["as by day", "some lost", "all lost", "one wrong"],
+)  # fmt: skip
+def test_the_cost_of_the_night_is_told_as_it_is(night: dict[str, Any], said: str):
+    assert said in describe_night({"recordings": [_row("day", 20, 20), night]})
+
+
+@pytest.mark.parametrize(
+    ("false", "said"), [(0, "none is given a pose"), (2, "2 wrongly get a pose")]
+)
+def test_wrong_acceptances_are_told(false: int, said: str):
+    evaluation = {
+        "num_elsewhere": 30,
+        "recordings": [_row("day", 20, 20), _row("elsewhere", 0, 0, false, 30)],
+    }
+    assert said in describe_out_of_map(evaluation)

@@ -1,0 +1,78 @@
+"""What an edit costs the sessions that the map already has, and that its history tells it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from topoloc import TopoMetricMap
+from topoloc.apps.cli import main
+from topoloc.lifelong.prune import select_landmarks
+from topoloc.lifelong.recall_change import describe_recall_change, measure_recall_change
+
+
+def test_a_map_that_lost_its_landmarks_localizes_fewer_of_its_earlier_nodes(room_map: Path):
+    with TopoMetricMap.load(room_map) as topomap:
+        nodes = [select_landmarks(node, np.arange(3)) for node in topomap.nodes]
+        poorer = replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes])
+        counts = measure_recall_change(topomap, poorer, 4)
+        assert measure_recall_change(topomap, poorer, 0) == {}
+    assert counts == {
+        "earlier_asked": 4,
+        "earlier_localized_before": 4,
+        "earlier_localized_after": 0,
+    }
+    assert (
+        describe_recall_change(counts)
+        == "of 4 earlier nodes, each asked without itself, 4 localized before and 0 after"
+    )
+    assert describe_recall_change({"landmarks_gone": 3}) is None
+
+
+def test_the_history_tells_it(room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path, settings = Path(shutil.copy(room_map, tmp_path / "room.topo")), tmp_path / "prune.toml"
+    settings.write_text("[prune]\nearlier_asked = 3\n")
+    assert (
+        main(
+            [
+                "prune",
+                str(path),
+                "--max-mb",
+                f"{0.8 * path.stat().st_size / 1e6:.4f}",
+                "--config",
+                str(settings),
+            ]
+        )
+        == 0
+    )
+    capsys.readouterr()
+    assert main(["history", str(path)]) == 0
+    assert (
+        "of 3 earlier nodes, each asked without itself, 3 localized before and 3 after"
+        in capsys.readouterr().out
+    )
+    assert main(["history", str(path), "--json", "-"]) == 0
+    assert (
+        json.loads(capsys.readouterr().out)["edits"][-1]["changes"]["earlier_localized_after"] == 3
+    )
+    settings.write_text("[prune]\nearlier_asked = 0\n")
+    assert (
+        main(
+            [
+                "prune",
+                str(path),
+                "--max-mb",
+                f"{0.7 * path.stat().st_size / 1e6:.4f}",
+                "--config",
+                str(settings),
+            ]
+        )
+        == 0
+    )
+    with TopoMetricMap.load(path) as topomap:
+        assert "earlier_asked" not in (topomap.edits[-1].changes or {})

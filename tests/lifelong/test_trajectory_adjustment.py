@@ -1,0 +1,71 @@
+"""A walk of a single camera adjusted as a whole: what the map says of its first part tells how long
+the rest is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tiny_world import CAMERA, path_pose, render, room
+from topoloc.geometry.rigid import Rigid3
+from topoloc.lifelong.session_poses import SessionPosesConfig
+from topoloc.lifelong.trajectory_adjustment import adjust_trajectory
+from topoloc.localization.result import Localization
+from topoloc.recordings.frame import StereoFrame
+from topoloc.slam.monocular_config import MonocularOdometryConfig
+from topoloc.slam.monocular_odometry import MonocularOdometry, MonocularSubmap
+
+TRUTH = [path_pose(0.5 * number) for number in range(20)]
+KNOWN = range(8)
+
+
+@pytest.fixture
+def stretch() -> MonocularSubmap:
+    odometry, panels = MonocularOdometry(MonocularOdometryConfig()), room()
+    for number, pose in enumerate(TRUTH):
+        odometry.process(
+            number,
+            StereoFrame(
+                f"{number}",
+                number * 100_000_000,
+                render(panels, pose, noise_seed=number)[0],
+                CAMERA,
+            ),
+        )
+    (found,) = odometry.submaps
+    return found
+
+
+def _too_long(by: float) -> list[Rigid3 | None]:
+    """The truth, but what lies beyond the known part is stretched."""
+    last = TRUTH[KNOWN[-1]].translation
+    beyond = [
+        Rigid3(pose.rotation, last + by * (pose.translation - last)) for pose in TRUTH[len(KNOWN) :]
+    ]
+    return [*TRUTH[: len(KNOWN)], *beyond]
+
+
+def _off(poses: list[Rigid3 | None]) -> float:
+    return max(
+        float(np.linalg.norm(pose.translation - true.translation))
+        for pose, true in zip(poses, TRUTH, strict=True)
+        if pose is not None
+    )
+
+
+def _answers() -> dict[int, Localization]:
+    covariance = np.diag([1e-5] * 3 + [1e-7] * 3)
+    return {k: Localization(TRUTH[k], covariance, 0.99, 0, [], 100, 80) for k in KNOWN}
+
+
+def test_the_whole_says_how_long_the_rest_is(stretch: MonocularSubmap):
+    held = _too_long(1.15)
+    adjusted = adjust_trajectory(stretch, held, _answers(), 8.0, SessionPosesConfig().adjustment)
+    assert _off(held) > 0.08
+    assert _off(adjusted) < 0.03
+
+
+def test_frames_without_a_pose_stay_without(stretch: MonocularSubmap):
+    held: list[Rigid3 | None] = [None, *_too_long(1.02)[1:15]]
+    adjusted = adjust_trajectory(stretch, held, _answers(), 8.0, SessionPosesConfig().adjustment)
+    assert [pose is None for pose in adjusted] == [True] + [False] * 14

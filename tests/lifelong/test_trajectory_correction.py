@@ -1,0 +1,86 @@
+"""A walk drawn to what the map answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.lifelong.trajectory_correction import CorrectionConfig, correct_trajectory
+from topoloc.localization.result import Localization
+
+D_THRESH, CONFIG = 0.3, CorrectionConfig()
+TRUTH = [Rigid3(np.eye(3), np.array([0.0, 0.05 * k, 0.0])) for k in range(100)]
+ANSWERED = range(60)
+
+
+def _localized(pose: Rigid3, sigma_m: float = 0.03, sigma_deg: float = 1.0) -> Localization:
+    """`camera_covariance` is that of these sigmas."""
+    of_camera = np.diag([sigma_m**2 / 3.0] * 3 + [np.radians(sigma_deg) ** 2 / 3.0] * 3)
+    adjoint = pose.adjoint()
+    return Localization(pose, adjoint @ of_camera @ adjoint.T, 0.99, 0, [], 100, 80)
+
+
+def _bent(by_m: float, by_deg: float) -> list[Rigid3 | None]:
+    """Off by so much at both ends, and right in the middle."""
+    bend = np.cos(np.linspace(0.0, 2.0 * np.pi, len(TRUTH)))
+    turns = [exp_so3(np.array([0.0, 0.0, np.radians(by_deg) * share])) for share in bend]
+    return [
+        Rigid3(turn @ pose.rotation, pose.translation + np.array([by_m * share, 0.0, 0.0]))
+        for pose, turn, share in zip(TRUTH, turns, bend, strict=True)
+    ]
+
+
+def _off(poses: list[Rigid3 | None]) -> np.ndarray:
+    """Metres and degrees from the truth, a row a frame."""
+    apart = [
+        pose.inverse() @ true for pose, true in zip(poses, TRUTH, strict=True) if pose is not None
+    ]
+    return np.array([(np.linalg.norm(one.translation), np.degrees(one.angle())) for one in apart])
+
+
+def test_where_the_map_answers_the_walk_is_as_it_says():
+    walk, answers = _bent(0.05, 1.5), {k: _localized(TRUTH[k], 0.03, 0.6) for k in ANSWERED}
+    straight = correct_trajectory(walk, answers, D_THRESH, CONFIG)
+    known, before = _off(straight)[:60], _off(walk)[:60]
+    assert np.all(before.max(axis=0) > (0.049, 1.49))
+    assert np.all(known.max(axis=0) < 0.5 * before.max(axis=0))
+
+
+def test_far_beyond_the_answers_it_keeps_its_own_shape():
+    walk, answers = _bent(0.05, 1.5), {k: _localized(TRUTH[k]) for k in ANSWERED}
+    straight = correct_trajectory(walk, answers, D_THRESH, CONFIG)
+    np.testing.assert_allclose(_off(straight)[90:], _off(walk)[90:], atol=1e-6)
+
+
+def test_single_answers_and_ones_that_are_not_sure_hardly_move_it():
+    walk: list[Rigid3 | None] = [*TRUTH]
+    beside = Rigid3(np.eye(3), TRUTH[30].translation + np.array([0.08, 0.0, 0.0]))
+    answers = {k: _localized(TRUTH[k]) for k in ANSWERED} | {30: _localized(beside)}
+    assert _off(correct_trajectory(walk, answers, D_THRESH, CONFIG))[:, 0].max() < 0.012
+    unsure = {
+        k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.1, 0.0, 0.0])), 0.5)
+        for k in range(0, 60, 6)
+    }
+    assert _off(correct_trajectory(walk, unsure, D_THRESH, CONFIG))[:, 0].max() < 0.005
+
+
+def test_what_the_map_is_sure_of_and_contradicts_is_no_bend():
+    walk: list[Rigid3 | None] = [*TRUTH]
+    elsewhere = {
+        k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.2, 0.0, 0.0])))
+        for k in range(50, 60)
+    }
+    np.testing.assert_array_equal(
+        _off(correct_trajectory(walk, elsewhere, D_THRESH, CONFIG)), _off(walk)
+    )
+
+
+@pytest.mark.parametrize("answers", [{}, {3: _localized(TRUTH[3])}])
+def test_frames_without_a_pose_stay_without(answers: dict[int, Localization]):
+    walk: list[Rigid3 | None] = [*TRUTH[:3], None, *TRUTH[4:], None]
+    assert [
+        k
+        for k, pose in enumerate(correct_trajectory(walk, answers, D_THRESH, CONFIG))
+        if pose is None
+    ] == [3, 100]

@@ -1,0 +1,81 @@
+"""A wrong calibration is named, and paid for."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from topoloc.geometry.camera import Camera
+from topoloc.localization import image_calibration_check
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.open import open_sequence
+
+
+def with_focal(camera: Camera, scale: float) -> Camera:
+    return replace(camera, params=(scale * camera.fx, scale * camera.fy, camera.cx, camera.cy))
+
+
+@pytest.fixture(scope="module")
+def localizer(room_map: Path) -> Localizer:
+    return Localizer(TopoMetricMap.load(room_map))
+
+
+def test_right_calibrations_are_not_doubted(localizer: Localizer, queries: Path):
+    for frame in open_sequence(queries):
+        result = localizer.localize(frame.image, frame.camera)
+        assert not isinstance(result, Localization) or result.calibration_doubt is None
+
+
+@pytest.mark.parametrize("scale", [0.93, 1.08])
+def test_a_wrong_focal_length_is_named(localizer: Localizer, queries: Path, scale: float):
+    num_named = 0
+    for frame in open_sequence(queries):
+        assert frame.camera is not None
+        assert frame.world_from_cam is not None
+        result = localizer.localize(frame.image, with_focal(frame.camera, scale))
+        if not isinstance(result, Localization):
+            num_named += "the picture says f" in result.detail
+        elif result.calibration_doubt is not None:
+            num_named += 1
+            doubt = result.calibration_doubt
+            assert doubt.has_focal_mismatch
+            assert doubt.focal_length_px == pytest.approx(frame.camera.fx, rel=0.02)
+            assert result.to_json("a")["calibration_doubt"]["detail"] == str(doubt)
+            way = np.linalg.norm(
+                result.world_from_cam.translation - frame.world_from_cam.translation
+            )
+            assert way < 3.0 * np.sqrt(np.trace(result.camera_covariance[:3, :3]))
+    assert num_named >= 0.8 * len(open_sequence(queries))
+
+
+def test_another_camera_is_named_only_where_it_explains_the_picture_better(
+    localizer: Localizer, queries: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """What a map is off by may ask for a camera that shows the points no nearer to where they must
+    be."""
+    gains = list[float]()
+
+    def gain(before: PoseFit, after: PoseFit) -> float:
+        assert num_nearer(before, before) == 0.0
+        assert num_nearer(after, before) < 0.0
+        gains.append(num_nearer(before, after))
+        return gains[-1]
+
+    num_nearer = image_calibration_check._gain
+    monkeypatch.setattr(image_calibration_check, "_gain", gain)
+    frame = open_sequence(queries)[0]
+    assert frame.camera is not None
+    doubted = localizer.localize(frame.image, with_focal(frame.camera, 1.08))
+    assert gains[-1] > 2.0 * image_calibration_check._LEAST_GAIN
+    monkeypatch.setattr(image_calibration_check, "_gain", lambda before, after: 0.0)
+    believed = localizer.localize(frame.image, with_focal(frame.camera, 1.08))
+    assert "the picture says f" in (
+        doubted.detail if isinstance(doubted, NotLocalized) else str(doubted.calibration_doubt)
+    )
+    assert isinstance(believed, Localization)
+    assert believed.calibration_doubt is None
+    assert believed.seen_camera is not None, "what it shows still counts beside what others do"

@@ -1,0 +1,405 @@
+"""Who comes back along a corridor that was mapped in one direction is localized by its walls, and
+nobody else is."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_corridor import (
+    WIDE,
+    WalkAhead,
+    back,
+    built_corridor,
+    corridor,
+    corridor_of_two_kinds,
+    seen_ahead,
+    seen_on_the_way_back,
+)
+from tiny_world import path_pose, render, room
+from topoloc.errors import MapError
+from topoloc.features.feature_types import (
+    FEATURE_TYPES,
+    SURF,
+    FeatureConfig,
+    default_learned_type,
+    find_feature_type,
+)
+from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.belief import Hypothesis
+from topoloc.localization.config import VirtualViewSearchConfig
+from topoloc.localization.fitted_weights import load_fitted_weights
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.open_map import OpenMap
+from topoloc.localization.query import Query, QueryImage
+from topoloc.localization.refine import evaluate_proposal
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.search import Search
+from topoloc.localization.walls import propose_virtual_views as propose_walls_module
+from topoloc.localization.walls.propose_virtual_views import (
+    VirtualViewSearch,
+    propose_virtual_views,
+)
+from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.topomap import TopoMetricMap, VirtualNodes
+
+NO_WALLS = LocalizerConfig(walls=VirtualViewSearchConfig(num_places=0))
+DISTORTED = Camera("OPENCV", 560, 400, (260.0, 262.0, 283.0, 197.0, -0.12, 0.02, 0.0005, -0.0003))
+
+
+@pytest.fixture(scope="module")
+def localizer() -> Localizer:
+    return Localizer(built_corridor())
+
+
+@cache
+def _found_on_the_way_back() -> list[tuple[Localization | NotLocalized, Rigid3]]:
+    localizer = Localizer(built_corridor())
+    return [(localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()]
+
+
+def _is_right(result: Localization | NotLocalized, truth: Rigid3) -> bool:
+    return isinstance(result, Localization) and _is_pose(result.world_from_cam, truth)
+
+
+def _is_by_walls(result: Localization | NotLocalized) -> bool:
+    return (
+        isinstance(result, Localization)
+        and result.evidence is not None
+        and result.evidence.num_distinct is not None
+    )
+
+
+def _is_pose(world_from_cam: Rigid3, truth: Rigid3) -> bool:
+    return translation_error(world_from_cam, truth) < 0.3 and rotation_error(
+        world_from_cam, truth
+    ) < np.deg2rad(5.0)
+
+
+def test_the_way_back_is_localized_by_the_walls():
+    assert all(_is_right(result, truth) for result, truth in _found_on_the_way_back())
+    without = Localizer(built_corridor(), NO_WALLS)
+    answers = [
+        (without.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()
+    ]
+    answered = [
+        _is_right(result, truth) for result, truth in answers if isinstance(result, Localization)
+    ]
+    assert len(answered) < 0.5 * len(answers)  # where viewpoints suffice
+    assert all(answered)
+
+
+def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
+    topomap = localizer.topomap
+    assert topomap.sides is not None
+    with_sides = {summary.name for summary in topomap.sides.summaries}
+    by_walls = [
+        (result, truth) for result, truth in _found_on_the_way_back() if _is_by_walls(result)
+    ]
+    assert len(by_walls) >= 3
+    for result, truth in by_walls:
+        assert isinstance(result, Localization)
+        assert localizer.config.walls.min_found <= result.num_inliers <= result.num_matches
+        assert 0.5 <= result.probability <= 1.0
+        node = topomap.summaries[
+            result.node_id
+        ]  # an ordinary one, which saw the same wall from its other side
+        assert node.name in with_sides
+        assert 2.0 < truth.translation[1] - node.world_from_cam.translation[1] < 7.5
+        assert len(result.candidates) == localizer.config.num_candidates
+        assert result.times_ms["walls"] > 0.0
+        assert (
+            sum(ms for stage, ms in result.times_ms.items() if stage != "total")
+            <= result.times_ms["total"]
+        )
+        # the covariance covers the error, and would not cover a wrong corridor's length
+        assert np.linalg.eigvalsh(result.covariance).min() > 0.0
+        xi = (result.world_from_cam.inverse() @ truth).log()
+        assert float(xi @ np.linalg.solve(result.camera_covariance, xi)) < 30.0
+        assert np.sqrt(np.linalg.eigvalsh(result.camera_covariance[:3, :3])[-1]) < 0.3
+
+
+def test_the_points_seen_are_handed_on(localizer: Localizer):
+    """Streams follow them: each is a point of the walls, at the pixel of the picture."""
+    picture, truth = seen_on_the_way_back()[2]
+    result, named = localizer.localize_with_inliers(picture, WIDE, None)
+    assert isinstance(result, Localization)
+    ((_, seen),) = named
+    assert len(seen.points_img) == result.num_inliers
+    offsets = np.linalg.norm(
+        WIDE.img_from_cam(truth.inverse().apply(seen.points_world)) - seen.points_img, axis=1
+    )
+    assert np.median(offsets) < 3.0
+
+
+def test_the_walls_are_looked_at_once_for_all_maps(
+    localizer: Localizer, monkeypatch: pytest.MonkeyPatch
+):
+    extracted = list[tuple[int, ...]]()
+    extract = propose_walls_module.extract_from_normalized
+    monkeypatch.setattr(
+        propose_walls_module,
+        "extract_from_normalized",
+        lambda grey, config: extracted.append(grey.shape) or extract(grey, config),
+    )
+    image, _ = seen_on_the_way_back()[2]
+    picture = QueryImage(image, WIDE)
+    first, second = (localizer.localize_query(picture)[0] for _ in range(2))
+    assert isinstance(first, Localization)
+    assert isinstance(second, Localization)
+    assert np.array_equal(first.world_from_cam.matrix(), second.world_from_cam.matrix())
+    assert len(extracted) == 2  # to the left and to the right
+
+
+def test_another_camera_with_distortion_is_localized_on_the_way_back(localizer: Localizer):
+    truth = back(5.2, x=0.1, yaw=0.04)
+    picture, _ = render(corridor(), truth, DISTORTED, noise_seed=3)
+    assert _is_right(localizer.localize(picture, DISTORTED), truth)
+
+
+def test_pictures_in_the_map_s_own_direction_are_answered_as_without_walls(localizer: Localizer):
+    without = Localizer(built_corridor(), NO_WALLS)
+    for picture, _ in seen_ahead():
+        one, other = localizer.localize(picture, WIDE), without.localize(picture, WIDE)
+        assert isinstance(one, Localization)
+        assert isinstance(other, Localization)
+        np.testing.assert_array_equal(one.world_from_cam.matrix(), other.world_from_cam.matrix())
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+        assert one.probability == other.probability
+        assert "walls" not in one.times_ms  # nor did they wait
+
+
+def _elsewhere() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    pictures = {"noise": rng.integers(0, 256, (WIDE.height, WIDE.width), dtype=np.uint8)}
+    pictures["blank"] = np.full((WIDE.height, WIDE.width), 120, np.uint8)
+    pictures["half blank"] = np.where(
+        np.arange(WIDE.width) < 240, pictures["noise"], pictures["blank"]
+    )
+    pictures |= {f"room {k}": render(room(), path_pose(k), WIDE)[0] for k in (1, 9)}
+    return pictures | {
+        f"another corridor {k}": picture
+        for k, (picture, _) in enumerate(seen_on_the_way_back(seed=5)[::2])
+    }
+
+
+def test_pictures_from_elsewhere_are_refused(localizer: Localizer):
+    answered = [
+        name
+        for name, picture in _elsewhere().items()
+        if isinstance(localizer.localize(picture, WIDE), Localization)
+    ]
+    assert answered == []
+
+
+def test_a_wall_in_a_mirror_is_no_wall_of_the_map(localizer: Localizer):
+    for picture, _ in seen_on_the_way_back()[::3]:
+        assert isinstance(
+            localizer.localize(np.ascontiguousarray(picture[:, ::-1]), WIDE), NotLocalized
+        )
+
+
+def test_a_camera_that_is_not_known_or_sees_no_walls_gets_no_answer_by_them(localizer: Localizer):
+    picture, truth = seen_on_the_way_back()[0]
+    assert "walls" not in localizer.localize(picture, None).times_ms
+    narrow = Camera.pinhole(480, 320, 900.0, 900.0, 239.5, 159.5)
+    assert isinstance(
+        localizer.localize(render(corridor(), truth, narrow)[0], narrow), NotLocalized
+    )
+
+
+def _twice(topomap: TopoMetricMap, apart: float) -> TopoMetricMap:
+    """A map whose walls stand a second time so many metres farther along."""
+    sides = topomap.sides
+    assert sides is not None
+    moved = Rigid3(np.eye(3), np.array([0.0, apart, 0.0]))
+    count, (model,) = len(sides.nodes), sides.coarse_models.values()
+    copies = [
+        replace(
+            node,
+            summary=replace(
+                node.summary, node_id=count + k, world_from_cam=moved @ node.summary.world_from_cam
+            ),
+        )
+        for k, node in enumerate(sides.nodes)
+    ]
+    nodes, ids = [*sides.nodes, *copies], model.arrays["node_ids"]
+    arrays = dict(model.arrays) | {
+        "vectors": np.concatenate([model.arrays["vectors"]] * 2),
+        "node_ids": np.concatenate([ids, ids + count]).astype(ids.dtype),
+        "centres": np.concatenate(
+            [model.arrays["centres"], model.arrays["centres"] + moved.translation]
+        ),
+    }
+    models = {model.name: replace(model, arrays=arrays)}
+    return replace(
+        topomap, sides=VirtualNodes([node.summary for node in nodes], nodes, models, sides.kind)
+    )
+
+
+def test_walls_that_stand_in_two_places_are_no_answer():
+    localizer = Localizer(_twice(built_corridor(), apart=60.0))
+    results = [
+        (localizer.localize(picture, WIDE), truth) for picture, truth in seen_on_the_way_back()[::2]
+    ]
+    assert not any(_is_by_walls(result) for result, _ in results)
+    assert all(
+        _is_right(result, truth) for result, truth in results if isinstance(result, Localization)
+    )  # of viewpoints
+
+
+def _by_the_walls(
+    topomap: TopoMetricMap, picture: np.ndarray, config: VirtualViewSearchConfig | None = None
+) -> list[Hypothesis]:
+    """What the walls let expect, whatever the nodes say; the likeliest first."""
+    search = _search(topomap, picture, config)
+    for proposal in propose_virtual_views(search):
+        hypothesis = evaluate_proposal(search, proposal)
+        if hypothesis is not None:
+            search.belief = search.belief.with_hypothesis(
+                hypothesis, search.config.evidence, search.weights.rivals
+            )
+    return search.belief.ranked(search.weights.rivals)
+
+
+def _search(
+    topomap: TopoMetricMap, picture: np.ndarray, config: VirtualViewSearchConfig | None = None
+) -> Search:
+    open_map = OpenMap(topomap)
+    resolved = LocalizerConfig(walls=config or VirtualViewSearchConfig()).for_feature_type(SURF)
+    return Search(
+        Query(picture, WIDE, 1.0, open_map.feature_config),
+        open_map,
+        resolved,
+        load_fitted_weights("surf"),
+        correlated_error_share=0.1,
+    )
+
+
+def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_to():
+    picture, truth = seen_on_the_way_back()[2]
+    search = _search(built_corridor(), picture)
+    assert search.map.walls is not None
+    walls = VirtualViewSearch.of(search, search.map.walls)
+    away = Rigid3(truth.rotation, truth.translation + np.array([0.0, 2.0, 0.0]))
+    from_there = propose_walls_module._compare_views(walls, away)
+    from_here = propose_walls_module._compare_views(walls, truth)
+    assert from_there is not None
+    assert from_here is not None
+    again = propose_walls_module._compare_again(from_there)
+    assert from_there.num_agreeing < again.num_agreeing
+    assert again.num_agreeing > 0.7 * from_here.num_agreeing
+    assert propose_walls_module._compare_again(again).num_agreeing >= again.num_agreeing
+
+
+def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes():
+    picture, truth = seen_ahead()[1]
+    assert not any(
+        _is_pose(one.world_from_cam, truth)
+        for one in _by_the_walls(
+            built_corridor(), picture, VirtualViewSearchConfig(min_distance=0.0)
+        )
+    )
+    picture, truth = seen_on_the_way_back()[2]
+    assert _is_pose(_by_the_walls(built_corridor(), picture)[0].world_from_cam, truth)
+    assert _by_the_walls(built_corridor(), picture, VirtualViewSearchConfig(min_distance=1e3)) == []
+
+
+def test_walls_that_look_alike_elsewhere_have_less_for_them():
+    """The points there are the same, and so tell nothing; and each place is named once."""
+    picture, truth = seen_on_the_way_back()[2]
+    once, twice = (
+        _by_the_walls(m, picture) for m in (built_corridor(), _twice(built_corridor(), apart=60.0))
+    )
+    assert _is_pose(once[0].world_from_cam, truth)
+    assert len(twice) >= 2
+    assert all(hypothesis.is_from_virtual_views for hypothesis in (*once, *twice))
+    assert once[0].log_odds > twice[0].log_odds + 0.5
+    assert twice[0].log_odds >= twice[1].log_odds
+    ways = [hypothesis.world_from_cam.translation[1] for hypothesis in twice]
+    assert sorted(round((way - truth.translation[1]) / 60.0) for way in ways[:2]) == [0, 1]
+
+
+def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "corridor.topo"
+    corridor_of_two_kinds().save(path)
+    loaded = TopoMetricMap.load(path)
+    assert loaded.sides is not None
+    assert (
+        loaded.sides.kind == find_feature_type(loaded.kinds[1]).virtual_view_type != loaded.kinds[1]
+    )
+    assert loaded.with_feature_type(loaded.kinds[1]).sides is loaded.sides
+    localizer, learned = (
+        Localizer(loaded),
+        Localizer(loaded, LocalizerConfig(kinds=(loaded.kinds[1],))),
+    )
+    for picture, truth in seen_on_the_way_back()[::2]:
+        assert _is_right(localizer.localize(picture, WIDE), truth)
+        result = learned.localize(picture, WIDE)
+        assert _is_by_walls(result)
+        assert _is_right(result, truth)
+        mirrored = np.ascontiguousarray(picture[:, ::-1])
+        assert isinstance(localizer.localize(mirrored, WIDE), NotLocalized)
+    assert Localizer(loaded, LocalizerConfig(kinds=("surf",))).map.walls is None
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("UPDATE map SET value = '\"sift\"' WHERE key = 'kind_of_sides'")
+        database.commit()
+    with pytest.raises(MapError, match="kind_of_sides"):
+        TopoMetricMap.load(path)
+
+
+def test_walls_that_the_nodes_own_kind_describes_are_asked_still(monkeypatch: pytest.MonkeyPatch):
+    network = default_learned_type()
+    with monkeypatch.context() as patch:  # as maps were, before walls had a network of their own
+        patch.setitem(FEATURE_TYPES, network, replace(FEATURE_TYPES[network], sides=None))
+        topomap = build_map(
+            WalkAhead(0), BuildConfig(features=FeatureConfig(kind=network), other_kinds=())
+        )
+    assert topomap.sides is not None
+    assert topomap.sides.kind == network
+    localizer = Localizer(topomap)
+    assert localizer.weights.walls == load_fitted_weights(network).walls
+    for picture, truth in seen_on_the_way_back()[::2]:
+        result = localizer.localize(picture, WIDE)
+        assert _is_by_walls(result)
+        assert _is_right(result, truth)
+
+
+def test_from_a_file_the_same_is_answered(tmp_path: Path):
+    path = tmp_path / "corridor.topo"
+    built_corridor().save(path)
+    picture, truth = seen_on_the_way_back()[1]
+    assert _is_right(Localizer(TopoMetricMap.load(path)).localize(picture, WIDE), truth)
+
+
+SPOILT = {
+    "no coarse model": "DELETE FROM side_coarse_models",
+    "the model of the nodes": (
+        "UPDATE side_coarse_models SET arrays = (SELECT arrays FROM coarse_models)"
+    ),
+}
+
+
+@pytest.mark.parametrize("change", SPOILT.values(), ids=SPOILT.keys())
+def test_side_nodes_that_cannot_be_ranked_are_a_map_error_where_they_are_asked(
+    tmp_path: Path, change: str
+):
+    path = tmp_path / "corridor.topo"
+    built_corridor().save(path)
+    database = sqlite3.connect(path)
+    database.executescript(change)
+    database.close()
+    localizer = Localizer(TopoMetricMap.load(path))
+    assert isinstance(localizer.localize(seen_ahead()[0][0], WIDE), Localization)
+    with pytest.raises(MapError, match="side_coarse_models"):
+        localizer.localize(seen_on_the_way_back()[0][0], WIDE)

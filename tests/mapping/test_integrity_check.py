@@ -1,0 +1,75 @@
+"""`topoloc info --check`: every byte counts, and nodes that were moved together are found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_room import built_room
+from topoloc.apps.cli import main
+from topoloc.errors import MapError
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.map_facts.contradictions import find_contradictions
+from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.topomap import TopoMetricMap
+
+
+def test_a_whole_map_is_ok(saved: Path, capsys: pytest.CaptureFixture[str]):
+    assert find_map_damage(saved) == []
+    assert main(["info", str(saved), "--check"]) == 0
+    assert "ok" in capsys.readouterr().out
+
+
+def test_any_flipped_bit_is_found_or_does_no_harm(saved: Path):
+    content, rng, found = saved.read_bytes(), np.random.default_rng(0), 0
+    places = rng.integers(0, len(content), 60)
+    for place in places:
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        saved.write_bytes(flipped)
+        try:
+            harmed = find_map_damage(saved)
+        except MapError:
+            harmed = ["cannot be opened"]
+        if harmed:
+            found += 1
+        else:  # a byte that nothing is read from: what is saved again is what it was
+            TopoMetricMap.load(saved).save(saved)
+            assert saved.read_bytes() == content
+    assert found > 0.8 * len(places)
+
+
+def test_damage_is_told_in_one_line_and_by_the_exit_status(
+    saved: Path, capsys: pytest.CaptureFixture[str]
+):
+    content = saved.read_bytes()
+    place = content.index(TopoMetricMap.load(saved).nodes[1].template_jpeg[:40]) + 20
+    saved.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+    assert main(["info", str(saved)]) == 0
+    assert main(["info", str(saved), "--check"]) == 1
+    output = capsys.readouterr()
+    assert "checksum of a row of node_templates" in output.out
+    assert len(output.err.splitlines()) == 1
+
+
+def test_nodes_that_were_moved_together_are_found(tiny_recording: Path):
+    topomap = built_room(tiny_recording)
+    assert find_contradictions(topomap) == []
+    moved = {1, 2}
+    away = Rigid3(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    nodes = [
+        replace(
+            node, summary=replace(node.summary, world_from_cam=away @ node.summary.world_from_cam)
+        )
+        if row in moved
+        else node
+        for row, node in enumerate(topomap.nodes)
+    ]
+    found = find_contradictions(
+        replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes])
+    )
+    assert {contradiction.node_id for contradiction in found} == moved
+    assert all(0.9 < contradiction.metres < 1.1 for contradiction in found)

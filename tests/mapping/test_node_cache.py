@@ -1,0 +1,50 @@
+"""One budget of bytes for the nodes of all open maps."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+
+from topoloc.mapping.node_cache import CachedNodes, NodeCache, bytes_of
+
+
+def test_what_was_used_longest_ago_is_let_go_over_all_owners():
+    memory, read = NodeCache(1000), []
+
+    def reader(name: str) -> CachedNodes[np.ndarray]:
+        def read_row(row: int) -> np.ndarray:
+            read.append((name, row))
+            return np.zeros(50)  # 400 bytes
+
+        return CachedNodes(read_row, memory)
+
+    one, other = reader("one"), reader("other")
+    (
+        one(0),
+        other(0),
+        one(0),
+        other(1),
+    )  # the third is remembered, the fourth is too much: other(0) goes
+    assert read == [("one", 0), ("other", 0), ("other", 1)]
+    one(0), other(0)
+    assert read[3:] == [("other", 0)]
+    assert memory.num_bytes <= 1000
+    memory.resize(0)
+    assert memory.num_bytes == 0
+    one(0), one(0)
+    assert read[4:] == [("one", 0), ("one", 0)]
+
+
+def test_nodes_go_with_who_asked_for_them():
+    memory = NodeCache(10_000)
+    remembered = CachedNodes(lambda row: np.zeros(100), memory)
+    remembered(3)
+    assert memory.num_bytes == 800
+    del remembered
+    gc.collect()
+    assert memory.num_bytes == 0
+
+
+def test_bytes_are_those_of_arrays_wherever_they_are():
+    assert bytes_of((np.zeros(3), [b"abc", np.zeros(2, np.float32)], "text")) == 24 + 3 + 8

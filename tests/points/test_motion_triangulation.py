@@ -1,0 +1,170 @@
+"""3-D positions of a single picture's features from others under known poses: made points with
+known noise, and the rendered room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tiny_world
+from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.points.metric_points import MetricPoints, MetricPointsConfig, keypoint_sigmas
+from topoloc.points.motion_triangulation import (
+    MotionTriangulationConfig,
+    SourceImage,
+    compute_median_step,
+    select_source_images,
+    triangulate_from_motion,
+)
+
+CONFIG = MotionTriangulationConfig(pose_sigma_px=0.0)
+LENS = Camera("OPENCV", 640, 480, (500.0, 500.0, 319.5, 239.5, -0.1, 0.02, 0.0, 0.0))
+SIGMA_PX = 0.5
+POSES = [
+    Rigid3(exp_so3(np.array([0.0, 0.02 * k, 0.0])), np.array([0.2 * k, 0.03 * k, 0.05 * k]))
+    for k in (1, 2, 3, 4)
+]
+
+
+def _features(points_img: np.ndarray, descriptors: np.ndarray) -> Features:
+    ones = np.ones(len(points_img), np.float32)
+    return Features(points_img.astype(np.float32), ones, ones, ones, descriptors)
+
+
+def _made(num: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points before the camera in the origin (metres), and a descriptor of each."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack(
+        [rng.uniform(-1.0, 1.6, num), rng.uniform(-0.8, 0.8, num), rng.uniform(2.5, 6.0, num)]
+    )
+    descriptors = rng.normal(size=(num, 64)).astype(np.float32)
+    return points, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
+
+
+def _located(
+    points: np.ndarray,
+    descriptors: np.ndarray,
+    order: list[np.ndarray] | None = None,
+    poses: list[Rigid3] = POSES,
+) -> MetricPoints:
+    """What is located of these points; `order` says which descriptor each point shows to each other
+    picture."""
+    rng = np.random.default_rng(7)
+    sigmas = np.full(len(points), SIGMA_PX)
+    own = _features(
+        LENS.img_from_cam(points) + SIGMA_PX * rng.normal(size=(len(points), 2)), descriptors
+    )
+    others = []
+    for k, world_from_other in enumerate(poses):
+        other_from_cam = world_from_other.inverse()
+        seen = LENS.img_from_cam(other_from_cam.apply(points)) + SIGMA_PX * rng.normal(
+            size=(len(points), 2)
+        )
+        shown = descriptors if order is None else descriptors[order[k]]
+        others.append(SourceImage(_features(seen, shown), sigmas, LENS, other_from_cam))
+    return triangulate_from_motion(own, sigmas, LENS, others, 0.3, CONFIG)
+
+
+def test_errors_are_as_large_as_the_covariances_say():
+    points, descriptors = _made()
+    located = _located(points, descriptors)
+    assert located.valid.mean() > 0.95
+    errors = (located.points_cam - points)[located.valid]
+    squares = np.einsum(
+        "ni,nij,nj->n", errors, np.linalg.inv(located.covariances[located.valid]), errors
+    )
+    assert 2.0 < np.mean(squares) < 4.5  # three degrees of freedom
+    assert np.quantile(np.abs(errors[:, 2]) / points[located.valid, 2], 0.5) < 0.01
+
+
+def test_mismatches_are_not_believed():
+    points, descriptors = _made()
+    rng = np.random.default_rng(3)
+    wrong = rng.random(len(points)) < 0.3
+    order = []
+    for _ in POSES:  # each picture is wrong about these points in another way
+        rows = np.arange(len(points))
+        rows[wrong] = rng.permutation(rows[wrong])
+        order.append(rows)
+    located = _located(points, descriptors, order)
+    assert located.valid[~wrong].mean() > 0.95
+    assert located.valid[wrong].mean() < 0.05
+
+
+def test_one_picture_or_none_or_no_motion_locates_nothing():
+    points, descriptors = _made(50)
+    for poses in ([], POSES[:1], [Rigid3.identity()] * 3):
+        located = _located(points, descriptors, poses=poses)
+        assert not located.valid.any()
+        assert np.isnan(located.points_cam).all()
+
+
+def test_points_of_the_rendered_room():
+    panels, config = tiny_world.room(), MetricPointsConfig()
+    poses = [tiny_world.path_pose(index) for index in range(10)]
+    (left, depth), *others = (
+        tiny_world.render(panels, pose, noise_seed=k) for k, pose in enumerate(poses)
+    )
+    features = extract_features(left, FeatureConfig())
+    pictures = []
+    for k in select_source_images(
+        poses, 0, compute_median_step(poses), MotionTriangulationConfig()
+    ):
+        found = extract_features(others[k - 1][0], FeatureConfig())
+        pictures.append(
+            SourceImage(
+                found,
+                keypoint_sigmas(found, config),
+                tiny_world.CAMERA,
+                poses[k].inverse() @ poses[0],
+            )
+        )
+    located = triangulate_from_motion(
+        features,
+        keypoint_sigmas(features, config),
+        tiny_world.CAMERA,
+        pictures,
+        0.3,
+        MotionTriangulationConfig(),
+    )
+    columns, rows = np.rint(features.points_img[located.valid]).astype(int).T
+    truth = depth[rows, columns]
+    errors = (located.points_cam[located.valid, 2] - truth) / np.sqrt(
+        located.covariances[located.valid, 2, 2]
+    )
+    assert located.valid.mean() > 0.3
+    assert (np.abs(errors) > 4).mean() < 0.03
+
+
+class TestChoice:
+    """Which pictures locate the points of another."""
+
+    LINE = tuple(Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(40))
+
+    def test_distances_grow(self):
+        chosen = select_source_images(
+            self.LINE, 5, compute_median_step(self.LINE), MotionTriangulationConfig()
+        )
+        assert sorted(abs(k - 5) for k in chosen) == [1, 2, 4, 7, 12, 20, 33, 34]
+
+    def test_pictures_that_look_elsewhere_or_stand_in_one_place_do_not_count(self):
+        turned = [
+            replace(pose, rotation=exp_so3(np.array([0.0, 1.5 * (k % 2), 0.0])))
+            for k, pose in enumerate(self.LINE)
+        ]
+        assert all(
+            k % 2 == 0 for k in select_source_images(turned, 4, 0.1, MotionTriangulationConfig())
+        )
+        standing = [Rigid3.identity()] * 5
+        assert compute_median_step(standing) == 0.0
+        assert select_source_images(standing, 0, 0.0, MotionTriangulationConfig()) == []
+
+    def test_the_step_is_that_of_pictures_that_moved(self):
+        waited = [self.LINE[k] for k in (0, 0, 0, 1, 1, 2, 3)]
+        assert compute_median_step(waited) == pytest.approx(0.1)
+        assert compute_median_step([Rigid3.identity()]) == 0.0
