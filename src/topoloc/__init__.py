@@ -12,85 +12,234 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from topoloc.apps.service.client import AsyncClient, Client
+    from topoloc.atlas.atlas import Atlas, is_atlas
+    from topoloc.atlas.atlas_localizer import AtlasLocalizer
+    from topoloc.atlas.config import AtlasConfig
+    from topoloc.atlas.evaluated_tile import EvaluatedTile
+    from topoloc.atlas.location_prior import GeoPositionPrior
+    from topoloc.atlas.map_cache import MapCache
+    from topoloc.atlas.shared_world import SharedWorld
     from topoloc.compiled import set_num_threads
-    from topoloc.errors import TopolocError
+    from topoloc.errors import (
+        AtlasError,
+        CalibrationError,
+        ConfigError,
+        DuplicateSessionError,
+        FeatureTypeError,
+        GeoreferenceError,
+        MapError,
+        MissingExtraError,
+        ObjectStoreError,
+        QueryError,
+        RecordingError,
+        TopolocError,
+        TrajectoryError,
+        UnreadableImageError,
+        WeightsError,
+    )
+    from topoloc.evaluation.metrics import EvaluatedQuery
+    from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
     from topoloc.geometry.camera import Camera
-    from topoloc.geometry.geodesy import GeoPose
+    from topoloc.geometry.geodesy import GeoPoint, GeoPose, Georeference
+    from topoloc.geometry.pose_conventions import PoseConventions
     from topoloc.geometry.rig import StereoRig
     from topoloc.geometry.rigid import Rigid3
+    from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+    from topoloc.lifelong.prune import PruneConfig
+    from topoloc.lifelong.tile_comparison import TileJoinConfig
+    from topoloc.lifelong.tile_editing import edit_tile
+    from topoloc.lifelong.tile_joining import join_tiles
+    from topoloc.lifelong.tile_selection import TileSelectionConfig, find_tile_of_recording
+    from topoloc.lifelong.update import UpdateConfig
+    from topoloc.lifelong.weak_regions import WeakRegions, WeakRegionsConfig, find_weak_regions
+    from topoloc.localization.image_calibration_check import check_camera_calibrations
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.map_facts.map_building import build_map
     from topoloc.localization.provenance import Provenance
     from topoloc.localization.result import Alternative, Localization, NotLocalized
     from topoloc.localization.search import Trace
     from topoloc.mapping.build import BuildConfig
+    from topoloc.mapping.node_cache import set_node_cache_size
     from topoloc.mapping.topomap import TopoMetricMap
-    from topoloc.recordings.frame import DepthImage, StereoFrame
+    from topoloc.recordings.frame import DepthImage, StereoFrame, StereoSequence
     from topoloc.recordings.memory_sequence import MemorySequence
     from topoloc.recordings.open import open_sequence
+    from topoloc.recordings.trajectory import (
+        Trajectory,
+        read_trajectory,
+        with_pose_conventions,
+        with_trajectory,
+        write_tum,
+    )
+    from topoloc.slam.slam import SlamConfig, SlamResult, run_slam
     from topoloc.tracking.stream_result import StreamedPose
+    from topoloc.tracking.tile_tracker import TileTracker
     from topoloc.tracking.tracker import Tracker, TrackerConfig
-    from topoloc.tracking.warm_up import warm_up
+    from topoloc.tracking.warm_up import is_warm, warm_up
 
     __version__: str
 
 __all__ = [
     "Alternative",
     "AsyncClient",
+    "Atlas",
+    "AtlasConfig",
+    "AtlasError",
+    "AtlasLocalizer",
     "BuildConfig",
+    "CalibrationError",
     "Camera",
     "Client",
+    "ConfigError",
     "DepthImage",
+    "DuplicateSessionError",
+    "EvaluatedQuery",
+    "EvaluatedTile",
+    "FeatureTypeError",
+    "GeoPoint",
     "GeoPose",
+    "GeoPositionPrior",
+    "Georeference",
+    "GeoreferenceError",
     "Localization",
     "Localizer",
     "LocalizerConfig",
+    "MapCache",
+    "MapError",
     "MemorySequence",
+    "MissingExtraError",
     "NotLocalized",
+    "ObjectStoreError",
+    "PoseConventions",
     "Provenance",
+    "PruneConfig",
+    "QueryError",
+    "RecordingError",
     "Rigid3",
+    "SharedWorld",
+    "SlamConfig",
+    "SlamResult",
     "StereoFrame",
     "StereoRig",
+    "StereoSequence",
     "StreamedPose",
+    "TileJoinConfig",
+    "TileSelectionConfig",
+    "TileTracker",
     "TopoMetricMap",
     "TopolocError",
     "Trace",
     "Tracker",
     "TrackerConfig",
+    "Trajectory",
+    "TrajectoryError",
+    "UncalibratedCamera",
+    "UnreadableImageError",
+    "UpdateConfig",
+    "WeakRegions",
+    "WeakRegionsConfig",
+    "WeightsError",
     "__version__",
     "build_map",
+    "check_camera_calibrations",
+    "edit_tile",
+    "find_tile_of_recording",
+    "find_weak_regions",
+    "is_atlas",
+    "is_warm",
+    "join_tiles",
+    "localize_out_of_map",
+    "localize_queries",
     "open_sequence",
+    "read_trajectory",
+    "run_slam",
+    "set_node_cache_size",
     "set_num_threads",
     "warm_up",
+    "with_pose_conventions",
+    "with_trajectory",
+    "write_tum",
 ]
 
 _MODULES = {
     "Alternative": "topoloc.localization.result",
     "AsyncClient": "topoloc.apps.service.client",
+    "Atlas": "topoloc.atlas.atlas",
+    "AtlasConfig": "topoloc.atlas.config",
+    "AtlasError": "topoloc.errors",
+    "AtlasLocalizer": "topoloc.atlas.atlas_localizer",
     "BuildConfig": "topoloc.mapping.build",
+    "CalibrationError": "topoloc.errors",
     "Camera": "topoloc.geometry.camera",
     "Client": "topoloc.apps.service.client",
+    "ConfigError": "topoloc.errors",
     "DepthImage": "topoloc.recordings.frame",
+    "DuplicateSessionError": "topoloc.errors",
+    "EvaluatedQuery": "topoloc.evaluation.metrics",
+    "EvaluatedTile": "topoloc.atlas.evaluated_tile",
+    "FeatureTypeError": "topoloc.errors",
+    "GeoPoint": "topoloc.geometry.geodesy",
     "GeoPose": "topoloc.geometry.geodesy",
+    "GeoPositionPrior": "topoloc.atlas.location_prior",
+    "Georeference": "topoloc.geometry.geodesy",
+    "GeoreferenceError": "topoloc.errors",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
+    "MapCache": "topoloc.atlas.map_cache",
+    "MapError": "topoloc.errors",
     "MemorySequence": "topoloc.recordings.memory_sequence",
+    "MissingExtraError": "topoloc.errors",
     "NotLocalized": "topoloc.localization.result",
+    "ObjectStoreError": "topoloc.errors",
+    "PoseConventions": "topoloc.geometry.pose_conventions",
     "Provenance": "topoloc.localization.provenance",
+    "PruneConfig": "topoloc.lifelong.prune",
+    "QueryError": "topoloc.errors",
+    "RecordingError": "topoloc.errors",
     "Rigid3": "topoloc.geometry.rigid",
+    "SharedWorld": "topoloc.atlas.shared_world",
+    "SlamConfig": "topoloc.slam.slam",
+    "SlamResult": "topoloc.slam.slam",
     "StereoFrame": "topoloc.recordings.frame",
     "StereoRig": "topoloc.geometry.rig",
+    "StereoSequence": "topoloc.recordings.frame",
     "StreamedPose": "topoloc.tracking.stream_result",
+    "TileJoinConfig": "topoloc.lifelong.tile_comparison",
+    "TileSelectionConfig": "topoloc.lifelong.tile_selection",
+    "TileTracker": "topoloc.tracking.tile_tracker",
     "TopoMetricMap": "topoloc.mapping.topomap",
     "TopolocError": "topoloc.errors",
     "Trace": "topoloc.localization.search",
     "Tracker": "topoloc.tracking.tracker",
     "TrackerConfig": "topoloc.tracking.tracker",
+    "Trajectory": "topoloc.recordings.trajectory",
+    "TrajectoryError": "topoloc.errors",
+    "UncalibratedCamera": "topoloc.geometry.uncalibrated_camera",
+    "UnreadableImageError": "topoloc.errors",
+    "UpdateConfig": "topoloc.lifelong.update",
+    "WeakRegions": "topoloc.lifelong.weak_regions",
+    "WeakRegionsConfig": "topoloc.lifelong.weak_regions",
+    "WeightsError": "topoloc.errors",
     "build_map": "topoloc.localization.map_facts.map_building",
+    "check_camera_calibrations": "topoloc.localization.image_calibration_check",
+    "edit_tile": "topoloc.lifelong.tile_editing",
+    "find_tile_of_recording": "topoloc.lifelong.tile_selection",
+    "find_weak_regions": "topoloc.lifelong.weak_regions",
+    "is_atlas": "topoloc.atlas.atlas",
+    "is_warm": "topoloc.tracking.warm_up",
+    "join_tiles": "topoloc.lifelong.tile_joining",
+    "localize_out_of_map": "topoloc.evaluation.query_localization",
+    "localize_queries": "topoloc.evaluation.query_localization",
     "open_sequence": "topoloc.recordings.open",
+    "read_trajectory": "topoloc.recordings.trajectory",
+    "run_slam": "topoloc.slam.slam",
+    "set_node_cache_size": "topoloc.mapping.node_cache",
     "set_num_threads": "topoloc.compiled",
     "warm_up": "topoloc.tracking.warm_up",
+    "with_pose_conventions": "topoloc.recordings.trajectory",
+    "with_trajectory": "topoloc.recordings.trajectory",
+    "write_tum": "topoloc.recordings.trajectory",
 }
 
 

@@ -184,7 +184,7 @@ def load_plugins(group: str) -> dict[str, Any]:
 
 
 def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
-    from topoloc.errors import TopolocError
+    from topoloc import TopolocError
 
     try:
         _check_address_space()
@@ -218,7 +218,7 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
 def _check_address_space() -> None:
     """Below this OpenBLAS, FAISS and LLVM end the process from within while they are loaded, with
     no word of their own."""
-    from topoloc.errors import TopolocError
+    from topoloc import TopolocError
 
     try:
         import resource

@@ -67,7 +67,8 @@ class Command:
         self._check_usage()
         found, joined = [], None
         if self.action == "info":
-            from topoloc.atlas.atlas import Atlas, tile_problem
+            from topoloc import Atlas
+            from topoloc.atlas.atlas import tile_problem
 
             atlas = Atlas.open(self.atlas)
             manifest = atlas.manifest

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from topoloc import BuildConfig, SlamConfig
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
 from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cli.output import (
@@ -28,9 +29,7 @@ from topoloc.apps.cli.output import (
 from topoloc.apps.cli.recording_pieces import Pieces, SplitOptions, split_recording
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cli.tile_joining import JoinedTiles, join_overlapping_tiles
-from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.description import describe_map
-from topoloc.slam.slam import SlamConfig
 
 if TYPE_CHECKING:
     from topoloc.apps.cluster.tiles import Outcome, TileJob
@@ -297,7 +296,7 @@ class Command:
 
 def _check_atlas(last: str) -> None:
     """Hold that an atlas lies there, or may. Raises UsageError."""
-    from topoloc.atlas.atlas import is_atlas
+    from topoloc import is_atlas
 
     is_other = (
         os.path.isfile(last)

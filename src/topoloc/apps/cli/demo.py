@@ -11,6 +11,21 @@ from typing import Annotated, Any
 
 import tyro
 
+from topoloc import (
+    EvaluatedQuery,
+    Localization,
+    Localizer,
+    MissingExtraError,
+    StereoSequence,
+    TopolocError,
+    TopoMetricMap,
+    Trajectory,
+    build_map,
+    localize_out_of_map,
+    localize_queries,
+    open_sequence,
+    write_tum,
+)
 from topoloc.apps.cli.output import (
     File,
     UsageError,
@@ -22,18 +37,9 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.demo.recordings import ROLES, SHIPPED, Role, find_missing_recordings
 from topoloc.demo.report_texts import PAPER_LAB, create_report_texts, describe_night
-from topoloc.errors import MissingExtraError, TopolocError
-from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording, summarize
-from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
-from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.map_building import build_map
-from topoloc.localization.result import Localization
+from topoloc.evaluation.metrics import group_by_recording, summarize
 from topoloc.mapping.description import describe_map
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.atomic import write_text
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.open import open_sequence
-from topoloc.recordings.trajectory import Trajectory, write_tum
+from topoloc.plugin import write_text
 
 Progress = Callable[[str, int, int], None]
 OUT_OF_MAP = "elsewhere"

@@ -11,6 +11,17 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from topoloc import (
+    AtlasConfig,
+    EvaluatedQuery,
+    EvaluatedTile,
+    Localizer,
+    LocalizerConfig,
+    Rigid3,
+    StereoSequence,
+    TrajectoryError,
+    check_camera_calibrations,
+)
 from topoloc.apps.cli.features_option import QUERY_FEATURES
 from topoloc.apps.cli.map_or_atlas import open_localizer
 from topoloc.apps.cli.output import (
@@ -31,24 +42,16 @@ from topoloc.apps.cli.remote_queries import OpenQueries, QueryRecording, RemoteM
 from topoloc.apps.cli.self_evaluation import evaluate_map_itself
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ClusterConfig
-from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.evaluated_tile import EvaluatedTile
-from topoloc.errors import TrajectoryError
 from topoloc.evaluation.metrics import (
     MAX_ROTATION_DEG,
     MAX_TRANSLATION,
-    EvaluatedQuery,
     format_length,
     group_by_recording,
     summarize,
 )
 from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.image_calibration_check import check_camera_calibrations
-from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.description import describe_map
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.json_file import read_json
+from topoloc.plugin import read_json
 
 
 @dataclass(frozen=True)

@@ -8,21 +8,23 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import (
+    AtlasConfig,
+    AtlasLocalizer,
+    Localization,
+    LocalizerConfig,
+    StereoFrame,
+    TopoMetricMap,
+    open_sequence,
+)
 from topoloc.apps.cli.features_option import QUERY_FEATURES, create_localizer
 from topoloc.apps.cli.map_or_atlas import is_atlas, open_atlas, parse_camera
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
 from topoloc.apps.report.explanation_page import row_of, verdict, write_explanation
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
-from topoloc.atlas.config import AtlasConfig
-from topoloc.localization.localizer import LocalizerConfig
 from topoloc.localization.query import QueryImage
 from topoloc.localization.query_camera import parse_camera_option, select_frame_camera
-from topoloc.localization.result import Localization
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import as_monocular
 
 

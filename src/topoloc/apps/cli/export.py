@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import Atlas, TopolocError, TopoMetricMap, is_atlas
 from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
 from topoloc.apps.cli.tile_option import (
     TileOption,
@@ -21,9 +22,6 @@ from topoloc.apps.viewer.map_scene import create_map_scene
 from topoloc.apps.viewer.results_scene import create_results_scene
 from topoloc.apps.viewer.scene import Scene
 from topoloc.apps.viewer.world_scene import create_world_scene
-from topoloc.atlas.atlas import Atlas, is_atlas
-from topoloc.errors import TopolocError
-from topoloc.mapping.topomap import TopoMetricMap
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,15 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import FeatureTypeError, Localizer, LocalizerConfig, TopoMetricMap
 from topoloc.apps.cli.output import UsageError
-from topoloc.errors import FeatureTypeError
 from topoloc.features.feature_types import (
     FEATURE_TYPES,
     SURF,
     check_available,
     default_learned_type,
 )
-from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.topomap import TopoMetricMap
 
 BUILD_FEATURES = Annotated[
     str | None,

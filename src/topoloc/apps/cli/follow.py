@@ -11,6 +11,22 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import (
+    AtlasConfig,
+    CalibrationError,
+    Localization,
+    LocalizerConfig,
+    NotLocalized,
+    StereoFrame,
+    StereoSequence,
+    StreamedPose,
+    TileTracker,
+    TopoMetricMap,
+    Tracker,
+    TrackerConfig,
+    UncalibratedCamera,
+    UnreadableImageError,
+)
 from topoloc.apps.cli.features_option import QUERY_FEATURES, create_localizer
 from topoloc.apps.cli.map_or_atlas import is_atlas, open_atlas, parse_camera
 from topoloc.apps.cli.output import (
@@ -26,18 +42,8 @@ from topoloc.apps.cli.query_answers import QueryAnswer, format_answer
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.robots.ros_publisher import RosPublisher
-from topoloc.atlas.config import AtlasConfig
-from topoloc.errors import CalibrationError, UnreadableImageError
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.localizer import LocalizerConfig
 from topoloc.localization.query_camera import CameraOfSize, select_frame_camera
-from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.recording import as_monocular
-from topoloc.tracking.stream_result import StreamedPose
-from topoloc.tracking.tile_tracker import TileTracker
-from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 ReadFrame = Callable[[], StereoFrame]
 """Reads a picture whose turn it is. Raises UnreadableImageError."""

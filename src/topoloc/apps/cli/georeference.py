@@ -9,12 +9,10 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from topoloc import GeoPoint, Georeference, GeoreferenceError, Rigid3, TopoMetricMap
 from topoloc.apps.cli.output import File, UsageError, check_outputs, print_fields, write_json
 from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
 from topoloc.apps.cli.wait_message import print_waiting
-from topoloc.errors import GeoreferenceError
-from topoloc.geometry.geodesy import GeoPoint, Georeference
-from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.control_points import ControlPoints, read_control_points, read_gnss
 from topoloc.mapping.edit import edit_map
 from topoloc.mapping.georeferencing import (
@@ -24,7 +22,6 @@ from topoloc.mapping.georeferencing import (
     fit_georeference,
     georeference_from_heading,
 )
-from topoloc.mapping.topomap import TopoMetricMap
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,12 @@ from typing import Annotated, Any
 
 import tyro
 
+from topoloc import Atlas, TopoMetricMap, is_atlas
 from topoloc.apps.cli.output import File, print_fields, write_json
 from topoloc.apps.cli.tile_option import run_for_each_tile
-from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.atlas.manifest import Tile
 from topoloc.lifelong.recall_change import describe_recall_change
 from topoloc.mapping.edit import count_undoable_edits
-from topoloc.mapping.topomap import TopoMetricMap
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import tyro
 
+from topoloc import MapError, is_atlas
 from topoloc.apps.cli import atlas
 from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_fields, write_json
-from topoloc.atlas.atlas import is_atlas
-from topoloc.errors import MapError
 from topoloc.mapping.description import describe_map
 
 MAX_PROBLEMS = 20
@@ -37,7 +36,7 @@ class Command:
     its place on earth."""
 
     def run(self) -> int:
-        from topoloc.mapping.topomap import TopoMetricMap
+        from topoloc import TopoMetricMap
 
         if is_atlas(self.map) and self.graph:
             raise UsageError("--graph is of one map; name a tile's file")
@@ -117,8 +116,8 @@ def _print(info: dict[str, Any]) -> None:
 
 
 def _format_place(facts: dict[str, Any] | None) -> str:
+    from topoloc import Georeference
     from topoloc.apps.cli.georeference import format_georeference
-    from topoloc.geometry.geodesy import Georeference
 
     return (
         "unknown (topoloc georeference says where)"

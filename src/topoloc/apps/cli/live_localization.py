@@ -7,15 +7,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 
+from topoloc import AtlasLocalizer, CalibrationError, Localizer, Tracker, UncalibratedCamera
 from topoloc.apps.cli.output import UsageError, catch_stop_signals
 from topoloc.apps.cli.query_answers import QueryAnswer
 from topoloc.apps.formats.live import LiveImage, LiveSource, is_live
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
-from topoloc.errors import CalibrationError
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.localizer import Localizer
 from topoloc.localization.query_camera import CameraOfSize
-from topoloc.tracking.tracker import Tracker
 
 NEEDS_CALIBRATION = (
     "a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single"

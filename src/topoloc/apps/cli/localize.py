@@ -11,6 +11,26 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import (
+    AtlasConfig,
+    AtlasError,
+    AtlasLocalizer,
+    CalibrationError,
+    GeoPositionPrior,
+    Localizer,
+    LocalizerConfig,
+    NotLocalized,
+    QueryError,
+    Rigid3,
+    StereoSequence,
+    TopolocError,
+    Tracker,
+    TrackerConfig,
+    UncalibratedCamera,
+    UnreadableImageError,
+    read_trajectory,
+    write_tum,
+)
 from topoloc.apps.cli.features_option import QUERY_FEATURES
 from topoloc.apps.cli.live_localization import NEEDS_CALIBRATION, find_live_input, localize_live
 from topoloc.apps.cli.map_or_atlas import is_atlas, open_localizer, parse_camera
@@ -35,27 +55,11 @@ from topoloc.apps.cli.query_answers import (
     to_trajectory,
 )
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
-from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.location_prior import GeoPositionPrior
-from topoloc.errors import (
-    AtlasError,
-    CalibrationError,
-    QueryError,
-    TopolocError,
-    UnreadableImageError,
-)
-from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query_camera import CameraOfSize, select_frame_camera
-from topoloc.localization.result import NotLocalized
 from topoloc.mapping.sessions import find_source_path
-from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import find_format
 from topoloc.recordings.recording import as_monocular
-from topoloc.recordings.trajectory import match_frame_poses, read_trajectory, write_tum
-from topoloc.tracking.tracker import Tracker, TrackerConfig
+from topoloc.recordings.trajectory import match_frame_poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,20 +14,27 @@ from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
+from topoloc import (
+    BuildConfig,
+    PoseConventions,
+    RecordingError,
+    SlamConfig,
+    StereoSequence,
+    TopoMetricMap,
+    build_map,
+    run_slam,
+    with_pose_conventions,
+    with_trajectory,
+)
 from topoloc.apps.cli.output import UsageError, open_recording
 from topoloc.apps.formats.colmap import align_to_trajectory
 from topoloc.apps.formats.metric_scale import estimate_metric_scale
-from topoloc.errors import RecordingError
-from topoloc.geometry.pose_conventions import PoseConventions
-from topoloc.localization.map_facts.map_building import SkippedChecks, build_map
-from topoloc.mapping.build import BuildConfig, Progress
+from topoloc.localization.map_facts.map_building import SkippedChecks
 from topoloc.mapping.schema import SCHEMA_VERSION
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import StereoSequence
+from topoloc.plugin import Progress
 from topoloc.recordings.open import split_selection
 from topoloc.recordings.recording import has_scale, scale_poses
-from topoloc.recordings.trajectory import with_pose_conventions, with_trajectory
-from topoloc.slam.slam import SlamConfig, apply_slam_poses, run_slam
+from topoloc.slam.slam import apply_slam_poses
 
 
 @dataclass(frozen=True)

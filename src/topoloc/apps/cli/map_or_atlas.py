@@ -5,16 +5,20 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from topoloc import (
+    Atlas,
+    AtlasConfig,
+    AtlasLocalizer,
+    Localizer,
+    LocalizerConfig,
+    MapCache,
+    TopoMetricMap,
+    is_atlas,
+    set_node_cache_size,
+)
 from topoloc.apps.cli.features_option import create_localizer
 from topoloc.apps.cli.output import UsageError
-from topoloc.atlas.atlas import Atlas, is_atlas
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
-from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.map_cache import MapCache
-from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query_camera import CameraOfSize, parse_camera_option
-from topoloc.mapping.node_cache import set_node_cache_size
-from topoloc.mapping.topomap import TopoMetricMap
 
 __all__ = ["atlas_localizer", "is_atlas", "open_atlas", "open_localizer", "parse_camera"]
 

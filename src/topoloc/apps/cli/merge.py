@@ -9,18 +9,15 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import Atlas, LocalizerConfig, TopoMetricMap, UpdateConfig, is_atlas
 from topoloc.apps.cli.atlas import describe, print_atlas
 from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
 from topoloc.apps.cli.session_update import describe_outdated_models
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.cli.tile_joining import join_overlapping_tiles
-from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.lifelong.merge import merge_maps
-from topoloc.lifelong.update import UpdateConfig
-from topoloc.localization.localizer import LocalizerConfig
 from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.sessions import Edit, today
-from topoloc.mapping.topomap import TopoMetricMap
 
 
 @dataclass(frozen=True)

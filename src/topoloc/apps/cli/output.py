@@ -15,10 +15,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc.errors import MissingExtraError, TopolocError
-from topoloc.recordings.atomic import remove_stale_files, write_text
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.open import open_sequence
+from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequence
+from topoloc.plugin import remove_stale_files, write_text
 from topoloc.recordings.recording import recording_notes
 
 # Given or not: no `--no-...`, and no "(default: False)" in the help.

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from topoloc import Atlas, PruneConfig, is_atlas
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.cli.tile_option import (
@@ -18,8 +19,7 @@ from topoloc.apps.cli.tile_option import (
     run_for_each_tile,
 )
 from topoloc.apps.cli.wait_message import print_waiting
-from topoloc.atlas.atlas import Atlas, is_atlas
-from topoloc.lifelong.prune import PruneConfig, prune_map
+from topoloc.lifelong.prune import prune_map
 from topoloc.mapping.edit import edit_map
 
 

@@ -8,11 +8,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.image_calibration_check import check_camera_calibrations
-from topoloc.localization.result import Localization, NotLocalized
-from topoloc.recordings.trajectory import Trajectory
-from topoloc.tracking.stream_result import StreamedPose
+from topoloc import (
+    Localization,
+    NotLocalized,
+    Rigid3,
+    StreamedPose,
+    Trajectory,
+    check_camera_calibrations,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from topoloc import CalibrationError, MissingExtraError, StereoFrame, TopolocError
 from topoloc.apps.cli.output import (
     File,
     UsageError,
@@ -28,9 +29,7 @@ from topoloc.apps.formats.capture.carla_capture import (
 from topoloc.apps.formats.capture.recording_writer import RecordingWriter
 from topoloc.apps.formats.capture.zed_capture import sdk_frames, side_by_side_frames
 from topoloc.apps.formats.live import LiveSource
-from topoloc.errors import CalibrationError, MissingExtraError, TopolocError
-from topoloc.recordings.calibration import CalibrationForSize, parse_calibration
-from topoloc.recordings.frame import StereoFrame
+from topoloc.plugin import CalibrationForSize, parse_calibration
 
 _ZED_SIZE = (2560, 720)
 

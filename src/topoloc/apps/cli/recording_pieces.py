@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 
+from topoloc import TopolocError, open_sequence
 from topoloc.apps.cli.map_jobs import MapJob
 from topoloc.apps.cli.output import UsageError
-from topoloc.errors import TopolocError
-from topoloc.recordings.open import open_sequence, split_selection
+from topoloc.recordings.open import split_selection
 
 MIN_OVERLAP = 3
 

@@ -12,32 +12,39 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from topoloc import (
+    Atlas,
+    AtlasConfig,
+    EvaluatedQuery,
+    EvaluatedTile,
+    Localizer,
+    LocalizerConfig,
+    MissingExtraError,
+    PoseConventions,
+    RecordingError,
+    Rigid3,
+    StereoSequence,
+    TopolocError,
+    TopoMetricMap,
+    WeightsError,
+    localize_out_of_map,
+    localize_queries,
+    with_pose_conventions,
+)
 from topoloc.apps.cli.features_option import create_localizer
 from topoloc.apps.cli.map_or_atlas import atlas_localizer
 from topoloc.apps.cli.output import open_recording
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
-from topoloc.atlas.atlas import Atlas, absolute_address, store_at
-from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.evaluated_tile import EvaluatedTile
+from topoloc.atlas.atlas import absolute_address, store_at
 from topoloc.atlas.manifest import Manifest
-from topoloc.errors import MissingExtraError, RecordingError, TopolocError, WeightsError
-from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.evaluation.query_localization import (
     QueriedMap,
     create_image_reader,
     find_frames_with_truth,
-    localize_out_of_map,
-    localize_queries,
 )
 from topoloc.features.feature_types import check_available
-from topoloc.geometry.pose_conventions import PoseConventions
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.mapping.build import Progress
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.trajectory import with_pose_conventions
+from topoloc.plugin import Progress
 
 MAX_IMAGES = 50
 """Of a piece: a second or so for map and recording to be opened is little beside them."""

@@ -5,6 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from topoloc import (
+    LocalizerConfig,
+    MissingExtraError,
+    TopoMetricMap,
+    WeakRegions,
+    WeakRegionsConfig,
+    find_weak_regions,
+)
 from topoloc.apps.cli.features_option import create_localizer
 from topoloc.apps.cli.map_or_atlas import is_atlas
 from topoloc.apps.cli.output import (
@@ -15,11 +23,7 @@ from topoloc.apps.cli.output import (
     write_json,
 )
 from topoloc.apps.cli.settings_file import read_settings, with_option
-from topoloc.errors import MissingExtraError
-from topoloc.lifelong.weak_regions import WeakRegions, WeakRegionsConfig, find_weak_regions
-from topoloc.localization.localizer import LocalizerConfig
 from topoloc.mapping.description import describe_map
-from topoloc.mapping.topomap import TopoMetricMap
 
 
 def evaluate_map_itself(

@@ -8,16 +8,13 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import AtlasConfig, LocalizerConfig, MissingExtraError, TrackerConfig
 from topoloc.apps.cli.features_option import QUERY_FEATURES
 from topoloc.apps.cli.output import File, Flag, UsageError, catch_stop_signals
 from topoloc.apps.cli.served_maps import ServedMaps, read_token
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ReplicasConfig
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.atlas.config import AtlasConfig
-from topoloc.errors import MissingExtraError
-from topoloc.localization.localizer import LocalizerConfig
-from topoloc.tracking.tracker import TrackerConfig
 
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 

@@ -6,17 +6,20 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from topoloc import (
+    AtlasConfig,
+    LocalizerConfig,
+    MapCache,
+    TopolocError,
+    TrackerConfig,
+    is_warm,
+    set_node_cache_size,
+    set_num_threads,
+    warm_up,
+)
 from topoloc.apps.cli.features_option import create_localizer
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.tile_fetcher import TileFetcher
-from topoloc.compiled import set_num_threads
-from topoloc.errors import TopolocError
-from topoloc.localization.localizer import LocalizerConfig
-from topoloc.mapping.node_cache import set_node_cache_size
-from topoloc.tracking.tracker import TrackerConfig
-from topoloc.tracking.warm_up import is_warm, warm_up
 
 MIN_TOKEN_LENGTH = 16
 

@@ -10,18 +10,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from topoloc import (
+    LocalizerConfig,
+    PoseConventions,
+    SlamConfig,
+    StereoSequence,
+    TopoMetricMap,
+    UpdateConfig,
+    with_pose_conventions,
+    with_trajectory,
+)
 from topoloc.apps.cli.output import UsageError, open_recording
 from topoloc.apps.cli.wait_message import print_waiting
-from topoloc.geometry.pose_conventions import PoseConventions
-from topoloc.lifelong.update import MapUpdate, UpdateConfig, check_session_is_new, update_map
-from topoloc.localization.localizer import LocalizerConfig
-from topoloc.mapping.build import Progress
+from topoloc.lifelong.update import MapUpdate, check_session_is_new, update_map
 from topoloc.mapping.edit import edit_map
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.trajectory import with_pose_conventions, with_trajectory
+from topoloc.plugin import Progress
 from topoloc.slam.pose_checks import check_poses
-from topoloc.slam.slam import SlamConfig, estimate_slam_poses
+from topoloc.slam.slam import estimate_slam_poses
 
 
 @dataclass(frozen=True)

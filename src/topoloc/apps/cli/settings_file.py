@@ -15,9 +15,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from topoloc import ConfigError
 from topoloc.apps.cli import PLUGIN_PACKAGES, all_commands, load_plugins
 from topoloc.apps.cli.output import UsageError
-from topoloc.bounds import (
+from topoloc.plugin import (
     field_annotations,
     field_bounds,
     find_violation,
@@ -26,7 +27,6 @@ from topoloc.bounds import (
     strip_annotation,
     suggest_name,
 )
-from topoloc.errors import ConfigError
 
 T = TypeVar("T")
 
@@ -48,8 +48,8 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize", "serve", "follow")),
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
     "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
-    "tile_choice": ("topoloc.lifelong.tile_selection", "TileChoiceConfig", ("update",)),
-    "against_itself": ("topoloc.lifelong.weak_regions", "WeakPartsConfig", ("evaluate",)),
+    "tile_choice": ("topoloc.lifelong.tile_selection", "TileSelectionConfig", ("update",)),
+    "against_itself": ("topoloc.lifelong.weak_regions", "WeakRegionsConfig", ("evaluate",)),
     "join": ("topoloc.lifelong.tile_comparison", "TileJoinConfig", ("atlas", "build", "merge")),
     "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.apps.service.config", "ServiceConfig", ("serve",)),

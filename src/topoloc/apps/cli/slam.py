@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from topoloc import Rigid3, SlamConfig, SlamResult, StereoSequence, Trajectory, run_slam, write_tum
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -24,10 +25,6 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.apps.cli.settings_file import read_settings
 from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.trajectory import Trajectory, write_tum
-from topoloc.slam.slam import SlamConfig, SlamResult, run_slam
 
 
 @dataclass(frozen=True)

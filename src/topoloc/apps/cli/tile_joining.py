@@ -38,8 +38,8 @@ def join_overlapping_tiles(
     Raises:
         TopolocError: as of `join_tiles` and `run_on_ray`.
     """
-    from topoloc.lifelong.tile_comparison import TileJoinConfig
-    from topoloc.lifelong.tile_joining import NotCompared, join_tiles
+    from topoloc import TileJoinConfig, join_tiles
+    from topoloc.lifelong.tile_joining import NotCompared
 
     def report_pair(one: PairResult) -> None:
         if is_verbose and not isinstance(one.found, NotCompared):
@@ -66,10 +66,10 @@ def _join_on_ray(
     ray: str,
 ) -> TileJoiningResult:
     """As `join_tiles`, a task a pair; told in the order in which they are done."""
+    from topoloc import Atlas, TileJoinConfig
     from topoloc.apps.cluster.config import ClusterConfig
     from topoloc.apps.cluster.tasks import JobProgress, run_on_ray
-    from topoloc.atlas.atlas import Atlas, absolute_address
-    from topoloc.lifelong.tile_comparison import TileJoinConfig
+    from topoloc.atlas.atlas import absolute_address
     from topoloc.lifelong.tile_joining import PairJob, TileJoiningResult, select_tile_pairs
 
     def show(number: int, state: PairResult | JobProgress) -> None:

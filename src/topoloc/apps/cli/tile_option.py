@@ -9,10 +9,9 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
+from topoloc import Atlas, AtlasError, MapError, ObjectStoreError, SharedWorld, is_atlas
 from topoloc.apps.cli.output import UsageError
-from topoloc.atlas.atlas import Atlas, is_atlas
-from topoloc.atlas.shared_world import SharedWorld, group_shared_worlds, world_of_tile
-from topoloc.errors import AtlasError, MapError, ObjectStoreError
+from topoloc.atlas.shared_world import group_shared_worlds, world_of_tile
 
 TileOption = Annotated[str | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(atlases only)")]
 _MAX_LISTED = 8
@@ -35,7 +34,7 @@ def edit_map_or_tile(where: str, tile_id: str | None, edit: Callable[[Path], T])
             f"{where} is an atlas: --tile says which of its maps is meant"
             f" ({_format_ids(list(Atlas.open(where).manifest.by_id))})"
         )
-    from topoloc.lifelong.tile_editing import edit_tile
+    from topoloc import edit_tile
 
     return edit_tile(where, tile_id, edit)[1]
 

@@ -12,6 +12,14 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from topoloc import (
+    Atlas,
+    AtlasConfig,
+    DuplicateSessionError,
+    TileSelectionConfig,
+    edit_tile,
+    find_tile_of_recording,
+)
 from topoloc.apps.cli.map_or_atlas import open_atlas
 from topoloc.apps.cli.output import interruptible
 from topoloc.apps.cli.recordings_table import print_notes, recordings_table
@@ -20,13 +28,9 @@ from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.connection import connect_to_cluster
 from topoloc.apps.cluster.tasks import Job, JobProgress, OnJobState, run_locally, run_on_ray
 from topoloc.apps.cluster.tiles import Outcome, State, run_tile_work
-from topoloc.atlas.atlas import Atlas, absolute_address
-from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.atlas import absolute_address
 from topoloc.atlas.manifest import Tile
-from topoloc.errors import DuplicateSessionError
-from topoloc.lifelong.tile_editing import edit_tile
-from topoloc.lifelong.tile_selection import TileSelectionConfig, find_tile_of_recording
-from topoloc.mapping.build import Progress
+from topoloc.plugin import Progress
 
 
 @dataclass(frozen=True)

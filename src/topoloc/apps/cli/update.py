@@ -8,6 +8,16 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import (
+    AtlasConfig,
+    LocalizerConfig,
+    SlamConfig,
+    TileSelectionConfig,
+    Trajectory,
+    UpdateConfig,
+    is_atlas,
+    write_tum,
+)
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -22,13 +32,6 @@ from topoloc.apps.cli.output import (
 from topoloc.apps.cli.session_update import SessionUpdateOptions, describe_update
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.cluster.config import ClusterConfig
-from topoloc.atlas.atlas import is_atlas
-from topoloc.atlas.config import AtlasConfig
-from topoloc.lifelong.tile_selection import TileSelectionConfig
-from topoloc.lifelong.update import UpdateConfig
-from topoloc.localization.localizer import LocalizerConfig
-from topoloc.recordings.trajectory import Trajectory, write_tum
-from topoloc.slam.slam import SlamConfig
 
 
 @dataclass(frozen=True)

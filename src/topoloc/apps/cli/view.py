@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from topoloc import Atlas, TopoMetricMap, is_atlas
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.tile_option import (
     TileOption,
@@ -25,9 +26,7 @@ from topoloc.apps.viewer.page import write_scene_page
 from topoloc.apps.viewer.result_files import read_results
 from topoloc.apps.viewer.screenshot import find_browser, write_screenshot
 from topoloc.apps.viewer.world_document import create_world_document
-from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.mapping.contents import get_map_id
-from topoloc.mapping.topomap import TopoMetricMap
 
 _DEFAULT_MAX_POINTS = SceneBudget().max_points
 

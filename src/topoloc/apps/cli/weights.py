@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc.errors import WeightsError
+from topoloc import WeightsError
 from topoloc.features.network_files import (
     NETWORKS,
     NetworkInfo,
@@ -26,7 +26,7 @@ from topoloc.features.network_files import (
     find_network_info,
     read_bytes,
 )
-from topoloc.recordings.atomic import atomic_write
+from topoloc.plugin import atomic_write
 
 CONVERTERS = "topoloc.network_converters"
 """Group of entry points: `convert(kind, weights, target, properties)` writes the ONNX file of
