@@ -11,14 +11,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from topoloc.apps.export.map_export import export
+    from topoloc.apps.report.explanation import explain
     from topoloc.apps.service.client import AsyncClient, Client
+    from topoloc.apps.viewer.map_page import view
     from topoloc.atlas.atlas import Atlas, is_atlas
     from topoloc.atlas.atlas_localizer import AtlasLocalizer
     from topoloc.atlas.config import AtlasConfig
     from topoloc.atlas.evaluated_tile import EvaluatedTile
     from topoloc.atlas.location_prior import GeoPositionPrior
+    from topoloc.atlas.manifest import Tile
     from topoloc.atlas.map_cache import MapCache
     from topoloc.atlas.shared_world import SharedWorld
+    from topoloc.atlas.tile_fetcher import TileFetcher
     from topoloc.compiled import set_num_threads
     from topoloc.errors import (
         AtlasError,
@@ -37,28 +42,39 @@ if TYPE_CHECKING:
         UnreadableImageError,
         WeightsError,
     )
+    from topoloc.evaluation.evaluate import Evaluation, evaluate
     from topoloc.evaluation.metrics import EvaluatedQuery
-    from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
+    from topoloc.evaluation.query_localization import (
+        find_frames_with_truth,
+        localize_out_of_map,
+        localize_queries,
+    )
+    from topoloc.evaluation.world_alignment import WorldFit
+    from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
     from topoloc.geometry.camera import Camera
     from topoloc.geometry.geodesy import GeoPoint, GeoPose, Georeference
     from topoloc.geometry.pose_conventions import PoseConventions
     from topoloc.geometry.rig import StereoRig
     from topoloc.geometry.rigid import Rigid3
     from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+    from topoloc.lifelong.map_files import merge, prune, update
     from topoloc.lifelong.prune import PruneConfig
     from topoloc.lifelong.tile_comparison import TileJoinConfig
     from topoloc.lifelong.tile_editing import edit_tile
-    from topoloc.lifelong.tile_joining import join_tiles
+    from topoloc.lifelong.tile_joining import PairResult, join_tiles
     from topoloc.lifelong.tile_selection import TileSelectionConfig, find_tile_of_recording
-    from topoloc.lifelong.update import UpdateConfig
+    from topoloc.lifelong.update import MapUpdate, UpdateConfig
     from topoloc.lifelong.weak_regions import WeakRegions, WeakRegionsConfig, find_weak_regions
     from topoloc.localization.image_calibration_check import check_camera_calibrations
     from topoloc.localization.localizer import Localizer, LocalizerConfig
-    from topoloc.localization.map_facts.map_building import build_map
+    from topoloc.localization.map_facts.contradictions import check_map
+    from topoloc.localization.map_facts.map_building import SkippedChecks, build_map
     from topoloc.localization.provenance import Provenance
     from topoloc.localization.result import Alternative, Localization, NotLocalized
     from topoloc.localization.search import Trace
     from topoloc.mapping.build import BuildConfig
+    from topoloc.mapping.edit import read_history, undo_edit
+    from topoloc.mapping.georeference import GeoreferenceResult, georeference
     from topoloc.mapping.node_cache import set_node_cache_size
     from topoloc.mapping.topomap import TopoMetricMap
     from topoloc.recordings.frame import DepthImage, StereoFrame, StereoSequence
@@ -95,21 +111,25 @@ __all__ = [
     "DuplicateSessionError",
     "EvaluatedQuery",
     "EvaluatedTile",
+    "Evaluation",
     "FeatureTypeError",
     "GeoPoint",
     "GeoPose",
     "GeoPositionPrior",
     "Georeference",
     "GeoreferenceError",
+    "GeoreferenceResult",
     "Localization",
     "Localizer",
     "LocalizerConfig",
     "MapCache",
     "MapError",
+    "MapUpdate",
     "MemorySequence",
     "MissingExtraError",
     "NotLocalized",
     "ObjectStoreError",
+    "PairResult",
     "PoseConventions",
     "Provenance",
     "PruneConfig",
@@ -117,12 +137,15 @@ __all__ = [
     "RecordingError",
     "Rigid3",
     "SharedWorld",
+    "SkippedChecks",
     "SlamConfig",
     "SlamResult",
     "StereoFrame",
     "StereoRig",
     "StereoSequence",
     "StreamedPose",
+    "Tile",
+    "TileFetcher",
     "TileJoinConfig",
     "TileSelectionConfig",
     "TileTracker",
@@ -139,22 +162,37 @@ __all__ = [
     "WeakRegions",
     "WeakRegionsConfig",
     "WeightsError",
+    "WorldFit",
     "__version__",
+    "absolute_trajectory_errors",
     "build_map",
     "check_camera_calibrations",
+    "check_map",
     "edit_tile",
+    "evaluate",
+    "explain",
+    "export",
+    "find_frames_with_truth",
     "find_tile_of_recording",
     "find_weak_regions",
+    "georeference",
     "is_atlas",
     "is_warm",
     "join_tiles",
     "localize_out_of_map",
     "localize_queries",
+    "merge",
     "open_sequence",
+    "prune",
+    "read_history",
     "read_trajectory",
+    "relative_drift",
     "run_slam",
     "set_node_cache_size",
     "set_num_threads",
+    "undo_edit",
+    "update",
+    "view",
     "warm_up",
     "with_pose_conventions",
     "with_trajectory",
@@ -177,21 +215,25 @@ _MODULES = {
     "DuplicateSessionError": "topoloc.errors",
     "EvaluatedQuery": "topoloc.evaluation.metrics",
     "EvaluatedTile": "topoloc.atlas.evaluated_tile",
+    "Evaluation": "topoloc.evaluation.evaluate",
     "FeatureTypeError": "topoloc.errors",
     "GeoPoint": "topoloc.geometry.geodesy",
     "GeoPose": "topoloc.geometry.geodesy",
     "GeoPositionPrior": "topoloc.atlas.location_prior",
     "Georeference": "topoloc.geometry.geodesy",
     "GeoreferenceError": "topoloc.errors",
+    "GeoreferenceResult": "topoloc.mapping.georeference",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
     "MapCache": "topoloc.atlas.map_cache",
     "MapError": "topoloc.errors",
+    "MapUpdate": "topoloc.lifelong.update",
     "MemorySequence": "topoloc.recordings.memory_sequence",
     "MissingExtraError": "topoloc.errors",
     "NotLocalized": "topoloc.localization.result",
     "ObjectStoreError": "topoloc.errors",
+    "PairResult": "topoloc.lifelong.tile_joining",
     "PoseConventions": "topoloc.geometry.pose_conventions",
     "Provenance": "topoloc.localization.provenance",
     "PruneConfig": "topoloc.lifelong.prune",
@@ -199,12 +241,15 @@ _MODULES = {
     "RecordingError": "topoloc.errors",
     "Rigid3": "topoloc.geometry.rigid",
     "SharedWorld": "topoloc.atlas.shared_world",
+    "SkippedChecks": "topoloc.localization.map_facts.map_building",
     "SlamConfig": "topoloc.slam.slam",
     "SlamResult": "topoloc.slam.slam",
     "StereoFrame": "topoloc.recordings.frame",
     "StereoRig": "topoloc.geometry.rig",
     "StereoSequence": "topoloc.recordings.frame",
     "StreamedPose": "topoloc.tracking.stream_result",
+    "Tile": "topoloc.atlas.manifest",
+    "TileFetcher": "topoloc.atlas.tile_fetcher",
     "TileJoinConfig": "topoloc.lifelong.tile_comparison",
     "TileSelectionConfig": "topoloc.lifelong.tile_selection",
     "TileTracker": "topoloc.tracking.tile_tracker",
@@ -221,21 +266,36 @@ _MODULES = {
     "WeakRegions": "topoloc.lifelong.weak_regions",
     "WeakRegionsConfig": "topoloc.lifelong.weak_regions",
     "WeightsError": "topoloc.errors",
+    "WorldFit": "topoloc.evaluation.world_alignment",
+    "absolute_trajectory_errors": "topoloc.geometry.alignment",
     "build_map": "topoloc.localization.map_facts.map_building",
     "check_camera_calibrations": "topoloc.localization.image_calibration_check",
+    "check_map": "topoloc.localization.map_facts.contradictions",
     "edit_tile": "topoloc.lifelong.tile_editing",
+    "evaluate": "topoloc.evaluation.evaluate",
+    "explain": "topoloc.apps.report.explanation",
+    "export": "topoloc.apps.export.map_export",
+    "find_frames_with_truth": "topoloc.evaluation.query_localization",
     "find_tile_of_recording": "topoloc.lifelong.tile_selection",
     "find_weak_regions": "topoloc.lifelong.weak_regions",
+    "georeference": "topoloc.mapping.georeference",
     "is_atlas": "topoloc.atlas.atlas",
     "is_warm": "topoloc.tracking.warm_up",
     "join_tiles": "topoloc.lifelong.tile_joining",
     "localize_out_of_map": "topoloc.evaluation.query_localization",
     "localize_queries": "topoloc.evaluation.query_localization",
+    "merge": "topoloc.lifelong.map_files",
     "open_sequence": "topoloc.recordings.open",
+    "prune": "topoloc.lifelong.map_files",
+    "read_history": "topoloc.mapping.edit",
     "read_trajectory": "topoloc.recordings.trajectory",
+    "relative_drift": "topoloc.geometry.alignment",
     "run_slam": "topoloc.slam.slam",
     "set_node_cache_size": "topoloc.mapping.node_cache",
     "set_num_threads": "topoloc.compiled",
+    "undo_edit": "topoloc.mapping.edit",
+    "update": "topoloc.lifelong.map_files",
+    "view": "topoloc.apps.viewer.map_page",
     "warm_up": "topoloc.tracking.warm_up",
     "with_pose_conventions": "topoloc.recordings.trajectory",
     "with_trajectory": "topoloc.recordings.trajectory",

@@ -12,8 +12,9 @@ import pytest
 
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
+from topoloc.apps.cli.history import _describe_recall_change
 from topoloc.lifelong.prune import select_landmarks
-from topoloc.lifelong.recall_change import describe_recall_change, measure_recall_change
+from topoloc.lifelong.recall_change import measure_recall_change
 
 
 def test_a_map_that_lost_its_landmarks_localizes_fewer_of_its_earlier_nodes(room_map: Path):
@@ -28,10 +29,10 @@ def test_a_map_that_lost_its_landmarks_localizes_fewer_of_its_earlier_nodes(room
         "earlier_localized_after": 0,
     }
     assert (
-        describe_recall_change(counts)
+        _describe_recall_change(counts)
         == "of 4 earlier nodes, each asked without itself, 4 localized before and 0 after"
     )
-    assert describe_recall_change({"landmarks_gone": 3}) is None
+    assert _describe_recall_change({"landmarks_gone": 3}) is None
 
 
 def test_the_history_tells_it(room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

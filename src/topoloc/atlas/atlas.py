@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import importlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from topoloc.atlas.global_descriptors import GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index import AtlasIndex
@@ -15,6 +17,7 @@ from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of
 from topoloc.errors import AtlasError
+from topoloc.mapping.edit import read_history
 
 _OBJECT_STORES = "topoloc.apps.stores.object_store"
 """The module of `ObjectStore`. A string: fsspec is an extra, and stores are an app."""
@@ -58,6 +61,71 @@ class Atlas:
             )
         return Atlas(store, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}"))
 
+    @staticmethod
+    def from_manifest(where: str, data: bytes) -> Atlas:
+        """Return the atlas there as these bytes of a manifest describe it, which need not be its
+        newest one. Raises AtlasError."""
+        return Atlas(store_at(where), Manifest.from_bytes(data, where))
+
+    @staticmethod
+    def create(
+        where: str, maps: Sequence[str], tile_id: str | None = None, world: str | None = None
+    ) -> Atlas:
+        """Create an atlas of map files, which are copied.
+
+        Args:
+            where: a folder, or a prefix of an object store such as s3://bucket/campus.
+            maps: paths of map files. Each becomes a tile, with the name of its file without .topo.
+            tile_id: the name of the tile, for one map.
+            world: the name of the world that all maps share; by default each has its own.
+
+        Raises:
+            AtlasError: an atlas exists there, two tiles get one name, or it cannot be written.
+            MapError: a map is missing, damaged or empty.
+        """
+        from topoloc.atlas.editing import create_atlas, new_tiles
+
+        return Atlas(store_at(where), create_atlas(where, new_tiles(maps, tile_id, world)))
+
+    @staticmethod
+    def add(
+        where: str,
+        maps: Sequence[str],
+        tile_id: str | None = None,
+        world: str | None = None,
+        replaces: bool = False,
+    ) -> Atlas:
+        """Add map files to the atlas there, as `create`; with `replaces` tiles of the same names
+        are replaced. Raises AtlasError, MapError."""
+        from topoloc.atlas.editing import add_tiles, new_tiles
+
+        return Atlas(store_at(where), add_tiles(where, new_tiles(maps, tile_id, world), replaces))
+
+    @staticmethod
+    def remove(where: str, tile_ids: Sequence[str]) -> Atlas:
+        """Remove tiles from the atlas there. Raises AtlasError."""
+        from topoloc.atlas.editing import remove_tiles
+
+        return Atlas(store_at(where), remove_tiles(where, tile_ids))
+
+    @staticmethod
+    def merge(sources: Sequence[str], where: str) -> Atlas:
+        """Create an atlas of the tiles of all sources, atlases or map files, with their joins.
+        Raises AtlasError, MapError."""
+        from topoloc.atlas.merging import merge_atlases
+
+        return Atlas(store_at(where), merge_atlases(sources, where))
+
+    @property
+    def address(self) -> str:
+        """Its address from any working directory."""
+        return absolute_address(self.store.where)
+
+    def find_problem(self, tile_id: str) -> str | None:
+        """Return the first difference between a tile's files and their checksums, None if there is
+        none. Raises AtlasError: the atlas has no such tile."""
+        return tile_problem(self, self.tile(tile_id))
+
     def tile(self, tile_id: str) -> Tile:
         """Raises AtlasError where there is no such tile."""
         tile = self.manifest.by_id.get(tile_id)
@@ -71,6 +139,12 @@ class Atlas:
     def map_path(self, tile: Tile) -> Path:
         """The tile's map file. Raises AtlasError where it is missing."""
         return self.store.local_path(tile.map.name, tile.map.sha256)
+
+    def history(self, tile_id: str) -> list[dict[str, Any]]:
+        """Return the edits of a tile's map, as `read_history` does. Raises AtlasError, MapError."""
+        tile = self.tile(tile_id)
+        log = None if tile.undo is None else self.store.local_path(tile.undo.name, tile.undo.sha256)
+        return read_history(self.map_path(tile), log)
 
     @cached_property
     def _opened(self) -> OpenedIndex:

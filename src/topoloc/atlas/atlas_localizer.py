@@ -200,6 +200,10 @@ class AtlasLocalizer:
         *_, ranking = self._rankings(query_image, StageClock())
         return ranking
 
+    def rank_image(self, image: Image, camera: Camera | UncalibratedCamera) -> TileRanking:
+        """Return the tiles by their similarity to an image, as `rank`."""
+        return self.rank(QueryImage(image, camera))
+
     def _rankings(self, query_image: QueryImage, clock: StageClock) -> Iterator[TileRanking]:
         """As `rank`, by the cheapest kind of features; then by the next as well, until a tile
         leads."""

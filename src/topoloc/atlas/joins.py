@@ -54,6 +54,11 @@ class Join:
             residual=None if residual is None else number(residual, "residual"),
         )
 
+    def sigmas_at(self, point_second: Float[np.ndarray, "3"]) -> tuple[float, float]:
+        """Return one sigma of the position (m, in the worst direction) of a point of the second
+        tile in the world of the first, and one sigma of the rotation (rad)."""
+        return sigmas_at(self.first_from_second.apply(point_second), self.covariance)
+
     @property
     def pair(self) -> tuple[str, str]:
         """The ids of the tiles."""

@@ -30,6 +30,27 @@ class SharedWorld:
     tiles: tuple[PlacedTile, ...]
     georeference: Georeference | None
 
+    @staticmethod
+    def group(manifest: Manifest) -> list[SharedWorld]:
+        """Group all tiles by the worlds that they share, the world with most nodes first."""
+        groups: dict[str | None, list[PlacedTile]] = {}
+        for tile in manifest.tiles:
+            joint, pose = tile.in_joint_world, tile.atlas_from_world
+            key, pose = (joint.joint, joint.joint_from_world) if pose is None else (None, pose)
+            groups.setdefault(key, []).append(PlacedTile(tile, pose))
+        origin = manifest.origin
+        on_earth = None if origin is None else Georeference(origin, Rigid3.identity(), "atlas")
+        worlds = [
+            SharedWorld(tuple(group), on_earth if key is None else None)
+            for key, group in groups.items()
+        ]
+        return sorted(worlds, key=lambda world: -world.num_nodes)
+
+    @staticmethod
+    def of_tile(manifest: Manifest, tile: Tile) -> SharedWorld:
+        """Return a tile alone, in the world of its map."""
+        return SharedWorld((PlacedTile(tile, Rigid3.identity()),), manifest.georeference_of(tile))
+
     @property
     def num_nodes(self) -> int:
         return sum(placed.tile.num_nodes for placed in self.tiles)
@@ -39,27 +60,6 @@ class SharedWorld:
         return next(
             (placed.world_from_map for placed in self.tiles if placed.tile.tile_id == tile_id), None
         )
-
-
-def group_shared_worlds(manifest: Manifest) -> list[SharedWorld]:
-    """All tiles by the worlds that they share, the one of most nodes first."""
-    groups: dict[str | None, list[PlacedTile]] = {}
-    for tile in manifest.tiles:
-        joint, pose = tile.in_joint_world, tile.atlas_from_world
-        key, pose = (joint.joint, joint.joint_from_world) if pose is None else (None, pose)
-        groups.setdefault(key, []).append(PlacedTile(tile, pose))
-    origin = manifest.origin
-    on_earth = None if origin is None else Georeference(origin, Rigid3.identity(), "atlas")
-    worlds = [
-        SharedWorld(tuple(group), on_earth if key is None else None)
-        for key, group in groups.items()
-    ]
-    return sorted(worlds, key=lambda world: -world.num_nodes)
-
-
-def world_of_tile(manifest: Manifest, tile: Tile) -> SharedWorld:
-    """A tile alone, in the world of its map."""
-    return SharedWorld((PlacedTile(tile, Rigid3.identity()),), manifest.georeference_of(tile))
 
 
 def iter_open_tiles(

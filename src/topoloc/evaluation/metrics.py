@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -30,6 +30,10 @@ class EvaluatedQuery:
     nearest one: see `find_neighbour_ids`. `is_in_other_world`: the pose is in a world of which the
     truth says nothing, that of another tile of an atlas, and so it is false.
     """
+
+    max_translation_m: ClassVar[float] = MAX_TRANSLATION
+    max_rotation_deg: ClassVar[float] = MAX_ROTATION_DEG
+    """A pose that is further off than either is a false accept."""
 
     query: str
     result: Localization | NotLocalized

@@ -9,7 +9,7 @@ probability is not calibrated.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -202,6 +202,48 @@ def default_learned_type() -> str:
     """
     check_available(LEARNED_TYPES[0].name)
     return LEARNED_TYPES[0].name
+
+
+def parse_feature_types(text: str) -> list[str]:
+    """Return the feature types that a text names, such as `surf,sift`, `learned` or `both` (SURF,
+    then the default learned type).
+
+    Raises:
+        FeatureTypeError: one is unknown, or is named twice.
+        MissingExtraError, WeightsError: the network of the default learned type is missing.
+    """
+    if text == "both":
+        names = [SURF.name, default_learned_type()]
+    else:
+        names = [default_learned_type()] if text == "learned" else text.split(",")
+    if unknown := [name for name in names if name not in FEATURE_TYPES]:
+        raise FeatureTypeError(f"no features {unknown[0]!r}; there are {', '.join(FEATURE_TYPES)}")
+    if len(set(names)) < len(names):
+        raise FeatureTypeError(f"--features {text}: a kind is named twice")
+    return names
+
+
+def select_stored_types(stored: Sequence[str], text: str) -> tuple[str, ...]:
+    """Return those of the stored feature types, in their order, that a text names: `learned`,
+    `both` (all), or names such as `surf,topoloc-net`.
+
+    Raises:
+        FeatureTypeError: the map does not store one of them.
+    """
+    if text == "both":
+        return tuple(stored)
+    named = text.split(",")
+    found = [
+        name
+        for name in stored
+        if name in named or (text == "learned" and FEATURE_TYPES[name].network is not None)
+    ]
+    missing = [name for name in named if name not in found] if text != "learned" else []
+    if missing or not found:
+        raise FeatureTypeError(
+            f"the map holds no features {(missing or [text])[0]} (it holds: {', '.join(stored)})"
+        )
+    return tuple(found)
 
 
 def check_available(name: str) -> None:

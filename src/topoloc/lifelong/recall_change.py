@@ -32,16 +32,3 @@ def measure_recall_change(
             answer.is_localized for answer in answers.values()
         )
     return counts
-
-
-def describe_recall_change(changes) -> str | None:
-    """The same in words; None where it was not measured."""
-    if not changes.get("earlier_asked"):
-        return None
-    asked, before, after = (
-        changes[f"earlier_{name}"] for name in ("asked", "localized_before", "localized_after")
-    )
-    return (
-        f"of {asked} earlier nodes, each asked without itself, {before} localized before and"
-        f" {after} after"
-    )

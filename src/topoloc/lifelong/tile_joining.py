@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.atlas import Atlas, absolute_address
 from topoloc.atlas.editing import add_joins
 from topoloc.atlas.joins import Join
 from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
@@ -35,6 +36,8 @@ _NUM_BEST = 3
 _MAX_BYTES = 512_000_000
 
 OnCompared = Callable[["PairResult"], None]
+RunPairJobs = Callable[[list["PairJob"]], list["PairResult"]]
+"""Runs jobs elsewhere, such as on a cluster; the results are in the order of the jobs."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,35 @@ class PairResult:
     first: str
     second: str
     found: TileTransform | NotJoined
+
+    @property
+    def problem(self) -> str | None:
+        """Why the tiles could not be compared; None if they were."""
+        return self.found.reason if isinstance(self.found, NotCompared) else None
+
+    def __str__(self) -> str:
+        if isinstance(self.found, NotJoined):
+            return self.found.reason
+        if self.found.is_from_shared_images:
+            return f"joined, by {self.found.num_agreeing} pictures that are part of both"
+        return (
+            f"joined, {self.found.num_agreeing} nodes agree, {self.found.num_recognised} of"
+            f" {self.found.num_near} that must be recognised are"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the pair, whether it was joined, and the figures or the reason."""
+        found, row = self.found, {"first": self.first, "second": self.second}
+        if isinstance(found, NotJoined):
+            return row | {"joined": False, "reason": found.reason}
+        return row | {
+            "joined": True,
+            "num_agreeing": found.num_agreeing,
+            "same_pictures": found.is_from_shared_images,
+            "num_near": found.num_near,
+            "num_recognised": found.num_recognised,
+            "agreeing": round(found.agreeing, 3),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +97,7 @@ def join_tiles(
     config: TileJoinConfig | None = None,
     on_compared: OnCompared | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
+    run_jobs: RunPairJobs | None = None,
 ) -> TileJoiningResult:
     """Tiles that overlap joined, those of them that no join connects directly yet.
 
@@ -72,6 +105,7 @@ def join_tiles(
         tile_ids: only pairs with one of these; none: all.
         tell: is told of each pair that was compared.
         pairs: just these are compared, by the ids of the tiles; None: those that look alike.
+        run_jobs: compares the pairs instead, as jobs; `on_compared` is not called then.
 
     Raises:
         ConfigError: a setting is out of its bounds.
@@ -79,27 +113,23 @@ def join_tiles(
         FeatureKindError, MissingExtraError, WeightsError: maps' features cannot be compared here.
     """
     config, atlas = config or TileJoinConfig(), Atlas.open(where)
+    selected = _select_pairs(atlas, tile_ids, config, pairs)
+    if run_jobs is not None:
+        jobs = [
+            PairJob(absolute_address(where), first.tile_id, second.tile_id, config)
+            for first, second in selected
+        ]
+        done = run_jobs(jobs) if jobs else []
+        return TileJoiningResult(Atlas.open(where).manifest, done)
     maps, pair_results = MapCache([], Localizer, _MAX_BYTES), list[PairResult]()
     try:
-        for first, second in _select_pairs(atlas, tile_ids, config, pairs):
+        for first, second in selected:
             pair_results.append(_join_pair(atlas, maps, (first, second), config))
             if on_compared is not None:
                 on_compared(pair_results[-1])
     finally:
         maps.close()
     return TileJoiningResult(Atlas.open(where).manifest, pair_results)
-
-
-def select_tile_pairs(
-    where: str,
-    tile_ids: Sequence[str] = (),
-    config: TileJoinConfig | None = None,
-    pairs: Sequence[tuple[str, str]] | None = None,
-) -> list[tuple[str, str]]:
-    """The ids of the tiles that `join_tiles` compares, in its order. Raises ConfigError, AtlasError
-    as that does."""
-    found = _select_pairs(Atlas.open(where), tile_ids, config or TileJoinConfig(), pairs)
-    return [(first.tile_id, second.tile_id) for first, second in found]
 
 
 @dataclass(frozen=True)

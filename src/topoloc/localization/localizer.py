@@ -17,9 +17,11 @@ import copy
 import time
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
 from topoloc.bounds import check_bounds
+from topoloc.features.feature_types import select_stored_types
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
@@ -48,6 +50,9 @@ class Localizer:
     or ONNX Runtime, is not here, each with what it lacks.
 
     Args:
+        topomap: the map, or the path of its file, which is opened.
+        features: the map's feature types that are used: `learned`, `both`, or names such as
+            `surf,topoloc-net`; by default those of `config.kinds`.
         coarse: names the candidate nodes instead of one of the map's own coarse localizers: any
             object with `CoarseLocalizer.rank` (`topoloc/retrieval/coarse.py`), such as retrieval of
             another kind or a prior from elsewhere. `config.coarse` is then left aside.
@@ -57,19 +62,24 @@ class Localizer:
         ConfigError: a setting is out of bounds.
         FeatureKindError: the map's features are of a kind that there is not.
         EmptyMapError: the map has no node.
-        MapError: the map has no such coarse localizer.
+        MapError: the map file cannot be read, or the map has no such coarse localizer.
         MissingExtraError, WeightsError: a network of features is not here, and the map has no
             others, or `config.kinds` names them.
     """
 
     def __init__(
         self,
-        topomap: TopoMetricMap,
+        topomap: TopoMetricMap | str | Path,
         config: LocalizerConfig | None = None,
         coarse: CoarseLocalizer | None = None,
         weights: FittedWeights | None = None,
+        features: str | None = None,
     ) -> None:
+        if isinstance(topomap, str | Path):
+            topomap = TopoMetricMap.load(topomap)
         config = config or LocalizerConfig()
+        if features is not None:
+            config = replace(config, kinds=select_stored_types(topomap.kinds, features))
         check_bounds(config)
         self.topomap, self.map_id = topomap, get_map_id(topomap)
         kinds, self.unavailable_types = select_feature_types(topomap, config.kinds)

@@ -11,7 +11,7 @@ import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +122,25 @@ def count_undoable_edits(path: str | Path, log: Path | None = None) -> int:
     path = Path(os.path.realpath(path))
     with closing(MapFile(path)) as file:
         return len(find_undo_entries(log or undo_log_path(path), file.digest))
+
+
+def read_history(path: str | Path, log: Path | None = None) -> list[dict[str, Any]]:
+    """Return the edits of a map file as JSON, the first one first, each with whether it can be
+    undone (`undoable`).
+
+    Args:
+        log: the undo file, by default the one beside the map file.
+
+    Raises:
+        MapError: the map is missing or damaged.
+    """
+    num_undoable = count_undoable_edits(path, log)
+    with TopoMetricMap.load(path) as topomap:
+        edits = [asdict(edit) for edit in topomap.edits]
+    return [
+        edit | {"undoable": number > len(edits) - num_undoable}
+        for number, edit in enumerate(edits, start=1)
+    ]
 
 
 @contextmanager

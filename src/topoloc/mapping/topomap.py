@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, no_type_check
+from typing import Any, ClassVar, no_type_check
 
 import numpy as np
 
 from topoloc.errors import FeatureTypeError, MapError
-from topoloc.mapping.contents import MapContents
+from topoloc.mapping.contents import MapContents, get_map_id
 from topoloc.mapping.entries import (
     CorrelatedErrors,
     Edge,
@@ -33,6 +33,7 @@ from topoloc.mapping.entries import (
 from topoloc.mapping.map_file import MapFile
 from topoloc.mapping.map_reading import open_map
 from topoloc.mapping.map_writing import save_map
+from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.session_illumination import find_node_illumination_groups
 from topoloc.mapping.sessions import Edit, Session
 from topoloc.retrieval.coarse import (
@@ -66,6 +67,21 @@ class TopoMetricMap(MapContents):
     A map that was loaded holds its file open; ``with TopoMetricMap.load(path) as topomap`` or
     `close` let go of it. It is pickled as its path, and several threads may read it.
     """
+
+    schema_version: ClassVar[int] = SCHEMA_VERSION
+    """Schema of the map files that `save` writes."""
+
+    def describe(self, path: str | Path) -> dict[str, Any]:
+        """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres,
+        sessions, edits, configuration. Raises EmptyMapError: the map has no node."""
+        from topoloc.mapping.description import describe_map
+
+        return describe_map(self, Path(path))
+
+    @property
+    def resolved_id(self) -> str:
+        """The map's identifier, 16 hexadecimal digits, also of a map without a stored one."""
+        return get_map_id(self)
 
     def row_of(self, node_id: int) -> int:
         """The row of a node. Raises KeyError where the map has no node of this id."""

@@ -74,6 +74,24 @@ class SlamResult:
     disparity_bias_px: list[float]
     right_residuals_px: Float[np.ndarray, " n"]
 
+    def apply(self, sequences: Sequence[StereoSequence]) -> list[StereoSequence]:
+        """Return the recordings that were given to `run_slam` with the estimated poses, and with
+        those of stretches that stayed apart.
+
+        Raises:
+            RecordingError: one of them shares no place with the others.
+        """
+        for sequence, poses in zip(sequences, self.poses, strict=True):
+            if not any(poses):
+                raise RecordingError(
+                    f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it"
+                    " alone"
+                )
+        return [
+            SequenceView(sequence, list(range(len(sequence))), poses, tuple(apart))
+            for sequence, poses, apart in zip(sequences, self.poses, self.apart, strict=True)
+        ]
+
 
 def run_slam(
     sequences: StereoSequence | Sequence[StereoSequence],
@@ -140,28 +158,7 @@ def estimate_slam_poses(
     Raises:
         RecordingError: one of them shares no place with the others; and as `run_slam`.
     """
-    return apply_slam_poses(sequences, run_slam(sequences, config, progress))
-
-
-def apply_slam_poses(
-    sequences: Sequence[StereoSequence], result: SlamResult
-) -> list[StereoSequence]:
-    """The recordings with the poses that `run_slam` has found in them, and those of stretches that
-    stayed apart.
-
-    Raises:
-        RecordingError: one of them shares no place with the others.
-    """
-    for sequence, poses in zip(sequences, result.poses, strict=True):
-        if not any(poses):
-            raise RecordingError(
-                f"{sequence.name}: no place of it was recognised in {sequences[0].name}; map it"
-                " alone"
-            )
-    return [
-        SequenceView(sequence, list(range(len(sequence))), poses, tuple(apart))
-        for sequence, poses, apart in zip(sequences, result.poses, result.apart, strict=True)
-    ]
+    return run_slam(sequences, config, progress).apply(sequences)
 
 
 def _track_recording(

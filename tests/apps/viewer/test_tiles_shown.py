@@ -18,7 +18,7 @@ from topoloc.apps.viewer.world_scene import create_world_scene
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, create_atlas
 from topoloc.atlas.joins import Join
-from topoloc.atlas.shared_world import group_shared_worlds, world_of_tile
+from topoloc.atlas.shared_world import SharedWorld
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
@@ -46,7 +46,7 @@ def _points(document: dict) -> np.ndarray:
 
 def test_each_tile_stands_where_it_lies(campus: Path, tiny_recording: Path):
     atlas = Atlas.open(str(campus))
-    world, alone = group_shared_worlds(atlas.manifest)
+    world, alone = SharedWorld.group(atlas.manifest)
     assert ([placed.tile.tile_id for placed in world.tiles], alone.tiles[0].tile.tile_id) == (
         ["hall", "room"],
         "far",
@@ -82,7 +82,7 @@ def test_each_tile_stands_where_it_lies(campus: Path, tiny_recording: Path):
 
 def test_answers_stand_where_their_tile_lies(campus: Path, tiny_recording: Path, room_map: Path):
     atlas = Atlas.open(str(campus))
-    world = group_shared_worlds(atlas.manifest)[0]
+    world = SharedWorld.group(atlas.manifest)[0]
     frame = open_sequence(str(tiny_recording))[3]
     with TopoMetricMap.load(room_map) as topomap:
         result = Localizer(topomap).localize(frame.image, frame.camera)
@@ -108,10 +108,10 @@ def test_answers_stand_where_their_tile_lies(campus: Path, tiny_recording: Path,
 
 def test_an_export_holds_all_of_them(campus: Path):
     atlas = Atlas.open(str(campus))
-    world = group_shared_worlds(atlas.manifest)[0]
+    world = SharedWorld.group(atlas.manifest)[0]
     both, one = (
         create_world_scene(atlas, world, "campus"),
-        create_world_scene(atlas, world_of_tile(atlas.manifest, atlas.tile("room")), "room"),
+        create_world_scene(atlas, SharedWorld.of_tile(atlas.manifest, atlas.tile("room")), "room"),
     )
     half = len(one.views)
     assert (len(both.views), len(both.points.world)) == (2 * half, 2 * len(one.points.world))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -68,7 +69,6 @@ class Command:
         found, joined = [], None
         if self.action == "info":
             from topoloc import Atlas
-            from topoloc.atlas.atlas import tile_problem
 
             atlas = Atlas.open(self.atlas)
             manifest = atlas.manifest
@@ -76,13 +76,13 @@ class Command:
                 found = [
                     f"tile {tile.tile_id}: {problem}"
                     for tile in manifest.tiles
-                    if (problem := tile_problem(atlas, tile))
+                    if (problem := atlas.find_problem(tile.tile_id))
                 ]
         else:
             settings = read_settings(self.config)
             manifest = None if self.action == "join" else self._write()
             if manifest is None or self.join:
-                ids = [tile.tile_id for tile in self._create_tile()] if self.join else self.names
+                ids = self._new_ids() if self.join else self.names
                 joined = join_overlapping_tiles(
                     self.atlas, ids, settings, self.json != "-", ray=self.ray
                 )
@@ -97,21 +97,17 @@ class Command:
         return 1 if found else 0
 
     def _write(self) -> Any:
-        from topoloc.atlas.editing import add_tiles, create_atlas, remove_tiles
+        from topoloc import Atlas
 
         if self.action == "remove":
-            return remove_tiles(self.atlas, self.names)
-        new = self._create_tile()
-        return (
-            create_atlas(self.atlas, new)
-            if self.action == "create"
-            else add_tiles(self.atlas, new, self.replace)
-        )
+            return Atlas.remove(self.atlas, self.names).manifest
+        if self.action == "create":
+            return Atlas.create(self.atlas, self.names, self.id, self.world).manifest
+        return Atlas.add(self.atlas, self.names, self.id, self.world, self.replace).manifest
 
-    def _create_tile(self) -> Any:
-        from topoloc.atlas.editing import new_tiles
-
-        return new_tiles(self.names, self.id, self.world)
+    def _new_ids(self) -> list[str]:
+        """The ids of the tiles that `create` and `add` write."""
+        return [self.id or Path(name).name.removesuffix(".topo") for name in self.names]
 
     def _check_usage(self) -> None:
         if self.action == "info" and self.names:
@@ -167,10 +163,8 @@ def group_tiles_by_world(manifest: Any) -> dict[str, list[str]]:
 def _describe_join(join: Any, manifest: Any) -> dict[str, Any]:
     """What the manifest says of it, and one sigma of where the second tile's middle lies in the
     first's world."""
-    from topoloc.atlas.joins import sigmas_at
-
     middle = manifest.by_id[join.second].box_world.mean(axis=0)
-    metres, radians = sigmas_at(join.first_from_second.apply(middle), join.covariance)
+    metres, radians = join.sigmas_at(middle)
     return join.to_json() | {"sigma_m": metres, "sigma_deg": math.degrees(radians)}
 
 

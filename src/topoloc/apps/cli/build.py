@@ -29,7 +29,6 @@ from topoloc.apps.cli.output import (
 from topoloc.apps.cli.recording_pieces import Pieces, SplitOptions, split_recording
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cli.tile_joining import JoinedTiles, join_overlapping_tiles
-from topoloc.mapping.description import describe_map
 
 if TYPE_CHECKING:
     from topoloc.apps.cluster.tiles import Outcome, TileJob
@@ -174,7 +173,7 @@ class Command:
         with progress_bar() as progress:
             topomap, poses_from = map_job.make(progress)
         topomap.save(target)
-        info = describe_map(topomap, target)
+        info = topomap.describe(target)
         if self.json != "-":
             size = (
                 f"{info['num_nodes']} nodes, {info['num_points']} points,"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +13,7 @@ import tyro
 
 from topoloc import (
     EvaluatedQuery,
+    Evaluation,
     Localization,
     Localizer,
     MissingExtraError,
@@ -37,8 +38,6 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.demo.recordings import ROLES, SHIPPED, Role, find_missing_recordings
 from topoloc.demo.report_texts import PAPER_LAB, create_report_texts, describe_night
-from topoloc.evaluation.metrics import group_by_recording, summarize
-from topoloc.mapping.description import describe_map
 from topoloc.plugin import write_text
 
 Progress = Callable[[str, int, int], None]
@@ -72,7 +71,7 @@ class Command:
             topomap = _build_lab_map(folder, out / "lab.topo", progress)
             mapped = time.perf_counter()
             answers = _localize_queries(topomap, folder, progress)
-        evaluation = summarize(answers) | {"map": describe_map(topomap, out / "lab.topo")}
+        evaluation = Evaluation(answers).to_json() | {"map": topomap.describe(out / "lab.topo")}
         _write_results(out, folder, answers)
         try:
             import_report_writer()(
@@ -149,11 +148,11 @@ def _label(sequence: StereoSequence) -> str:
     return sequence.name.replace("_", " ")
 
 
-def _write_results(out: Path, folder: Path, answers: Sequence[EvaluatedQuery]) -> None:
+def _write_results(out: Path, folder: Path, answers: list[EvaluatedQuery]) -> None:
     """One JSON line a query, and the poses found in each recording as a trajectory."""
     lines = [json.dumps(a.result.to_json(f"{a.recording}/{a.query}")) for a in answers]
     write_text(out / "results.jsonl", "\n".join(lines) + "\n")
-    groups = group_by_recording(answers)
+    groups = Evaluation(answers).by_recording
     for sequence in _open(folder, "queries"):
         t_ns = dict(zip(sequence.names, sequence.t_ns, strict=True))
         found = [

@@ -15,12 +15,13 @@ from topoloc import (
     AtlasConfig,
     EvaluatedQuery,
     EvaluatedTile,
+    Evaluation,
     Localizer,
     LocalizerConfig,
     Rigid3,
     StereoSequence,
     TrajectoryError,
-    check_camera_calibrations,
+    WorldFit,
 )
 from topoloc.apps.cli.features_option import QUERY_FEATURES
 from topoloc.apps.cli.map_or_atlas import open_localizer
@@ -42,16 +43,7 @@ from topoloc.apps.cli.remote_queries import OpenQueries, QueryRecording, RemoteM
 from topoloc.apps.cli.self_evaluation import evaluate_map_itself
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ClusterConfig
-from topoloc.evaluation.metrics import (
-    MAX_ROTATION_DEG,
-    MAX_TRANSLATION,
-    format_length,
-    group_by_recording,
-    summarize,
-)
-from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
-from topoloc.mapping.description import describe_map
-from topoloc.plugin import read_json
+from topoloc.plugin import format_length, read_json
 
 
 @dataclass(frozen=True)
@@ -143,7 +135,7 @@ class Command:
         write_report = import_report_writer() if self.report else None
         judged = self._open_map(settings, config)
         topomap = judged.topomap
-        info = describe_map(topomap, topomap.file.path if topomap.file else Path(self.map))
+        info = topomap.describe(topomap.file.path if topomap.file else self.map)
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         asked = self._open_recordings(map_from_truth)
         with progress_bar() as progress:
@@ -156,15 +148,12 @@ class Command:
                 answers = localize_on_ray(
                     sent, asked, self.ray, settings.of(ClusterConfig), progress
                 )
-        of_worlds = (
-            [] if isinstance(judged, EvaluatedTile) else group_by_recording(answers).values()
-        )
-        fits = [fit for of_one in of_worlds if (fit := fit_worlds(of_one)) is not None]
-        calibrations = _check_calibrations(answers)
-        evaluation = summarize(answers) | {
+        evaluated = Evaluation(answers)
+        fits = [] if isinstance(judged, EvaluatedTile) else evaluated.world_fits
+        evaluation = evaluated.to_json() | {
             "map": info,
             "world_fits": [fit.to_json() for fit in fits],
-            "calibrations": calibrations,
+            "calibrations": evaluated.calibrations(),
         }
         if self.json != "-":
             _print(evaluation)
@@ -244,17 +233,6 @@ class Command:
                 self.fit_map_from_truth,
                 {"map_from_truth": fits[0].map_from_truth.matrix().tolist()},
             )
-
-
-def _check_calibrations(answers: Sequence[EvaluatedQuery]) -> list[dict[str, Any]]:
-    """What the pictures of each recording say together of their cameras."""
-    return [
-        {"recording": name} | verdict.to_json()
-        for name, of_one in group_by_recording(answers).items()
-        for verdict in check_camera_calibrations(
-            answer.result for answer in of_one if answer.world_from_cam is not None
-        )
-    ]
 
 
 def _report_world_fit(fit: WorldFit, written: str | None) -> str:
@@ -348,8 +326,8 @@ def _print(evaluation: dict[str, Any]) -> None:
         (
             "false accepts",
             (
-                f"{e['false_accepts']} ({elsewhere}of poses off by more than {MAX_TRANSLATION} m or"
-                f" {MAX_ROTATION_DEG:g} deg)"
+                f"{e['false_accepts']} ({elsewhere}of poses off by more than"
+                f" {EvaluatedQuery.max_translation_m} m or {EvaluatedQuery.max_rotation_deg:g} deg)"
             ),
         )
     )

@@ -21,11 +21,10 @@ from topoloc.apps.cli.features_option import QUERY_FEATURES, create_localizer
 from topoloc.apps.cli.map_or_atlas import is_atlas, open_atlas, parse_camera
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.settings_file import read_settings, with_option
+from topoloc.apps.query_camera import parse_camera_option, select_frame_camera
 from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
 from topoloc.apps.report.explanation_page import row_of, verdict, write_explanation
-from topoloc.localization.query import QueryImage
-from topoloc.localization.query_camera import parse_camera_option, select_frame_camera
-from topoloc.recordings.recording import as_monocular
+from topoloc.plugin import as_monocular
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class Command:
         assert tile_id is not None
         likest = ", ".join(
             f"{name} {likeness:.2f}"
-            for name, likeness in localizer.rank(QueryImage(frame.image, camera))[:5]
+            for name, likeness in localizer.rank_image(frame.image, camera)[:5]
         )
         said = f"in tile {tile_id}"
         if not isinstance(result, Localization):

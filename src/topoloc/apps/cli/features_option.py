@@ -8,15 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from topoloc import FeatureTypeError, Localizer, LocalizerConfig, TopoMetricMap
+from topoloc import BuildConfig, FeatureTypeError, Localizer, LocalizerConfig, TopoMetricMap
 from topoloc.apps.cli.output import UsageError
-from topoloc.features.feature_types import (
-    FEATURE_TYPES,
-    SURF,
-    check_available,
-    default_learned_type,
-)
-from topoloc.mapping.config import MapConfig
+from topoloc.plugin import check_available, parse_feature_types
 
 BUILD_FEATURES = Annotated[
     str | None,
@@ -34,24 +28,19 @@ QUERY_FEATURES = Annotated[
 ]
 
 
-def select_build_features(config: MapConfig, features: str | None) -> MapConfig:
+def select_build_features(config: BuildConfig, features: str | None) -> BuildConfig:
     """The configuration with the kinds of features that the option names, the first one first.
 
     Raises:
         UsageError: an unknown kind, or one that is named twice.
         MissingExtraError, WeightsError: what a kind that is wanted needs is not here.
     """
-    if features is None:
-        kinds = config.kinds
-    elif features == "both":
-        kinds = [SURF.name, default_learned_type()]
-    else:
-        kinds = [default_learned_type()] if features == "learned" else features.split(",")
-        config = replace(config, other_kinds=())
-    if unknown := [kind for kind in kinds if kind not in FEATURE_TYPES]:
-        raise UsageError(f"no features {unknown[0]!r}; there are {', '.join(FEATURE_TYPES)}")
-    if len(set(kinds)) < len(kinds):
-        raise UsageError(f"--features {features}: a kind is named twice")
+    kinds = config.kinds
+    if features is not None:
+        try:
+            kinds = parse_feature_types(features)
+        except FeatureTypeError as error:
+            raise UsageError(str(error)) from None
     for kind in kinds:
         check_available(kind)
     return replace(
@@ -66,32 +55,10 @@ def create_localizer(
     each of the map's that cannot be asked.
 
     Raises:
-        FeatureKindError: the map does not hold them.
+        FeatureTypeError: the map does not hold them.
         MissingExtraError, WeightsError: what they need is not here.
     """
-    localizer = Localizer(topomap, _with_feature_types(topomap, config, features))
+    localizer = Localizer(topomap, config, features=features)
     for kind, lacking in localizer.unavailable_types.items():
         print(f"warning: features {kind} of the map are not asked: {lacking}", file=sys.stderr)
     return localizer
-
-
-def _with_feature_types(
-    topomap: TopoMetricMap, config: LocalizerConfig, features: str | None
-) -> LocalizerConfig:
-    if features is None:
-        return config
-    if features == "both":
-        return replace(config, kinds=tuple(topomap.kinds))
-    named = features.split(",")
-    kinds = [
-        kind
-        for kind in topomap.kinds
-        if kind in named or (features == "learned" and FEATURE_TYPES[kind].network is not None)
-    ]
-    missing = [name for name in named if name not in kinds] if features != "learned" else []
-    if missing or not kinds:
-        raise FeatureTypeError(
-            f"the map holds no features {(missing or [features])[0]} (it holds:"
-            f" {', '.join(topomap.kinds)})"
-        )
-    return replace(config, kinds=tuple(kinds))

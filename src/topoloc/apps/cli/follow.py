@@ -41,9 +41,9 @@ from topoloc.apps.cli.output import (
 from topoloc.apps.cli.query_answers import QueryAnswer, format_answer
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.formats.live import LiveSource, is_live
+from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
 from topoloc.apps.robots.ros_publisher import RosPublisher
-from topoloc.localization.query_camera import CameraOfSize, select_frame_camera
-from topoloc.recordings.recording import as_monocular
+from topoloc.plugin import as_monocular
 
 ReadFrame = Callable[[], StereoFrame]
 """Reads a picture whose turn it is. Raises UnreadableImageError."""

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
-from topoloc import GeoPoint, Georeference, GeoreferenceError, Rigid3, TopoMetricMap
+from topoloc import (
+    GeoPoint,
+    Georeference,
+    GeoreferenceError,
+    GeoreferenceResult,
+    georeference,
+)
 from topoloc.apps.cli.output import File, UsageError, check_outputs, print_fields, write_json
 from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
 from topoloc.apps.cli.wait_message import print_waiting
-from topoloc.mapping.control_points import ControlPoints, read_control_points, read_gnss
-from topoloc.mapping.edit import edit_map
-from topoloc.mapping.georeferencing import (
-    GeoreferenceFit,
-    UpDirection,
-    estimate_up_direction,
-    fit_georeference,
-    georeference_from_heading,
-)
 
 
 @dataclass(frozen=True)
@@ -63,58 +59,27 @@ class Command:
             [self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path]
         )
         origin = None if self.origin is None else _parse_origin(self.origin)
-        found, facts, fitted = edit_map_or_tile(
-            self.map, self.tile, lambda path: self._edit_georeference(path, origin)
+        result = edit_map_or_tile(
+            self.map,
+            self.tile,
+            lambda path: georeference(path, origin, self.gnss, self.points, self.up, print_waiting),
         )
+        facts = _describe_result(result)
         if self.json != "-":
-            _print(found, facts, fitted)
+            _print(result, facts)
         write_json(self.json, facts)
         return 0
 
-    def _edit_georeference(
-        self, path: Path, origin: tuple[GeoPoint, float] | None
-    ) -> tuple[Georeference, dict[str, Any], tuple[ControlPoints, GeoreferenceFit] | None]:
-        """Where the map lies, with what is said of it, and what it was fitted to."""
-        with edit_map(path, print_waiting) as edit:
-            topomap = edit.topomap
-            posed = [image.world_from_cam for image in topomap.place_images] or [
-                s.world_from_cam for s in topomap.summaries
-            ]
-            if not posed:
-                raise GeoreferenceError(f"map {path} has no mapping picture")
-            up = estimate_up_direction(posed, self.up)
-            found, fitted = self._estimate_georeference(topomap, posed[0], up, origin)
-            edit.commit(replace(topomap, georeference=found), f"georeference {found.source}")
-        facts = found.to_json() | {
-            "heading_deg": found.heading_deg(posed[0].rotation[:, 2]),
-            "up": None if self.points else up.axis,
-        }
-        if fitted is not None:
-            fit = fitted[1]
-            facts |= {
-                "num_points": len(fit.is_inlier),
-                "num_used": int(fit.is_inlier.sum()),
-                "residuals_m": fit.residuals_m.round(4).tolist(),
-            }
-        return found, facts, fitted
 
-    def _estimate_georeference(
-        self,
-        topomap: TopoMetricMap,
-        first: Rigid3,
-        up: UpDirection,
-        origin: tuple[GeoPoint, float] | None,
-    ) -> tuple[Georeference, tuple[ControlPoints, GeoreferenceFit] | None]:
-        """Where the map lies, and what that was fitted to."""
-        if origin is not None:
-            return georeference_from_heading(first, *origin, up), None
-        if self.points is not None:
-            known = read_control_points(Path(self.points))
-            fit = fit_georeference(known.points_world, known.places, "points")
-        else:
-            known = read_gnss(Path(self.gnss or ""), topomap)
-            fit = fit_georeference(known.points_world, known.places, "gnss", up)
-        return fit.georeference, (known, fit)
+def _describe_result(result: GeoreferenceResult) -> dict[str, Any]:
+    facts = result.georeference.to_json() | {"heading_deg": result.heading_deg, "up": result.up}
+    if result.names:
+        facts |= {
+            "num_points": len(result.is_inlier),
+            "num_used": int(result.is_inlier.sum()),
+            "residuals_m": result.residuals_m.round(4).tolist(),
+        }
+    return facts
 
 
 def _parse_origin(text: str) -> tuple[GeoPoint, float]:
@@ -138,11 +103,9 @@ def format_georeference(georeference: Georeference) -> str:
     return f"{o.lat:.7f}, {o.lon:.7f}, {o.h:.2f} m (from {georeference.source}{fitted})"
 
 
-def _print(
-    found: Georeference, facts: dict[str, Any], fitted: tuple[ControlPoints, GeoreferenceFit] | None
-) -> None:
+def _print(result: GeoreferenceResult, facts: dict[str, Any]) -> None:
     lines = [
-        ("origin", format_georeference(found)),
+        ("origin", format_georeference(result.georeference)),
         (
             "first picture looks to",
             f"{facts['heading_deg']:.1f} degrees from true north, clockwise",
@@ -150,22 +113,23 @@ def _print(
     ]
     if facts["up"] is not None:
         lines.append(("up", f"the world's {facts['up']}"))
-    if fitted is not None:
-        known, fit = fitted
-        worst = int(np.argmax(np.where(fit.is_inlier, fit.residuals_m, -1.0)))
+    if result.names:
+        worst = int(np.argmax(np.where(result.is_inlier, result.residuals_m, -1.0)))
         lines.append(("points", f"{facts['num_used']} of {facts['num_points']} agree"))
         lines.append(
             (
                 "residuals",
                 (
-                    f"rms {found.rms_m:.3f} m, largest {fit.residuals_m[worst]:.3f} m"
-                    f" ({known.names[worst]})"
+                    f"rms {result.georeference.rms_m:.3f} m, largest"
+                    f" {result.residuals_m[worst]:.3f} m ({result.names[worst]})"
                 ),
             )
         )
-        if not fit.is_inlier.all():
+        if not result.is_inlier.all():
             left_out = ", ".join(
-                known.names[k] for k in np.flatnonzero(~fit.is_inlier)[:5].tolist()
+                result.names[k] for k in np.flatnonzero(~result.is_inlier)[:5].tolist()
             )
-            lines.append(("left out", f"{left_out}{', ...' if (~fit.is_inlier).sum() > 5 else ''}"))
+            lines.append(
+                ("left out", f"{left_out}{', ...' if (~result.is_inlier).sum() > 5 else ''}")
+            )
     print_fields(lines)

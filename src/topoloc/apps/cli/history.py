@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
 
-from topoloc import Atlas, TopoMetricMap, is_atlas
+from topoloc import Atlas, is_atlas, read_history
 from topoloc.apps.cli.output import File, print_fields, write_json
 from topoloc.apps.cli.tile_option import run_for_each_tile
-from topoloc.atlas.manifest import Tile
-from topoloc.lifelong.recall_change import describe_recall_change
-from topoloc.mapping.edit import count_undoable_edits
 
 
 @dataclass(frozen=True)
@@ -28,10 +24,10 @@ class Command:
     def run(self) -> int:
         if is_atlas(self.map):
             return self._show_tiles()
-        facts, num_undoable = _read_edits(self.map)
+        facts = read_history(self.map)
         if self.json != "-":
             _print_edits(facts, "nothing is known of how this map was made")
-            _print_undo(self.map, num_undoable)
+            _print_undo(self.map, facts)
         write_json(self.json, {"map": self.map, "edits": facts})
         return 0
 
@@ -39,11 +35,11 @@ class Command:
         atlas = Atlas.open(self.map)
 
         def print_tile_history(tile_id: str) -> dict[str, Any]:
-            edits, num_undoable = _read_tile_edits(atlas, atlas.tile(tile_id))
+            edits = atlas.history(tile_id)
             if self.json != "-":
                 print(f"tile {tile_id}")
                 _print_edits(edits, "nothing is known of how this tile was made")
-                _print_undo(f"{self.map} --tile {tile_id}", num_undoable)
+                _print_undo(f"{self.map} --tile {tile_id}", edits)
             return {"edits": edits}
 
         tiles, are_all_told = run_for_each_tile(
@@ -53,25 +49,8 @@ class Command:
         return 0 if are_all_told else 1
 
 
-def _read_tile_edits(atlas: Atlas, tile: Tile) -> tuple[list[dict[str, Any]], int]:
-    """As `_read_edits`. Raises MapError."""
-    log = None if tile.undo is None else atlas.store.local_path(tile.undo.name, tile.undo.sha256)
-    return _read_edits(atlas.map_path(tile), log)
-
-
-def _read_edits(path: str | Path, log: Path | None = None) -> tuple[list[dict[str, Any]], int]:
-    """The edits of a map file, the first one first, and how many of the last ones can be taken
-    back, by the undo file beside it or another one. Raises MapError."""
-    num_undoable = count_undoable_edits(path, log)
-    with TopoMetricMap.load(path) as topomap:
-        edits = [asdict(edit) for edit in topomap.edits]
-    return [
-        edit | {"undoable": number > len(edits) - num_undoable}
-        for number, edit in enumerate(edits, start=1)
-    ], num_undoable
-
-
-def _print_undo(where: str, num_undoable: int) -> None:
+def _print_undo(where: str, edits: list[dict[str, Any]]) -> None:
+    num_undoable = sum(edit["undoable"] for edit in edits)
     if num_undoable:
         print(
             f"`topoloc undo {where}` takes the last one back"
@@ -94,7 +73,7 @@ def _print_edits(edits: list[dict[str, Any]], without: str) -> None:
 
 def _format_changes(changes) -> str:
     """What an edit changed, in the words of its numbers."""
-    recall, numbers = describe_recall_change(changes or {}), (changes or {}).items()
+    recall, numbers = _describe_recall_change(changes or {}), (changes or {}).items()
     shown = {
         name.replace("_", " "): value
         for name, value in numbers
@@ -102,3 +81,17 @@ def _format_changes(changes) -> str:
     }
     said = [f"{name} {value}" for name, value in shown.items()] + ([recall] if recall else [])
     return "" if not said else ": " + ", ".join(said)
+
+
+def _describe_recall_change(changes) -> str | None:
+    """How many earlier nodes were localized before and after an edit; None if it was not
+    measured."""
+    if not changes.get("earlier_asked"):
+        return None
+    asked, before, after = (
+        changes[f"earlier_{name}"] for name in ("asked", "localized_before", "localized_after")
+    )
+    return (
+        f"of {asked} earlier nodes, each asked without itself, {before} localized before and"
+        f" {after} after"
+    )

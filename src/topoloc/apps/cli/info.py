@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc import MapError, is_atlas
+from topoloc import MapError, check_map, is_atlas
 from topoloc.apps.cli import atlas
 from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_fields, write_json
-from topoloc.mapping.description import describe_map
 
 MAX_PROBLEMS = 20
 
@@ -44,7 +43,7 @@ class Command:
             return atlas.Command("info", self.map, check=self.check, json=self.json).run()
         check_outputs([self.json, self.graph], inputs=[self.map])
         with TopoMetricMap.load(self.map) as topomap:
-            found = _find_damage(topomap, Path(self.map)) if self.check else []
+            found = check_map(self.map) if self.check else []
             if found:
                 print("\n".join(found[:MAX_PROBLEMS]))
                 raise MapError(
@@ -55,20 +54,11 @@ class Command:
                 from topoloc.apps.export.map_graph import write_graph
 
                 write_graph(topomap, Path(self.graph))
-            info = describe_map(topomap, Path(self.map)) | ({"check": "ok"} if self.check else {})
+            info = topomap.describe(self.map) | ({"check": "ok"} if self.check else {})
         if self.json != "-":
             _print(info)
         write_json(self.json, info)
         return 0
-
-
-def _find_damage(topomap: Any, path: Path) -> list[str]:
-    """What is wrong with the bytes of the file, or, where nothing is, with what they say."""
-    from topoloc.localization.map_facts.contradictions import find_contradictions
-    from topoloc.mapping.integrity_check import find_map_damage
-
-    found = find_map_damage(path)
-    return found or [str(contradiction) for contradiction in find_contradictions(topomap)]
 
 
 def _print(info: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ from topoloc import AtlasLocalizer, CalibrationError, Localizer, Tracker, Uncali
 from topoloc.apps.cli.output import UsageError, catch_stop_signals
 from topoloc.apps.cli.query_answers import QueryAnswer
 from topoloc.apps.formats.live import LiveImage, LiveSource, is_live
-from topoloc.localization.query_camera import CameraOfSize
+from topoloc.apps.query_camera import CameraOfSize
 
 NEEDS_CALIBRATION = (
     "a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single"

@@ -55,11 +55,8 @@ from topoloc.apps.cli.query_answers import (
     to_trajectory,
 )
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
-from topoloc.localization.query_camera import CameraOfSize, select_frame_camera
-from topoloc.mapping.sessions import find_source_path
-from topoloc.recordings.open import find_format
-from topoloc.recordings.recording import as_monocular
-from topoloc.recordings.trajectory import match_frame_poses
+from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
+from topoloc.plugin import as_monocular, find_format, find_source_path, match_frame_poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from topoloc import (
     BuildConfig,
     PoseConventions,
     RecordingError,
+    SkippedChecks,
     SlamConfig,
     StereoSequence,
     TopoMetricMap,
@@ -29,12 +30,7 @@ from topoloc import (
 from topoloc.apps.cli.output import UsageError, open_recording
 from topoloc.apps.formats.colmap import align_to_trajectory
 from topoloc.apps.formats.metric_scale import estimate_metric_scale
-from topoloc.localization.map_facts.map_building import SkippedChecks
-from topoloc.mapping.schema import SCHEMA_VERSION
-from topoloc.plugin import Progress
-from topoloc.recordings.open import split_selection
-from topoloc.recordings.recording import has_scale, scale_poses
-from topoloc.slam.slam import apply_slam_poses
+from topoloc.plugin import Progress, has_scale, scale_poses, split_selection
 
 
 @dataclass(frozen=True)
@@ -77,7 +73,7 @@ class MapJob:
         sequences, poses_from = self._open()
         if poses_from[0] == "slam":
             result = run_slam(sequences, self.slam, progress)
-            sequences = apply_slam_poses(sequences, result)
+            sequences = result.apply(sequences)
             apart = result.num_submaps - result.num_joined
             if apart:
                 print(
@@ -120,7 +116,7 @@ class MapJob:
         ]
         facts = {
             "settings": asdict(self),
-            "versions": [__version__, SCHEMA_VERSION],
+            "versions": [__version__, TopoMetricMap.schema_version],
             "files": sorted(
                 (os.path.abspath(path), path.stat().st_size, path.stat().st_mtime_ns)
                 for path in files

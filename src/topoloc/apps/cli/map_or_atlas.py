@@ -18,7 +18,7 @@ from topoloc import (
 )
 from topoloc.apps.cli.features_option import create_localizer
 from topoloc.apps.cli.output import UsageError
-from topoloc.localization.query_camera import CameraOfSize, parse_camera_option
+from topoloc.apps.query_camera import CameraOfSize, parse_camera_option
 
 __all__ = ["atlas_localizer", "is_atlas", "open_atlas", "open_localizer", "parse_camera"]
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from topoloc import Atlas, LocalizerConfig, TopoMetricMap, UpdateConfig, is_atlas
+from topoloc import Atlas, LocalizerConfig, UpdateConfig, is_atlas, merge
 from topoloc.apps.cli.atlas import describe, print_atlas
 from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
 from topoloc.apps.cli.session_update import describe_outdated_models
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.cli.tile_joining import join_overlapping_tiles
-from topoloc.lifelong.merge import merge_maps
-from topoloc.mapping.schema import SCHEMA_VERSION
-from topoloc.mapping.sessions import Edit, today
 
 
 @dataclass(frozen=True)
@@ -51,23 +48,15 @@ class Command:
         settings = read_settings(self.config)
         if is_of_tiles:
             return self._merge_tiles(settings)
-        with (
-            TopoMetricMap.load(self.first) as first,
-            TopoMetricMap.load(self.second) as second,
-            progress_bar() as progress,
-        ):
-            merged = merge_maps(
-                first, second, settings.of(UpdateConfig), settings.of(LocalizerConfig), progress
+        with progress_bar() as progress:
+            c = merge(
+                self.first,
+                self.second,
+                self.out,
+                settings.of(UpdateConfig),
+                settings.of(LocalizerConfig),
+                progress,
             )
-            edit = Edit(
-                first.free_ids.edit,
-                f"merge {Path(self.second).name}",
-                today(),
-                SCHEMA_VERSION,
-                merged.changes,
-            )
-            replace(merged.topomap, edits=[*first.edits, edit]).save(self.out)
-        c = merged.changes | {"bytes": Path(self.out).stat().st_size}
         if self.json != "-":
             recognised = (
                 f"{c['agreeing']} of {c['nodes_of_second']} nodes of {self.second} were recognised"
@@ -83,10 +72,9 @@ class Command:
     def _merge_tiles(self, settings: Settings) -> int:
         """An atlas of two; then tiles of the second are compared with those of the first. Status 1
         where some could not be."""
-        from topoloc.atlas.merging import merge_atlases
 
         first = Atlas.open(self.first).manifest.by_id if is_atlas(self.first) else {}
-        merged = merge_atlases([self.first, self.second], self.out)
+        merged = Atlas.merge([self.first, self.second], self.out).manifest
         second = (
             Atlas.open(self.second).manifest.by_id
             if is_atlas(self.second)

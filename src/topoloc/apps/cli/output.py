@@ -16,8 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequence
-from topoloc.plugin import remove_stale_files, write_text
-from topoloc.recordings.recording import recording_notes
+from topoloc.plugin import recording_notes, remove_stale_files, write_text
 
 # Given or not: no `--no-...`, and no "(default: False)" in the help.
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc import Atlas, PruneConfig, is_atlas
+from topoloc import Atlas, PruneConfig, is_atlas, prune
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.cli.tile_option import (
@@ -19,8 +19,6 @@ from topoloc.apps.cli.tile_option import (
     run_for_each_tile,
 )
 from topoloc.apps.cli.wait_message import print_waiting
-from topoloc.lifelong.prune import prune_map
-from topoloc.mapping.edit import edit_map
 
 
 @dataclass(frozen=True)
@@ -77,23 +75,10 @@ class Command:
 
     def _prune_map(self, path: Path, config: PruneConfig, name: str) -> dict[str, Any]:
         """What was dropped from a map file, which is said of it by its name."""
-        with edit_map(path, print_waiting) as edit:
-            before = edit.path.stat().st_size
-            pruned = prune_map(
-                edit.topomap,
-                edit.path,
-                None if self.max_mb is None else round(self.max_mb * 1e6),
-                config,
-            )
-            changes = pruned.changes | {"bytes_before": before}
-            walked_km = edit.topomap.length_m / 1e3
-            if pruned.topomap is not edit.topomap:
-                to_size = "" if self.max_mb is None else f" to {self.max_mb:g} MB"
-                how = ", descriptors coarse" if config.descriptors == "coarse" else ""
-                edit.commit(pruned.topomap, f"prune{to_size}{how}", changes)
-        changes["bytes"] = path.stat().st_size
+        pruned = prune(path, self.max_mb, config, print_waiting)
+        changes = pruned.changes
         if self.json != "-":
-            print(f"{name}: {describe_prune(changes, walked_km)}")
+            print(f"{name}: {describe_prune(changes, pruned.length_m / 1e3)}")
         return changes
 
 

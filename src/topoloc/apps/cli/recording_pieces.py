@@ -11,7 +11,7 @@ from hashlib import sha256
 from topoloc import TopolocError, open_sequence
 from topoloc.apps.cli.map_jobs import MapJob
 from topoloc.apps.cli.output import UsageError
-from topoloc.recordings.open import split_selection
+from topoloc.plugin import split_selection
 
 MIN_OVERLAP = 3
 

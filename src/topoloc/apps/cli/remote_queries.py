@@ -11,6 +11,8 @@ import platform
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 from topoloc import (
     Atlas,
@@ -27,6 +29,7 @@ from topoloc import (
     TopolocError,
     TopoMetricMap,
     WeightsError,
+    find_frames_with_truth,
     localize_out_of_map,
     localize_queries,
     with_pose_conventions,
@@ -36,15 +39,7 @@ from topoloc.apps.cli.map_or_atlas import atlas_localizer
 from topoloc.apps.cli.output import open_recording
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
-from topoloc.atlas.atlas import absolute_address, store_at
-from topoloc.atlas.manifest import Manifest
-from topoloc.evaluation.query_localization import (
-    QueriedMap,
-    create_image_reader,
-    find_frames_with_truth,
-)
-from topoloc.features.feature_types import check_available
-from topoloc.plugin import Progress
+from topoloc.plugin import Progress, check_available
 
 MAX_IMAGES = 50
 """Of a piece: a second or so for map and recording to be opened is little beside them."""
@@ -96,7 +91,10 @@ class OpenQueries:
         )
 
     def answers(
-        self, queried_map: QueriedMap, progress: Progress, frames: Sequence[int] | None = None
+        self,
+        queried_map: Localizer | EvaluatedTile,
+        progress: Progress,
+        frames: Sequence[int] | None = None,
     ) -> list[EvaluatedQuery]:
         """As of `localize_queries` and `localize_out_of_map`; of these frames, or of all."""
         if self.recording.is_out_of_map:
@@ -128,7 +126,9 @@ class RemoteMap:
     features: str | None
 
     @staticmethod
-    def of(queried_map: QueriedMap, config: LocalizerConfig, features: str | None) -> RemoteMap:
+    def of(
+        queried_map: Localizer | EvaluatedTile, config: LocalizerConfig, features: str | None
+    ) -> RemoteMap:
         """That which the command has opened."""
         if isinstance(queried_map, Localizer):
             return RemoteMap(
@@ -136,14 +136,14 @@ class RemoteMap:
             )
         atlas, settings = queried_map.localizer.atlas, queried_map.localizer.config
         sent = RemoteAtlas(
-            absolute_address(atlas.store.where),
+            atlas.address,
             atlas.manifest.to_bytes(),
             queried_map.tile_id,
             settings,
         )
         return RemoteMap(sent, _find_available(_feature_types_of(atlas)), config, features)
 
-    def open_map(self, notes: list[str]) -> QueriedMap:
+    def open_map(self, notes: list[str]) -> Localizer | EvaluatedTile:
         """The same here; what is wrong with tiles becomes known by `notes`, while they are asked.
 
         Raises:
@@ -155,7 +155,7 @@ class RemoteMap:
             self._check_same_features(self.source.kinds)
             return create_localizer(self.source, self.config, self.features)
         sent = self.source
-        atlas = Atlas(store_at(sent.where), Manifest.from_bytes(sent.manifest, sent.where))
+        atlas = Atlas.from_manifest(sent.where, sent.manifest)
         self._check_same_features(_feature_types_of(atlas))
         return EvaluatedTile.of(
             atlas_localizer(atlas, self.config, self.features, sent.settings, notes.append),
@@ -248,8 +248,14 @@ def localize_on_ray(
         if outcome.reason is not None:
             raise TopolocError(outcome.reason)
         for frame, answer in zip(piece.frames, outcome.answers, strict=True):
-            answers.append(replace(answer, read_image=create_image_reader(queries.sequence, frame)))
+            answers.append(
+                replace(answer, read_image=partial(_read_image, queries.sequence, frame))
+            )
     return answers
+
+
+def _read_image(sequence: StereoSequence, index: int) -> Any:
+    return sequence[index].image
 
 
 def _split_queries(queried_map: RemoteMap, queries: OpenQueries) -> Iterator[Piece]:

@@ -23,7 +23,6 @@ from topoloc.apps.cli.output import (
     write_json,
 )
 from topoloc.apps.cli.settings_file import read_settings, with_option
-from topoloc.mapping.description import describe_map
 
 
 def evaluate_map_itself(
@@ -48,7 +47,7 @@ def evaluate_map_itself(
     json, report = outputs["json"], outputs["report"]
     write_page = _import_page_writer() if report else None
     with TopoMetricMap.load(path) as topomap:
-        info = describe_map(topomap, Path(path))
+        info = topomap.describe(path)
         with progress_bar() as progress:
             weak = find_weak_regions(
                 create_localizer(topomap, queried_nodes, features),

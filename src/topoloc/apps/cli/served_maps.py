@@ -10,6 +10,7 @@ from topoloc import (
     AtlasConfig,
     LocalizerConfig,
     MapCache,
+    TileFetcher,
     TopolocError,
     TrackerConfig,
     is_warm,
@@ -19,7 +20,6 @@ from topoloc import (
 )
 from topoloc.apps.cli.features_option import create_localizer
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.atlas.tile_fetcher import TileFetcher
 
 MIN_TOKEN_LENGTH = 16
 

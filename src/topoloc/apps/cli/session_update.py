@@ -6,27 +6,25 @@ settings; and the map file, updated.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from topoloc import (
     LocalizerConfig,
+    MapUpdate,
     PoseConventions,
     SlamConfig,
     StereoSequence,
-    TopoMetricMap,
     UpdateConfig,
+    run_slam,
+    update,
     with_pose_conventions,
     with_trajectory,
 )
 from topoloc.apps.cli.output import UsageError, open_recording
 from topoloc.apps.cli.wait_message import print_waiting
-from topoloc.lifelong.update import MapUpdate, check_session_is_new, update_map
-from topoloc.mapping.edit import edit_map
-from topoloc.plugin import Progress
-from topoloc.slam.pose_checks import check_poses
-from topoloc.slam.slam import estimate_slam_poses
+from topoloc.plugin import Progress, default_pose_source
 
 
 @dataclass(frozen=True)
@@ -58,63 +56,52 @@ class OpenSessionUpdate:
 
     def __init__(self, options: SessionUpdateOptions, sequence: StereoSequence) -> None:
         self.options, self.sequence = options, sequence
-        self._posed_sequence: tuple[StereoSequence, str] | None = None
+        self._posed_sequence: StereoSequence | None = None
 
     def join(self, path: Path, progress: Progress) -> MapUpdate:
         """The map file, replaced by one with this session in it; the changes tell its bytes before
         and after.
 
         Raises:
-            UsageError: the options contradict each other, or the recording.
-            SessionKnownError: it is in the map already.
-            TopolocError: as of `update_map`, `edit_map` and `estimate_slam_poses`.
+            UsageError: the options contradict each other.
+            TopolocError: as of `update` and `run_slam`.
         """
         one = self.options
-        with edit_map(path, print_waiting) as edit:
-            check_session_is_new(edit.topomap, self.sequence)  # before its motion is found
-            posed, poses_from = self._posed_sequence = self._posed_sequence or self._with_poses(
-                progress
-            )
-            update = update_map(edit.topomap, posed, poses_from, one.update, one.localize, progress)
-            changes = update.changes | {"bytes_before": edit.path.stat().st_size}
-            edit.commit(self._name_light(update.topomap), f"update {self.sequence.name}", changes)
-        return replace(update, changes=changes | {"bytes": path.stat().st_size})
+        poses_from = one.trajectory or default_pose_source(self.sequence)
 
-    def _name_light(self, topomap: TopoMetricMap) -> TopoMetricMap:
-        """The map with the name of its last session's light."""
-        *others, last = topomap.sessions
-        light = self.options.light
-        return (
-            topomap
-            if light is None
-            else replace(topomap, sessions=[*others, replace(last, light_name=light)])
+        def find_poses() -> StereoSequence:
+            if self._posed_sequence is None:
+                self._posed_sequence = self._with_poses(poses_from, progress)
+            return self._posed_sequence
+
+        return update(
+            path,
+            self.sequence,
+            poses_from,
+            find_poses,
+            one.update,
+            one.localize,
+            one.light,
+            "unchecked" not in (one.poses or "").split(","),
+            progress,
+            print_waiting,
         )
 
-    def _with_poses(self, progress: Progress) -> tuple[StereoSequence, str]:
-        """The recording with its own motion, and where that comes from."""
-        one, sequence = self.options, self.sequence
-        is_single = (first := sequence[0]).right is None and first.depth is None
-        poses_from = one.trajectory or (
-            "truth" if any(sequence.poses) else "map" if is_single else "slam"
-        )
-        if poses_from in ("slam", "map") and one.poses is not None:
+    def _with_poses(self, poses_from: str, progress: Progress) -> StereoSequence:
+        """The recording with its own motion."""
+        if poses_from in ("slam", "map") and self.options.poses is not None:
             raise UsageError(
                 "--poses says how given poses are written; those of SLAM and of the map are ours"
             )
         if poses_from == "map":
-            return sequence, poses_from
+            return self.sequence
         if poses_from == "slam":
-            return estimate_slam_poses([sequence], one.slam, progress)[0], poses_from
-        conventions = (one.poses or "").split(",")
+            return run_slam([self.sequence], self.options.slam, progress).apply([self.sequence])[0]
+        conventions = (self.options.poses or "").split(",")
         reading = PoseConventions.of(",".join(name for name in conventions if name != "unchecked"))
-        posed = (
-            with_pose_conventions(sequence, reading)
-            if poses_from == "truth"
-            else with_trajectory(sequence, Path(poses_from), reading)
-        )
-        if "unchecked" not in conventions:
-            check_poses(posed)
-        return posed, poses_from
+        if poses_from == "truth":
+            return with_pose_conventions(self.sequence, reading)
+        return with_trajectory(self.sequence, Path(poses_from), reading)
 
 
 def describe_update(changes: dict[str, Any]) -> str:

@@ -11,7 +11,17 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc import Rigid3, SlamConfig, SlamResult, StereoSequence, Trajectory, run_slam, write_tum
+from topoloc import (
+    Rigid3,
+    SlamConfig,
+    SlamResult,
+    StereoSequence,
+    Trajectory,
+    absolute_trajectory_errors,
+    relative_drift,
+    run_slam,
+    write_tum,
+)
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -24,7 +34,6 @@ from topoloc.apps.cli.output import (
     write_json,
 )
 from topoloc.apps.cli.settings_file import read_settings
-from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
 
 
 @dataclass(frozen=True)

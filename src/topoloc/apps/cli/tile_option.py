@@ -11,7 +11,6 @@ import tyro
 
 from topoloc import Atlas, AtlasError, MapError, ObjectStoreError, SharedWorld, is_atlas
 from topoloc.apps.cli.output import UsageError
-from topoloc.atlas.shared_world import group_shared_worlds, world_of_tile
 
 TileOption = Annotated[str | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(atlases only)")]
 _MAX_LISTED = 8
@@ -59,8 +58,8 @@ def select_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
         AtlasError: there is no such tile, or none at all.
     """
     if tile_id is not None:
-        return world_of_tile(atlas.manifest, atlas.tile(tile_id))
-    worlds = group_shared_worlds(atlas.manifest)
+        return SharedWorld.of_tile(atlas.manifest, atlas.tile(tile_id))
+    worlds = SharedWorld.group(atlas.manifest)
     if not worlds:
         raise AtlasError(
             f"the atlas {atlas.store.where} has no tiles; `topoloc atlas add` adds them"

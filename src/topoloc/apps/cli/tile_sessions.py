@@ -16,6 +16,7 @@ from topoloc import (
     Atlas,
     AtlasConfig,
     DuplicateSessionError,
+    Tile,
     TileSelectionConfig,
     edit_tile,
     find_tile_of_recording,
@@ -28,8 +29,6 @@ from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.connection import connect_to_cluster
 from topoloc.apps.cluster.tasks import Job, JobProgress, OnJobState, run_locally, run_on_ray
 from topoloc.apps.cluster.tiles import Outcome, State, run_tile_work
-from topoloc.atlas.atlas import absolute_address
-from topoloc.atlas.manifest import Tile
 from topoloc.plugin import Progress
 
 
@@ -115,7 +114,8 @@ class AtlasUpdate:
             AtlasError: no atlas is there, or it has no tile `tile_id`.
             MissingExtraError, ClusterError: as of `connect_to_cluster`.
         """
-        atlas, where = Atlas.open(self.atlas), absolute_address(self.atlas)
+        atlas = Atlas.open(self.atlas)
+        where = atlas.address
         tile = None if self.tile_id is None else atlas.tile(self.tile_id)
         names = [options.recording for options in self.update_options]
         with (

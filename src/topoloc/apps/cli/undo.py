@@ -7,10 +7,10 @@ from typing import Annotated
 
 import tyro
 
+from topoloc import undo_edit
 from topoloc.apps.cli.output import File, write_json
 from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
 from topoloc.apps.cli.wait_message import print_waiting
-from topoloc.mapping.edit import undo_edit
 
 
 @dataclass(frozen=True)

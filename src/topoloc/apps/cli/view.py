@@ -26,7 +26,6 @@ from topoloc.apps.viewer.page import write_scene_page
 from topoloc.apps.viewer.result_files import read_results
 from topoloc.apps.viewer.screenshot import find_browser, write_screenshot
 from topoloc.apps.viewer.world_document import create_world_document
-from topoloc.mapping.contents import get_map_id
 
 _DEFAULT_MAX_POINTS = SceneBudget().max_points
 
@@ -79,7 +78,7 @@ class Command:
             _warn_of_other_worlds(results, document["results"])
         else:
             with TopoMetricMap.load(self.map) as topomap:
-                _warn_of_other_maps(results, get_map_id(topomap))
+                _warn_of_other_maps(results, topomap.resolved_id)
                 document = create_document(topomap, Path(self.map).stem, results, budget)
         if self.out:
             write_scene_page(Path(self.out), document)

@@ -17,16 +17,16 @@ from typing import Annotated, Literal
 import tyro
 
 from topoloc import WeightsError
-from topoloc.features.network_files import (
+from topoloc.plugin import (
     NETWORKS,
     NetworkInfo,
+    atomic_write,
     cache_folder,
     check_network_file,
     find_network,
     find_network_info,
     read_bytes,
 )
-from topoloc.plugin import atomic_write
 
 CONVERTERS = "topoloc.network_converters"
 """Group of entry points: `convert(kind, weights, target, properties)` writes the ONNX file of

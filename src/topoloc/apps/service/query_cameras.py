@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from topoloc.apps.query_camera import parse_camera_option
 from topoloc.apps.service.query_request import parse_json
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.query_camera import parse_camera_option
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.calibration import parse_intrinsics
 from topoloc.recordings.image_io import EncodedImage, exif_focal_length

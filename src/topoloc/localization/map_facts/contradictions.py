@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.mapping.entries import TopoNode
+from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -53,6 +55,23 @@ class Contradiction:
             f"node {self.node_id} contradicts node {self.other_id}: {apart} from where that one's"
             " points see it"
         )
+
+
+def check_map(path: str | Path) -> list[str]:
+    """Check every byte of a map file and, if these are intact, whether its nodes agree with their
+    neighbours.
+
+    Returns:
+        One line for each problem; nothing if the map is intact.
+
+    Raises:
+        MapError: the map cannot be opened.
+    """
+    found = find_map_damage(Path(path))
+    if found:
+        return found
+    with TopoMetricMap.load(path) as topomap:
+        return [str(contradiction) for contradiction in find_contradictions(topomap)]
 
 
 def find_contradictions(

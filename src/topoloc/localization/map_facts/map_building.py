@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +20,7 @@ from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
 from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.open import open_sequence
 from topoloc.slam.pose_checks import check_pose_coverage, check_poses
 from topoloc.slam.slam import estimate_slam_poses
 
@@ -33,7 +35,7 @@ class SkippedChecks:
 
 
 def build_map(
-    sequences: StereoSequence | Sequence[StereoSequence],
+    sequences: StereoSequence | str | Path | Sequence[StereoSequence | str | Path],
     config: build.BuildConfig | None = None,
     progress: build.Progress | None = None,
     poses_from: Sequence[str] | None = None,
@@ -46,6 +48,7 @@ def build_map(
     build` does.
 
     Args:
+        sequences: the recordings, or their paths, which `open_sequence` opens.
         poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the
             map to remember; given, SLAM is not run.
         trust: what is taken as it comes; by default poses are held against the pictures, but for
@@ -62,10 +65,9 @@ def build_map(
     config = config or build.BuildConfig()
     for kind in config.kinds:
         find_feature_type(kind)
-    sequences, skipped_checks = (
-        [sequences] if isinstance(sequences, StereoSequence) else list(sequences),
-        skipped_checks or SkippedChecks(),
-    )
+    given = [sequences] if isinstance(sequences, StereoSequence | str | Path) else sequences
+    sequences = [open_sequence(one) if isinstance(one, str | Path) else one for one in given]
+    skipped_checks = skipped_checks or SkippedChecks()
     if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
         sequences, poses_from = (
             estimate_slam_poses(sequences, progress=progress),

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from topoloc.errors import QueryError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.calibration import parse_calibration
-from topoloc.recordings.frame import StereoFrame
+from topoloc import Camera, QueryError, StereoFrame, TopoMetricMap, UncalibratedCamera
+from topoloc.plugin import parse_calibration
 
 CameraOfSize = Callable[[int, int], Camera | UncalibratedCamera]
 """The camera of a picture of this width and height."""

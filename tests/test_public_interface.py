@@ -1,0 +1,82 @@
+"""The public names do the work of the commands, from paths."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import topoloc
+from topoloc.demo.recordings import SHIPPED
+
+
+@pytest.fixture(scope="module")
+def lab_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("lab") / "lab.topo"
+    topoloc.build_map(f"{SHIPPED / 'map_lap1'}@0:30").save(path)
+    return path
+
+
+def test_a_map_is_built_and_localized_in_by_paths(lab_map: Path):
+    frame = topoloc.open_sequence(SHIPPED / "map_lap1")[10]
+    localizer = topoloc.Localizer(str(lab_map))
+    result = localizer.localize(frame.image, frame.camera)
+    assert isinstance(result, topoloc.Localization)
+    assert frame.world_from_cam is not None
+    error = result.world_from_cam.translation - frame.world_from_cam.translation
+    assert abs(error).max() < 0.05
+
+
+def test_a_map_is_evaluated(lab_map: Path):
+    known = topoloc.open_sequence(f"{SHIPPED / 'map_lap1'}@1:20:6")
+    other = topoloc.open_sequence(f"{SHIPPED / 'corridor'}@0:2")
+    evaluation = topoloc.evaluate(topoloc.Localizer(lab_map), [known], [other])
+    figures = evaluation.to_json()
+    assert figures["num_queries"] == figures["num_localized"] == len(known)
+    assert (figures["num_elsewhere"], figures["false_accepts"]) == (len(other), 0)
+    assert list(evaluation.by_recording) == [known.name, other.name]
+    assert evaluation.world_fits == []
+
+
+def test_a_map_file_is_edited_and_the_edits_undone(lab_map: Path, tmp_path: Path):
+    path = tmp_path / "lab.topo"
+    path.write_bytes(lab_map.read_bytes())
+    size = path.stat().st_size
+    pruned = topoloc.prune(path, max_mb=0.8 * size / 1e6)
+    assert pruned.changes["bytes"] == path.stat().st_size < size
+    topoloc.georeference(path, origin=(topoloc.GeoPoint(48.1, 11.6, 520.0), 90.0))
+    assert [edit["undoable"] for edit in topoloc.read_history(path)][-2:] == [True, True]
+    assert topoloc.check_map(path) == []
+    for _ in range(2):
+        topoloc.undo_edit(path)
+    assert path.read_bytes() == lab_map.read_bytes()
+    with pytest.raises(ValueError, match="one of origin, gnss and points"):
+        topoloc.georeference(path)
+
+
+def test_a_recording_joins_a_map_once(lab_map: Path, tmp_path: Path):
+    path = tmp_path / "lab.topo"
+    path.write_bytes(lab_map.read_bytes())
+    updated = topoloc.update(path, f"{SHIPPED / 'map_lap2'}@0:12", light="morning")
+    assert updated.changes["session"] == 2 or updated.changes["session"] == 1
+    with topoloc.TopoMetricMap.load(path) as topomap:
+        assert topomap.sessions[-1].light_name == "morning"
+    with pytest.raises(topoloc.DuplicateSessionError):
+        topoloc.update(path, f"{SHIPPED / 'map_lap2'}@0:12")
+
+
+def test_a_map_is_exported_and_viewed(lab_map: Path, tmp_path: Path):
+    topoloc.export(lab_map, tmp_path / "points.ply")
+    topoloc.view(lab_map, tmp_path / "lab.html")
+    assert (tmp_path / "points.ply").read_bytes().startswith(b"ply")
+    assert "</html>" in (tmp_path / "lab.html").read_text(encoding="utf-8")
+
+
+def test_an_atlas_is_made_of_map_files(lab_map: Path, tmp_path: Path):
+    where = str(tmp_path / "campus")
+    assert topoloc.Atlas.create(where, [str(lab_map)]).find_problem("lab") is None
+    atlas = topoloc.Atlas.add(where, [str(lab_map)], tile_id="again", world="lab")
+    assert list(atlas.manifest.by_id) == ["again", "lab"] and topoloc.is_atlas(where)
+    assert topoloc.Atlas.remove(where, ["again"]).history("lab")[0]["edit_id"] == 1
+    with pytest.raises(topoloc.AtlasError, match="no tile"):
+        atlas.find_problem("cellar")
