@@ -24,7 +24,7 @@ from pathlib import Path
 
 from ray.cluster_utils import Cluster
 
-from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
+from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
 from topoloc.apps.cluster.tiles import Outcome, TileJob, derive_tile_ids
 from topoloc.atlas.atlas import Atlas

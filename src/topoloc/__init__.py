@@ -75,7 +75,6 @@ if TYPE_CHECKING:
     from topoloc.mapping.build import BuildConfig
     from topoloc.mapping.edit import read_history, undo_edit
     from topoloc.mapping.georeference import GeoreferenceResult, georeference
-    from topoloc.mapping.node_cache import set_node_cache_size
     from topoloc.mapping.topomap import TopoMetricMap
     from topoloc.recordings.frame import DepthImage, StereoFrame, StereoSequence
     from topoloc.recordings.memory_sequence import MemorySequence
@@ -91,7 +90,7 @@ if TYPE_CHECKING:
     from topoloc.tracking.stream_result import StreamedPose
     from topoloc.tracking.tile_tracker import TileTracker
     from topoloc.tracking.tracker import Tracker, TrackerConfig
-    from topoloc.tracking.warm_up import is_warm, warm_up
+    from topoloc.tracking.warm_up import warm_up
 
     __version__: str
 
@@ -177,7 +176,6 @@ __all__ = [
     "find_weak_regions",
     "georeference",
     "is_atlas",
-    "is_warm",
     "join_tiles",
     "localize_out_of_map",
     "localize_queries",
@@ -188,7 +186,6 @@ __all__ = [
     "read_trajectory",
     "relative_drift",
     "run_slam",
-    "set_node_cache_size",
     "set_num_threads",
     "undo_edit",
     "update",
@@ -280,7 +277,6 @@ _MODULES = {
     "find_weak_regions": "topoloc.lifelong.weak_regions",
     "georeference": "topoloc.mapping.georeference",
     "is_atlas": "topoloc.atlas.atlas",
-    "is_warm": "topoloc.tracking.warm_up",
     "join_tiles": "topoloc.lifelong.tile_joining",
     "localize_out_of_map": "topoloc.evaluation.query_localization",
     "localize_queries": "topoloc.evaluation.query_localization",
@@ -291,7 +287,6 @@ _MODULES = {
     "read_trajectory": "topoloc.recordings.trajectory",
     "relative_drift": "topoloc.geometry.alignment",
     "run_slam": "topoloc.slam.slam",
-    "set_node_cache_size": "topoloc.mapping.node_cache",
     "set_num_threads": "topoloc.compiled",
     "undo_edit": "topoloc.mapping.edit",
     "update": "topoloc.lifelong.map_files",

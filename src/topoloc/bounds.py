@@ -190,6 +190,18 @@ def field_bounds(kind: Any) -> list[Bound]:
     )
 
 
+def describe_range(kind: Any) -> str:
+    """Return the values that an annotation allows, for a comment in a file of settings: its choices
+    or its bounds; empty if it has none."""
+    plain, _ = strip_annotation(kind)
+    if get_origin(plain) is Literal:
+        choices = [
+            json.dumps(one) if isinstance(one, bool | str) else repr(one) for one in get_args(plain)
+        ]
+        return "one of " + ", ".join(choices)
+    return " and ".join(map(str, field_bounds(kind)))
+
+
 def strip_annotation(kind: Any) -> tuple[Any, bool]:
     """The type that an annotation names, without bounds and None, and whether None is allowed."""
     if get_origin(kind) is Annotated:

@@ -12,30 +12,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from topoloc.bounds import (
+        describe_range,
         field_annotations,
-        field_bounds,
         find_violation,
         parse_settings,
         quote_key,
-        strip_annotation,
         suggest_name,
     )
     from topoloc.evaluation.metrics import format_length
     from topoloc.features.feature_types import check_available, parse_feature_types
-    from topoloc.features.network_files import (
-        NETWORKS,
-        NetworkInfo,
-        cache_folder,
-        check_network_file,
-        find_network,
-        find_network_info,
-        read_bytes,
-    )
-    from topoloc.lifelong.map_files import default_pose_source
+    from topoloc.features.network_files import NETWORKS, NetworkInfo, cache_folder, read_bytes
     from topoloc.mapping.build import Progress
     from topoloc.mapping.sessions import find_source_path
     from topoloc.recordings.atomic import atomic_write, remove_stale_files, write_text
-    from topoloc.recordings.calibration import CalibrationForSize, parse_calibration
+    from topoloc.recordings.calibration import parse_calibration
     from topoloc.recordings.format import RecordingFormat
     from topoloc.recordings.json_file import read_json
     from topoloc.recordings.open import find_format, split_selection
@@ -51,7 +41,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "NETWORKS",
-    "CalibrationForSize",
     "NetworkInfo",
     "Progress",
     "Recording",
@@ -60,13 +49,9 @@ __all__ = [
     "atomic_write",
     "cache_folder",
     "check_available",
-    "check_network_file",
-    "default_pose_source",
+    "describe_range",
     "field_annotations",
-    "field_bounds",
     "find_format",
-    "find_network",
-    "find_network_info",
     "find_source_path",
     "find_violation",
     "format_length",
@@ -83,14 +68,12 @@ __all__ = [
     "remove_stale_files",
     "scale_poses",
     "split_selection",
-    "strip_annotation",
     "suggest_name",
     "write_text",
 ]
 
 _MODULES = {
     "NETWORKS": "topoloc.features.network_files",
-    "CalibrationForSize": "topoloc.recordings.calibration",
     "NetworkInfo": "topoloc.features.network_files",
     "Progress": "topoloc.mapping.build",
     "Recording": "topoloc.recordings.recording",
@@ -99,13 +82,9 @@ _MODULES = {
     "atomic_write": "topoloc.recordings.atomic",
     "cache_folder": "topoloc.features.network_files",
     "check_available": "topoloc.features.feature_types",
-    "check_network_file": "topoloc.features.network_files",
-    "default_pose_source": "topoloc.lifelong.map_files",
+    "describe_range": "topoloc.bounds",
     "field_annotations": "topoloc.bounds",
-    "field_bounds": "topoloc.bounds",
     "find_format": "topoloc.recordings.open",
-    "find_network": "topoloc.features.network_files",
-    "find_network_info": "topoloc.features.network_files",
     "find_source_path": "topoloc.mapping.sessions",
     "find_violation": "topoloc.bounds",
     "format_length": "topoloc.evaluation.metrics",
@@ -122,7 +101,6 @@ _MODULES = {
     "remove_stale_files": "topoloc.recordings.atomic",
     "scale_poses": "topoloc.recordings.recording",
     "split_selection": "topoloc.recordings.open",
-    "strip_annotation": "topoloc.bounds",
     "suggest_name": "topoloc.bounds",
     "write_text": "topoloc.recordings.atomic",
 }

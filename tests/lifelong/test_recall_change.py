@@ -12,7 +12,7 @@ import pytest
 
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
-from topoloc.apps.cli.history import _describe_recall_change
+from topoloc.apps.cli.maps.history import _describe_recall_change
 from topoloc.lifelong.prune import select_landmarks
 from topoloc.lifelong.recall_change import measure_recall_change
 

@@ -24,6 +24,7 @@ from topoloc.atlas.manifest import Tile
 from topoloc.atlas.watched_atlas import WatchedAtlas
 from topoloc.errors import MapError, MapNotFoundError
 from topoloc.localization.localizer import Localizer
+from topoloc.mapping.node_cache import set_node_cache_size
 from topoloc.mapping.topomap import TopoMetricMap
 
 SUFFIX = ".topo"
@@ -101,6 +102,19 @@ class MapCache:
         ]
         self._files = [Path(source) for source in sources if not is_atlas(source)]
         self.names()
+
+    @staticmethod
+    def with_memory(
+        sources: Sequence[str],
+        open_localizer: OpenLocalizer,
+        memory_mb: int,
+        tile_path: TilePath = Atlas.map_path,
+    ) -> MapCache:
+        """Create a cache that uses half of the memory (megabytes) for nodes, of all maps of this
+        process, and half for the rest of the open maps. Raises as the class does."""
+        budget = memory_mb * 500_000
+        set_node_cache_size(budget)
+        return MapCache(sources, open_localizer, budget, tile_path)
 
     def names(self) -> list[str]:
         """Of all maps, as they are there now; no object store is asked.

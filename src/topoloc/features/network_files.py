@@ -44,6 +44,24 @@ class NetworkInfo:
     url: str = ""
     package: str = ""
 
+    @staticmethod
+    def of_name(name: str) -> NetworkInfo:
+        """Return the network of a name. Raises WeightsError: there is none."""
+        if name not in NETWORKS:
+            raise WeightsError(f"no network {name!r}; there are {', '.join(NETWORKS)}")
+        return NETWORKS[name]
+
+    @staticmethod
+    def of_file(path: Path) -> NetworkInfo:
+        """Return the network of an ONNX file, which is run on a small picture. Raises as
+        `open_network`."""
+        return _check_network_file(path)
+
+    def find_file(self) -> Path:
+        """Return its ONNX file, of the package or else of the cache. Raises WeightsError: it is
+        missing; the text names the command that fetches it."""
+        return find_network(self.name)
+
     @property
     def install_hint(self) -> str:
         """The command that brings it here."""
@@ -100,7 +118,7 @@ def find_network(name: str) -> Path:
     Raises:
         WeightsError: unknown, or not here; says which command gets it.
     """
-    network = find_network_info(name)
+    network = NetworkInfo.of_name(name)
     for folder in (_BUNDLED_FOLDER, cache_folder()):
         if (path := folder / f"{name}.onnx").is_file():
             return path
@@ -170,9 +188,7 @@ def open_network(
     return NETWORKS[properties["topoloc_network"]], session
 
 
-def check_network_file(path: Path) -> NetworkInfo:
-    """Which network a ready ONNX file is; it is tried on a small picture, too. Raises as
-    `open_network`."""
+def _check_network_file(path: Path) -> NetworkInfo:
     network, session = open_network(path, num_threads=1)
     scores, dense, *_ = map(
         np.asarray,
@@ -187,13 +203,6 @@ def check_network_file(path: Path) -> NetworkInfo:
             f"network {path}: its outputs are not scores and descriptors of the picture"
         )
     return network
-
-
-def find_network_info(name: str) -> NetworkInfo:
-    """By name. Raises WeightsError."""
-    if name not in NETWORKS:
-        raise WeightsError(f"no network {name!r}; there are {', '.join(NETWORKS)}")
-    return NETWORKS[name]
 
 
 def read_bytes(path: Path) -> bytes:

@@ -45,7 +45,7 @@ def update(
     path: str | Path,
     sequence: StereoSequence | str | Path,
     poses_from: str | None = None,
-    find_poses: Callable[[], StereoSequence] | None = None,
+    find_poses: Callable[[str], StereoSequence] | None = None,
     config: UpdateConfig | None = None,
     localizer_config: LocalizerConfig | None = None,
     light: str | None = None,
@@ -61,8 +61,8 @@ def update(
         poses_from: the source of its poses, stored in the map: `truth` (its own poses, metres, in
             any world), `slam`, `map` (localized in the map, image by image), or a name for given
             poses. By default as `default_pose_source`.
-        find_poses: returns the recording with its poses; called only if the session is new. By
-            default SLAM runs if `poses_from` is `slam`.
+        find_poses: returns the recording with its poses from this source; called only if the
+            session is new. By default SLAM runs if `poses_from` is `slam`.
         light: the name of the recording's illumination; by default it has none.
         is_checked: whether given poses are compared with the images first.
         progress: called with a stage's name, steps done and steps in all.
@@ -84,7 +84,7 @@ def update(
     with edit_map(path, on_wait) as edit:
         check_session_is_new(edit.topomap, sequence)  # before its poses are estimated
         if find_poses is not None:
-            posed = find_poses()
+            posed = find_poses(poses_from)
         elif poses_from == "slam":
             posed = estimate_slam_poses([sequence], progress=progress)[0]
         else:

@@ -38,13 +38,15 @@ _TEXELS_PER_METRE = 130.0
 _WALL_Z, _WALL_SLOPE = 2.0, 0.4  # the wall: z = 2 m + 0.4 x
 
 
-def is_warm() -> bool:
+def _is_warm() -> bool:
     """Whether the machine code of what answers is kept: of kernels with which a search begins and
     ends, and of the last in streams."""
     return all(map(is_cached, (integral_image, match_projections, solve_factored)))
 
 
-def warm_up(progress: Progress | None = None) -> None:
+def warm_up(
+    progress: Progress | None = None, only_if_cold: Callable[[], None] | None = None
+) -> None:
     """Compile, or load, all that localizing an image or a stream calls, so that the first query
     takes no longer than the later ones.
 
@@ -53,7 +55,13 @@ def warm_up(progress: Progress | None = None) -> None:
 
     Args:
         progress: called with ("compiling", steps done, steps in all).
+        only_if_cold: called before the work, which is left out if the machine code of the main
+            kernels is in the cache already; by default everything is compiled or loaded.
     """
+    if only_if_cold is not None:
+        if _is_warm():
+            return
+        only_if_cold()
     wall = _make_texture(seed=0)
     pictures = [_render_wall(wall, place)[0] for place in (0.0, 0.1, 0.2)]
     lost = _render_wall(_make_texture(seed=1), 0.0)[0]

@@ -218,7 +218,7 @@ def test_ctrl_c_in_mid_evaluation(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("topoloc.apps.cli.remote_queries.localize_queries", interrupted)
+    monkeypatch.setattr("topoloc.apps.cli.queries.remote_queries.localize_queries", interrupted)
     files = ["--json", tmp_path / "a.json", "--report", tmp_path / "a.html"]
     assert "interrupted" in complaint("evaluate", room_map, queries, *files)
 
@@ -229,7 +229,7 @@ def test_ctrl_c_in_a_compiled_function_is_no_bug(
     def interrupted(*_: object, **__: object) -> None:
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
 
-    monkeypatch.setattr("topoloc.apps.cli.map_jobs.build_map", interrupted)
+    monkeypatch.setattr("topoloc.apps.cli.mapping.map_jobs.build_map", interrupted)
     assert "interrupted" in complaint("build", recording, tmp_path / "room.topo")
 
 

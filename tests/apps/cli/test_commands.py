@@ -16,7 +16,7 @@ import pytest
 
 from built_room import unseen_views
 from topoloc.apps.cli import main
-from topoloc.apps.cli.localize import Localizer
+from topoloc.apps.cli.queries.localize import Localizer
 from topoloc.geometry.alignment import translation_error
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.trajectory import Trajectory, read_trajectory, write_tum

@@ -16,7 +16,7 @@ import pytest
 import topoloc.apps.cli.weights as weights
 from tiny_network import write_network
 from topoloc.apps.cli import main
-from topoloc.features.network_files import NETWORKS, check_network_file, find_network
+from topoloc.features.network_files import NETWORKS, NetworkInfo, find_network
 
 PUBLISHED = b"the published weights"
 
@@ -84,7 +84,7 @@ def test_a_ready_network_is_kept_under_its_own_name(
         r"^edgepoint2-t32 +MIT +HITCSC/EdgePoint2 +not here$", capsys.readouterr().out, re.MULTILINE
     )
     assert main(["weights", "convert", str(ready)]) == 0
-    assert check_network_file(cache / "edgepoint2-t32.onnx").name == "edgepoint2-t32"
+    assert NetworkInfo.of_file(cache / "edgepoint2-t32.onnx").name == "edgepoint2-t32"
     capsys.readouterr()
     assert main(["weights", "list"]) == 0
     assert str(cache / "edgepoint2-t32.onnx") in capsys.readouterr().out

@@ -7,7 +7,7 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from topoloc.apps.cli.remote_queries import Piece, PieceAnswers
+from topoloc.apps.cli.queries.remote_queries import Piece, PieceAnswers
 from topoloc.mapping.build import Progress
 
 

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from topoloc.apps.cli.map_jobs import MapJob
+from topoloc.apps.cli.mapping.map_jobs import MapJob
 from topoloc.mapping.build import Progress
 from topoloc.mapping.topomap import TopoMetricMap
 

@@ -19,7 +19,7 @@ import pytest
 from logging_maker import LoggingMaker
 
 from topoloc.apps.cli import main
-from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
+from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress

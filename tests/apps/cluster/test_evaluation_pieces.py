@@ -15,8 +15,9 @@ import pytest
 from dying_piece import DyingPiece
 
 from built_room import unseen_views, write_pictures
-from topoloc.apps.cli import main, remote_queries
-from topoloc.apps.cli.remote_queries import OpenQueries, Piece, QueryRecording, RemoteMap
+from topoloc.apps.cli import main
+from topoloc.apps.cli.queries import remote_queries
+from topoloc.apps.cli.queries.remote_queries import OpenQueries, Piece, QueryRecording, RemoteMap
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.errors import MapError, MissingExtraError, RecordingError, TrajectoryError
 from topoloc.evaluation.metrics import summarize

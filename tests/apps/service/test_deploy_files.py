@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import tyro
 
-from topoloc.apps.cli.serve import Command
+from topoloc.apps.cli.queries.serve import Command
 
 ROOT = Path(__file__).parents[3]
 DOCKERFILE = (ROOT / "Dockerfile").read_text(encoding="utf-8")

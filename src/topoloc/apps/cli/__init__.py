@@ -30,63 +30,63 @@ COMMANDS = {
         ),
     ),
     "slam": (
-        "topoloc.apps.cli.slam",
+        "topoloc.apps.cli.mapping.slam",
         "where did the camera go? a stereo or RGB-D recording becomes a trajectory",
     ),
     "build": (
-        "topoloc.apps.cli.build",
+        "topoloc.apps.cli.mapping.build",
         "map a place: a stereo or RGB-D recording becomes one map file",
     ),
     "localize": (
-        "topoloc.apps.cli.localize",
+        "topoloc.apps.cli.queries.localize",
         "where were these images taken? 6-DoF poses of images, folders, recordings",
     ),
     "evaluate": (
-        "topoloc.apps.cli.evaluate",
+        "topoloc.apps.cli.queries.evaluate",
         "localize a recording with known truth and judge the poses",
     ),
     "explain": (
-        "topoloc.apps.cli.explain",
+        "topoloc.apps.cli.queries.explain",
         "why a picture got its answer, or none, and what would help",
     ),
-    "info": ("topoloc.apps.cli.info", "what a map file holds"),
+    "info": ("topoloc.apps.cli.maps.info", "what a map file holds"),
     "atlas": (
-        "topoloc.apps.cli.atlas",
+        "topoloc.apps.cli.maps.atlas",
         "many maps asked as one: an atlas made, added to, looked into",
     ),
     "update": (
-        "topoloc.apps.cli.update",
+        "topoloc.apps.cli.maps.update",
         "a new recording joins a map: another light, a changed room, new parts",
     ),
-    "merge": ("topoloc.apps.cli.merge", "one map of two that were made apart and overlap"),
+    "merge": ("topoloc.apps.cli.maps.merge", "one map of two that were made apart and overlap"),
     "prune": (
-        "topoloc.apps.cli.prune",
+        "topoloc.apps.cli.maps.prune",
         "drop from a map what is gone, and what adds least, to a size",
     ),
     "history": (
-        "topoloc.apps.cli.history",
+        "topoloc.apps.cli.maps.history",
         "how a map came to be what it is: its edits, and which can be taken back",
     ),
-    "undo": ("topoloc.apps.cli.undo", "take the last edit of a map back, to the byte"),
+    "undo": ("topoloc.apps.cli.maps.undo", "take the last edit of a map back, to the byte"),
     "record": (
-        "topoloc.apps.cli.record",
+        "topoloc.apps.cli.mapping.record",
         (
             "a recording made: a ZED, CARLA, a webcam or a stream becomes a folder that every"
             " command reads"
         ),
     ),
     "export": (
-        "topoloc.apps.cli.export",
+        "topoloc.apps.cli.maps.export",
         "a map or results for other programs: COLMAP, nerfstudio, PLY, GeoJSON, MCAP, TUM, KITTI",
     ),
-    "view": ("topoloc.apps.cli.view", "a map and what was found in it, in 3-D in the browser"),
+    "view": ("topoloc.apps.cli.maps.view", "a map and what was found in it, in 3-D in the browser"),
     "georeference": (
-        "topoloc.apps.cli.georeference",
+        "topoloc.apps.cli.maps.georeference",
         "where on earth a map lies; its results then carry OGC GeoPoses",
     ),
-    "serve": ("topoloc.apps.cli.serve", "an HTTP service that localizes pictures in maps"),
+    "serve": ("topoloc.apps.cli.queries.serve", "an HTTP service that localizes pictures in maps"),
     "follow": (
-        "topoloc.apps.cli.follow",
+        "topoloc.apps.cli.queries.follow",
         "where is this camera now? a line for each picture of a webcam, a stream, a recording",
     ),
     "weights": (

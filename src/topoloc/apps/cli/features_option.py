@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Annotated
 
 import tyro
 
-from topoloc import BuildConfig, FeatureTypeError, Localizer, LocalizerConfig, TopoMetricMap
+from topoloc import (
+    BuildConfig,
+    FeatureTypeError,
+    Localizer,
+    LocalizerConfig,
+    MissingExtraError,
+    TopoMetricMap,
+    WeightsError,
+)
 from topoloc.apps.cli.output import UsageError
 from topoloc.plugin import check_available, parse_feature_types
 
@@ -62,3 +71,16 @@ def create_localizer(
     for kind, lacking in localizer.unavailable_types.items():
         print(f"warning: features {kind} of the map are not asked: {lacking}", file=sys.stderr)
     return localizer
+
+
+def find_available_types(kinds: Iterable[str]) -> frozenset[str]:
+    """Return those of the feature types that are available on this machine."""
+
+    def is_available(kind: str) -> bool:
+        try:
+            check_available(kind)
+        except (MissingExtraError, WeightsError):
+            return False
+        return True
+
+    return frozenset(kind for kind in kinds if is_available(kind))

@@ -14,7 +14,6 @@ from topoloc import (
     MapCache,
     TopoMetricMap,
     is_atlas,
-    set_node_cache_size,
 )
 from topoloc.apps.cli.features_option import create_localizer
 from topoloc.apps.cli.output import UsageError
@@ -49,9 +48,9 @@ def atlas_localizer(
 ) -> AtlasLocalizer:
     """As `open_atlas`, of one that is read; `warn` is told what is wrong with single tiles. Raises
     AtlasError."""
-    budget = MEMORY_MB * 500_000
-    set_node_cache_size(budget)
-    maps = MapCache([], lambda topomap: create_localizer(topomap, config, features), budget)
+    maps = MapCache.with_memory(
+        [], lambda topomap: create_localizer(topomap, config, features), MEMORY_MB
+    )
     return AtlasLocalizer(atlas, maps, atlas_config, warn)
 
 

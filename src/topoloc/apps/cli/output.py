@@ -251,6 +251,11 @@ def _error(metres: float, degrees: float) -> str:
     return f"{100 * metres:.2f} cm, {degrees:.2f} deg"
 
 
+def print_waiting() -> None:
+    """On standard error: another process edits the map, and this one waits for it."""
+    print("another process edits this map; waiting for it ...", file=sys.stderr, flush=True)
+
+
 def write_json(path: str | None, data: Any) -> None:
     """Write `data` to the file of `--json`; `-` is standard output, None nowhere."""
     if path == "-":

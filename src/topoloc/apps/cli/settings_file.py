@@ -13,18 +13,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import is_dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Any, TypeVar
 
 from topoloc import ConfigError
 from topoloc.apps.cli import PLUGIN_PACKAGES, all_commands, load_plugins
 from topoloc.apps.cli.output import UsageError
 from topoloc.plugin import (
+    describe_range,
     field_annotations,
-    field_bounds,
     find_violation,
     parse_settings,
     quote_key,
-    strip_annotation,
     suggest_name,
 )
 
@@ -146,7 +145,8 @@ def _format_table(config: Any, key: str, note: str = "") -> Iterator[str]:
             value = getattr(config, name)
             yield from _format_comment(notes.get(name, ""))
             line = f"# {name} =" if value is None else f"{name} = {_to_toml(value)}"
-            yield f"{line}  # {_format_range(kind)}" if _format_range(kind) else line
+            limits = describe_range(kind)
+            yield f"{line}  # {limits}" if limits else line
     yield ""
     for name in nested:
         yield from _format_table(getattr(config, name), f"{key}.{name}", notes.get(name, ""))
@@ -161,13 +161,6 @@ def _format_comment(text: str) -> list[str]:
 def _class_summary(kind: type) -> str:
     """The first paragraph of a class's docstring."""
     return " ".join((inspect.getdoc(kind) or "").partition("\n\n")[0].split())
-
-
-def _format_range(kind: Any) -> str:
-    plain, _ = strip_annotation(kind)
-    if get_origin(plain) is Literal:
-        return "one of " + ", ".join(map(_to_toml, get_args(plain)))
-    return " and ".join(map(str, field_bounds(kind)))
 
 
 def _to_toml(value: Any) -> str:

@@ -22,9 +22,6 @@ from topoloc.plugin import (
     NetworkInfo,
     atomic_write,
     cache_folder,
-    check_network_file,
-    find_network,
-    find_network_info,
     read_bytes,
 )
 
@@ -68,7 +65,7 @@ class Command:
 def _print_networks() -> None:
     for network in NETWORKS.values():
         try:
-            where = str(find_network(network.name))
+            where = str(network.find_file())
         except WeightsError:
             where = "not here"
         print(f"{network.name:17} {network.licence:10}  {network.origin:22}  {where}")
@@ -83,7 +80,7 @@ def cache_network(path: Path) -> tuple[NetworkInfo, Path]:
             missing; the cache cannot be written.
     """
     if path.suffix == ".onnx":
-        network = check_network_file(path)
+        network = NetworkInfo.of_file(path)
         return network, _write_network(network.name, lambda part: shutil.copyfile(path, part))
     data = read_bytes(path)
     if zipfile.is_zipfile(path) and path.suffix not in (".pt", ".pth"):
@@ -112,9 +109,9 @@ def fetch_network(name: str) -> Path:
         WeightsError: unknown, of another hash, or of a package, which is then named; as
             `cache_network`.
     """
-    network = find_network_info(name)
+    network = NetworkInfo.of_name(name)
     if not network.url:
-        return find_network(name)
+        return network.find_file()
     by_hand = f"fetch it on another machine and give it to `topoloc weights convert`: {network.url}"
     try:
         with urllib.request.urlopen(network.url, timeout=_TIMEOUT_SECONDS) as answer:
@@ -179,7 +176,7 @@ def _write_network(name: str, write: Callable[[Path], object]) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as part:
             write(part)
-            check_network_file(part)
+            NetworkInfo.of_file(part)
     except OSError as error:
         raise WeightsError(f"cannot write {path}: {error.strerror}") from error
     return path

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 from topoloc import AtlasLocalizer, CalibrationError, Localizer, Tracker, UncalibratedCamera
 from topoloc.apps.cli.output import UsageError, catch_stop_signals
-from topoloc.apps.cli.query_answers import QueryAnswer
+from topoloc.apps.cli.queries.query_answers import QueryAnswer
 from topoloc.apps.formats.live import LiveImage, LiveSource, is_live
 from topoloc.apps.query_camera import CameraOfSize
 

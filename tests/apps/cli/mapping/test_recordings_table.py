@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from topoloc.apps.cli.recordings_table import format_state, recordings_table
+from topoloc.apps.cli.mapping.recordings_table import format_state, recordings_table
 from topoloc.apps.cluster.tasks import JobProgress
 from topoloc.apps.cluster.tiles import Outcome
 

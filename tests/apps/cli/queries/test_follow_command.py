@@ -19,7 +19,7 @@ from mjpeg_camera import mjpeg_camera
 from topoloc.apps.cli import main
 from topoloc.geometry.rigid import Rigid3
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 def _lines(capsys: pytest.CaptureFixture[str], *args: object) -> list[str]:
@@ -102,7 +102,7 @@ def test_robots_hear_what_was_measured(
             assert covariance.shape == (6, 6)
             published.append((t_ns, world_from_cam.translation.tolist()))
 
-    monkeypatch.setattr("topoloc.apps.cli.follow.RosPublisher", Robots)
+    monkeypatch.setattr("topoloc.apps.cli.queries.follow.RosPublisher", Robots)
     answers = [
         json.loads(line) for line in _lines(capsys, room_map, f"{tiny_recording}@0:3", "--ros", 7)
     ]

@@ -11,7 +11,7 @@ import tyro
 from topoloc import AtlasConfig, LocalizerConfig, MissingExtraError, TrackerConfig
 from topoloc.apps.cli.features_option import QUERY_FEATURES
 from topoloc.apps.cli.output import File, Flag, UsageError, catch_stop_signals
-from topoloc.apps.cli.served_maps import ServedMaps, read_token
+from topoloc.apps.cli.queries.served_maps import ServedMaps, read_token
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ReplicasConfig
 from topoloc.apps.service.config import ServiceConfig

@@ -32,7 +32,6 @@ from topoloc import (
     write_tum,
 )
 from topoloc.apps.cli.features_option import QUERY_FEATURES
-from topoloc.apps.cli.live_localization import NEEDS_CALIBRATION, find_live_input, localize_live
 from topoloc.apps.cli.map_or_atlas import is_atlas, open_localizer, parse_camera
 from topoloc.apps.cli.output import (
     File,
@@ -46,7 +45,12 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_text,
 )
-from topoloc.apps.cli.query_answers import (
+from topoloc.apps.cli.queries.live_localization import (
+    NEEDS_CALIBRATION,
+    find_live_input,
+    localize_live,
+)
+from topoloc.apps.cli.queries.query_answers import (
     QueryAnswer,
     exit_status,
     format_answer,

@@ -38,7 +38,7 @@ from topoloc.apps.cli.output import (
     catch_stop_signals,
     open_recording,
 )
-from topoloc.apps.cli.query_answers import QueryAnswer, format_answer
+from topoloc.apps.cli.queries.query_answers import QueryAnswer, format_answer
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.query_camera import CameraOfSize, select_frame_camera

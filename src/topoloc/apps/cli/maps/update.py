@@ -18,6 +18,7 @@ from topoloc import (
     is_atlas,
     write_tum,
 )
+from topoloc.apps.cli.maps.session_update import SessionUpdateOptions, describe_update
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -29,7 +30,6 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.cli.session_update import SessionUpdateOptions, describe_update
 from topoloc.apps.cli.settings_file import Settings, read_settings
 from topoloc.apps.cluster.config import ClusterConfig
 
@@ -148,7 +148,7 @@ class Command:
         self, target: str, update_options: list[SessionUpdateOptions], settings: Settings
     ) -> int:
         """Each recording joins the tile that it is of; status 1 where one could not."""
-        from topoloc.apps.cli.tile_sessions import AtlasUpdate
+        from topoloc.apps.cli.maps.tile_sessions import AtlasUpdate
 
         configs = (
             settings.of(AtlasConfig),

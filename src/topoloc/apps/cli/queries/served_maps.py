@@ -13,8 +13,6 @@ from topoloc import (
     TileFetcher,
     TopolocError,
     TrackerConfig,
-    is_warm,
-    set_node_cache_size,
     set_num_threads,
     warm_up,
 )
@@ -48,18 +46,16 @@ class ServedMaps:
     def _open_maps(self) -> MapCache:
         """The maps, with half of the memory for nodes, and half for the rest of those that are
         open."""
-        if not is_warm():
-            print("compiling, once, a minute ...", file=sys.stderr, flush=True)
-            warm_up()
+        warm_up(
+            only_if_cold=lambda: print("compiling, once, a minute ...", file=sys.stderr, flush=True)
+        )
         if self.service.num_workers > 1:
             set_num_threads(1)
-        budget = self.service.memory_mb * 500_000
-        set_node_cache_size(budget)
         fetches = TileFetcher(self.service.fetch_s)
-        return MapCache(
+        return MapCache.with_memory(
             self.paths,
             lambda topomap: create_localizer(topomap, self.localizer, self.features),
-            budget,
+            self.service.memory_mb,
             fetches.path,
         )
 

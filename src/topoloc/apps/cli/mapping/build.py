@@ -13,7 +13,9 @@ import tyro
 
 from topoloc import BuildConfig, SlamConfig
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
-from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
+from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
+from topoloc.apps.cli.mapping.recording_pieces import Pieces, SplitOptions, split_recording
+from topoloc.apps.cli.maps.tile_joining import JoinedTiles, join_overlapping_tiles
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -26,9 +28,7 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.cli.recording_pieces import Pieces, SplitOptions, split_recording
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
-from topoloc.apps.cli.tile_joining import JoinedTiles, join_overlapping_tiles
 
 if TYPE_CHECKING:
     from topoloc.apps.cluster.tiles import Outcome, TileJob
@@ -113,8 +113,7 @@ class Command:
     ] = None
     """With --ray, the world that the poses of all recordings are in."""
     replace: Flag = False
-    """With --ray, a tile of the same id that was made of something else, or otherwise, is
-    replaced."""
+    """With --ray, replace a tile of the same id that was made of something else."""
     split: Annotated[
         str | None,
         tyro.conf.arg(metavar="FRAMES[,SHARED]", help_behavior_hint="(default: each whole)"),
@@ -124,8 +123,7 @@ class Command:
     join: Flag = False
     """With --ray, tiles that overlap are joined, as by `topoloc atlas join`."""
     json: File = None
-    """Write what `topoloc info` says of the new map, or what became of each recording, to this file
-    (- for standard output)."""
+    """Write the facts of the new map, or of each recording, as JSON (- for standard output)."""
     config: File = None
     """All other settings: a TOML file, as `topoloc config build` prints it."""
 
@@ -190,7 +188,7 @@ class Command:
         self, map_job: MapJob, atlas: str, settings: Settings, split: SplitOptions | None
     ) -> int:
         """Each recording a tile, on the cluster; status 1 where one could not be mapped."""
-        from topoloc.apps.cli.recordings_table import print_notes, recordings_table
+        from topoloc.apps.cli.mapping.recordings_table import print_notes, recordings_table
         from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
         from topoloc.apps.cluster.config import ClusterConfig
         from topoloc.apps.cluster.connection import connect_to_cluster

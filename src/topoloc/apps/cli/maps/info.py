@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc import MapError, check_map, is_atlas
-from topoloc.apps.cli import atlas
+from topoloc.apps.cli.maps import atlas
 from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_fields, write_json
 
 MAX_PROBLEMS = 20
@@ -107,7 +107,7 @@ def _print(info: dict[str, Any]) -> None:
 
 def _format_place(facts: dict[str, Any] | None) -> str:
     from topoloc import Georeference
-    from topoloc.apps.cli.georeference import format_georeference
+    from topoloc.apps.cli.maps.georeference import format_georeference
 
     return (
         "unknown (topoloc georeference says where)"

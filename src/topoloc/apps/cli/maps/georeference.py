@@ -15,9 +15,15 @@ from topoloc import (
     GeoreferenceResult,
     georeference,
 )
-from topoloc.apps.cli.output import File, UsageError, check_outputs, print_fields, write_json
+from topoloc.apps.cli.output import (
+    File,
+    UsageError,
+    check_outputs,
+    print_fields,
+    print_waiting,
+    write_json,
+)
 from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
-from topoloc.apps.cli.wait_message import print_waiting
 
 
 @dataclass(frozen=True)

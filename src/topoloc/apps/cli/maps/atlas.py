@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from topoloc.apps.cli.maps.tile_joining import join_overlapping_tiles
 from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, print_fields, write_json
 from topoloc.apps.cli.settings_file import read_settings
-from topoloc.apps.cli.tile_joining import join_overlapping_tiles
 
 Names = Annotated[
     tyro.conf.Positional[tuple[str, ...]],

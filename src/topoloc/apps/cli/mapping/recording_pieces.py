@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 
 from topoloc import TopolocError, open_sequence
-from topoloc.apps.cli.map_jobs import MapJob
+from topoloc.apps.cli.mapping.map_jobs import MapJob
 from topoloc.apps.cli.output import UsageError
 from topoloc.plugin import split_selection
 

@@ -22,9 +22,9 @@ from topoloc import (
     find_tile_of_recording,
 )
 from topoloc.apps.cli.map_or_atlas import open_atlas
+from topoloc.apps.cli.mapping.recordings_table import print_notes, recordings_table
+from topoloc.apps.cli.maps.session_update import SessionUpdateOptions
 from topoloc.apps.cli.output import interruptible
-from topoloc.apps.cli.recordings_table import print_notes, recordings_table
-from topoloc.apps.cli.session_update import SessionUpdateOptions
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.connection import connect_to_cluster
 from topoloc.apps.cluster.tasks import Job, JobProgress, OnJobState, run_locally, run_on_ray

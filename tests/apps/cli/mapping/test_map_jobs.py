@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.apps.cli.map_jobs import MapJob, PoseOptions
+from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cli.output import UsageError
 from topoloc.errors import RecordingError
 from topoloc.mapping.build import BuildConfig

@@ -22,9 +22,8 @@ from topoloc import (
     with_pose_conventions,
     with_trajectory,
 )
-from topoloc.apps.cli.output import UsageError, open_recording
-from topoloc.apps.cli.wait_message import print_waiting
-from topoloc.plugin import Progress, default_pose_source
+from topoloc.apps.cli.output import UsageError, open_recording, print_waiting
+from topoloc.plugin import Progress
 
 
 @dataclass(frozen=True)
@@ -67,9 +66,8 @@ class OpenSessionUpdate:
             TopolocError: as of `update` and `run_slam`.
         """
         one = self.options
-        poses_from = one.trajectory or default_pose_source(self.sequence)
 
-        def find_poses() -> StereoSequence:
+        def find_poses(poses_from: str) -> StereoSequence:
             if self._posed_sequence is None:
                 self._posed_sequence = self._with_poses(poses_from, progress)
             return self._posed_sequence
@@ -77,7 +75,7 @@ class OpenSessionUpdate:
         return update(
             path,
             self.sequence,
-            poses_from,
+            one.trajectory,
             find_poses,
             one.update,
             one.localize,

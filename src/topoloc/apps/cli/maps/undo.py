@@ -8,9 +8,8 @@ from typing import Annotated
 import tyro
 
 from topoloc import undo_edit
-from topoloc.apps.cli.output import File, write_json
+from topoloc.apps.cli.output import File, print_waiting, write_json
 from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
-from topoloc.apps.cli.wait_message import print_waiting
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from topoloc import Atlas, PruneConfig, is_atlas, prune
-from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
+from topoloc.apps.cli.output import File, UsageError, check_outputs, print_waiting, write_json
 from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.cli.tile_option import (
     TileOption,
@@ -18,7 +18,6 @@ from topoloc.apps.cli.tile_option import (
     edit_map_or_tile,
     run_for_each_tile,
 )
-from topoloc.apps.cli.wait_message import print_waiting
 
 
 @dataclass(frozen=True)

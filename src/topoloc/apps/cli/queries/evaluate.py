@@ -39,8 +39,13 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.cli.remote_queries import OpenQueries, QueryRecording, RemoteMap, localize_on_ray
-from topoloc.apps.cli.self_evaluation import evaluate_map_itself
+from topoloc.apps.cli.queries.remote_queries import (
+    OpenQueries,
+    QueryRecording,
+    RemoteMap,
+    localize_on_ray,
+)
+from topoloc.apps.cli.queries.self_evaluation import evaluate_map_itself
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.plugin import format_length, read_json

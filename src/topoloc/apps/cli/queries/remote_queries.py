@@ -28,18 +28,17 @@ from topoloc import (
     StereoSequence,
     TopolocError,
     TopoMetricMap,
-    WeightsError,
     find_frames_with_truth,
     localize_out_of_map,
     localize_queries,
     with_pose_conventions,
 )
-from topoloc.apps.cli.features_option import create_localizer
+from topoloc.apps.cli.features_option import create_localizer, find_available_types
 from topoloc.apps.cli.map_or_atlas import atlas_localizer
 from topoloc.apps.cli.output import open_recording
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
-from topoloc.plugin import Progress, check_available
+from topoloc.plugin import Progress
 
 MAX_IMAGES = 50
 """Of a piece: a second or so for map and recording to be opened is little beside them."""
@@ -132,7 +131,10 @@ class RemoteMap:
         """That which the command has opened."""
         if isinstance(queried_map, Localizer):
             return RemoteMap(
-                queried_map.topomap, _find_available(queried_map.topomap.kinds), config, features
+                queried_map.topomap,
+                find_available_types(queried_map.topomap.kinds),
+                config,
+                features,
             )
         atlas, settings = queried_map.localizer.atlas, queried_map.localizer.config
         sent = RemoteAtlas(
@@ -141,7 +143,7 @@ class RemoteMap:
             queried_map.tile_id,
             settings,
         )
-        return RemoteMap(sent, _find_available(_feature_types_of(atlas)), config, features)
+        return RemoteMap(sent, find_available_types(_feature_types_of(atlas)), config, features)
 
     def open_map(self, notes: list[str]) -> Localizer | EvaluatedTile:
         """The same here; what is wrong with tiles becomes known by `notes`, while they are asked.
@@ -163,7 +165,7 @@ class RemoteMap:
         )
 
     def _check_same_features(self, kinds: Iterable[str]) -> None:
-        other = sorted(_find_available(kinds) ^ self.kinds)
+        other = sorted(find_available_types(kinds) ^ self.kinds)
         if other:
             lacks = "lacks" if other[0] in self.kinds else "has"
             raise MissingExtraError(
@@ -292,16 +294,3 @@ def _create_progress_callback(
 
 def _feature_types_of(atlas: Atlas) -> set[str]:
     return {kind for tile in atlas.manifest.tiles for kind in tile.kinds}
-
-
-def _find_available(kinds: Iterable[str]) -> frozenset[str]:
-    """Those that can be had on this machine."""
-
-    def is_available(kind: str) -> bool:
-        try:
-            check_available(kind)
-        except (MissingExtraError, WeightsError):
-            return False
-        return True
-
-    return frozenset(kind for kind in kinds if is_available(kind))

@@ -10,11 +10,11 @@ from typing import Annotated
 import tyro
 
 from topoloc import Atlas, LocalizerConfig, UpdateConfig, is_atlas, merge
-from topoloc.apps.cli.atlas import describe, print_atlas
+from topoloc.apps.cli.maps.atlas import describe, print_atlas
+from topoloc.apps.cli.maps.session_update import describe_outdated_models
+from topoloc.apps.cli.maps.tile_joining import join_overlapping_tiles
 from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
-from topoloc.apps.cli.session_update import describe_outdated_models
 from topoloc.apps.cli.settings_file import Settings, read_settings
-from topoloc.apps.cli.tile_joining import join_overlapping_tiles
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from topoloc.apps.formats.capture.carla_capture import (
 from topoloc.apps.formats.capture.recording_writer import RecordingWriter
 from topoloc.apps.formats.capture.zed_capture import sdk_frames, side_by_side_frames
 from topoloc.apps.formats.live import LiveSource
-from topoloc.plugin import CalibrationForSize, parse_calibration
+from topoloc.plugin import parse_calibration
 
 _ZED_SIZE = (2560, 720)
 
@@ -183,9 +183,7 @@ class Command:
                     )
                 yield from side_by_side_frames(source, Path(self.camera))
             else:
-                yield from _single_frames(
-                    source, None if self.camera is None else parse_calibration(self.camera)
-                )
+                yield from _single_frames(source, self.camera)
 
     def _check_usage(self) -> None:
         if self.fps is not None and not self.fps > 0.0:
@@ -239,9 +237,8 @@ class Command:
         )
 
 
-def _single_frames(
-    source: LiveSource, calibration: CalibrationForSize | None
-) -> Iterator[StereoFrame]:
+def _single_frames(source: LiveSource, calibration_option: str | None) -> Iterator[StereoFrame]:
+    calibration = None if calibration_option is None else parse_calibration(calibration_option)
     camera = None
     for picture in source:
         height, width = picture.image.shape[:2]

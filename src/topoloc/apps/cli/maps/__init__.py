@@ -1,0 +1,1 @@
+"""Commands that show, edit, join and export maps and atlases."""

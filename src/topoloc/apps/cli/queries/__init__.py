@@ -1,0 +1,1 @@
+"""Commands that localize images, and that judge or explain the answers."""
