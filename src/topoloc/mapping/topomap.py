@@ -80,7 +80,7 @@ class TopoMetricMap(MapContents):
         itself by its first kind.
 
         Raises:
-            FeatureKindError: it holds no such features.
+            FeatureTypeError: it holds no such features.
         """
         if kind == self.kind:
             return self
