@@ -69,6 +69,8 @@ class EvaluatedQuery:
 
     @property
     def is_false_accept(self) -> bool:
+        """Return whether the result has a pose that is wrong: out of map, in another world, or
+        beyond the error limits."""
         if isinstance(self.result, NotLocalized):
             return False
         if self.world_from_cam is None or self.is_in_other_world:

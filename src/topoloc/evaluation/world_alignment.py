@@ -38,6 +38,7 @@ class WorldFit:
     num_localized: int
 
     def to_json(self) -> dict[str, Any]:
+        """Return the fit as JSON."""
         return {
             "recording": self.recording,
             "map_from_truth": self.map_from_truth.matrix().tolist(),

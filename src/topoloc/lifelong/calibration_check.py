@@ -79,9 +79,9 @@ def check_focal_length(
     middle = float(np.median(found))
     agreeing = sum(abs(one - middle) < _MAX_LOG_RATIO for one in found)
     if abs(middle) > _MAX_LOG_RATIO and agreeing >= _MIN_LOCALIZED:
-        said = sequence[tried[0]].camera
-        assert said is not None, "it was asked"
-        lengths = f"{said.fx * math.exp(middle):.0f} pixels, not {said.fx:.0f}"
+        stated = sequence[tried[0]].camera
+        assert stated is not None, "checked above"
+        lengths = f"{stated.fx * math.exp(middle):.0f} pixels, not {stated.fx:.0f}"
         raise CalibrationError(
             f"{sequence.name}: its calibration is not that of its camera: the map recognises"
             f" {agreeing} of {len(tried)} pictures where the focal length is about {lengths}; the"

@@ -63,9 +63,9 @@ def update_coarse_models(
         if of_name == SurfVlad.name:
             models[name] = _add_features(model, views.get(of_kind or topomap.kind, []))
         elif images:
-            grown = _add_images(model, images)
-            models[name] = grown or model
-            not_updated += [] if grown else [name]
+            extended = _add_images(model, images)
+            models[name] = extended or model
+            not_updated += [] if extended else [name]
     return UpdatedCoarseModels(models, sorted(not_updated))
 
 
@@ -73,10 +73,10 @@ def _add_features(model: CoarseModel, views: Sequence[PlaceFeatures]) -> CoarseM
     if not views:
         return model
     described = [(view.features, view.width, view.height) for view in views]
-    grown = SurfVlad.from_model(model).extend_with_features(
+    extended = SurfVlad.from_model(model).extend_with_features(
         described, np.array([view.node_id for view in views])
     )
-    return replace(grown.to_model(), name=model.name)
+    return replace(extended.to_model(), name=model.name)
 
 
 def _add_images(model: CoarseModel, images: Sequence[PlaceImage]) -> CoarseModel | None:

@@ -62,20 +62,20 @@ def merge_maps(
         )
     if first.map_id is not None and first.map_id == second.map_id:
         raise MapError("they are one map in two versions; nothing is merged")
-    held = _align_second_map(first, second, config, localizer_config, progress)
+    aligned = _align_second_map(first, second, config, localizer_config, progress)
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
     added = [
         row
-        for row, answer in held.answers.items()
+        for row, answer in aligned.answers.items()
         if not is_well_localized(answer, d_thresh, config)
     ]
-    poses = {row: pose for row, pose in enumerate(held.world_from_cams) if pose is not None}
+    poses = {row: pose for row, pose in enumerate(aligned.world_from_cams) if pose is not None}
     merged, not_updated = _add_nodes(first, second, added, poses)
     changes = {
         "nodes_of_second": len(second.summaries),
-        "localized": sum(answer is not None for answer in held.answers.values()),
-        "agreeing": len(held.inlier_idx),
+        "localized": sum(answer is not None for answer in aligned.answers.values()),
+        "agreeing": len(aligned.inlier_idx),
         "nodes_added": len(added),
         "not_taught": not_updated,
     }
@@ -242,8 +242,8 @@ def _transfer_virtual_nodes(
     poses: Mapping[int, Rigid3],
     summaries: Sequence[Any],
 ):
-    """Return the virtual nodes of both maps if they have the same feature type, else those of the
-    first."""
+    """Return the virtual nodes of both maps if they have the same feature type, else the first
+    map's."""
     if first.sides is None or second.sides is None or first.sides.kind != second.sides.kind:
         return first.sides
     row_of = {summary.node_id: row for row, summary in enumerate(second.summaries)}

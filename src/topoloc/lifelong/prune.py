@@ -87,6 +87,7 @@ class _FileSize:
 
     @staticmethod
     def of(path: Path, kinds: Sequence[str]) -> _FileSize:
+        """Measure a map's file with these feature types."""
         lengths = " + ".join(f"total(length({name}))" for name in _POINT_COLUMNS)
         counted = "SELECT count(*), total(length(jpeg)) FROM"
         with closing(
@@ -101,13 +102,15 @@ class _FileSize:
                 ).fetchone()[0]
                 bytes_per_point[kind] = (num_bytes + of_sums) / max(num, 1)
             num, of_templates = database.execute(f"{counted} node_templates").fetchone()
-            num_pictures, of_pictures = database.execute(f"{counted} place_images").fetchone()
-            of_walls = database.execute(f"SELECT {lengths} FROM side_node_points").fetchone()[0]
-        of_pictures *= max(1.0 - num / max(num_pictures, 1), 0.0)
+            num_images, of_images = database.execute(f"{counted} place_images").fetchone()
+            of_virtual_nodes = database.execute(
+                f"SELECT {lengths} FROM side_node_points"
+            ).fetchone()[0]
+        of_images *= max(1.0 - num / max(num_images, 1), 0.0)
         return _FileSize(
             path.stat().st_size,
             bytes_per_point,
-            (of_templates + of_walls + of_pictures) / max(num, 1),
+            (of_templates + of_virtual_nodes + of_images) / max(num, 1),
         )
 
     def bytes_without_points(self, topomap: TopoMetricMap) -> float:

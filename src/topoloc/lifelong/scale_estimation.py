@@ -55,6 +55,7 @@ class _LocalizedFrames:
     sigmas: Float[np.ndarray, " k"]
 
     def select(self, rows: Int[np.ndarray, " m"]) -> _LocalizedFrames:
+        """Return these rows of all columns."""
         return _LocalizedFrames(*(column[rows] for column in vars(self).values()))
 
 

@@ -183,21 +183,21 @@ def _align_stretches(
 ) -> SessionPoses:
     """Align each stretch by the localizations of its own images. Stretches that cannot be aligned
     have no poses. Raises the TrajectoryError of the first stretch if none can be aligned."""
-    held, refused = list[SessionPoses](), list[TrajectoryError]()
+    aligned, refused = list[SessionPoses](), list[TrajectoryError]()
     for odom, of_motion in zip(motions, answers, strict=True):
         try:
-            held.append(align_motion_to_map(name, odom, of_motion, d_thresh, config))
+            aligned.append(align_motion_to_map(name, odom, of_motion, d_thresh, config))
         except TrajectoryError as error:
             refused.append(error)
-    if not held:
+    if not aligned:
         raise refused[0]
-    world_from_cams: list[Rigid3 | None] = [None] * max(len(one.world_from_cams) for one in held)
-    for one in held:
+    world_from_cams: list[Rigid3 | None] = [None] * max(len(one.world_from_cams) for one in aligned)
+    for one in aligned:
         for index, pose in _known_poses(one.world_from_cams).items():
             world_from_cams[index] = pose
     every = {index: answer for of_motion in answers for index, answer in of_motion.items()}
     return SessionPoses(
-        world_from_cams, every, sorted(index for one in held for index in one.inlier_idx)
+        world_from_cams, every, sorted(index for one in aligned for index in one.inlier_idx)
     )
 
 
@@ -238,20 +238,20 @@ def _find_consensus(
     name: str,
     odom: Mapping[int, Rigid3],
     localized: Mapping[int, Localization],
-    num_asked: int,
+    num_queried: int,
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> list[int]:
     """Return the largest set of localized frames that one transform of the motion explains. Raises
     TrajectoryError."""
     indices = list(localized)
-    if num_asked < config.min_agreeing:
+    if num_queried < config.min_agreeing:
         raise TrajectoryError(
-            f"{name}: {_too_few_message(num_asked, config)}; the map stays as it is"
+            f"{name}: {_too_few_message(num_queried, config)}; the map stays as it is"
         )
     if len(indices) < config.min_agreeing:
         raise TrajectoryError(
-            f"{name}: the map recognises {len(indices)} of {num_asked} pictures asked: another"
+            f"{name}: the map recognises {len(indices)} of {num_queried} pictures asked: another"
             " place, or changed; the map stays as it is"
         )
     _check_scale(name, odom, localized, config)
@@ -292,8 +292,8 @@ def _find_inliers(
     return np.array(agrees)
 
 
-def _too_few_message(num_asked: int, config: SessionPosesConfig) -> str:
-    found = f"{num_asked} of its pictures are" if num_asked > 1 else "one of its pictures is"
+def _too_few_message(num_queried: int, config: SessionPosesConfig) -> str:
+    found = f"{num_queried} of its pictures are" if num_queried > 1 else "one of its pictures is"
     return (
         f"{found} as far apart as nodes of the map, too few to join: it takes {config.min_agreeing}"
     )

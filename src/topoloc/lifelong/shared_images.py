@@ -36,7 +36,7 @@ def estimate_by_shared_images(
         images that agree. None if the maps share too few images or the images do not agree.
     """
     here, there = _image_poses(first), _image_poses(second)
-    shared = sorted(here.keys() & there.keys(), key=lambda picture: (picture[0], picture[1]))
+    shared = sorted(here.keys() & there.keys(), key=lambda image_key: (image_key[0], image_key[1]))
     chosen = (
         np.unique(
             np.linspace(0, len(shared) - 1, min(len(shared), _MAX_IMAGES)).round().astype(int)
@@ -48,7 +48,7 @@ def estimate_by_shared_images(
     if len(poses) < config.min_independent:
         return None
     one, other = poses[len(poses) // 2]
-    said = [
+    estimates = [
         propagate_estimate(
             one.inverse() @ a,
             Rigid3.identity(),
@@ -59,7 +59,9 @@ def estimate_by_shared_images(
         for a, b in poses
     ]
     consensus = find_consensus(
-        [pose for pose, _ in said], np.stack([covariance for _, covariance in said]), config
+        [pose for pose, _ in estimates],
+        np.stack([covariance for _, covariance in estimates]),
+        config,
     )
     return None if consensus is None else _to_worlds(consensus, one, other)
 
@@ -78,7 +80,7 @@ def _to_worlds(
 
 def _image_poses(topomap: TopoMetricMap) -> dict[tuple[str, bytes], Rigid3]:
     """Return world_from_cam of each mapping image by its name and bytes. Images that occur several
-    times are left out, such as those of a covered lens."""
-    pictures = [(image.name, image.jpeg, image.world_from_cam) for image in topomap.place_images]
-    times = Counter(jpeg for _, jpeg, _ in pictures)
-    return {(name, jpeg): pose for name, jpeg, pose in pictures if times[jpeg] == 1}
+    times are left out, such as images of a covered camera."""
+    images = [(image.name, image.jpeg, image.world_from_cam) for image in topomap.place_images]
+    times = Counter(jpeg for _, jpeg, _ in images)
+    return {(name, jpeg): pose for name, jpeg, pose in images if times[jpeg] == 1}

@@ -97,23 +97,23 @@ def estimate_poses_by_map(
     ]
     for stretch in odometry.submaps:
         odom = stretch.submap_from_cams()
-        held, inlier_idx = align_stretch_to_map(sequence.name, odom, localized, d_thresh, config)
-        if held is not None:
+        aligned, inlier_idx = align_stretch_to_map(sequence.name, odom, localized, d_thresh, config)
+        if aligned is not None:
             anchors = {index: localized[index] for index in inlier_idx}
             adjusted = adjust_trajectory(
-                stretch, held, anchors, config.points_widened, config.adjustment
+                stretch, aligned, anchors, config.points_widened, config.adjustment
             )
             corrected = correct_trajectory(adjusted, anchors, d_thresh, config.bend)
-            held, inlier_idx = _reject_contradicted(
+            aligned, inlier_idx = _reject_contradicted(
                 corrected, localized, inlier_idx, d_thresh, config
             )
         for index in odom:
             answer = localized[index] if index in inlier_idx else localized.pop(index, None)
-            if held is None:
+            if aligned is None:
                 poses[index] = by_map[index] if index in inlier_idx and index in clear else None
             else:
                 poses[index] = _pose_if_consistent(
-                    held[index] if index < len(held) else None, answer, d_thresh, config
+                    aligned[index] if index < len(aligned) else None, answer, d_thresh, config
                 )
     known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
     if not known:
@@ -160,7 +160,7 @@ def align_stretch_to_map(
     inlier_idx = find_largest_consensus(
         odom, within_stretch, config.slack * d_thresh, config.slack_deg, config.scale
     )
-    held = None
+    aligned = None
     for _ in range(_NUM_REFITS):  # each refit uses the inliers found with the previous scale
         metric = (
             scale_to_metres(
@@ -173,15 +173,17 @@ def align_stretch_to_map(
         if len(within) < config.min_agreeing:
             return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config)
         try:
-            held = align_motion_to_map(
+            aligned = align_motion_to_map(
                 name, metric, within, d_thresh, config, NoiseScale()
             )  # fixed noise scales: the drift of the scale is not a random walk
         except TrajectoryError:
             return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config)
-        inlier_idx = held.inlier_idx
-    if held is None or not _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config):
+        inlier_idx = aligned.inlier_idx
+    if aligned is None or not _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config):
         return None, []
-    return _reject_contradicted(held.world_from_cams, within_stretch, inlier_idx, d_thresh, config)
+    return _reject_contradicted(
+        aligned.world_from_cams, within_stretch, inlier_idx, d_thresh, config
+    )
 
 
 def _reject_ambiguous(

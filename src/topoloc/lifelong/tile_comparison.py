@@ -89,10 +89,12 @@ class OpenTile:
 
     @property
     def topomap(self) -> TopoMetricMap:
+        """Return the tile's map."""
         return self.localizer.topomap
 
     @cached_property
     def poses(self) -> NodePoses:
+        """Return the poses of the tile's nodes."""
         return NodePoses.of([summary.world_from_cam for summary in self.topomap.summaries])
 
     @property
@@ -104,6 +106,7 @@ class OpenTile:
         return nodes.d_thresh, nodes.lambda_rot
 
     def world_from_node(self, row: int) -> Rigid3:
+        """Return the pose of the node of a row."""
         return self.topomap.summaries[row].world_from_cam
 
 
@@ -181,6 +184,7 @@ class _Comparison:
         )  # nodes of the second tile in the first, and nodes of the first in the second
 
     def verdict(self) -> TileTransform | NotJoined:
+        """Compare the tiles and return the transform, or the reason for no join."""
         config = self._config
         orders = self._rank_nodes_by_similarity()
         self._localize_nodes([order[: config.num_probed] for order in orders])

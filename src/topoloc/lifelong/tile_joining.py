@@ -117,6 +117,7 @@ class PairJob:
 
     @property
     def name(self) -> str:
+        """Return the name of the job."""
         return f"join {self.first} {self.second}"
 
     def run(self, progress: Progress) -> PairResult:
@@ -132,6 +133,7 @@ class PairJob:
             maps.close()
 
     def failure_outcome(self, reason: str) -> PairResult:
+        """Return the result of a job that did not finish."""
         return PairResult(self.first, self.second, NotCompared(reason))
 
 

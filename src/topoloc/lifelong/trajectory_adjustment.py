@@ -24,7 +24,7 @@ _NUM_NEIGHBOURS = 3
 
 def adjust_trajectory(
     stretch: MonocularSubmap,
-    held: Sequence[Rigid3 | None],
+    world_from_cams: Sequence[Rigid3 | None],
     anchors: Mapping[int, Localization],
     points_widened: float,
     config: BundleConfig,
@@ -36,20 +36,20 @@ def adjust_trajectory(
 
     Args:
         stretch: the odometry of the trajectory.
-        held: the initial poses of the frames, in the map's world and metres.
+        world_from_cams: the initial poses of the frames, in the map's world and metres.
         anchors: the trusted localizations, by frame.
         points_widened: the factor by which the sigmas of tracked points are larger than in
             odometry.
         config: the settings of the bundle adjustment.
     """
-    keyframes = _transform_to_map(stretch, held)
+    keyframes = _transform_to_map(stretch, world_from_cams)
     moved = set(map(id, keyframes))
     frames = {
         f.frame_idx: f
         for f in stretch.frames
-        if id(f.keyframe) in moved and _has_pose(held, f.frame_idx)
+        if id(f.keyframe) in moved and _has_pose(world_from_cams, f.frame_idx)
     }
-    relative = {index: _relative_pose(frame, held) for index, frame in frames.items()}
+    relative = {index: _relative_pose(frame, world_from_cams) for index, frame in frames.items()}
     for keyframe in keyframes:
         keyframe.observations.weights /= points_widened
     map_anchors = [
@@ -58,7 +58,7 @@ def adjust_trajectory(
         if index in anchors
     ]
     adjust_bundle(keyframes, [], stretch.landmarks, config, map_anchors)
-    adjusted = list(held)
+    adjusted = list(world_from_cams)
     for index, frame in frames.items():
         adjusted[index] = (
             relative[index] @ frame.keyframe.cam_from_world
@@ -66,13 +66,13 @@ def adjust_trajectory(
     return adjusted
 
 
-def _has_pose(held: Sequence[Rigid3 | None], index: int) -> bool:
-    return index < len(held) and held[index] is not None
+def _has_pose(world_from_cams: Sequence[Rigid3 | None], index: int) -> bool:
+    return index < len(world_from_cams) and world_from_cams[index] is not None
 
 
-def _relative_pose(frame: FramePose, held: Sequence[Rigid3 | None]) -> Rigid3:
+def _relative_pose(frame: FramePose, world_from_cams: Sequence[Rigid3 | None]) -> Rigid3:
     """Return cam_from_keyframe of a frame, in metres."""
-    pose = held[frame.frame_idx]
+    pose = world_from_cams[frame.frame_idx]
     assert pose is not None
     return frame.view_from_cam @ pose.inverse() @ frame.keyframe.cam_from_world.inverse()
 
@@ -91,18 +91,22 @@ def _keyframe_anchor(
     )
 
 
-def _transform_to_map(stretch: MonocularSubmap, held: Sequence[Rigid3 | None]) -> list[KeyFrame]:
+def _transform_to_map(
+    stretch: MonocularSubmap, world_from_cams: Sequence[Rigid3 | None]
+) -> list[KeyFrame]:
     """Move the key frames with a known pose, and their landmarks, into the map's world and metres.
     Return these key frames."""
     views = {f.frame_idx: f.view_from_cam for f in stretch.frames}
     keyframes = [
-        k for k in stretch.keyframes if _has_pose(held, k.frame_idx) and k.frame_idx in views
+        k
+        for k in stretch.keyframes
+        if _has_pose(world_from_cams, k.frame_idx) and k.frame_idx in views
     ]
     before = [k.cam_from_world for k in keyframes]
     after = [
         views[k.frame_idx] @ pose.inverse()
         for k in keyframes
-        if (pose := held[k.frame_idx]) is not None
+        if (pose := world_from_cams[k.frame_idx]) is not None
     ]
     moved = np.zeros(stretch.landmarks.num, np.bool_)
     for keyframe, old, new, metres in zip(

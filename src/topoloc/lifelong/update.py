@@ -132,18 +132,20 @@ def update_map(
     check_session_is_new(topomap, sequence)
     localizer = Localizer(topomap, localizer_config)
     if poses_from == "map":
-        held = estimate_poses_by_map(
+        session_poses = estimate_poses_by_map(
             sequence, Tracker(localizer), topomap.config, config.poses, progress
         )
     else:
-        held = estimate_poses_by_motion(sequence, localizer, topomap.config, config.poses, progress)
+        session_poses = estimate_poses_by_motion(
+            sequence, localizer, topomap.config, config.poses, progress
+        )
     session_id = topomap.free_ids.session
-    without = [None] * (len(sequence) - len(held.world_from_cams))
+    without = [None] * (len(sequence) - len(session_poses.world_from_cams))
     posed_sequence = SequenceView(
-        sequence, list(range(len(sequence))), [*held.world_from_cams, *without]
+        sequence, list(range(len(sequence))), [*session_poses.world_from_cams, *without]
     )
     frames = select_posed_frames(posed_sequence, session_id)
-    content = _create_session_content(topomap, frames, held, config, progress)
+    content = _create_session_content(topomap, frames, session_poses, config, progress)
     session = _create_session(session_id, sequence, frames, content, poses_from)
     updated = update_coarse_models(topomap, content.views, content.images)
     changed = replace(_add_session(topomap, session, frames, content), coarse_models=updated.models)
@@ -155,7 +157,7 @@ def update_map(
     }
     changes |= (
         {"poses_from": poses_from}
-        | _count_changes(held, content, topomap.kind)
+        | _count_changes(session_poses, content, topomap.kind)
         | {"not_taught": updated.not_updated}
     )
     changed = with_map_statistics(changed, progress)
@@ -166,12 +168,14 @@ def update_map(
     )
 
 
-def _count_changes(held: SessionPoses, content: _SessionContent, kind: str) -> dict[str, Any]:
+def _count_changes(
+    session_poses: SessionPoses, content: _SessionContent, kind: str
+) -> dict[str, Any]:
     return {
-        "frames_by_odometry": len(held.propagated_idx),
-        "asked": len(held.answers),
-        "localized": sum(answer is not None for answer in held.answers.values()),
-        "agreeing": len(held.inlier_idx),
+        "frames_by_odometry": len(session_poses.propagated_idx),
+        "asked": len(session_poses.answers),
+        "localized": sum(answer is not None for answer in session_poses.answers.values()),
+        "agreeing": len(session_poses.inlier_idx),
         "nodes_added": len(content.nodes[kind]),
         "side_nodes_added": len(content.sides),
         "points_added": sum(len(node.features) for node in content.nodes[kind]),
@@ -233,7 +237,7 @@ def _has_same_images(
 def _create_session_content(
     topomap: TopoMetricMap,
     frames: Sequence[MappingFrame],
-    held: SessionPoses,
+    session_poses: SessionPoses,
     config: UpdateConfig,
     progress: Progress,
 ) -> _SessionContent:
@@ -245,7 +249,7 @@ def _create_session_content(
     by_index = {frame.index: frame for frame in frames}
     wanted = [
         by_index[k]
-        for k, answer in held.answers.items()
+        for k, answer in session_poses.answers.items()
         if k in by_index and not is_well_localized(answer, d_thresh, config)
     ]
     with_virtual_views = find_new_virtual_views(topomap, [frame.world_from_cam for frame in wanted])
@@ -257,7 +261,7 @@ def _create_session_content(
         if len(draft.points[topomap.kind].features) >= map_config.min_node_points:
             drafts.append(draft)
         progress("new nodes", done + 1, len(wanted))
-    covered = {by_index[k] for k in held.answers if k in by_index} - {
+    covered = {by_index[k] for k in session_poses.answers if k in by_index} - {
         draft.frame for draft in drafts
     }
     content = _SessionContent(

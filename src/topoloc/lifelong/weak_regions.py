@@ -72,6 +72,7 @@ class NodeQuality:
     reasons: tuple[Reason, ...]
 
     def to_json(self) -> dict[str, Any]:
+        """Return the node's quality as JSON."""
         queried_nodes = (
             None
             if self.answer is None
@@ -104,6 +105,7 @@ class WeakRegion:
         return positions[int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmin())]
 
     def to_json(self) -> dict[str, Any]:
+        """Return the region as JSON."""
         ids = [node.node_id for node in self.nodes]
         return {"reason": self.reason, "centre": self.centre.round(3).tolist(), "node_ids": ids}
 
@@ -137,6 +139,7 @@ class WeakRegions:
         return [node for node in self.nodes if node.answer is not None]
 
     def to_json(self) -> dict[str, Any]:
+        """Return all counts, regions and nodes as JSON."""
         return {
             "num_nodes": len(self.nodes),
             "num_sessions": len(self.session_names),
@@ -151,7 +154,7 @@ class WeakRegions:
         }
 
     def suggest_next_recording(self) -> str:
-        """Describe in one or two sentences where to record next."""
+        """Suggest in one or two sentences the places of the next recording."""
         sentences = list[str]()
         of_reason = {
             reason: [part for part in self.parts if part.reason == reason] for reason in REASONS

@@ -99,6 +99,7 @@ class MapConfig:
         return self.nodes.lambda_rot
 
     def to_json(self) -> dict[str, Any]:
+        """Return the settings and their version as JSON."""
         return {"version": CONFIG_VERSION, **asdict(self)}
 
 

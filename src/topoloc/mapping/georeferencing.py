@@ -49,6 +49,7 @@ class UpDirection:
 
     @property
     def world(self) -> Float[np.ndarray, "3"]:
+        """Return the unit vector of the direction in the world."""
         return AXES[self.axis]
 
 
@@ -177,6 +178,7 @@ class _PointPairs:
         return Rigid3(rotation, centre_enu - rotation @ centre_world)
 
     def residuals(self, enu_from_world: Rigid3) -> Float[np.ndarray, " n"]:
+        """Return the distance of each pair after the transform, in metres."""
         return np.linalg.norm(enu_from_world.apply(self.world) - self.enu, axis=1)
 
 

@@ -46,8 +46,8 @@ of a second."""
 MAX_ROWS = 1_000_000
 MAX_BYTES = 50_000_000
 MAX_ARRAYS_BYTES = 800_000_000
-"""Limits of one value: MAX_BYTES for an image, a node's points or a text, MAX_ARRAYS_BYTES for a
-coarse localizer's arrays (the whole VGG-11 has 258 MB)."""
+"""Limits of one value in bytes. MAX_BYTES holds for an image, a node's points or a text.
+MAX_ARRAYS_BYTES holds for a coarse localizer's arrays (the whole VGG-11 has 258 MB)."""
 _PYTHON_TYPES = {"INTEGER": int, "TEXT": str, "BLOB": bytes}
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: MAX_ARRAYS_BYTES + 1_000_000,

@@ -93,6 +93,7 @@ class _Writer:
         self._camera_ids: dict[str, int] = {}
 
     def write(self, topomap: MapContents) -> None:
+        """Write all tables of the map in one transaction."""
         self._database.execute("PRAGMA journal_mode = OFF")
         self._database.execute("BEGIN")
         for table in TABLES:

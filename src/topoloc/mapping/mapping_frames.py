@@ -63,6 +63,7 @@ class MappingFrame:
         return read_left_frame(self.sequence, self.index)
 
     def view(self, with_depth: bool = True) -> PreparedFrame:
+        """Read the frame and prepare it for measurements."""
         return prepare_view(self.read(), with_depth)
 
 

@@ -86,6 +86,7 @@ class NodeDrafts:
     num_points: dict[str, list[int]] = field(default_factory=dict)
 
     def append(self, draft: NodeDraft) -> None:
+        """Add a draft as the last row."""
         self.rows[draft.frame] = len(self.disk_list)
         self.world_from_nodes.append(draft.image.world_from_cam)
         self.cameras.setdefault(draft.frame.session_id, draft.image.camera)

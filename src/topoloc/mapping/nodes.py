@@ -57,6 +57,7 @@ class NodePoses:
 
     @staticmethod
     def of(world_from_nodes: list[Rigid3]) -> NodePoses:
+        """Stack poses (world_from_node) into arrays."""
         return NodePoses(
             np.array([p.translation for p in world_from_nodes]),
             np.array([p.rotation for p in world_from_nodes]),

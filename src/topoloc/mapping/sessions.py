@@ -58,11 +58,13 @@ class Session:
 
     @property
     def start_date(self) -> str | None:
-        """Return the ISO date and time (UTC), or None if the recording's clock has no date."""
+        """Return the ISO date and time (UTC) of the first mapping image, or None if the recording's
+        clock has no date."""
         return _format_date(self.start_ns)
 
     @property
     def end_date(self) -> str | None:
+        """Return the ISO date and time (UTC) of the last mapping image, or None as `start_date`."""
         return _format_date(self.end_ns)
 
 

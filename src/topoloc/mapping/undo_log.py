@@ -217,7 +217,7 @@ def _write_previous(log: sqlite3.Connection, depth: int, path: Path, target: Pat
                 database,
                 table,
                 [*columns, "checksum"],
-                lambda *asked: _select_old_rows(log, depth, *asked),
+                lambda *args: _select_old_rows(log, depth, *args),
             )
         database.execute("COMMIT")
         database.execute("DETACH now")

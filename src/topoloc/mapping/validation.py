@@ -78,6 +78,7 @@ def parse_json(text: str) -> Any:
 
 
 def check_count(value: int, least: int, most: int, what: str) -> int:
+    """Return `value` if it is within `least` and `most`. Raises CorruptDataError otherwise."""
     if not least <= value <= most:
         raise CorruptDataError(f"{what}: {value} is not within {least} and {most}")
     return value

@@ -39,7 +39,7 @@ def parse_calibration(text: str | Path) -> CalibrationForSize:
     if "," in str(text) and not path.exists():
         return parse_intrinsics(str(text))
     if path.suffix.lower() in YAML_SUFFIXES:
-        read_calibration_yaml(path, 1000, 1000)  # complains before the first picture is read
+        read_calibration_yaml(path, 1000, 1000)  # raises errors before the first image is read
         return lambda width, height: read_calibration_yaml(path, width, height)
     camera_calibration = read_camera_json(path)
     return lambda width, height: camera_calibration
@@ -54,7 +54,7 @@ def parse_intrinsics(text: str) -> CalibrationForSize:
         raise CalibrationError(
             f"{text[:80]}: neither a file nor four numbers fx,fy,cx,cy"
         ) from None
-    Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
+    Camera.pinhole(1, 1, fx, fy, cx, cy)  # raises errors before the first image is read
     return lambda width, height: CameraCalibration(
         camera_from_intrinsics(fx, fy, cx, cy, width, height)
     )

@@ -84,8 +84,7 @@ def find_times_problem(t_ns: Sequence[int]) -> str | None:
 
 
 def find_frame_problem(frame: StereoFrame) -> str | None:
-    """Describe in one line what is wrong with a frame in memory. Return None if it is
-    consistent."""
+    """Describe in one line the problem of a frame in memory. Return None if it is consistent."""
     problem = (
         find_image_problem(frame.image)
         or find_time_problem(frame.t_ns)

@@ -113,7 +113,7 @@ class Recording:
 
 @runtime_checkable
 class _SupportsMonocular(Protocol):
-    """A sequence that may have right or depth pictures."""
+    """A sequence that may have right or depth images."""
 
     def monocular(self) -> StereoSequence:
         """Return the recording without right and depth images."""
@@ -144,15 +144,18 @@ class SequenceView:
 
     @property
     def name(self) -> str:
+        """Return the name of the base sequence."""
         return self.base.name
 
     @property
     def names(self) -> list[str]:
+        """Return the name of each frame."""
         names = self.base.names
         return [names[index] for index in self.indices]
 
     @property
     def t_ns(self) -> list[int]:
+        """Return the time of each frame, in integer nanoseconds."""
         t_ns = self.base.t_ns
         return [t_ns[index] for index in self.indices]
 
