@@ -199,8 +199,8 @@ def _merge_session_counts(topomap: TopoMetricMap, config: PruneConfig) -> TopoMe
 def _drop_nodes(
     topomap: TopoMetricMap, file: _FileSize, max_bytes: int, config: PruneConfig
 ) -> TopoMetricMap:
-    """Remove nodes until each remaining node can keep `few_points` landmarks. Return the same map
-    if none needs to be removed."""
+    """Remove nodes until each remaining node can keep `few_points` landmarks, or no further node
+    can be removed. Return the same map if none needs to be removed."""
     remaining = {
         kind: np.array([(~_find_vanished(node, config)).sum() for node in topomap.nodes_of(kind)])
         for kind in topomap.kinds

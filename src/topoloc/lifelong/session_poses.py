@@ -46,14 +46,15 @@ class SessionPosesConfig:
     """Maximum relative difference between the motion's scale and the map's. Three sigmas of the
     measured scale are added, and the ratio of one localization sigma to the longest distance."""
     max_drift: Annotated[float, Between(0, 1)] = 0.03
-    """Tolerance between two agreeing localizations: share of the distance travelled between them,
-    ..."""
+    """Tolerance of the position between two agreeing localizations, as a share of the distance
+    travelled between them. `slack` is added."""
     max_turn_drift_deg: Annotated[float, AtLeast(0)] = 0.3
-    """... degrees per metre travelled, ..."""
+    """Tolerance of the rotation between two agreeing localizations, in degrees per metre travelled.
+    `slack_deg` is added."""
     slack: Annotated[float, Above(0)] = 0.3
-    """... a constant part in D_thresh, ..."""
+    """Constant part of the position tolerance, in D_thresh."""
     slack_deg: Annotated[float, Above(0)] = 2.0
-    """... and a constant part in degrees."""
+    """Constant part of the rotation tolerance, in degrees."""
     min_agreeing: Annotated[int, Between(2, 1000)] = 5
     """Minimum number of localized images that agree with the motion. The session is refused if
     there are fewer."""
@@ -70,10 +71,9 @@ class SessionPosesConfig:
     map."""
     motion_factors: Annotated[tuple[float, ...], Above(0)] = (0.5, 1.0, 3.0, 10.0)
     """Candidate factors for the sigmas of the motion (stereo, RGB-D and given poses). The most
-    likely factor is selected ..."""
+    likely pair of a motion factor and an answer factor is selected."""
     answer_factors: Annotated[tuple[float, ...], Above(0)] = (1.0 / 3.0, 1.0)
-    """... together with one of these factors for the sigmas of the localizations, in addition to
-    `widened`."""
+    """Candidate factors for the sigmas of the localizations, applied in addition to `widened`."""
     rival_share: Annotated[float, Between(0, 1)] = 0.3
     """Of a single camera, the agreeing localizations are rejected if a rival set with at least this
     share of their number agrees on another trajectory."""

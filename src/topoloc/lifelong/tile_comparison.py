@@ -64,9 +64,9 @@ class TileJoinConfig:
     """Factor applied to the sigmas of the localizations, because neighbours share errors of the
     map."""
     sigma: Annotated[float, Above(0)] = 0.01
-    """Additional sigma of a localization, in metres ..."""
+    """Additional position sigma of a localization, in metres."""
     sigma_deg: Annotated[float, Above(0)] = 0.2
-    """... and in degrees."""
+    """Additional rotation sigma of a localization, in degrees."""
     near: Annotated[float, Above(0)] = 3.0
     """A node must be localized if it is within this many D_thresh (distance of Eq. 1) of a node of
     the other tile."""

@@ -64,10 +64,10 @@ class UpdateConfig:
 
     poses: SessionPosesConfig = field(default_factory=SessionPosesConfig)
     min_inliers: Annotated[int, Between(1, 10_000)] = 60
-    """An image becomes no node if the map localizes it with at least this many inliers ..."""
+    """Minimum number of inliers of a well localized image. Such an image becomes no node."""
     max_sigma: Annotated[float, Above(0)] = 0.3
-    """... and with a position sigma of at most this many D_thresh. Correlated errors of the map's
-    points are left out of the sigma, because a node aligned by the map would share them."""
+    """Maximum position sigma of a well localized image, in D_thresh. Correlated errors of the map's
+    points are left out, because a node aligned by the map would share them."""
     earlier_asked: Annotated[int, Between(0, 10_000)] = 24
     """Maximum number of earlier nodes localized before and after the edit, to record the change of
     recall in the map's history. 0 skips this."""

@@ -37,22 +37,22 @@ class WeakRegionsConfig:
     this."""
     beside: Annotated[float, AtLeast(0)] = 0.0
     """Nodes of the same session within this many D_thresh (Eq. 1) are hidden together with a node.
-    Nodes of one session are more than one D_thresh apart. So by default only the node itself is
-    hidden, and its nearest node is further away than from any image of the trajectory."""
+    Nodes of one session are more than one D_thresh apart, so 0 hides only the node itself. Its
+    nearest remaining node is then further away than for any query on the trajectory."""
     min_inliers: Annotated[int, Between(1, 10_000)] = 60
     """The rest of the map must localize a node with at least this many inliers. An update adds no
     node for such an image."""
     min_landmarks: Annotated[int, Between(1, 100_000)] = 100
     """A node with fewer landmarks than this is weak."""
     reach: Annotated[float, Above(0)] = 4.0
-    """A node has an opposite view if another node within this many D_thresh ..."""
+    """Maximum distance of a node with the opposite view, in D_thresh."""
     min_turn_deg: Annotated[float, Between(1, 180)] = 120.0
-    """... is rotated by at least this many degrees."""
+    """Minimum angle between opposite views, in degrees."""
     min_seen_share: Annotated[float, Between(0, 1)] = 0.2
-    """Another session covers a node if other sessions saw at least this share of its landmarks, or
-    if it has a node ..."""
+    """A node is weak if other sessions saw less than this share of its landmarks and none has a
+    node beside it."""
     stood_by: Annotated[float, AtLeast(0)] = 1.5
-    """... within this many D_thresh (Eq. 1)."""
+    """Maximum distance of another session's node beside a node, in D_thresh (Eq. 1)."""
     apart: Annotated[float, Above(0)] = 3.0
     """Weak nodes within this many D_thresh of each other form one region."""
 
