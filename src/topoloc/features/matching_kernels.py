@@ -92,8 +92,8 @@ def find_nearest(
     """Write the column of the largest product of each query row (the first of equal ones) and that
     product.
 
-    The column is -1 if the winner fails the ratio test or if no product is comparable (NaN). `query`
-    and `packed` are those of `multiply`. Columns from `num_columns` on are ignored.
+    The column is -1 if the winner fails the ratio test or if no product is comparable (NaN).
+    `query` and `packed` are those of `multiply`. Columns from `num_columns` on are ignored.
 
     Column k belongs to the map point `points[k]`. Columns within `radii` of the winner's point are
     duplicates and not rivals. Without points (0, 3), every other column is a rival. A ratio of 0
