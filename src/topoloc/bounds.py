@@ -117,13 +117,13 @@ def parse_settings(
     kinds, known = field_annotations(of), known or list(iter_keys(of, key))
     values = {name: getattr(default, name) for name in kinds} if default is not None else {}
     for name, value in data.items():
-        its_key = f"{key}.{quote_key(name)}"
+        full_key = f"{key}.{quote_key(name)}"
         if name in kinds:
             values[name] = parse_value(
-                kinds[name], value, its_key, values.get(name), known, is_strict
+                kinds[name], value, full_key, values.get(name), known, is_strict
             )
         elif is_strict:
-            raise ConfigError(f"{its_key}: no such setting{suggest_name(its_key, known)}")
+            raise ConfigError(f"{full_key}: no such setting{suggest_name(full_key, known)}")
     required = (
         field.name
         for field in fields(of)  # pyright: ignore[reportArgumentType]
@@ -226,8 +226,8 @@ def find_violation(value: Any, kind: Any) -> str | None:
 
 
 def _convert_to_declared(value: Any, plain: Any) -> Any:
-    """Convert types that TOML and JSON lack: lists to tuples, whole numbers to floats where a float
-    is declared."""
+    """Convert types that TOML and JSON lack: lists to tuples, and whole numbers to floats if a
+    float is declared."""
     if get_origin(plain) is tuple and isinstance(value, list):
         items = get_args(plain)
         kinds = [items[0]] * len(value) if items[-1] is ... else [*items, *[None] * len(value)]

@@ -90,19 +90,13 @@ def set_num_threads(number: int) -> None:
 def num_threads(default: int = _DEFAULT_NUM_THREADS) -> int:
     """Return the number set by `set_num_threads`, or `default` if it was not called. In a worker
     thread the number is 1."""
-    return (
-        1
-        if hasattr(_thread_local, "is_one_of_several")
-        else _configured[0]
-        if _configured
-        else default
-    )
+    return 1 if hasattr(_thread_local, "is_worker") else _configured[0] if _configured else default
 
 
 def mark_worker_thread() -> None:
     """Mark this Python thread as one of several workers, so that it starts no further threads
     (`features/parallel.py`)."""
-    _thread_local.is_one_of_several = True
+    _thread_local.is_worker = True
 
 
 class _KernelCache(NullCache):
@@ -197,9 +191,9 @@ def _cache_folders(source: str) -> list[str]:
     """Return the folders for the code of functions from the folder `source`. This is
     `NUMBA_CACHE_DIR` if it is set. Otherwise it is `__pycache__` beside the functions, then the
     user's cache folder."""
-    apart = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    subfolder = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     if named := config.CACHE_DIR:  # pyright: ignore[reportAttributeAccessIssue]
-        return [os.path.join(named, apart)]
+        return [os.path.join(named, subfolder)]
     folders = [os.path.join(source, "__pycache__")]
     with contextlib.suppress(RuntimeError):  # the user has no home folder
         folders.append(
@@ -207,7 +201,7 @@ def _cache_folders(source: str) -> list[str]:
                 Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
                 / "topoloc"
                 / "kernels"
-                / apart
+                / subfolder
             )
         )
     return folders

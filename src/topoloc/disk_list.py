@@ -1,5 +1,5 @@
-"""Hold a long list of which only the entries used last stay in memory. Maps of any length are built
-with it."""
+"""Hold a long list with only the entries used last in memory. Maps of any length are built with
+it."""
 
 from __future__ import annotations
 
@@ -172,26 +172,26 @@ class _Unpickler(pickle.Unpickler):
         return self._shared_objects[pid]
 
 
-def bytes_of(value: Any, apart: Container[int] = ()) -> int:
+def bytes_of(value: Any, excluded_ids: Container[int] = ()) -> int:
     """Return the bytes of the arrays and byte strings in a value, its fields, its items and the
-    values of its dicts. Objects whose `id` is in `apart` do not count."""
-    total, left = 0, [value]
+    values of its dicts. Objects whose `id` is in `excluded_ids` do not count."""
+    total, pending = 0, [value]
     while (
-        left
+        pending
     ):  # no recursion: a node draft has hundreds of parts and is counted after each of its images
-        one = left.pop()
-        if id(one) in apart:
+        item = pending.pop()
+        if id(item) in excluded_ids:
             continue
-        if isinstance(one, np.ndarray):
-            total += one.nbytes
-        elif isinstance(one, bytes):
-            total += len(one)
-        elif isinstance(one, dict):
-            left.extend(one.values())
-        elif isinstance(one, list | tuple):
-            left.extend(one)
+        if isinstance(item, np.ndarray):
+            total += item.nbytes
+        elif isinstance(item, bytes):
+            total += len(item)
+        elif isinstance(item, dict):
+            pending.extend(item.values())
+        elif isinstance(item, list | tuple):
+            pending.extend(item)
         else:
-            left.extend([getattr(one, name) for name in _dataclass_fields(type(one))])
+            pending.extend([getattr(item, name) for name in _dataclass_fields(type(item))])
     return total
 
 

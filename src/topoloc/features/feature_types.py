@@ -26,7 +26,7 @@ Normalization = Literal["none", "paper", "wide"]
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Select the features of an image. A map stores these plain values and creates the
+    """Hold the settings of feature extraction. A map stores these plain values and creates the
     configuration from them again."""
 
     kind: str = "surf"

@@ -72,11 +72,11 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
         np.full(len(order), KEY_POINT_SIZE_PX, np.float32),
         np.zeros(len(order), np.float32),
     )
-    of_picture = (height / scores.shape[0], width / scores.shape[1])
+    image_fractions = (height / scores.shape[0], width / scores.shape[1])
     cells = (
         None
         if network_output.places is None
-        else compute_cell_means(network_output.places, *of_picture)
+        else compute_cell_means(network_output.places, *image_fractions)
     )
     return Features(points_img, sizes, angles, found[order], dense.sample(points_img), cells, dense)
 
@@ -126,15 +126,18 @@ def run_network(
         os.getpid(),
     )
     names = [output.name for output in session.get_outputs()]
-    of = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
-    scores, places = of["scores"][0, 0], of.get("places")
-    if "coarse" in of:
+    outputs = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
+    scores, places = outputs["scores"][0, 0], outputs.get("places")
+    if "coarse" in outputs:
         dense = TwoLevelDescriptors(
-            of["coarse"][0], of["fine"][0], of["fine_weights"], len(scores) / of["fine"].shape[1]
+            outputs["coarse"][0],
+            outputs["fine"][0],
+            outputs["fine_weights"],
+            len(scores) / outputs["fine"].shape[1],
         )
     else:
         dense = SingleLevelDescriptors(
-            of["descriptors"][0], len(scores) / of["descriptors"].shape[2]
+            outputs["descriptors"][0], len(scores) / outputs["descriptors"].shape[2]
         )
     return NetworkOutput(scores, dense, None if places is None else places[0])
 

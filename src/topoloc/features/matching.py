@@ -28,7 +28,7 @@ _NO_RADII = np.zeros(0, np.float32)
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    """Select how descriptors are matched."""
+    """Hold the settings of descriptor matching."""
 
     method: Literal["exact", "flann"] = "exact"
     """`exact` compares every descriptor with every other. `flann` searches FLANN's KD-trees."""

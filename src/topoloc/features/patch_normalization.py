@@ -20,7 +20,7 @@ from topoloc.features.patch_normalization_kernels import normalize_band
 
 @dataclass(frozen=True)
 class PatchNormalizationConfig:
-    """Select the form of patch normalisation. `PatchNormalizationConfig.paper` is the paper's
+    """Hold the settings of patch normalisation. `PatchNormalizationConfig.paper` is the paper's
     form."""
 
     window_px: Annotated[int, Between(3, 127)] = 17

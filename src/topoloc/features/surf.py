@@ -43,7 +43,7 @@ LEVEL_SPACINGS = 1.4 * LEVEL_RATIO ** np.arange(33)
 
 @dataclass(frozen=True)
 class SurfConfig:
-    """Set the SURF detector."""
+    """Hold the settings of SURF."""
 
     hessian_threshold: Annotated[float, AtLeast(0)] = 400.0
     """Threshold of the Hessian's determinant for images of 0..255, as in OpenCV."""

@@ -25,7 +25,7 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True)
 class VirtualViewConfig:
-    """Set the field of view of the virtual views. Tangents are of angles off the virtual camera's
+    """Hold the field of view of the virtual views. Tangents are of angles off the virtual camera's
     axis: 1 is 45 degrees ahead."""
 
     farthest: Annotated[float, Between(0.1, 10)] = 3.0

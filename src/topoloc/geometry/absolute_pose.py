@@ -40,7 +40,7 @@ _ESTIMATOR_VARIANCE = 0.8265
 
 @dataclass(frozen=True)
 class AbsolutePoseConfig:
-    """Set how a pose is estimated from 2-D/3-D matches."""
+    """Hold the settings of pose estimation from 2-D/3-D matches."""
 
     method: Literal["poselib", "opencv"] = "poselib"
     """PoseLib's RANSAC, or OpenCV's, which stops at 1000 iterations or a confidence of 0.99 and has
@@ -350,7 +350,7 @@ def _invert_information(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarr
 def select_inliers(
     cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig
 ) -> Bool[np.ndarray, " n"]:
-    """Return the inliers of a pose. The threshold is widened for uncertain points."""
+    """Return the inliers of a pose. With poselib the threshold is widened for uncertain points."""
     errors_px = np.linalg.norm(
         camera.img_from_cam(cam_from_world.apply(matches.points_world)) - matches.points_img, axis=1
     )

@@ -138,9 +138,15 @@ def estimate_image_calibration(
             np.ascontiguousarray(pose.rotation),
             np.ascontiguousarray(pose.translation),
         )
-        of_points = (observed, points_world, point_covariances, sigma_px / camera.fx, _CAUCHY_SCALE)
+        point_args = (
+            observed,
+            points_world,
+            point_covariances,
+            sigma_px / camera.fx,
+            _CAUCHY_SCALE,
+        )
         information, gradient, squares = calibration_equations(
-            rotation, translation, free, *of_points
+            rotation, translation, free, *point_args
         )
         information[6:, 6:] += np.eye(3) / _PRIOR_SIGMA**2
         gradient[6:] += free / _PRIOR_SIGMA**2
@@ -181,8 +187,12 @@ def compute_intrinsics_deviation(
 ) -> IntrinsicsDeviation:
     """Return the deviation of the estimate, found with `camera`, from the image's original
     calibration. Both cameras must have one image size."""
-    own = corrected_camera(camera, found)
-    way = np.array([own.cx - calibrated.cx, own.cy - calibrated.cy]) / calibrated.fx
+    estimated = corrected_camera(camera, found)
+    principal_point_shift = (
+        np.array([estimated.cx - calibrated.cx, estimated.cy - calibrated.cy]) / calibrated.fx
+    )
     return IntrinsicsDeviation(
-        np.array([math.log(own.fx / calibrated.fx), *way]), found.covariance, place
+        np.array([math.log(estimated.fx / calibrated.fx), *principal_point_shift]),
+        found.covariance,
+        place,
     )

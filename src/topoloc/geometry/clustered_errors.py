@@ -1,10 +1,10 @@
 """Estimate how much correlated errors of neighbouring matches inflate the variance of a pose.
 
-PnP's covariance assumes independent errors. If a chair was moved by a centimetre, or the depth of a
-wall is wrong, the errors of all its points pull the pose in one direction. Then the summed gradient
-of an image cell is larger than that of independent errors. The inflation is the ratio of two
-covariances of the pose: the clustered "sandwich" and the plain one (Liang and Zeger, *Longitudinal
-data analysis using generalized linear models*, 1986).
+PnP's covariance assumes independent errors. If a chair was moved or the depth of a wall is wrong,
+the errors of all its points pull the pose in one direction. Then the summed gradient of an image
+cell is larger than that of independent errors. The inflation is the ratio of two covariances of the
+pose: the clustered "sandwich" and the plain one (Liang and Zeger, *Longitudinal data analysis using
+generalized linear models*, 1986).
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ def compute_variance_inflation(
         np.isfinite(information).all() and np.linalg.matrix_rank(information, hermitian=True) == 6
     ):
         return 1.0
-    of_fit = len(used) / (
+    fit_correction = len(used) / (
         len(used) - 3.0
     )  # the pose is fitted to the same matches, which makes the sums smaller
     variance_alone, variance_together = (
         np.trace(np.linalg.solve(information, gradients)) for gradients in (independent, clustered)
     )
     return (
-        max(1.0, float(of_fit * variance_together / variance_alone))
+        max(1.0, float(fit_correction * variance_together / variance_alone))
         if variance_alone > 0.0
         else 1.0
     )

@@ -1,4 +1,4 @@
-"""Estimate one transform from many estimates of which most may be wrong.
+"""Estimate one transform from many estimates, most of which may be wrong.
 
 Each estimate is a hypothesis. The one with the most independent estimates that agree within their
 covariances is refined with all of these (weighted least squares on SE(3)). It is rejected if too
@@ -23,7 +23,7 @@ _MIN_STEP = 1e-9
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """Set when estimates agree, and how many must agree."""
+    """Hold the conditions under which estimates agree and a consensus is accepted."""
 
     max_sigmas: Annotated[float, Above(0)] = 4.8
     """Estimates agree if they differ by no more than this (all six residuals together, in sigma).
@@ -41,7 +41,7 @@ class ConsensusConfig:
 
 @dataclass(frozen=True)
 class DriftConfig:
-    """Set the drift of the motion along which an estimate is propagated."""
+    """Hold the drift of the motion along which an estimate is propagated."""
 
     drift: Annotated[float, AtLeast(0)] = 0.02
     """Standard deviation of the translation, as a fraction of the distance."""

@@ -28,7 +28,7 @@ _MIN_DEPTH_SIGMA_PX = 0.03
 
 @dataclass(frozen=True)
 class DisparityConfig:
-    """Set how disparities are measured."""
+    """Hold the settings of disparity measurement."""
 
     half_px: Annotated[int, Between(1, 50)] = 5
     """Half side of the window that is correlated along the row."""

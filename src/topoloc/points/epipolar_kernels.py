@@ -236,10 +236,12 @@ def match_in_ranges(
     images of one size).
 
     Point n is searched among min_disparities[n] .. min_disparities[n] + range_lengths[n] - 1. The
-    result is NaN in these cases: the point is too near the border, it has no texture, or its best
-    score is below `min_score`. It is also NaN if another place on the row reaches `max_ratio` of
-    the best score, or if the search back from the right image misses the point by more than a
-    pixel.
+    result is NaN if
+
+    * the point is too near the border or has no texture,
+    * its best score is below `min_score`,
+    * the best score elsewhere on the row reaches `max_ratio` of it, or
+    * the search back from the right image misses the point by more than a pixel.
     """
     side = 2 * half + 1
     most = 1

@@ -39,7 +39,7 @@ SCALES_PER_SIZE = 1.2 / 9.0
 
 @dataclass(frozen=True)
 class MetricPointsConfig:
-    """Set how the 3-D positions of features are computed."""
+    """Hold the settings for the 3-D positions of features."""
 
     max_relative_sigma: Annotated[float, Above(0)] = 0.3
     """Points whose depth has a larger standard deviation than this fraction of it are dropped."""

@@ -26,7 +26,7 @@ from topoloc.points.metric_points import MetricPoints
 
 @dataclass(frozen=True)
 class MotionTriangulationConfig:
-    """Set how features of single images with poses are triangulated."""
+    """Hold the settings of triangulation from single images with known poses."""
 
     steps: Annotated[tuple[float, ...], Above(0)] = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
     """Distances of the other images, in units of the median distance of consecutive images."""

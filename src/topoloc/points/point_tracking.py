@@ -22,7 +22,7 @@ from topoloc.points.point_tracking_kernels import refine_tracks, select_cell_cor
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Set which points are tracked, and how."""
+    """Hold the settings of point tracking."""
 
     num_corners: Annotated[int, Between(1, 100_000)] = 450
     """Number of grid cells. Each cell holds at most one new corner."""

@@ -18,7 +18,7 @@ from topoloc.retrieval.efficientnet import NUM_CHANNELS as EFFICIENTNET_CHANNELS
 from topoloc.retrieval.efficientnet import efficientnet_features
 from topoloc.retrieval.network_config import BackboneName
 
-# Statistics of ImageNet, on which these networks were trained. The input is (RGB in [0, 1] - mean)
+# Statistics of ImageNet, for the pretrained networks. The input is (RGB in [0, 1] - mean)
 # / deviation.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)

@@ -13,7 +13,7 @@ BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "efficientnet_lite0", 
 
 @dataclass(frozen=True)
 class NetworkInputConfig:
-    """Set the size of the network's input. An image is cropped to the aspect ratio of the mapping
+    """Hold the size of the network's input. An image is cropped to the aspect ratio of the mapping
     images, reduced, and stretched to this size."""
 
     width_px: Annotated[int, Between(32, 2048)] = 224
@@ -24,14 +24,14 @@ class NetworkInputConfig:
 
 @dataclass(frozen=True)
 class ClassifierNetworkConfig:
-    """Set the network of cnn-fc."""
+    """Hold the settings of cnn-fc's network."""
 
     picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
 
 
 @dataclass(frozen=True)
 class PooledNetworkConfig:
-    """Set the network of cnn-nn: pooled features of a pretrained network."""
+    """Hold the settings of cnn-nn's network: pooled features of a pretrained network."""
 
     picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
     depth: Annotated[int | None, Between(1, 100)] = None
@@ -49,7 +49,7 @@ class PooledNetworkConfig:
 
 @dataclass(frozen=True)
 class VladNetworkConfig:
-    """Set the network of vlad-nn: NetVLAD of a network's features."""
+    """Hold the settings of vlad-nn's network: NetVLAD of a network's features."""
 
     picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
     depth: Annotated[int | None, Between(1, 100)] = None

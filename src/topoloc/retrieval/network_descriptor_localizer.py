@@ -72,8 +72,8 @@ class NetworkDescriptorLocalizer:
         vectors = np.concatenate(
             [known["vectors"], *(part.astype(known["vectors"].dtype) for part in parts)]
         )
-        of_nodes = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
-        return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": of_nodes})
+        all_node_ids = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
+        return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": all_node_ids})
 
     def vectors(self, images: Sequence[Image]) -> Float32[np.ndarray, "n d"]:
         """Return the unit vectors of the images.

@@ -36,7 +36,7 @@ _SUPPRESSED_SHARE = 0.5
 
 @dataclass(frozen=True)
 class VladConfig:
-    """Set surf-vlad."""
+    """Hold the settings of surf-vlad."""
 
     num_words: Annotated[int, Between(1, 65_536)] = 64
     """Visual words of the vocabulary."""
@@ -243,8 +243,8 @@ def append_positions(
     weight of 0 descriptors are unchanged."""
     if not config.position_weight:
         return features.descriptors
-    places = (features.points_img + 0.5) / np.array([width, height], np.float32) - 0.5
-    return np.hstack([features.descriptors, config.position_weight * places]).astype(np.float32)
+    positions = (features.points_img + 0.5) / np.array([width, height], np.float32) - 0.5
+    return np.hstack([features.descriptors, config.position_weight * positions]).astype(np.float32)
 
 
 def vlad(
@@ -286,10 +286,10 @@ def learn_words_from_parts(
                 total, config.max_training_descriptors, replace=False
             )
         )
-    of_parts = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
+    rows_by_part = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
     rows = [
         part(k)[rows - (ends[k] - num_rows[k])]
-        for k, rows in enumerate(of_parts)
+        for k, rows in enumerate(rows_by_part)
         if len(rows) or k == 0
     ]
     return learn_visual_words(np.concatenate(rows), config.num_words, config.seed)
