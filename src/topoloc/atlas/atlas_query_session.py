@@ -29,6 +29,7 @@ class AtlasQuerySession:
 
     @property
     def is_past_deadline(self) -> bool:
+        """Return whether the deadline has passed."""
         return time.perf_counter() > self.deadline
 
     @property

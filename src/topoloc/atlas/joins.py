@@ -32,6 +32,7 @@ class Join:
     residual: float | None = 0.0
 
     def to_json(self) -> dict[str, Any]:
+        """Return the join as a JSON object."""
         return {
             "first": self.first,
             "second": self.second,
@@ -77,6 +78,7 @@ class JointPose:
     covariance: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
 
     def to_json(self) -> dict[str, Any]:
+        """Return the pose as a JSON object."""
         pose = self.joint_from_world.matrix()[:3].tolist()
         return {
             "world": self.joint,

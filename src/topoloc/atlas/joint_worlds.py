@@ -48,7 +48,7 @@ def place_tiles(
         if tile.atlas_from_world is not None
     }
     all_adjusted = adjust_joins(joins, {tile.tile_id: tile.world for tile in ordered}, known)
-    parallel_map: list[Tile] = []
+    placed: list[Tile] = []
     for tile in ordered:
         joint = all_adjusted.places.get(tile.world)
         pose = tile.atlas_from_world or known.get(tile.world)
@@ -59,8 +59,8 @@ def place_tiles(
             if pose is None or tile.geo_box is not None or origin is None
             else _geo_box(origin, pose, tile.box_world)
         )
-        parallel_map.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
-    return tuple(parallel_map), all_adjusted.joins
+        placed.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
+    return tuple(placed), all_adjusted.joins
 
 
 def _place_by_georeference(tile: Tile, origin: GeoPoint | None) -> Tile:
@@ -250,7 +250,7 @@ def _optimize_worlds(
 
     The covariance is that of a single path, which is an upper bound.
     """
-    place_tiles = dict[str, JointPose]()
+    places = dict[str, JointPose]()
     for anchor, group in _groups(joins, worlds, anchored).items():
         names = [anchor, *(name for name in group if name != anchor)]
         rows = {name: row for row, name in enumerate(names)}
@@ -258,8 +258,8 @@ def _optimize_worlds(
         poses = [group[name].joint_from_world.inverse() for name in names]
         poses = optimize_pose_graph(poses, edges, config) if len(edges) >= len(names) else poses
         for name, world_from_joint in zip(names, poses, strict=True):
-            place_tiles[name] = replace(group[name], joint_from_world=world_from_joint.inverse())
-    return place_tiles
+            places[name] = replace(group[name], joint_from_world=world_from_joint.inverse())
+    return places
 
 
 def _edge(join: Join, worlds: Mapping[str, str], rows: Mapping[str, int]) -> Edge:

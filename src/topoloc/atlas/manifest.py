@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.atlas.joins import Join, JointPose
-from topoloc.atlas.joint_worlds import place_tiles as placed_tiles
+from topoloc.atlas.joint_worlds import place_tiles
 from topoloc.atlas.manifest_values import ID, count, matching, number, of
 from topoloc.errors import AtlasError, GeoreferenceError, TrajectoryError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
@@ -41,6 +41,7 @@ class StoredFile:
     num_bytes: int
 
     def to_json(self) -> dict[str, Any]:
+        """Return the file as a JSON object."""
         return {"file": self.name, "sha256": self.sha256, "bytes": self.num_bytes}
 
 
@@ -108,6 +109,7 @@ class Tile:
         return self.atlas_from_world.inverse() @ other.atlas_from_world
 
     def to_json(self) -> dict[str, Any]:
+        """Return the tile as a JSON object."""
         known = self.georeference
         made_of: dict[str, Any] = {} if self.recipe is None else {"recipe": self.recipe}
         if self.joint is not None:
@@ -154,6 +156,7 @@ class Manifest:
 
     @cached_property
     def by_id(self) -> dict[str, Tile]:
+        """Return the tiles by id."""
         return {tile.tile_id: tile for tile in self.tiles}
 
     @cached_property
@@ -200,8 +203,8 @@ class Manifest:
                 ),
                 None,
             )
-        place_tiles, adjusted_joins = placed_tiles(tiles, self._select_joins(tiles, joins), origin)
-        after = Manifest(self.serial + 1, place_tiles, origin, {}, adjusted_joins)
+        placed, adjusted_joins = place_tiles(tiles, self._select_joins(tiles, joins), origin)
+        after = Manifest(self.serial + 1, placed, origin, {}, adjusted_joins)
         retired = dict.fromkeys(self.files, now) | dict(self.retired)
         return replace(
             after,

@@ -46,6 +46,7 @@ class CachedMap:
 
     @property
     def num_bytes(self) -> int:
+        """Return the size of the map file, bytes."""
         return self.stamp[1]
 
 
@@ -136,6 +137,7 @@ class MapCache:
 
     @property
     def num_open(self) -> int:
+        """Return the number of open maps."""
         with self._lock:
             return sum(entry.opened is not None for entry in self._entries.values())
 
@@ -172,6 +174,7 @@ class MapCache:
         return opened
 
     def release_map(self, opened: CachedMap) -> None:
+        """Release a map from `acquire_map`. A retired map is closed after its last user."""
         with self._lock:
             opened.num_users -= 1
             is_last = opened.is_retired and opened.num_users == 0

@@ -34,6 +34,7 @@ class SharedWorld:
 
     @property
     def num_nodes(self) -> int:
+        """Return the number of nodes of all tiles."""
         return sum(placed.tile.num_nodes for placed in self.tiles)
 
     def world_from_map_of(self, tile_id: str | None) -> Rigid3 | None:

@@ -100,6 +100,7 @@ class FolderStore:
         self.folder, self.where = folder, str(folder)
 
     def manifest(self) -> bytes | None:
+        """See `Store.manifest`."""
         try:
             return (self.folder / MANIFEST).read_bytes()
         except (FileNotFoundError, NotADirectoryError):
@@ -110,12 +111,14 @@ class FolderStore:
             ) from None
 
     def version(self) -> Hashable | None:
+        """See `Store.version`."""
         with suppress(OSError):
             status = (self.folder / MANIFEST).stat()
             return status.st_mtime_ns, status.st_size, status.st_ino
         return None
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
+        """See `Store.commit`."""
         with self._lock():
             if self.manifest() != before:
                 return False
@@ -127,6 +130,7 @@ class FolderStore:
         return True
 
     def put(self, name: str, path: Path) -> None:
+        """See `Store.put`."""
         target = self.folder / name
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -140,15 +144,18 @@ class FolderStore:
             raise AtlasError(f"cannot write {target}: {error.strerror}") from error
 
     def local_path(self, name: str, sha256: str) -> Path:
+        """See `Store.local_path`."""
         path = self.folder / name
         if not path.is_file():
             raise AtlasError(f"{path} is missing")
         return path
 
     def cached(self, name: str, sha256: str) -> Path | None:
+        """See `Store.cached`."""
         return self.local_path(name, sha256)
 
     def ages(self) -> dict[str, float]:
+        """See `Store.ages`."""
         now, ages = time.time(), dict[str, float]()
         with suppress(OSError):
             for entry in os.scandir(self.folder / TILES):
@@ -157,6 +164,7 @@ class FolderStore:
         return ages
 
     def remove(self, name: str) -> None:
+        """See `Store.remove`."""
         with suppress(FileNotFoundError):
             (self.folder / name).unlink()
 

@@ -38,6 +38,7 @@ class TileFetch:
 
     @property
     def is_stale(self) -> bool:
+        """Return whether the fetch ended so long ago that it may be repeated."""
         return time.monotonic() > self.finished_at + _RETRY_AFTER_S
 
 

@@ -52,6 +52,7 @@ class Hypothesis:
 
     @property
     def world_from_cam(self) -> Rigid3:
+        """Return the pose."""
         return self.fit.world_from_cam
 
     @cached_property
@@ -66,6 +67,7 @@ class Hypothesis:
 
     @property
     def is_from_virtual_views(self) -> bool:
+        """Return whether the pose was found by virtual views."""
         return self.evidence.is_from_virtual_views
 
 

@@ -72,6 +72,7 @@ def integer(value: Any, key: str, min_value: int = 0, max_value: int = 2**63 - 1
 
 
 def text(value: Any, key: str) -> str:
+    """Return a value that must be a text."""
     if not isinstance(value, str):
         raise ResultError(f"no result: {key!r} is no text")
     return value

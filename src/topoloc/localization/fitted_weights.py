@@ -133,6 +133,7 @@ class FittedWeights:
 
     @property
     def is_calibrated(self) -> bool:
+        """Return whether the weights were fitted to this feature type."""
         return self.calibration_error is not None
 
     def to_json(self) -> dict[str, Any]:

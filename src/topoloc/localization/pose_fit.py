@@ -29,6 +29,7 @@ class PointObservations:
         return len(self.points_img)
 
     def select(self, rows: np.ndarray) -> PointObservations:
+        """Return the given rows."""
         return PointObservations(
             self.points_img[rows], self.points_world[rows], self.covariances[rows]
         )
@@ -61,6 +62,7 @@ class PoseFit:
 
     @property
     def num_inliers(self) -> int:
+        """Return the number of inliers, 0 without a pose."""
         return int(self.pose.inliers.sum()) if self.pose else 0
 
     @property

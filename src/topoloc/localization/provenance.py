@@ -39,6 +39,7 @@ class Provenance:
     joint_from_cam: Rigid3 | None = None
 
     def to_json(self) -> dict[str, Any]:
+        """Return the provenance as keys of a result's JSON."""
         camera = None if self.camera is None else self.camera.to_json()
         of_atlas: dict[str, Any] = {} if self.tile is None else {"tile": self.tile}
         if self.atlas_from_cam is not None:

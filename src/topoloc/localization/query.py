@@ -37,6 +37,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
+        """Add the duration of the context to a named stage."""
         start = time.perf_counter()
         try:
             yield
@@ -46,6 +47,7 @@ class StageClock:
             )
 
     def times_ms(self) -> dict[str, float]:
+        """Return the milliseconds of each stage, and `total`."""
         return self._times_ms | {"total": (time.perf_counter() - self._start) * 1e3}
 
 
@@ -123,7 +125,7 @@ class QueryImage:
         """Return a query image made of local features only, by feature type.
 
         Its pixels are zero. Steps that read pixels find nothing in it: other scales and rotations,
-        virtual views, and global descriptors of a network.
+        virtual views, and dense or global descriptors of a network.
         """
         return QueryImage(
             np.zeros((camera.height, camera.width), np.uint8),
@@ -155,6 +157,7 @@ class Query:
 
     @cached_property
     def grey(self) -> UInt8[np.ndarray, "h w"]:
+        """Return the reduced image in grey."""
         return to_grey(self.image)
 
     @cached_property
@@ -171,6 +174,7 @@ class Query:
 
     @property
     def is_past_deadline(self) -> bool:
+        """Return whether the deadline has passed."""
         return time.perf_counter() > self.deadline
 
 

@@ -46,8 +46,8 @@ class QuerySession:
     def compute_best_case_evidence(self, least: float) -> Evidence | None:
         """Return the best evidence that a coarse search could give, from the strongest features.
 
-        It uses the first feature type. It returns None if fewer than `least` features agree or the
-        evidence is too weak. For an out-of-map image this is much cheaper than a coarse search.
+        It uses the first feature type. It returns None if fewer than `least` features agree or too
+        few points are found. For an out-of-map image this is much cheaper than a coarse search.
         """
         quick_search = replace(self.searches[0])
         proposal = propose_quick(quick_search, least)

@@ -77,6 +77,7 @@ class Localization:
 
     @property
     def localized(self) -> Literal[True]:
+        """Return True."""
         return True
 
     @property
@@ -179,6 +180,7 @@ class Alternative:
     tile: str | None = None
 
     def to_json(self) -> dict[str, Any]:
+        """Return the alternative as a JSON object."""
         pose = {
             "world_from_cam": pose_to_json(self.world_from_cam),
             "probability": self.probability,
@@ -224,6 +226,7 @@ class NotLocalized:
 
     @property
     def localized(self) -> Literal[False]:
+        """Return False."""
         return False
 
     def to_json(self, query: str) -> dict[str, Any]:

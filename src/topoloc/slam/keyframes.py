@@ -72,6 +72,7 @@ class Observations:
         )
 
     def append(self, other: Observations) -> None:
+        """Append the rows of other observations."""
         self.landmark_ids = np.concatenate([self.landmark_ids, other.landmark_ids])
         self.measured = np.concatenate([self.measured, other.measured])
         self.weights = np.concatenate([self.weights, other.weights])

@@ -65,6 +65,7 @@ class ObservationChunks:
 
     @property
     def num_observations(self) -> int:
+        """Return the number of observations in all chunks."""
         return sum(map(len, self._observation_orders))
 
     def __iter__(self) -> Iterator[ObservationChunk]:

@@ -3,7 +3,7 @@ fit.
 
 Steps between images are measured from the images alone (`measured_steps.py`), without scale for a
 single camera. A trajectory with the right convention has nearly the same steps. If it does not,
-three alternatives are tested in turn. The first are the conventions of
+three kinds of alternatives are tested. The first are the conventions of
 `geometry/pose_conventions.py`, the second a shifted clock. The third is a camera mounted on the
 body that the poses describe. That is hand-eye calibration, body_step @ body_from_cam =
 body_from_cam @ camera_step (Park and Martin, *Robot sensor calibration: solving AX = XB on the
@@ -80,6 +80,7 @@ class PoseCheckResult:
 
     @property
     def is_accepted(self) -> bool:
+        """Return whether the poses are accepted. Too few informative steps also accept them."""
         return not self.conventions and (
             self.num_informative < _MIN_INFORMATIVE_STEPS
             or self.num_consistent >= _MIN_ACCEPTED_RATIO * self.num_informative

@@ -68,8 +68,8 @@ class OdometryConfig:
     max_starts: Annotated[int, Between(0, 1000)] = 16
     """Maximum number of start poses in each direction along the motion."""
     repeat_depth: Annotated[float, AtLeast(0)] = 1.0
-    """Extent of the start poses, as a share of the median depth. It is at least the last step and
-    the uncertainty of the prediction."""
+    """Extent of the start poses, as a share of the median depth. It is at least the predicted step
+    and the uncertainty of the prediction."""
     repeat_share: Annotated[float, Between(0, 1)] = 0.3
     """Minimum share of the visible points that agree at a repetition."""
     max_repeats: Annotated[int, Between(0, 1000)] = 8
@@ -111,6 +111,7 @@ class Tracks:
         return cls(landmark_ids, points_img, points_img, np.zeros(len(points_img), np.float32))
 
     def select(self, rows: np.ndarray) -> Tracks:
+        """Return the given rows."""
         return Tracks(
             self.landmark_ids[rows],
             self.points_img[rows],

@@ -227,7 +227,10 @@ def _match_pairs(
     config: JoinConfig,
     loops: LoopConfig,
 ) -> list[Link]:
-    """Match each pair in both directions. Skip links that exceed the camera's maximum speed."""
+    """Match each pair in both directions.
+
+    Links within a recording that exceed the camera's maximum speed are skipped.
+    """
     links = []
     for source, target in (ends for pair in pairs for ends in (pair, pair[::-1])):
         a, b = keyframes[source].place, keyframes[target].place

@@ -17,8 +17,8 @@ class TriangulatedPoints:
 
     `points` are nearest to all rays (world). `num_rays` is their number. `parallax` is the largest
     angle between the first ray and another (radians). `max_reprojection_px` is the largest
-    reprojection error, infinite behind a camera. Values are NaN if the point cannot be
-    triangulated.
+    reprojection error, infinite behind a camera. `points` and `max_reprojection_px` are NaN if the
+    point cannot be triangulated.
     """
 
     points: Float[np.ndarray, "n 3"]

@@ -1,10 +1,10 @@
 """Track map points from image to image, between two full localizations.
 
 The inliers of a full localization are tracked with the Lucas-Kanade method and aligned with their
-patches in that image (`points/point_tracking.py`). The pose is that of the localized image, moved by the motion of
-the points. For this, each point is placed on the ray of its pixel in that image, at the depth from
-the map. Errors of the map are then the same before and after the motion. Only wrong depths affect
-the motion.
+patches in that image (`points/point_tracking.py`). The pose is that of the localized image, moved
+by the motion of the points. For this, each point is placed on the ray of its pixel in that image,
+at the depth from the map. Errors of the map are then the same before and after the motion. Only
+wrong depths affect the motion.
 """
 
 from __future__ import annotations
@@ -88,6 +88,7 @@ class PointTracker:
 
     @property
     def camera(self) -> Camera:
+        """Return the camera of the tracked images."""
         return self._camera
 
     def track_points(

@@ -33,6 +33,7 @@ class PoseErrors:
 
     @property
     def total(self) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of the whole error."""
         return self.noise + self.correlated
 
 

@@ -397,7 +397,7 @@ def _merge_duplicates(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
 def _is_same_motion(a: MotionState, b: MotionState) -> bool:
     """Return whether two states differ by less than their covariances allow.
 
-    The limit is about the median of the squared distance.
+    The limit on the squared Mahalanobis distance (12 degrees of freedom) is 6.
     """
     error = np.concatenate(
         [(a.world_from_cam.inverse() @ b.world_from_cam).log(), b.velocity - a.velocity]
@@ -406,10 +406,7 @@ def _is_same_motion(a: MotionState, b: MotionState) -> bool:
 
 
 def is_same_pose(a: Rigid3, b: Rigid3) -> bool:
-    """Return whether two poses are within 0.25 m and 5 degrees.
-
-    Two right localizations can be this far apart (`Localization.probability`).
-    """
+    """Return whether two poses are within 0.25 m and 5 degrees."""
     return translation_error(a, b) < 0.25 and (a.inverse() @ b).angle() < math.radians(5.0)
 
 

@@ -53,6 +53,7 @@ class PoseWindow:
         self._covariance = np.zeros((6, 6))  # of the last one of these
 
     def clear(self) -> None:
+        """Remove all images."""
         self._entries.clear()
         self._smoothed.clear()
 

@@ -79,7 +79,7 @@ class TrackerConfig:
     """An image is also localized in full if the points moved by more than this share of the image
     width."""
     retry_after: Annotated[float, AtLeast(0)] = 0.1
-    """Seconds before the next attempt, if it failed and the points are still tracked."""
+    """Minimum seconds between two full localizations while the points are tracked."""
     max_doubt: Annotated[float, Above(0)] = 0.3
     """Maximum direction uncertainty of the prediction (three sigma, radians). Above it, coarse
     retrieval is used."""

@@ -66,6 +66,7 @@ class CandidatePlaces:
         )
 
     def rows(self, rows: Int[np.ndarray, " m"]) -> CandidatePlaces:
+        """Return the given rows."""
         return CandidatePlaces(self.rotations[rows], self.centres[rows], self.likeness[rows])
 
 

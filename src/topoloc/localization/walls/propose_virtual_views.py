@@ -79,6 +79,7 @@ class VirtualViewSearch:
 
     @staticmethod
     def of(search: Search, index: VirtualViewIndex) -> VirtualViewSearch:
+        """Extract both side views of the query image and select the candidate places."""
         query, seen, named = search.query, list[QueryVirtualView](), list[CandidatePlaces]()
         assert isinstance(query.input_camera, Camera)
         for view in make_virtual_views(query.input_camera, index.view_config):
@@ -101,6 +102,7 @@ class VirtualViewSearch:
 
     @property
     def camera(self) -> Camera:
+        """Return the camera of the query."""
         return self.search.query.camera
 
     def virtual_nodes_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[int]:
