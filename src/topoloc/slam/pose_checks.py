@@ -57,7 +57,7 @@ _MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = (
     3.0,
     60,
     1.0,
-)  # number of shifts tested in each direction: _NUM_SHIFTS
+)  # seconds, seconds, number of shifts in each direction, seconds
 _SUSPICIOUS_ERROR, _MAX_ERROR_RATIO = 0.3, 0.4
 _NUM_MOUNTING_ITERATIONS, _MIN_SINGULAR_RATIO = 5, 0.05
 _BODY_COMPLEXITY = 4.0  # in conventions: a mounting has six parameters
