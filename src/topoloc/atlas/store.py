@@ -28,7 +28,6 @@ except ImportError:  # Windows
 
 MANIFEST = "atlas.json"
 _LOCK = ".atlas.lock"
-_CHUNK = 1 << 20
 
 
 @runtime_checkable
@@ -66,8 +65,8 @@ class Store(Protocol):
         is missing."""
         ...
 
-    def ages(self) -> dict[str, float]:
-        """Seconds since each file was put."""
+    def ages(self, folder: str) -> dict[str, float]:
+        """Seconds since each file of a folder of the store was put, by the file's name."""
         ...
 
     def remove(self, name: str) -> None:
@@ -130,12 +129,12 @@ class FolderStore:
     def cached(self, name: str, sha256: str) -> Path | None:
         return self.local_path(name, sha256)
 
-    def ages(self) -> dict[str, float]:
+    def ages(self, folder: str) -> dict[str, float]:
         now, ages = time.time(), dict[str, float]()
         with suppress(OSError):
-            for entry in os.scandir(self.folder / TILES):
+            for entry in os.scandir(self.folder / folder):
                 if entry.is_file() and not entry.name.startswith("."):
-                    ages[f"{TILES}/{entry.name}"] = now - entry.stat().st_mtime
+                    ages[f"{folder}/{entry.name}"] = now - entry.stat().st_mtime
         return ages
 
     def remove(self, name: str) -> None:
@@ -163,11 +162,8 @@ class FolderStore:
 
 def sha256_of(path: Path) -> str:
     """Of a file, in hexadecimal digits. Raises AtlasError."""
-    digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                digest.update(chunk)
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise AtlasError(f"cannot read {path}: {error.strerror}") from None
-    return digest.hexdigest()
