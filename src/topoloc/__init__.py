@@ -12,10 +12,24 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from topoloc.apps.service.client import AsyncClient, Client
+    from topoloc.atlas.editing import NewTile, add_tiles, read_manifest
+    from topoloc.atlas.manifest import Tile
     from topoloc.compiled import set_num_threads
-    from topoloc.errors import TopolocError
+    from topoloc.errors import (
+        AtlasError,
+        CalibrationError,
+        ClusterError,
+        ConfigError,
+        MissingExtraError,
+        ObjectStoreError,
+        RecordingError,
+        TopolocError,
+        TrajectoryError,
+        UnreadableImageError,
+    )
     from topoloc.geometry.camera import Camera
     from topoloc.geometry.geodesy import GeoPose
+    from topoloc.geometry.pose_conventions import PoseConventions
     from topoloc.geometry.rig import StereoRig
     from topoloc.geometry.rigid import Rigid3
     from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -25,9 +39,12 @@ if TYPE_CHECKING:
     from topoloc.localization.search import Trace
     from topoloc.mapping.build import BuildConfig
     from topoloc.mapping.topomap import TopoMetricMap
-    from topoloc.recordings.frame import DepthImage, StereoFrame
+    from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
+    from topoloc.recordings.image_io import read_depth, read_image
     from topoloc.recordings.memory_sequence import MemorySequence
     from topoloc.recordings.open import open_sequence
+    from topoloc.recordings.trajectory import Trajectory, tum_text
+    from topoloc.recordings.trajectory_alignment import align_to_trajectory
     from topoloc.tracking.stream_result import StreamedPose
     from topoloc.tracking.tracker import Tracker, TrackerConfig
     from topoloc.tracking.warm_up import warm_up
@@ -37,59 +54,101 @@ if TYPE_CHECKING:
 __all__ = [
     "Alternative",
     "AsyncClient",
+    "AtlasError",
     "BuildConfig",
+    "CalibrationError",
     "Camera",
     "Client",
+    "ClusterError",
+    "ConfigError",
     "DepthImage",
     "GeoPose",
+    "Image",
     "Localization",
     "Localizer",
     "LocalizerConfig",
     "MemorySequence",
+    "MissingExtraError",
+    "NewTile",
     "NotLocalized",
+    "ObjectStoreError",
+    "PoseConventions",
     "Provenance",
+    "RecordingError",
     "Rigid3",
     "StereoFrame",
     "StereoRig",
+    "StereoSequence",
     "StreamedPose",
+    "Tile",
     "TopoMetricMap",
     "TopolocError",
     "Trace",
     "Tracker",
     "TrackerConfig",
+    "Trajectory",
+    "TrajectoryError",
+    "UnreadableImageError",
     "__version__",
+    "add_tiles",
+    "align_to_trajectory",
     "build_map",
     "open_sequence",
+    "read_depth",
+    "read_image",
+    "read_manifest",
     "set_num_threads",
+    "tum_text",
     "warm_up",
 ]
 
 _MODULES = {
     "Alternative": "topoloc.localization.result",
     "AsyncClient": "topoloc.apps.service.client",
+    "AtlasError": "topoloc.errors",
     "BuildConfig": "topoloc.mapping.build",
+    "CalibrationError": "topoloc.errors",
     "Camera": "topoloc.geometry.camera",
     "Client": "topoloc.apps.service.client",
+    "ClusterError": "topoloc.errors",
+    "ConfigError": "topoloc.errors",
     "DepthImage": "topoloc.recordings.frame",
     "GeoPose": "topoloc.geometry.geodesy",
+    "Image": "topoloc.recordings.frame",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
     "MemorySequence": "topoloc.recordings.memory_sequence",
+    "MissingExtraError": "topoloc.errors",
+    "NewTile": "topoloc.atlas.editing",
     "NotLocalized": "topoloc.localization.result",
+    "ObjectStoreError": "topoloc.errors",
+    "PoseConventions": "topoloc.geometry.pose_conventions",
     "Provenance": "topoloc.localization.provenance",
+    "RecordingError": "topoloc.errors",
     "Rigid3": "topoloc.geometry.rigid",
     "StereoFrame": "topoloc.recordings.frame",
     "StereoRig": "topoloc.geometry.rig",
+    "StereoSequence": "topoloc.recordings.frame",
     "StreamedPose": "topoloc.tracking.stream_result",
+    "Tile": "topoloc.atlas.manifest",
     "TopoMetricMap": "topoloc.mapping.topomap",
     "TopolocError": "topoloc.errors",
     "Trace": "topoloc.localization.search",
     "Tracker": "topoloc.tracking.tracker",
     "TrackerConfig": "topoloc.tracking.tracker",
+    "Trajectory": "topoloc.recordings.trajectory",
+    "TrajectoryError": "topoloc.errors",
+    "UnreadableImageError": "topoloc.errors",
+    "add_tiles": "topoloc.atlas.editing",
+    "align_to_trajectory": "topoloc.recordings.trajectory_alignment",
     "build_map": "topoloc.localization.map_facts.map_building",
     "open_sequence": "topoloc.recordings.open",
+    "read_depth": "topoloc.recordings.image_io",
+    "read_image": "topoloc.recordings.image_io",
+    "read_manifest": "topoloc.atlas.editing",
     "set_num_threads": "topoloc.compiled",
+    "tum_text": "topoloc.recordings.trajectory",
     "warm_up": "topoloc.tracking.warm_up",
 }
 
