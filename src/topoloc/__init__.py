@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from topoloc.atlas.atlas import Atlas, is_atlas
     from topoloc.atlas.atlas_localizer import AtlasLocalizer
     from topoloc.atlas.config import AtlasConfig
+    from topoloc.atlas.editing import NewTile, add_tiles, read_manifest
     from topoloc.atlas.evaluated_tile import EvaluatedTile
     from topoloc.atlas.location_prior import GeoPositionPrior
     from topoloc.atlas.manifest import Tile
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from topoloc.errors import (
         AtlasError,
         CalibrationError,
+        ClusterError,
         ConfigError,
         DuplicateSessionError,
         FeatureTypeError,
@@ -76,16 +78,19 @@ if TYPE_CHECKING:
     from topoloc.mapping.edit import read_history, undo_edit
     from topoloc.mapping.georeference import GeoreferenceResult, georeference
     from topoloc.mapping.topomap import TopoMetricMap
-    from topoloc.recordings.frame import DepthImage, StereoFrame, StereoSequence
+    from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
+    from topoloc.recordings.image_io import read_depth, read_image
     from topoloc.recordings.memory_sequence import MemorySequence
     from topoloc.recordings.open import open_sequence
     from topoloc.recordings.trajectory import (
         Trajectory,
         read_trajectory,
+        tum_text,
         with_pose_conventions,
         with_trajectory,
         write_tum,
     )
+    from topoloc.recordings.trajectory_alignment import align_to_trajectory
     from topoloc.slam.slam import SlamConfig, SlamResult, run_slam
     from topoloc.tracking.stream_result import StreamedPose
     from topoloc.tracking.tile_tracker import TileTracker
@@ -105,6 +110,7 @@ __all__ = [
     "CalibrationError",
     "Camera",
     "Client",
+    "ClusterError",
     "ConfigError",
     "DepthImage",
     "DuplicateSessionError",
@@ -118,6 +124,7 @@ __all__ = [
     "Georeference",
     "GeoreferenceError",
     "GeoreferenceResult",
+    "Image",
     "Localization",
     "Localizer",
     "LocalizerConfig",
@@ -126,6 +133,7 @@ __all__ = [
     "MapUpdate",
     "MemorySequence",
     "MissingExtraError",
+    "NewTile",
     "NotLocalized",
     "ObjectStoreError",
     "PairResult",
@@ -164,6 +172,8 @@ __all__ = [
     "WorldFit",
     "__version__",
     "absolute_trajectory_errors",
+    "add_tiles",
+    "align_to_trajectory",
     "build_map",
     "check_camera_calibrations",
     "check_map",
@@ -182,11 +192,15 @@ __all__ = [
     "merge",
     "open_sequence",
     "prune",
+    "read_depth",
     "read_history",
+    "read_image",
+    "read_manifest",
     "read_trajectory",
     "relative_drift",
     "run_slam",
     "set_num_threads",
+    "tum_text",
     "undo_edit",
     "update",
     "view",
@@ -207,6 +221,7 @@ _MODULES = {
     "CalibrationError": "topoloc.errors",
     "Camera": "topoloc.geometry.camera",
     "Client": "topoloc.apps.service.client",
+    "ClusterError": "topoloc.errors",
     "ConfigError": "topoloc.errors",
     "DepthImage": "topoloc.recordings.frame",
     "DuplicateSessionError": "topoloc.errors",
@@ -220,6 +235,7 @@ _MODULES = {
     "Georeference": "topoloc.geometry.geodesy",
     "GeoreferenceError": "topoloc.errors",
     "GeoreferenceResult": "topoloc.mapping.georeference",
+    "Image": "topoloc.recordings.frame",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
@@ -228,6 +244,7 @@ _MODULES = {
     "MapUpdate": "topoloc.lifelong.update",
     "MemorySequence": "topoloc.recordings.memory_sequence",
     "MissingExtraError": "topoloc.errors",
+    "NewTile": "topoloc.atlas.editing",
     "NotLocalized": "topoloc.localization.result",
     "ObjectStoreError": "topoloc.errors",
     "PairResult": "topoloc.lifelong.tile_joining",
@@ -265,6 +282,8 @@ _MODULES = {
     "WeightsError": "topoloc.errors",
     "WorldFit": "topoloc.evaluation.world_alignment",
     "absolute_trajectory_errors": "topoloc.geometry.alignment",
+    "add_tiles": "topoloc.atlas.editing",
+    "align_to_trajectory": "topoloc.recordings.trajectory_alignment",
     "build_map": "topoloc.localization.map_facts.map_building",
     "check_camera_calibrations": "topoloc.localization.image_calibration_check",
     "check_map": "topoloc.localization.map_facts.contradictions",
@@ -283,11 +302,15 @@ _MODULES = {
     "merge": "topoloc.lifelong.map_files",
     "open_sequence": "topoloc.recordings.open",
     "prune": "topoloc.lifelong.map_files",
+    "read_depth": "topoloc.recordings.image_io",
     "read_history": "topoloc.mapping.edit",
+    "read_image": "topoloc.recordings.image_io",
+    "read_manifest": "topoloc.atlas.editing",
     "read_trajectory": "topoloc.recordings.trajectory",
     "relative_drift": "topoloc.geometry.alignment",
     "run_slam": "topoloc.slam.slam",
     "set_num_threads": "topoloc.compiled",
+    "tum_text": "topoloc.recordings.trajectory",
     "undo_edit": "topoloc.mapping.edit",
     "update": "topoloc.lifelong.map_files",
     "view": "topoloc.apps.viewer.map_page",

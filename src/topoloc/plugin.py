@@ -11,7 +11,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from topoloc.atlas.atlas import absolute_address
+    from topoloc.atlas.manifest import check_tile_id
     from topoloc.bounds import (
+        AtLeast,
+        Between,
         describe_range,
         field_annotations,
         find_violation,
@@ -24,84 +28,154 @@ if TYPE_CHECKING:
     from topoloc.features.network_files import NETWORKS, NetworkInfo, cache_folder, read_bytes
     from topoloc.mapping.build import Progress
     from topoloc.mapping.sessions import find_source_path
-    from topoloc.recordings.atomic import atomic_write, remove_stale_files, write_text
+    from topoloc.recordings.atomic import (
+        atomic_write,
+        remove_stale_files,
+        temporary_folder,
+        write_bytes,
+        write_text,
+    )
     from topoloc.recordings.calibration import parse_calibration
+    from topoloc.recordings.camera_json import read_camera_json
     from topoloc.recordings.format import RecordingFormat
-    from topoloc.recordings.json_file import read_json
+    from topoloc.recordings.image_io import MAX_PIXELS, EncodedImage, image_size
+    from topoloc.recordings.json_file import (
+        json_number,
+        json_numbers,
+        json_rigid,
+        parse_relative_path,
+        read_json,
+    )
     from topoloc.recordings.open import find_format, split_selection
     from topoloc.recordings.recording import (
+        DepthImages,
         Recording,
         as_monocular,
+        find_nearest_idx,
         has_scale,
+        list_images,
+        natural_key,
         recording_notes,
         scale_poses,
+        times_from_rate,
     )
     from topoloc.recordings.text_files import read_text
-    from topoloc.recordings.trajectory import match_frame_poses
+    from topoloc.recordings.trajectory import (
+        interpolate_poses,
+        match_frame_poses,
+        read_ground_truth,
+    )
+    from topoloc.recordings.video import Video, silence_opencv
 
 __all__ = [
+    "MAX_PIXELS",
     "NETWORKS",
+    "AtLeast",
+    "Between",
+    "DepthImages",
+    "EncodedImage",
     "NetworkInfo",
     "Progress",
     "Recording",
     "RecordingFormat",
+    "Video",
+    "absolute_address",
     "as_monocular",
     "atomic_write",
     "cache_folder",
     "check_available",
+    "check_tile_id",
     "describe_range",
     "field_annotations",
     "find_format",
+    "find_nearest_idx",
     "find_source_path",
     "find_violation",
     "format_length",
     "has_scale",
+    "image_size",
+    "interpolate_poses",
+    "json_number",
+    "json_numbers",
+    "json_rigid",
+    "list_images",
     "match_frame_poses",
+    "natural_key",
     "parse_calibration",
     "parse_feature_types",
+    "parse_relative_path",
     "parse_settings",
     "quote_key",
     "read_bytes",
+    "read_camera_json",
+    "read_ground_truth",
     "read_json",
     "read_text",
     "recording_notes",
     "remove_stale_files",
     "scale_poses",
+    "silence_opencv",
     "split_selection",
     "suggest_name",
+    "temporary_folder",
+    "times_from_rate",
+    "write_bytes",
     "write_text",
 ]
 
 _MODULES = {
+    "MAX_PIXELS": "topoloc.recordings.image_io",
     "NETWORKS": "topoloc.features.network_files",
+    "AtLeast": "topoloc.bounds",
+    "Between": "topoloc.bounds",
+    "DepthImages": "topoloc.recordings.recording",
+    "EncodedImage": "topoloc.recordings.image_io",
     "NetworkInfo": "topoloc.features.network_files",
     "Progress": "topoloc.mapping.build",
     "Recording": "topoloc.recordings.recording",
     "RecordingFormat": "topoloc.recordings.format",
+    "Video": "topoloc.recordings.video",
+    "absolute_address": "topoloc.atlas.atlas",
     "as_monocular": "topoloc.recordings.recording",
     "atomic_write": "topoloc.recordings.atomic",
     "cache_folder": "topoloc.features.network_files",
     "check_available": "topoloc.features.feature_types",
+    "check_tile_id": "topoloc.atlas.manifest",
     "describe_range": "topoloc.bounds",
     "field_annotations": "topoloc.bounds",
     "find_format": "topoloc.recordings.open",
+    "find_nearest_idx": "topoloc.recordings.recording",
     "find_source_path": "topoloc.mapping.sessions",
     "find_violation": "topoloc.bounds",
     "format_length": "topoloc.evaluation.metrics",
     "has_scale": "topoloc.recordings.recording",
+    "image_size": "topoloc.recordings.image_io",
+    "interpolate_poses": "topoloc.recordings.trajectory",
+    "json_number": "topoloc.recordings.json_file",
+    "json_numbers": "topoloc.recordings.json_file",
+    "json_rigid": "topoloc.recordings.json_file",
+    "list_images": "topoloc.recordings.recording",
     "match_frame_poses": "topoloc.recordings.trajectory",
+    "natural_key": "topoloc.recordings.recording",
     "parse_calibration": "topoloc.recordings.calibration",
     "parse_feature_types": "topoloc.features.feature_types",
+    "parse_relative_path": "topoloc.recordings.json_file",
     "parse_settings": "topoloc.bounds",
     "quote_key": "topoloc.bounds",
     "read_bytes": "topoloc.features.network_files",
+    "read_camera_json": "topoloc.recordings.camera_json",
+    "read_ground_truth": "topoloc.recordings.trajectory",
     "read_json": "topoloc.recordings.json_file",
     "read_text": "topoloc.recordings.text_files",
     "recording_notes": "topoloc.recordings.recording",
     "remove_stale_files": "topoloc.recordings.atomic",
     "scale_poses": "topoloc.recordings.recording",
+    "silence_opencv": "topoloc.recordings.video",
     "split_selection": "topoloc.recordings.open",
     "suggest_name": "topoloc.bounds",
+    "temporary_folder": "topoloc.recordings.atomic",
+    "times_from_rate": "topoloc.recordings.recording",
+    "write_bytes": "topoloc.recordings.atomic",
     "write_text": "topoloc.recordings.atomic",
 }
 

@@ -253,10 +253,20 @@ def _store_tiles(store: Store, new: Sequence[NewTile]) -> list[Tile]:
 
 def _restore_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> None:
     """Store files again that another writer removed as unreferenced before the commit."""
-    names = set(store.ages())
+    names = set(store.ages(TILES))
     for one, tile in zip(new, tiles, strict=True):
         if not {stored.name for stored in tile.files} <= names:
             store_tile(one, store)
+
+
+def read_manifest(where: str) -> Manifest:
+    """Return the manifest of an atlas as it is now; an empty one where no atlas is there yet.
+
+    Raises:
+        AtlasError: the manifest is damaged, or the store does not answer.
+        MissingExtraError: the store needs an extra that is not installed.
+    """
+    return _read(store_at(where), creates=True)[1]
 
 
 class _TileChangedError(Exception):
@@ -333,7 +343,7 @@ def _commit_change(
     """
     for _ in range(_MAX_TRIES):
         before, manifest = _read(store, creates)
-        now, ages = time.time(), store.ages()
+        now, ages = time.time(), store.ages(TILES)
         after = change(manifest, now)
         gone = [
             name
@@ -346,7 +356,9 @@ def _commit_change(
         if store.commit(before, after.to_bytes()):
             known = after.files | set(after.retired)
             for name in (
-                name for name, age in store.ages().items() if name not in known and age > grace_s
+                name
+                for name, age in store.ages(TILES).items()
+                if name not in known and age > grace_s
             ):
                 store.remove(name)
             return after

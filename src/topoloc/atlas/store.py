@@ -27,7 +27,6 @@ except ImportError:  # Windows
 
 MANIFEST = "atlas.json"
 _LOCK = ".atlas.lock"
-_CHUNK = 1 << 20
 
 
 @runtime_checkable
@@ -84,8 +83,8 @@ class Store(Protocol):
         """
         ...
 
-    def ages(self) -> dict[str, float]:
-        """Return the seconds since each file was stored, by name."""
+    def ages(self, folder: str) -> dict[str, float]:
+        """Return the seconds since each file of a folder of the store was stored, by name."""
         ...
 
     def remove(self, name: str) -> None:
@@ -154,13 +153,13 @@ class FolderStore:
         """See `Store.cached`."""
         return self.local_path(name, sha256)
 
-    def ages(self) -> dict[str, float]:
+    def ages(self, folder: str) -> dict[str, float]:
         """See `Store.ages`."""
         now, ages = time.time(), dict[str, float]()
         with suppress(OSError):
-            for entry in os.scandir(self.folder / TILES):
+            for entry in os.scandir(self.folder / folder):
                 if entry.is_file() and not entry.name.startswith("."):
-                    ages[f"{TILES}/{entry.name}"] = now - entry.stat().st_mtime
+                    ages[f"{folder}/{entry.name}"] = now - entry.stat().st_mtime
         return ages
 
     def remove(self, name: str) -> None:
@@ -191,11 +190,8 @@ def sha256_of(path: Path) -> str:
     Raises:
         AtlasError: the file cannot be read.
     """
-    digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                digest.update(chunk)
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise AtlasError(f"cannot read {path}: {error.strerror}") from None
-    return digest.hexdigest()

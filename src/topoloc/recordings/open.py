@@ -9,11 +9,11 @@ from functools import cache
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
-from topoloc.recordings import video
 from topoloc.recordings.calibration import parse_calibration, with_calibration
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.recording import parse_selection, sequence_subset
+from topoloc.recordings.video import Video
 
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
 # accepts any other folder with images. A format's module is imported when the format is tried.
@@ -68,7 +68,7 @@ def open_sequence(
         TrajectoryError: the recording's ground truth is malformed or matches no frame.
     """
     folder, selection = split_selection(str(path))
-    is_side_by_side = format is None and str(camera).endswith(".conf") and video.can_open(folder)
+    is_side_by_side = format is None and str(camera).endswith(".conf") and Video.can_open(folder)
     name = "zed" if is_side_by_side else find_format(path, format)
     sequence = _open_recording(
         folder, name, camera, {"images": images and Path(images), "topics": topics}

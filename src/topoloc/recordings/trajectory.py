@@ -50,6 +50,15 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.world_from_cam)
 
+    @staticmethod
+    def from_quaternions(rows: Float[np.ndarray, "n 7"], t_ns: list[int]) -> Trajectory:
+        """Return the trajectory of rows x, y, z (metres), qx, qy, qz, qw at these times.
+
+        A pose is computed when it is read. A quaternion need not be of unit length; reading the
+        pose of one without length raises TrajectoryError.
+        """
+        return Trajectory(LazyPoses(rows, pose_from_quaternion), t_ns)
+
 
 def read_trajectory(path: Path) -> Trajectory:
     """Read a TUM file (8 columns) or KITTI rows (12 columns). TUM times are in seconds, or in
@@ -73,7 +82,7 @@ def _read_numeric_trajectory(path: Path) -> Trajectory | None:
         return Trajectory(poses) if is_rotation.all() else None
     t_ns, rows = parse_uniform_times(table.lines), table.numbers[:, 1:]
     is_good = t_ns is not None and _is_unit_quaternion(rows[:, 3:]).all()
-    return Trajectory(LazyPoses(rows, pose_from_quaternion), t_ns) if is_good else None
+    return Trajectory.from_quaternions(rows, t_ns) if t_ns is not None and is_good else None
 
 
 def _trajectory_from_rows(path: Path) -> Trajectory:
@@ -101,7 +110,7 @@ def _timed_trajectory(path: Path, rows: _Rows, columns: Iterable[int]) -> Trajec
     """Read rows of a time and the given columns: x, y, z (metres) and a quaternion (x, y, z, w)."""
     t_ns, numbers = parse_times(rows, path, TrajectoryError), _parse_numbers(path, rows, columns)
     _check_rows(_is_unit_quaternion(numbers[:, 3:]), "not a rotation", path, rows)
-    return Trajectory(LazyPoses(numbers, pose_from_quaternion), t_ns)
+    return Trajectory.from_quaternions(numbers, t_ns)
 
 
 def read_asl_poses(path: Path) -> Trajectory:
@@ -131,14 +140,18 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     write_text(path, tum_text(trajectory))
 
 
-def tum_text(trajectory: Trajectory) -> str:
-    """Return the text of a TUM file, for a trajectory with times."""
+def tum_text(trajectory: Trajectory, header: bool = True) -> str:
+    """Return the lines of a TUM file of a trajectory with times.
+
+    Args:
+        header: begin with the comment that names the columns.
+    """
     assert trajectory.t_ns is not None
     rows = (
         tum_line(t_ns, pose)
         for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True)
     )
-    return "\n".join([TUM_HEADER, *rows]) + "\n"
+    return "".join(f"{line}\n" for line in ([TUM_HEADER] if header else []) + list(rows))
 
 
 def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:

@@ -34,11 +34,6 @@ _LOG_LEVEL_LOCK = threading.Lock()
 EXPECTED_FILES = "a video file (.mp4, .mov, .avi, .mkv, .webm)"
 
 
-def can_open(path: Path) -> bool:
-    """Return whether this is a video file, by its suffix."""
-    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
-
-
 @dataclass(eq=False)
 class _Reader:
     """Hold an open video and the number of its next frame."""
@@ -60,6 +55,31 @@ class Video:
     camera: Camera | None
     size: tuple[int, int]
     _reader: _Reader | None = field(default=None, repr=False)
+
+    @staticmethod
+    def can_open(path: Path) -> bool:
+        """Whether this is a video file, by its name."""
+        return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+    @staticmethod
+    def open(path: Path) -> Video:
+        """Open a video without a camera, whatever calibration lies beside it.
+
+        Raises:
+            RecordingError: no video, no frame in it that can be decoded, or its clock goes
+                backwards.
+            TrajectoryError: the truth is malformed or fits no frame.
+        """
+        size, rate = _read_frame_size(path)
+        t_ns = _read_times(path, rate)
+        poses = read_ground_truth(path.with_suffix(".tum"), [], t_ns)
+        names = [f"{index:06d}" for index in range(len(t_ns))]
+        return Video(path.name, path, names, t_ns, poses, None, size)
+
+    @staticmethod
+    def read_size(path: Path) -> tuple[int, int]:
+        """Return width and height of the first frame, in pixels. Raises RecordingError."""
+        return _read_frame_size(path)[0]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -116,7 +136,7 @@ def open_video(path: Path) -> Video:
         CalibrationError: camera.json is not usable, or its size differs from the frames'.
         TrajectoryError: the ground truth is malformed or matches no frame.
     """
-    video = open_uncalibrated_video(path)
+    video = Video.open(path)
     if not (path.parent / FILE_NAME).is_file():
         return video
     camera, (width, height) = read_camera_json(path.parent / FILE_NAME).camera, video.size
@@ -128,17 +148,7 @@ def open_video(path: Path) -> Video:
     return replace(video, camera=camera)
 
 
-def open_uncalibrated_video(path: Path) -> Video:
-    """Open a video and ignore any calibration beside it. Raises as `open_video`."""
-    size, rate = read_frame_size(path)
-    t_ns = _read_times(path, rate)
-    poses = read_ground_truth(path.with_suffix(".tum"), [], t_ns)
-    return Video(
-        path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, None, size
-    )
-
-
-def read_frame_size(path: Path) -> tuple[tuple[int, int], float]:
+def _read_frame_size(path: Path) -> tuple[tuple[int, int], float]:
     """Return width and height of the first frame in pixels, and the frame rate of the container.
     Raises RecordingError."""
     capture = _open_capture(path)
@@ -192,4 +202,4 @@ def silence_opencv() -> Iterator[None]:
             logging.setLogLevel(level)
 
 
-FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_video)
+FORMAT = RecordingFormat(EXPECTED_FILES, Video.can_open, open_video)

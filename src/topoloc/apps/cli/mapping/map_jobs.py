@@ -22,13 +22,13 @@ from topoloc import (
     SlamConfig,
     StereoSequence,
     TopoMetricMap,
+    align_to_trajectory,
     build_map,
     run_slam,
     with_pose_conventions,
     with_trajectory,
 )
 from topoloc.apps.cli.output import UsageError, open_recording
-from topoloc.apps.formats.colmap import align_to_trajectory
 from topoloc.apps.formats.metric_scale import estimate_metric_scale
 from topoloc.plugin import Progress, has_scale, scale_poses, split_selection
 
