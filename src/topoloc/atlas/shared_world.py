@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from topoloc.atlas.atlas import Atlas
@@ -40,6 +40,31 @@ class SharedWorld:
             (placed.world_from_map for placed in self.tiles if placed.tile.tile_id == tile_id), None
         )
 
+    def open_tiles(
+        self, atlas: Atlas, warn: Callable[[str], None]
+    ) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
+        """Tiles with their maps, each open for its turn. One that cannot be read is left out, and
+        `warn` told of it.
+
+        Raises:
+            AtlasError: none can be read.
+            ObjectStoreError: the store does not answer.
+        """
+        num_opened = 0
+        for one in self.tiles:
+            try:
+                topomap = TopoMetricMap.load(atlas.map_path(one.tile))
+            except ObjectStoreError:
+                raise
+            except MapError as error:
+                warn(f"tile {one.tile.tile_id} is left out: {error}")
+                continue
+            num_opened += 1
+            with topomap:
+                yield one, topomap
+        if num_opened == 0:
+            raise AtlasError(f"no tile of the atlas {atlas.store.where} can be read")
+
 
 def group_shared_worlds(manifest: Manifest) -> list[SharedWorld]:
     """All tiles by the worlds that they share, the one of most nodes first."""
@@ -60,29 +85,3 @@ def group_shared_worlds(manifest: Manifest) -> list[SharedWorld]:
 def world_of_tile(manifest: Manifest, tile: Tile) -> SharedWorld:
     """A tile alone, in the world of its map."""
     return SharedWorld((PlacedTile(tile, Rigid3.identity()),), manifest.georeference_of(tile))
-
-
-def iter_open_tiles(
-    atlas: Atlas, placed: Sequence[PlacedTile], warn: Callable[[str], None]
-) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
-    """Tiles with their maps, each open for its turn. One that cannot be read is left out, and
-    `warn` told of it.
-
-    Raises:
-        AtlasError: none can be read.
-        StoreError: the store does not answer.
-    """
-    num_opened = 0
-    for one in placed:
-        try:
-            topomap = TopoMetricMap.load(atlas.map_path(one.tile))
-        except ObjectStoreError:
-            raise
-        except MapError as error:
-            warn(f"tile {one.tile.tile_id} is left out: {error}")
-            continue
-        num_opened += 1
-        with topomap:
-            yield one, topomap
-    if num_opened == 0:
-        raise AtlasError(f"no tile of the atlas {atlas.store.where} can be read")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -41,6 +41,9 @@ class EvaluatedQuery:
     neighbour_ids: frozenset[int] = frozenset()
     is_in_other_world: bool = False
 
+    MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
+    MAX_ROTATION_DEG: ClassVar[float] = MAX_ROTATION_DEG
+
     @property
     def translation_m(self) -> float:
         """Distance from the truth, metres; NaN where there is no pose or no truth, or truth says
@@ -71,7 +74,9 @@ class EvaluatedQuery:
             return False
         if self.world_from_cam is None or self.is_in_other_world:
             return True
-        return self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
+        return (
+            self.translation_m > self.MAX_TRANSLATION or self.rotation_deg > self.MAX_ROTATION_DEG
+        )
 
     def to_json(self) -> dict[str, Any]:
         """The result's line, with its recording and its truth, which is null for an image from

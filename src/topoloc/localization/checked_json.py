@@ -82,7 +82,7 @@ def items(value: Any, key: str) -> list[Any]:
     return list(value)
 
 
-def rigid(value: Any, key: str) -> Rigid3:
+def pose_from_json(value: Any, key: str) -> Rigid3:
     """``{"translation": [x, y, z], "quat_wxyz": [w, x, y, z]}``."""
     data = value if isinstance(value, Mapping) else {}
     quat_wxyz = [
@@ -103,7 +103,7 @@ def rigid(value: Any, key: str) -> Rigid3:
 
 
 def pose_to_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
-    """A pose as all our JSON has it, metres; what `rigid` reads."""
+    """A pose as all our JSON has it, metres; what `pose_from_json` reads."""
     return {
         "translation": world_from_cam.translation.tolist(),
         "quat_wxyz": world_from_cam.quat_wxyz().tolist(),

@@ -92,6 +92,11 @@ class MapContents:
             edit=max([self.next_ids.edit, *(edit.edit_id + 1 for edit in self.edits)]),
         )
 
+    @property
+    def id(self) -> str:
+        """The map's id, 16 hexadecimal digits, see `get_map_id`."""
+        return get_map_id(self)
+
     def nodes_of(
         self, kind: str
     ):  # no return type: at run time an entry would be read to look at it
