@@ -202,7 +202,7 @@ def test_dense_descriptors_tell_what_is_found_of_what_must_be_in_view(
     changed("surf", _useless)
     monkeypatch.setattr(
         DenseDescriptors,
-        "agrees",
+        "check_agreement",
         lambda dense, points_img, descriptors: np.full(len(points_img), agrees),
     )
     changed(

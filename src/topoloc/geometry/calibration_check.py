@@ -1,11 +1,11 @@
-"""Does a picture fit its calibration? Pose, focal length and principal point together, from pixels
-of known points.
+"""Check a camera's calibration in one image: estimate pose, focal length and principal point
+together from pixels of map points.
 
-The pose that was found with a wrong focal length or principal point has given way as far as it
-could; what is left of the points' errors still leans one way. So from the pose found, Gauss-Newton
-frees three more numbers, all on the plane z = 1: observations there are `scale` times the
-projection, plus `offset`, where the focal length is `scale` times the calibrated one, and the
-principal point `offset` focal lengths beside the calibrated one.
+A pose found with a wrong focal length or principal point absorbs part of the error, but the
+residuals stay systematic. So Gauss-Newton starts from this pose and estimates three more unknowns
+on the plane z = 1. Observations are `scale` times the projection plus `offset`. `scale` is the
+focal length relative to the calibrated one. `offset` is the shift of the principal point in
+calibrated focal lengths.
 """
 
 from __future__ import annotations
@@ -22,21 +22,26 @@ from topoloc.geometry.camera import MODELS, Camera
 from topoloc.geometry.rigid import Rigid3
 
 _NUM_ITERATIONS = 3
-_MAX_POINTS = 256  # evenly among all: their noise is the least of what is unknown
+_MAX_POINTS = 256  # evenly chosen among all: their noise is the smallest error
 _CAUCHY_SCALE = 2.3849
-# standard deviation; without any, a wall seen straight leaves the focal length and the distance
-# open together
+# Standard deviation of the prior. Without it, a frontal view of a wall does not separate the focal
+# length from the distance.
 _PRIOR_SIGMA = 0.3
 _MIN_POINTS = 20
 MISMATCH_FOCAL_FIELDS = ("focal_length_px", "focal_sigma_px", "calibrated_focal_length_px")
-"""The first fields of a `CalibrationMismatch`, which are its JSON's keys as well."""
+"""The first fields of a `CalibrationMismatch`, which are also keys of its JSON."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageCalibration:
-    """What a picture says of its camera: the focal length as `scale` times the calibrated one, the
-    principal point's place beside the calibrated one (`offset`, focal lengths; x, y), `covariance`
-    of the logarithm of the scale and of the offset, and the pose that goes with them."""
+    """Hold the calibration estimated from one image.
+
+    Args:
+        scale: focal length relative to the calibrated one.
+        offset: principal point relative to the calibrated one, in focal lengths (x, y).
+        covariance: covariance of the logarithm of the scale and of the offset.
+        cam_from_world: pose estimated together with them.
+    """
 
     scale: float
     offset: Float[np.ndarray, " 2"]
@@ -46,12 +51,14 @@ class ImageCalibration:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsDeviation:
-    """What a picture says of its camera beside the calibration, whatever the picture's size.
+    """Hold the deviation of an image's estimated intrinsics from the calibration, independent of
+    the image size.
 
-    `deviation` is the logarithm of the focal length over the calibrated one, and the principal
-    point's way from the calibrated one (calibrated focal lengths; x, y); `covariance` is its noise,
-    of points that are wrong independently. Pictures that show one `place` (a node) share what its
-    points are wrong by.
+    Args:
+        deviation: logarithm of the focal length over the calibrated one, and the shift of the
+            principal point in calibrated focal lengths (x, y).
+        covariance: its noise under independent errors of the points.
+        place: node that the image shows. Images of one node share the errors of its points.
     """
 
     deviation: Float[np.ndarray, " 3"]
@@ -61,10 +68,11 @@ class IntrinsicsDeviation:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationMismatch:
-    """What the picture says of its camera, against the calibration: pixels of the image as it came.
+    """Compare the camera estimated from an image with the calibration, in pixels of the original
+    image.
 
-    `shift` is the left perturbation by which the pose differs that the picture's own camera leads
-    to (metres, radians).
+    `shift` is the left perturbation (metres, radians) from the pose under the calibration to the
+    pose under the estimated camera.
     """
 
     focal_length_px: float
@@ -89,6 +97,7 @@ class CalibrationMismatch:
         return f"the picture says {'; '.join(parts)}"
 
     def to_json(self) -> dict[str, Any]:
+        """Return the mismatch as JSON, with a text for the user as `detail`."""
         of = {
             "focal_length": self.has_focal_mismatch,
             "principal_point": self.has_principal_point_mismatch,
@@ -111,8 +120,8 @@ def estimate_image_calibration(
     cam_from_world: Rigid3,
     sigma_px: float,
 ) -> ImageCalibration | None:
-    """From n pixels of points (metres), beginning at a pose found with the calibration; None from
-    too few, or where nothing follows."""
+    """Estimate the calibration from n pixels of points (metres), starting from a pose found with
+    the given calibration. Return None if there are fewer than 20 points or the estimate fails."""
     if len(points_img) < _MIN_POINTS:
         return None
     rows = np.unique(np.linspace(0, len(points_img) - 1, _MAX_POINTS).astype(int))
@@ -129,9 +138,15 @@ def estimate_image_calibration(
             np.ascontiguousarray(pose.rotation),
             np.ascontiguousarray(pose.translation),
         )
-        of_points = (observed, points_world, point_covariances, sigma_px / camera.fx, _CAUCHY_SCALE)
+        point_args = (
+            observed,
+            points_world,
+            point_covariances,
+            sigma_px / camera.fx,
+            _CAUCHY_SCALE,
+        )
         information, gradient, squares = calibration_equations(
-            rotation, translation, free, *of_points
+            rotation, translation, free, *point_args
         )
         information[6:, 6:] += np.eye(3) / _PRIOR_SIGMA**2
         gradient[6:] += free / _PRIOR_SIGMA**2
@@ -150,7 +165,8 @@ def estimate_image_calibration(
 
 
 def corrected_camera(camera: Camera, found: ImageCalibration) -> Camera:
-    """The camera that a picture speaks of; its distortion is left as it is."""
+    """Return the camera with the estimated focal length and principal point. Its distortion is
+    unchanged."""
     focal = np.array([camera.fx, camera.fy])
     (fx, fy), (cx, cy) = (
         found.scale * focal,
@@ -169,10 +185,14 @@ def corrected_camera(camera: Camera, found: ImageCalibration) -> Camera:
 def compute_intrinsics_deviation(
     calibrated: Camera, camera: Camera, found: ImageCalibration, place: int
 ) -> IntrinsicsDeviation:
-    """What was found with `camera`, beside the calibration that the picture came with; both of one
-    picture size."""
-    own = corrected_camera(camera, found)
-    way = np.array([own.cx - calibrated.cx, own.cy - calibrated.cy]) / calibrated.fx
+    """Return the deviation of the estimate, found with `camera`, from the image's original
+    calibration. Both cameras must have one image size."""
+    estimated = corrected_camera(camera, found)
+    principal_point_shift = (
+        np.array([estimated.cx - calibrated.cx, estimated.cy - calibrated.cy]) / calibrated.fx
+    )
     return IntrinsicsDeviation(
-        np.array([math.log(own.fx / calibrated.fx), *way]), found.covariance, place
+        np.array([math.log(estimated.fx / calibrated.fx), *principal_point_shift]),
+        found.covariance,
+        place,
     )
