@@ -26,7 +26,7 @@ from topoloc.features.learned_kernels import (
 _RADIUS = 4  # grid steps to each side in which the most similar descriptor is searched
 
 
-class DenseDescriptors(ABC):
+class GridDescriptors(ABC):
     """Hold one descriptor every `stride_px` pixels. The descriptor of pixel (x, y) lies at column
     (x + 0.5) / stride_px - 0.5, and rows likewise."""
 
@@ -67,7 +67,7 @@ class DenseDescriptors(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class SingleLevelDescriptors(DenseDescriptors):
+class SingleLevelDescriptors(GridDescriptors):
     """Hold the output of most networks: one plane per component, not of unit length."""
 
     planes: Float32[np.ndarray, "d rows columns"]
@@ -87,7 +87,7 @@ class SingleLevelDescriptors(DenseDescriptors):
 
 
 @dataclass(frozen=True, eq=False)
-class TwoLevelDescriptors(DenseDescriptors):
+class TwoLevelDescriptors(GridDescriptors):
     """Hold two levels whose sum is the descriptors: `coarse`, enlarged bilinearly to twice its rows
     and columns, and `fine` times `weights`.
 

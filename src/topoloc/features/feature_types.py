@@ -3,6 +3,8 @@
 One entry in `FEATURE_TYPES` adds a type: its extraction function and its matching thresholds. The
 weights that calibrate its probabilities are fitted separately and stored with the code that uses
 them (`localization/fitted_weights.py`). Without them, results are marked as not calibrated.
+
+The extraction code of a type is loaded when it is used: OpenCV, Numba or ONNX Runtime with it.
 """
 
 from __future__ import annotations
@@ -17,9 +19,6 @@ from jaxtyping import UInt8
 from topoloc.bounds import AtLeast, Between
 from topoloc.errors import FeatureTypeError
 from topoloc.features.features import Features
-from topoloc.features.learned import LearnedConfig, check_network, extract_learned
-from topoloc.features.sift import SiftConfig, extract_sift
-from topoloc.features.surf import DESCRIPTOR_LENGTH, SurfConfig, extract_surf
 
 Normalization = Literal["none", "paper", "wide"]
 
@@ -112,6 +111,8 @@ class FeatureType:
 def _extract_surf(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
 ) -> Features:
+    from topoloc.features.surf import SurfConfig, extract_surf
+
     settings = SurfConfig(
         hessian_threshold=config.hessian_threshold,
         max_features=config.max_features,
@@ -123,6 +124,8 @@ def _extract_surf(
 def _extract_sift(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
 ) -> Features:
+    from topoloc.features.sift import SiftConfig, extract_sift
+
     return extract_sift(
         image,
         SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold),
@@ -138,6 +141,8 @@ def _learned_feature_type(
     def extract(
         image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
     ) -> Features:
+        from topoloc.features.learned import LearnedConfig, extract_learned
+
         return extract_learned(
             image,
             LearnedConfig(network, descriptor_size, config.max_features, min_score, num_threads),
@@ -162,7 +167,7 @@ def _learned_feature_type(
 SURF = FeatureType(
     "surf",
     _extract_surf,
-    DESCRIPTOR_LENGTH,
+    64,
     guided=GuidedThresholds(min_similarity=0.75, min_margin=0.03, max_scale=1.6, max_turn=0.6),
     distant=GuidedThresholds(min_similarity=0.8, min_margin=0.02, max_scale=1.5, max_turn=0.35),
 )
@@ -219,4 +224,6 @@ def check_available(name: str) -> None:
     """
     network = find_feature_type(name).network
     if network is not None:
+        from topoloc.features.learned import check_network
+
         check_network(network)

@@ -4,13 +4,34 @@ between two sets of them."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Int32, Shaped
-
-from topoloc.features.dense import DenseDescriptors
+from jaxtyping import Bool, Float, Float32, Int32, Shaped
 
 _ARRAY_FIELDS = ("points_img", "sizes_px", "angles", "responses", "descriptors")
+
+
+@runtime_checkable
+class DenseDescriptors(Protocol):
+    """The interface of dense descriptors of an image (`dense.py` implements it)."""
+
+    stride_px: float
+
+    @property
+    def size(self) -> int:
+        """Return the length of a descriptor."""
+        ...
+
+    def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+        """Return descriptors of unit length at these pixels, interpolated bilinearly."""
+        ...
+
+    def check_agreement(
+        self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Return for each point whether its best match lies at its projection."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from jaxtyping import Float32, UInt8
 
 from topoloc import compiled
 from topoloc.errors import WeightsError
-from topoloc.features.dense import DenseDescriptors, SingleLevelDescriptors, TwoLevelDescriptors
+from topoloc.features.dense import GridDescriptors, SingleLevelDescriptors, TwoLevelDescriptors
 from topoloc.features.features import Features
 from topoloc.features.learned_kernels import find_maxima, refine_subpixel
 from topoloc.features.network_files import NetworkInfo, find_network, open_network
@@ -106,7 +106,7 @@ class NetworkOutput:
     network has one."""
 
     scores: Float32[np.ndarray, "padded_h padded_w"]
-    dense: DenseDescriptors
+    dense: GridDescriptors
     places: Float32[np.ndarray, "c level_h level_w"] | None
 
 

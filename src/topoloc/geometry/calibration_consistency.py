@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.calibration_check import IntrinsicsDeviation
+from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 
 MIN_IMAGES, MIN_PLACES = 5, 4  # images of one place share their errors, however many there are

@@ -172,7 +172,7 @@ def compute_log_odds(evidence: Evidence, weights: FittedWeights) -> float:
     if evidence.is_from_virtual_views:
         features, walls = compute_virtual_view_features(evidence), weights.walls
         return (
-            sum(weight * x for weight, x in zip(walls.parallel_map, features, strict=True))
+            sum(weight * x for weight, x in zip(walls.as_vector, features, strict=True))
             + walls.bias
         )
     return compute_node_log_odds(evidence, weights.evidence)
@@ -183,9 +183,7 @@ def compute_node_log_odds(evidence: Evidence, weights: EvidenceWeights) -> float
     return (
         sum(
             weight * x
-            for weight, x in zip(
-                weights.parallel_map, compute_score_features(evidence), strict=True
-            )
+            for weight, x in zip(weights.as_vector, compute_score_features(evidence), strict=True)
         )
         + weights.bias
     )

@@ -43,7 +43,7 @@ class EvidenceWeights:
     clear_log_odds: float
 
     @property
-    def parallel_map(self) -> tuple[float, ...]:
+    def as_vector(self) -> tuple[float, ...]:
         """Return the weights in the order of `compute_score_features`, without the bias."""
         return (
             self.even_share,
@@ -93,7 +93,7 @@ class VirtualViewWeights:
     few_points: float
 
     @property
-    def parallel_map(self) -> tuple[float, ...]:
+    def as_vector(self) -> tuple[float, ...]:
         """Return the weights in the order of `compute_virtual_view_features`, without the bias."""
         shares = (self.found, self.chance, self.inliers, self.inlier_share, self.spread)
         return (*shares, self.distinct, self.lesser_side, self.even_share, self.doubt)

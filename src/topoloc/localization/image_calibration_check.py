@@ -18,9 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.calibration_check import (
-    CalibrationMismatch,
     ImageCalibration,
-    IntrinsicsDeviation,
     compute_intrinsics_deviation,
     corrected_camera,
     estimate_image_calibration,
@@ -29,6 +27,7 @@ from topoloc.geometry.calibration_consistency import (
     CalibrationConsistency,
     check_calibration_consistency,
 )
+from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.guided import match_guided

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import GeoreferenceError, ResultError
-from topoloc.geometry.calibration_check import (
+from topoloc.geometry.calibration_mismatch import (
     MISMATCH_FOCAL_FIELDS,
     CalibrationMismatch,
     IntrinsicsDeviation,
