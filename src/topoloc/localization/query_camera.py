@@ -8,7 +8,7 @@ from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.calibration import parse_calibration
+from topoloc.recordings.calibration import parse_calibration, parse_intrinsics
 from topoloc.recordings.frame import StereoFrame
 
 CameraOfSize = Callable[[int, int], Camera | UncalibratedCamera]
@@ -35,8 +35,14 @@ def select_frame_camera(
     )
 
 
-def parse_camera_option(text: str, topomap: TopoMetricMap | None) -> CameraOfSize:
+def parse_camera_option(
+    text: str, topomap: TopoMetricMap | None, allow_files: bool = True
+) -> CameraOfSize:
     """Parse the value of `--camera`. `map` is allowed only if a single map is queried.
+
+    Args:
+        allow_files: read the calibration from a file of that name; if not, the text must be
+            ``map``, ``unknown`` or ``fx,fy,cx,cy`` (pixels).
 
     Raises:
         CalibrationError: the value is invalid.
@@ -45,7 +51,7 @@ def parse_camera_option(text: str, topomap: TopoMetricMap | None) -> CameraOfSiz
         return _rescaled_camera(topomap.nodes[0].camera)
     if text == "unknown":
         return UncalibratedCamera.unknown
-    calibration = parse_calibration(text)
+    calibration = parse_calibration(text) if allow_files else parse_intrinsics(text)
     return lambda width, height: calibration(width, height).camera
 
 
