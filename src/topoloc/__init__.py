@@ -35,10 +35,13 @@ if TYPE_CHECKING:
         FeatureTypeError,
         GeoreferenceError,
         MapError,
+        MapNotFoundError,
         MissingExtraError,
         ObjectStoreError,
         QueryError,
         RecordingError,
+        ResultError,
+        ServiceError,
         TopolocError,
         TrajectoryError,
         UnreadableImageError,
@@ -66,17 +69,30 @@ if TYPE_CHECKING:
     from topoloc.lifelong.tile_joining import PairResult, join_tiles
     from topoloc.lifelong.tile_selection import TileSelectionConfig, find_tile_of_recording
     from topoloc.lifelong.update import MapUpdate, UpdateConfig
-    from topoloc.lifelong.weak_regions import WeakRegions, WeakRegionsConfig, find_weak_regions
+    from topoloc.lifelong.weak_regions import (
+        NodeQuality,
+        WeakRegion,
+        WeakRegions,
+        WeakRegionsConfig,
+        find_weak_regions,
+    )
     from topoloc.localization.image_calibration_check import check_camera_calibrations
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.map_facts.contradictions import check_map
     from topoloc.localization.map_facts.map_building import SkippedChecks, build_map
     from topoloc.localization.provenance import Provenance
-    from topoloc.localization.result import Alternative, Localization, NotLocalized
-    from topoloc.localization.search import Trace
+    from topoloc.localization.result import (
+        Alternative,
+        Localization,
+        NotLocalized,
+        result_from_json,
+    )
+    from topoloc.localization.search import Trace, TriedProposal
     from topoloc.mapping.build import BuildConfig
     from topoloc.mapping.edit import read_history, undo_edit
+    from topoloc.mapping.entries import TopoNode
     from topoloc.mapping.georeference import GeoreferenceResult, georeference
+    from topoloc.mapping.sessions import Illumination
     from topoloc.mapping.topomap import TopoMetricMap
     from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
     from topoloc.recordings.image_io import read_depth, read_image
@@ -124,16 +140,19 @@ __all__ = [
     "Georeference",
     "GeoreferenceError",
     "GeoreferenceResult",
+    "Illumination",
     "Image",
     "Localization",
     "Localizer",
     "LocalizerConfig",
     "MapCache",
     "MapError",
+    "MapNotFoundError",
     "MapUpdate",
     "MemorySequence",
     "MissingExtraError",
     "NewTile",
+    "NodeQuality",
     "NotLocalized",
     "ObjectStoreError",
     "PairResult",
@@ -142,7 +161,9 @@ __all__ = [
     "PruneConfig",
     "QueryError",
     "RecordingError",
+    "ResultError",
     "Rigid3",
+    "ServiceError",
     "SharedWorld",
     "SkippedChecks",
     "SlamConfig",
@@ -157,15 +178,18 @@ __all__ = [
     "TileSelectionConfig",
     "TileTracker",
     "TopoMetricMap",
+    "TopoNode",
     "TopolocError",
     "Trace",
     "Tracker",
     "TrackerConfig",
     "Trajectory",
     "TrajectoryError",
+    "TriedProposal",
     "UncalibratedCamera",
     "UnreadableImageError",
     "UpdateConfig",
+    "WeakRegion",
     "WeakRegions",
     "WeakRegionsConfig",
     "WeightsError",
@@ -198,6 +222,7 @@ __all__ = [
     "read_manifest",
     "read_trajectory",
     "relative_drift",
+    "result_from_json",
     "run_slam",
     "set_num_threads",
     "tum_text",
@@ -235,16 +260,19 @@ _MODULES = {
     "Georeference": "topoloc.geometry.geodesy",
     "GeoreferenceError": "topoloc.errors",
     "GeoreferenceResult": "topoloc.mapping.georeference",
+    "Illumination": "topoloc.mapping.sessions",
     "Image": "topoloc.recordings.frame",
     "Localization": "topoloc.localization.result",
     "Localizer": "topoloc.localization.localizer",
     "LocalizerConfig": "topoloc.localization.localizer",
     "MapCache": "topoloc.atlas.map_cache",
     "MapError": "topoloc.errors",
+    "MapNotFoundError": "topoloc.errors",
     "MapUpdate": "topoloc.lifelong.update",
     "MemorySequence": "topoloc.recordings.memory_sequence",
     "MissingExtraError": "topoloc.errors",
     "NewTile": "topoloc.atlas.editing",
+    "NodeQuality": "topoloc.lifelong.weak_regions",
     "NotLocalized": "topoloc.localization.result",
     "ObjectStoreError": "topoloc.errors",
     "PairResult": "topoloc.lifelong.tile_joining",
@@ -253,7 +281,9 @@ _MODULES = {
     "PruneConfig": "topoloc.lifelong.prune",
     "QueryError": "topoloc.errors",
     "RecordingError": "topoloc.errors",
+    "ResultError": "topoloc.errors",
     "Rigid3": "topoloc.geometry.rigid",
+    "ServiceError": "topoloc.errors",
     "SharedWorld": "topoloc.atlas.shared_world",
     "SkippedChecks": "topoloc.localization.map_facts.map_building",
     "SlamConfig": "topoloc.slam.slam",
@@ -268,15 +298,18 @@ _MODULES = {
     "TileSelectionConfig": "topoloc.lifelong.tile_selection",
     "TileTracker": "topoloc.tracking.tile_tracker",
     "TopoMetricMap": "topoloc.mapping.topomap",
+    "TopoNode": "topoloc.mapping.entries",
     "TopolocError": "topoloc.errors",
     "Trace": "topoloc.localization.search",
     "Tracker": "topoloc.tracking.tracker",
     "TrackerConfig": "topoloc.tracking.tracker",
     "Trajectory": "topoloc.recordings.trajectory",
     "TrajectoryError": "topoloc.errors",
+    "TriedProposal": "topoloc.localization.search",
     "UncalibratedCamera": "topoloc.geometry.uncalibrated_camera",
     "UnreadableImageError": "topoloc.errors",
     "UpdateConfig": "topoloc.lifelong.update",
+    "WeakRegion": "topoloc.lifelong.weak_regions",
     "WeakRegions": "topoloc.lifelong.weak_regions",
     "WeakRegionsConfig": "topoloc.lifelong.weak_regions",
     "WeightsError": "topoloc.errors",
@@ -308,6 +341,7 @@ _MODULES = {
     "read_manifest": "topoloc.atlas.editing",
     "read_trajectory": "topoloc.recordings.trajectory",
     "relative_drift": "topoloc.geometry.alignment",
+    "result_from_json": "topoloc.localization.result",
     "run_slam": "topoloc.slam.slam",
     "set_num_threads": "topoloc.compiled",
     "tum_text": "topoloc.recordings.trajectory",

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from topoloc.atlas.atlas import absolute_address
     from topoloc.atlas.manifest import check_tile_id
+    from topoloc.atlas.tile_fetcher import TilePending
     from topoloc.bounds import (
+        Above,
         AtLeast,
         Between,
         describe_range,
@@ -23,9 +25,11 @@ if TYPE_CHECKING:
         quote_key,
         suggest_name,
     )
-    from topoloc.evaluation.metrics import format_length
+    from topoloc.evaluation.metrics import format_length, group_by_recording
     from topoloc.features.feature_types import check_available, parse_feature_types
     from topoloc.features.network_files import NETWORKS, NetworkInfo, cache_folder, read_bytes
+    from topoloc.localization.checked_json import pose_from_json, pose_to_json
+    from topoloc.localization.node_matching import NodeMatcher
     from topoloc.mapping.build import Progress
     from topoloc.mapping.sessions import find_source_path
     from topoloc.recordings.atomic import (
@@ -33,12 +37,19 @@ if TYPE_CHECKING:
         remove_stale_files,
         temporary_folder,
         write_bytes,
+        write_folder,
         write_text,
     )
-    from topoloc.recordings.calibration import parse_calibration
+    from topoloc.recordings.calibration import parse_calibration, parse_intrinsics
     from topoloc.recordings.camera_json import read_camera_json
     from topoloc.recordings.format import RecordingFormat
-    from topoloc.recordings.image_io import MAX_PIXELS, EncodedImage, image_size
+    from topoloc.recordings.image_io import (
+        MAX_PIXELS,
+        EncodedImage,
+        encode_jpeg,
+        exif_focal_length,
+        image_size,
+    )
     from topoloc.recordings.json_file import (
         json_number,
         json_numbers,
@@ -64,20 +75,24 @@ if TYPE_CHECKING:
         interpolate_poses,
         match_frame_poses,
         read_ground_truth,
+        tum_text,
     )
     from topoloc.recordings.video import Video, silence_opencv
 
 __all__ = [
     "MAX_PIXELS",
     "NETWORKS",
+    "Above",
     "AtLeast",
     "Between",
     "DepthImages",
     "EncodedImage",
     "NetworkInfo",
+    "NodeMatcher",
     "Progress",
     "Recording",
     "RecordingFormat",
+    "TilePending",
     "Video",
     "absolute_address",
     "as_monocular",
@@ -86,12 +101,15 @@ __all__ = [
     "check_available",
     "check_tile_id",
     "describe_range",
+    "encode_jpeg",
+    "exif_focal_length",
     "field_annotations",
     "find_format",
     "find_nearest_idx",
     "find_source_path",
     "find_violation",
     "format_length",
+    "group_by_recording",
     "has_scale",
     "image_size",
     "interpolate_poses",
@@ -103,8 +121,11 @@ __all__ = [
     "natural_key",
     "parse_calibration",
     "parse_feature_types",
+    "parse_intrinsics",
     "parse_relative_path",
     "parse_settings",
+    "pose_from_json",
+    "pose_to_json",
     "quote_key",
     "read_bytes",
     "read_camera_json",
@@ -119,21 +140,26 @@ __all__ = [
     "suggest_name",
     "temporary_folder",
     "times_from_rate",
+    "tum_text",
     "write_bytes",
+    "write_folder",
     "write_text",
 ]
 
 _MODULES = {
     "MAX_PIXELS": "topoloc.recordings.image_io",
     "NETWORKS": "topoloc.features.network_files",
+    "Above": "topoloc.bounds",
     "AtLeast": "topoloc.bounds",
     "Between": "topoloc.bounds",
     "DepthImages": "topoloc.recordings.recording",
     "EncodedImage": "topoloc.recordings.image_io",
     "NetworkInfo": "topoloc.features.network_files",
+    "NodeMatcher": "topoloc.localization.node_matching",
     "Progress": "topoloc.mapping.build",
     "Recording": "topoloc.recordings.recording",
     "RecordingFormat": "topoloc.recordings.format",
+    "TilePending": "topoloc.atlas.tile_fetcher",
     "Video": "topoloc.recordings.video",
     "absolute_address": "topoloc.atlas.atlas",
     "as_monocular": "topoloc.recordings.recording",
@@ -142,12 +168,15 @@ _MODULES = {
     "check_available": "topoloc.features.feature_types",
     "check_tile_id": "topoloc.atlas.manifest",
     "describe_range": "topoloc.bounds",
+    "encode_jpeg": "topoloc.recordings.image_io",
+    "exif_focal_length": "topoloc.recordings.image_io",
     "field_annotations": "topoloc.bounds",
     "find_format": "topoloc.recordings.open",
     "find_nearest_idx": "topoloc.recordings.recording",
     "find_source_path": "topoloc.mapping.sessions",
     "find_violation": "topoloc.bounds",
     "format_length": "topoloc.evaluation.metrics",
+    "group_by_recording": "topoloc.evaluation.metrics",
     "has_scale": "topoloc.recordings.recording",
     "image_size": "topoloc.recordings.image_io",
     "interpolate_poses": "topoloc.recordings.trajectory",
@@ -159,8 +188,11 @@ _MODULES = {
     "natural_key": "topoloc.recordings.recording",
     "parse_calibration": "topoloc.recordings.calibration",
     "parse_feature_types": "topoloc.features.feature_types",
+    "parse_intrinsics": "topoloc.recordings.calibration",
     "parse_relative_path": "topoloc.recordings.json_file",
     "parse_settings": "topoloc.bounds",
+    "pose_from_json": "topoloc.localization.checked_json",
+    "pose_to_json": "topoloc.localization.checked_json",
     "quote_key": "topoloc.bounds",
     "read_bytes": "topoloc.features.network_files",
     "read_camera_json": "topoloc.recordings.camera_json",
@@ -175,7 +207,9 @@ _MODULES = {
     "suggest_name": "topoloc.bounds",
     "temporary_folder": "topoloc.recordings.atomic",
     "times_from_rate": "topoloc.recordings.recording",
+    "tum_text": "topoloc.recordings.trajectory",
     "write_bytes": "topoloc.recordings.atomic",
+    "write_folder": "topoloc.recordings.atomic",
     "write_text": "topoloc.recordings.atomic",
 }
 

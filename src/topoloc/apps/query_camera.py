@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from topoloc import Camera, QueryError, StereoFrame, TopoMetricMap, UncalibratedCamera
-from topoloc.plugin import parse_calibration
+from topoloc.plugin import parse_calibration, parse_intrinsics
 
 CameraOfSize = Callable[[int, int], Camera | UncalibratedCamera]
 """A function from image width and height to a camera model."""
@@ -31,8 +31,14 @@ def select_frame_camera(
     )
 
 
-def parse_camera_option(text: str, topomap: TopoMetricMap | None) -> CameraOfSize:
+def parse_camera_option(
+    text: str, topomap: TopoMetricMap | None, allow_files: bool = True
+) -> CameraOfSize:
     """Parse the value of `--camera`. `map` is allowed only if a single map is queried.
+
+    Args:
+        allow_files: read the calibration from a file of that name; if not, the text must be
+            ``map``, ``unknown`` or ``fx,fy,cx,cy`` (pixels).
 
     Raises:
         CalibrationError: the value is invalid.
@@ -41,7 +47,7 @@ def parse_camera_option(text: str, topomap: TopoMetricMap | None) -> CameraOfSiz
         return _rescaled_camera(topomap.nodes[0].camera)
     if text == "unknown":
         return UncalibratedCamera.unknown
-    calibration = parse_calibration(text)
+    calibration = parse_calibration(text) if allow_files else parse_intrinsics(text)
     return lambda width, height: calibration(width, height).camera
 
 

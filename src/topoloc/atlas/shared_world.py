@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from topoloc.atlas.atlas import Atlas
@@ -65,29 +65,28 @@ class SharedWorld:
             (placed.world_from_map for placed in self.tiles if placed.tile.tile_id == tile_id), None
         )
 
+    def open_tiles(
+        self, atlas: Atlas, warn: Callable[[str], None]
+    ) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
+        """Iterate over tiles with their maps. Each map is open during its iteration.
 
-def iter_open_tiles(
-    atlas: Atlas, placed: Sequence[PlacedTile], warn: Callable[[str], None]
-) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
-    """Iterate over tiles with their maps. Each map is open during its iteration.
+        A tile that cannot be read is skipped with a warning.
 
-    A tile that cannot be read is skipped with a warning.
-
-    Raises:
-        AtlasError: no tile can be read.
-        ObjectStoreError: the store does not respond.
-    """
-    num_opened = 0
-    for one in placed:
-        try:
-            topomap = TopoMetricMap.load(atlas.map_path(one.tile))
-        except ObjectStoreError:
-            raise
-        except MapError as error:
-            warn(f"tile {one.tile.tile_id} is left out: {error}")
-            continue
-        num_opened += 1
-        with topomap:
-            yield one, topomap
-    if num_opened == 0:
-        raise AtlasError(f"no tile of the atlas {atlas.store.where} can be read")
+        Raises:
+            AtlasError: no tile can be read.
+            ObjectStoreError: the store does not respond.
+        """
+        num_opened = 0
+        for one in self.tiles:
+            try:
+                topomap = TopoMetricMap.load(atlas.map_path(one.tile))
+            except ObjectStoreError:
+                raise
+            except MapError as error:
+                warn(f"tile {one.tile.tile_id} is left out: {error}")
+                continue
+            num_opened += 1
+            with topomap:
+                yield one, topomap
+        if num_opened == 0:
+            raise AtlasError(f"no tile of the atlas {atlas.store.where} can be read")

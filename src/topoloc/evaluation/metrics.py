@@ -47,6 +47,9 @@ class EvaluatedQuery:
     neighbour_ids: frozenset[int] = frozenset()
     is_in_other_world: bool = False
 
+    MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
+    MAX_ROTATION_DEG: ClassVar[float] = MAX_ROTATION_DEG
+
     @property
     def translation_m(self) -> float:
         """Return the distance from the ground truth in metres. NaN without a pose or ground truth
@@ -79,7 +82,9 @@ class EvaluatedQuery:
             return False
         if self.world_from_cam is None or self.is_in_other_world:
             return True
-        return self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
+        return (
+            self.translation_m > self.MAX_TRANSLATION or self.rotation_deg > self.MAX_ROTATION_DEG
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the result's JSON with its recording and its ground truth, which is null for an

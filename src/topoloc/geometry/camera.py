@@ -51,6 +51,11 @@ class Camera:
     height: int
     params: tuple[float, ...]
 
+    @staticmethod
+    def model_names() -> list[str]:
+        """Return the names of all camera models."""
+        return list(MODELS)
+
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise CalibrationError(

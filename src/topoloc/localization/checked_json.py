@@ -85,9 +85,9 @@ def items(value: Any, key: str) -> list[Any]:
     return list(value)
 
 
-def rigid(value: Any, key: str) -> Rigid3:
+def pose_from_json(value: Any, key: str) -> Rigid3:
     """Parse a pose ``{"translation": [x, y, z], "quat_wxyz": [w, x, y, z]}``, translation in
-    metres."""
+    metres. `key` is its name in errors. Raises ResultError."""
     data = value if isinstance(value, Mapping) else {}
     quat_wxyz = [
         number(one, f"{key}.quat_wxyz") for one in items(data.get("quat_wxyz"), f"{key}.quat_wxyz")
@@ -107,7 +107,7 @@ def rigid(value: Any, key: str) -> Rigid3:
 
 
 def pose_to_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
-    """Return a pose in the common JSON format (metres), as `rigid` reads it."""
+    """Return a pose in the common JSON format (metres), as `pose_from_json` reads it."""
     return {
         "translation": world_from_cam.translation.tolist(),
         "quat_wxyz": world_from_cam.quat_wxyz().tolist(),

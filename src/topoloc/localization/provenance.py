@@ -77,9 +77,11 @@ class Provenance:
                 None if t_ns is None else checked.integer(t_ns, "t_ns", -(2**63)),
                 None if camera is None else Camera.from_json(camera),
                 None if tile is None else checked.text(tile, "tile"),
-                None if pose is None else checked.rigid(pose, "atlas_from_cam"),
+                None if pose is None else checked.pose_from_json(pose, "atlas_from_cam"),
                 None if joint is None else checked.text(joint, "joint_world"),
-                None if joint_pose is None else checked.rigid(joint_pose, "joint_from_cam"),
+                None
+                if joint_pose is None
+                else checked.pose_from_json(joint_pose, "joint_from_cam"),
             )
         except CalibrationError as error:
             raise ResultError(f"no result: {error}") from None

@@ -148,7 +148,7 @@ class Localization:
             data.get(key) for key in ("focal_length_px", "evidence", "calibration_doubt")
         )
         return Localization(
-            checked.rigid(checked.require(data, "world_from_cam"), "world_from_cam"),
+            checked.pose_from_json(checked.require(data, "world_from_cam"), "world_from_cam"),
             checked.covariance(checked.require(data, "covariance"), "covariance"),
             checked.number(checked.require(data, "probability"), "probability", 0.0, 1.0),
             checked.integer(checked.require(data, "node"), "node"),
@@ -199,7 +199,7 @@ class Alternative:
         if not isinstance(data, Mapping):
             raise ResultError("no result: an alternative is an object")
         return Alternative(
-            checked.rigid(checked.require(data, "world_from_cam"), "world_from_cam"),
+            checked.pose_from_json(checked.require(data, "world_from_cam"), "world_from_cam"),
             checked.number(checked.require(data, "probability"), "probability", 0.0, 1.0),
             checked.integer(checked.require(data, "node"), "node"),
             _parse_geopose(data),

@@ -32,6 +32,15 @@ class TriedProposal:
     milliseconds: float
     features: str
 
+    @property
+    def fit(self) -> PoseFit:
+        """The last fit of it: that of the hypothesis, else the refined one if it has a pose."""
+        if self.hypothesis is not None:
+            return self.hypothesis.fit
+        if self.refined is not None and self.refined.pose is not None:
+            return self.refined
+        return self.first
+
 
 @dataclass(eq=False)
 class Trace:

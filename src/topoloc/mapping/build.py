@@ -7,9 +7,10 @@ the coarse localizer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -56,8 +57,15 @@ from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
 BuildConfig = MapConfig
-Progress = Callable[[str, int, int], None]
-"""Called with a stage's name, the number of steps done and the number of all steps."""
+
+
+@runtime_checkable
+class Progress(Protocol):
+    """A callable with a stage's name, steps done and steps in all."""
+
+    def __call__(self, stage: str, done: int, total: int, /) -> None:
+        """Report progress."""
+        ...
 
 
 def build_map(

@@ -97,6 +97,11 @@ class MapContents:
             edit=max([self.next_ids.edit, *(edit.edit_id + 1 for edit in self.edits)]),
         )
 
+    @property
+    def id(self) -> str:
+        """The map's id, 16 hexadecimal digits, see `get_map_id`."""
+        return get_map_id(self)
+
     def nodes_of(self, kind: str):  # no return type: a type check at run time would read an entry
         """Return the nodes with their points of one feature type. Raises KeyError if the map has no
         such type."""

@@ -21,7 +21,7 @@ from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.sessions import Illumination, measure_illumination
+from topoloc.mapping.sessions import Illumination
 from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.points.motion_triangulation import (
     SourceImage,
@@ -123,7 +123,7 @@ def extract_mapping_image(
         kind: extract_features(view.grey, config.feature_config_for(kind)) for kind in config.kinds
     }
     return MappingImage(
-        view.camera, world_from_view, features, jpeg, measure_illumination(view.picture)
+        view.camera, world_from_view, features, jpeg, Illumination.of_image(view.picture)
     )
 
 

@@ -34,6 +34,24 @@ class Illumination:
     red: float
     blue: float
 
+    @staticmethod
+    def of_image(image: Image) -> Illumination:
+        """Measure the illumination of an image (uint8) on every fourth pixel in each direction."""
+        sample = image[::4, ::4].astype(np.float64) / 255.0
+        grey = sample if sample.ndim == 2 else sample @ np.array([0.299, 0.587, 0.114])
+        red, green, blue = (
+            (1.0, 1.0, 1.0) if sample.ndim == 2 else sample.reshape(-1, 3).mean(axis=0) + 1e-3
+        )
+        dark, bright = float((grey < 1 / 16).mean()), float((grey > 15 / 16).mean())
+        return Illumination(
+            float(grey.mean()),
+            float(grey.std()),
+            dark,
+            bright,
+            float(red / green),
+            float(blue / green),
+        )
+
 
 @dataclass(frozen=True)
 class Session:
@@ -108,19 +126,6 @@ def find_pose_source(sequence: StereoSequence) -> str:
         )
         return find_pose_source(sequence.base) if is_same else "given"
     return "truth" if isinstance(sequence, Recording) else "given"
-
-
-def measure_illumination(image: Image) -> Illumination:
-    """Measure the illumination of an image (uint8) on every fourth pixel in each direction."""
-    sample = image[::4, ::4].astype(np.float64) / 255.0
-    grey = sample if sample.ndim == 2 else sample @ np.array([0.299, 0.587, 0.114])
-    red, green, blue = (
-        (1.0, 1.0, 1.0) if sample.ndim == 2 else sample.reshape(-1, 3).mean(axis=0) + 1e-3
-    )
-    dark, bright = float((grey < 1 / 16).mean()), float((grey > 15 / 16).mean())
-    return Illumination(
-        float(grey.mean()), float(grey.std()), dark, bright, float(red / green), float(blue / green)
-    )
 
 
 def average_illumination(lights: Sequence[Illumination]) -> Illumination | None:

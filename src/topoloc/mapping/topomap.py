@@ -33,6 +33,7 @@ from topoloc.mapping.entries import (
 from topoloc.mapping.map_file import MapFile
 from topoloc.mapping.map_reading import open_map
 from topoloc.mapping.map_writing import save_map
+from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.session_illumination import find_node_illumination_groups
 from topoloc.mapping.sessions import Edit, Session
@@ -86,6 +87,19 @@ class TopoMetricMap(MapContents):
     def row_of(self, node_id: int) -> int:
         """Return the row of a node. Raises KeyError if the map has no node with this id."""
         return self._rows[node_id]
+
+    def find_neighbours(self, rows: Sequence[int], max_neighbours: int) -> list[list[int]]:
+        """Return for each of these nodes the nearest others of them, by the distance of Eq. 1.
+
+        Entries are positions in `rows`, the nearest first.
+        """
+        poses = [self.summaries[row].world_from_cam for row in rows]
+        stacked, neighbours = NodePoses.of(poses), list[list[int]]()
+        for k, pose in enumerate(poses):
+            distances = node_distances(pose, stacked, self.config.lambda_rot)
+            order = np.argsort(distances, kind="stable")[: max_neighbours + 1]
+            neighbours.append([int(other) for other in order if other != k])
+        return neighbours
 
     @cached_property
     def _rows(self) -> dict[int, int]:

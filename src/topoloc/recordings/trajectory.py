@@ -165,12 +165,6 @@ def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
     )
 
 
-def kitti_text(trajectory: Trajectory) -> str:
-    """Return one line per pose: the upper 3x4 of its matrix, row by row."""
-    rows = (pose.matrix()[:3].ravel().tolist() for pose in trajectory.world_from_cam)
-    return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
-
-
 def interpolate_poses(
     trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2
 ) -> list[Rigid3 | None]:
