@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     )
     from topoloc.recordings.camera_json import read_camera_json
     from topoloc.recordings.format import RecordingFormat
-    from topoloc.recordings.frame import Image
     from topoloc.recordings.image_io import (
         MAX_PIXELS,
         EncodedImage,
@@ -53,7 +52,7 @@ if TYPE_CHECKING:
         times_from_rate,
     )
     from topoloc.recordings.text_files import read_text
-    from topoloc.recordings.trajectory import interpolate_poses, read_ground_truth, tum_text
+    from topoloc.recordings.trajectory import interpolate_poses, read_ground_truth
     from topoloc.recordings.video import Video, silence_opencv
 
 __all__ = [
@@ -63,7 +62,6 @@ __all__ = [
     "Between",
     "DepthImages",
     "EncodedImage",
-    "Image",
     "NodeMatcher",
     "Recording",
     "RecordingFormat",
@@ -97,7 +95,6 @@ __all__ = [
     "suggest_name",
     "temporary_folder",
     "times_from_rate",
-    "tum_text",
     "write_bytes",
     "write_folder",
     "write_text",
@@ -109,7 +106,6 @@ _MODULES = {
     "Between": "topoloc.bounds",
     "DepthImages": "topoloc.recordings.recording",
     "EncodedImage": "topoloc.recordings.image_io",
-    "Image": "topoloc.recordings.frame",
     "MAX_PIXELS": "topoloc.recordings.image_io",
     "NodeMatcher": "topoloc.localization.node_matching",
     "Recording": "topoloc.recordings.recording",
@@ -144,7 +140,6 @@ _MODULES = {
     "suggest_name": "topoloc.bounds",
     "temporary_folder": "topoloc.recordings.atomic",
     "times_from_rate": "topoloc.recordings.recording",
-    "tum_text": "topoloc.recordings.trajectory",
     "write_bytes": "topoloc.recordings.atomic",
     "write_folder": "topoloc.recordings.atomic",
     "write_text": "topoloc.recordings.atomic",

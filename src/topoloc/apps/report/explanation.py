@@ -13,6 +13,7 @@ import numpy as np
 from topoloc import (
     Camera,
     Illumination,
+    Image,
     Localization,
     Localizer,
     NotLocalized,
@@ -21,7 +22,6 @@ from topoloc import (
     TriedProposal,
     UncalibratedCamera,
 )
-from topoloc.plugin import Image
 
 _MIN_FEATURES, _MIN_PROBABILITY = 150, 0.5
 _DARKER, _BRIGHTER = 0.6, 1.7  # times the light of the nearest session

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from topoloc import Localization, TopoMetricMap
+from topoloc import Image, Localization, TopoMetricMap
 from topoloc.apps.report.explanation import EvaluatedPose, Explanation
 from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, decode_template, draw_pair
 from topoloc.apps.report.page_template import render_page
-from topoloc.plugin import Image, encode_jpeg, write_text
+from topoloc.plugin import encode_jpeg, write_text
 
 _POSES_TEXT = (
     "Of each first pose: points were sought where the map expects them, and weighed. Found counts"

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from topoloc import Camera, EvaluatedQuery, Localization, MapError, TopoNode
+from topoloc import Camera, EvaluatedQuery, Image, Localization, MapError, TopoNode
 from topoloc.apps.viewer.map_scene import decode_jpeg
-from topoloc.plugin import Image, NodeMatcher
+from topoloc.plugin import NodeMatcher
 
 # Pictures are shown, and matched, no wider than this.
 IMAGE_WIDTH_PX = 480

@@ -11,6 +11,7 @@ import numpy as np
 
 from topoloc import (
     EvaluatedQuery,
+    Image,
     Localization,
     NotLocalized,
     TopoMetricMap,
@@ -24,7 +25,7 @@ from topoloc.apps.report.match_images import (
     draw_pair,
     match_with_node,
 )
-from topoloc.plugin import Image, NodeMatcher, encode_jpeg, format_length, group_by_recording
+from topoloc.plugin import NodeMatcher, encode_jpeg, format_length, group_by_recording
 
 NUM_WORST = 6
 

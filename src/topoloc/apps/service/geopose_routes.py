@@ -14,6 +14,7 @@ from fastapi.responses import JSONResponse, Response
 from topoloc import (
     Camera,
     Georeference,
+    Image,
     Localization,
     NotLocalized,
     TopoMetricMap,
@@ -39,7 +40,7 @@ from topoloc.apps.service.query_handler import decode_image
 from topoloc.apps.service.query_request import read_body
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
-from topoloc.plugin import EncodedImage, Image
+from topoloc.plugin import EncodedImage
 
 router = APIRouter()
 _MAX_DISAGREEMENT_M = 10.0

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from topoloc import (
     AtlasLocalizer,
     Camera,
+    Image,
     Localization,
     Localizer,
     MapCache,
@@ -27,7 +28,7 @@ from topoloc.apps.service.query_cameras import parse_camera_field
 from topoloc.apps.service.query_request import QueryRequest
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.served_atlases import ServedAtlases
-from topoloc.plugin import EncodedImage, Image, image_size
+from topoloc.plugin import EncodedImage, image_size
 
 T = TypeVar("T")
 
