@@ -98,6 +98,10 @@ def test_public_names_are_in_the_reference_once_each(door: ModuleType):
     assert sorted(described) == sorted(door.__all__)
 
 
+def test_a_public_name_has_one_door():
+    assert set(topoloc.__all__) & set(topoloc.plugin.__all__) == set()
+
+
 def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixture[str]):
     """The table of the paper's own settings."""
     from topoloc.apps.cli import main

@@ -75,7 +75,6 @@ if TYPE_CHECKING:
         interpolate_poses,
         match_frame_poses,
         read_ground_truth,
-        tum_text,
     )
     from topoloc.recordings.video import Video, silence_opencv
 
@@ -140,20 +139,19 @@ __all__ = [
     "suggest_name",
     "temporary_folder",
     "times_from_rate",
-    "tum_text",
     "write_bytes",
     "write_folder",
     "write_text",
 ]
 
 _MODULES = {
-    "MAX_PIXELS": "topoloc.recordings.image_io",
-    "NETWORKS": "topoloc.features.network_files",
     "Above": "topoloc.bounds",
     "AtLeast": "topoloc.bounds",
     "Between": "topoloc.bounds",
     "DepthImages": "topoloc.recordings.recording",
     "EncodedImage": "topoloc.recordings.image_io",
+    "MAX_PIXELS": "topoloc.recordings.image_io",
+    "NETWORKS": "topoloc.features.network_files",
     "NetworkInfo": "topoloc.features.network_files",
     "NodeMatcher": "topoloc.localization.node_matching",
     "Progress": "topoloc.mapping.build",
@@ -207,7 +205,6 @@ _MODULES = {
     "suggest_name": "topoloc.bounds",
     "temporary_folder": "topoloc.recordings.atomic",
     "times_from_rate": "topoloc.recordings.recording",
-    "tum_text": "topoloc.recordings.trajectory",
     "write_bytes": "topoloc.recordings.atomic",
     "write_folder": "topoloc.recordings.atomic",
     "write_text": "topoloc.recordings.atomic",

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from topoloc import GeoreferenceError, Trajectory, TrajectoryError
+from topoloc import GeoreferenceError, Trajectory, TrajectoryError, tum_text
 from topoloc.apps.viewer.scene import Scene, View
-from topoloc.plugin import tum_text
 
 _CAMERA_RGB = (255, 0, 0)
 

@@ -18,9 +18,9 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from topoloc import AtlasError, GeoPositionPrior, Georeference, Localization
+from topoloc import AtlasError, GeoPositionPrior, Georeference, Image, Localization
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.plugin import EncodedImage, Image
+from topoloc.plugin import EncodedImage
 
 R = TypeVar("R", bound=BaseModel)
 MEDIA_TYPE = "application/vnd.oscp+json"
