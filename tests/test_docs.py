@@ -6,7 +6,6 @@ from __future__ import annotations
 import importlib
 import re
 import sqlite3
-import warnings
 from contextlib import closing
 from pathlib import Path
 
@@ -148,26 +147,39 @@ def test_python_examples_compile_and_use_public_names():
         assert set(re.findall(r"(?<!from )\btopoloc\.(\w+)", block)) <= set(topoloc.__all__)
 
 
-def test_the_plan_names_the_files_that_are_there():
-    for package in (
-        "src/topoloc",
-        "worlds/src/topoloc_worlds",
-        "training/src/topoloc_training",
-        "paper/src/topoloc_paper",
-    ):
-        rooms = re.search(rf"^{package}/\n(.*?)^\w", PLAN, re.MULTILINE | re.DOTALL)
-        assert rooms
-        named = set(re.findall(r"\b(\w+\.py)\b", rooms.group(1)))
-        there = {path.name for path in (ROOT / package).rglob("*.py") if path.stat().st_size > 0}
-        assert named - there == set(), package
-        if missing := sorted(
-            name
-            for name in there - named
-            if not name.endswith("_kernels.py") and not name.startswith("__")
-        ):
-            warnings.warn(
-                f"docs/architecture.md, {package}: not named: " + ", ".join(missing), stacklevel=1
-            )
+def test_every_path_that_the_plan_names_exists():
+    """Paths in the plan are relative to the package, or else to the repository."""
+    named = re.findall(r"`([\w./-]+(?:/[\w.-]*|\.(?:py|md|toml)))`", PLAN)
+    assert len(named) > 40
+    places = (ROOT / "src" / "topoloc", ROOT)
+    assert [path for path in named if not any((at / path).exists() for at in places)] == []
+
+
+def test_every_package_is_in_the_table_of_layers():
+    package = ROOT / "src" / "topoloc"
+    table = re.search(r"^## Layers\n(.*?)^## ", PLAN, re.MULTILINE | re.DOTALL)
+    assert table
+    rows = [row for row in table.group(1).splitlines() if row.startswith("| `")]
+    named = {name for row in rows for name in re.findall(r"`(\w+)(?:/|\.py)`", row.split("|")[1])}
+    there = {path.parent.name for path in package.glob("*/__init__.py")}
+    there |= {path.stem for path in package.glob("*.py") if not path.stem.startswith("__")}
+    assert named == there
+    applications = {path.parent.name for path in package.glob("apps/*/__init__.py")}
+    assert set(re.findall(r"`apps/(\w+)`", table.group(1))) == applications
+
+
+def test_every_name_in_the_plan_is_defined_in_the_file_beside_it():
+    rows = re.findall(
+        r"^\| ((?:`\w+`(?:, )?)+) \| ((?:`[\w/]+\.py`(?:, )?)+) \|", PLAN, re.MULTILINE
+    )
+    assert len(rows) > 20
+    for names, paths in rows:
+        text = "".join(
+            (ROOT / "src" / "topoloc" / path).read_text(encoding="utf-8")
+            for path in re.findall(r"`([^`]+)`", paths)
+        )
+        for name in re.findall(r"`(\w+)`", names):
+            assert re.search(rf"^(?:class|def) {name}\b|^{name} = ", text, re.MULTILINE), name
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
