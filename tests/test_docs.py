@@ -26,6 +26,7 @@ CLI = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
 MAP_FORMAT = (ROOT / "docs" / "map-format.md").read_text(encoding="utf-8")
 PLAN = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+JOURNAL = sorted((ROOT / "docs" / "journal").glob("*.md"))
 
 LOCALIZED = Localization(
     Rigid3.identity(), np.eye(6), 1.0, 0, [NodeScore(0, 1.0)], 30, 20, {"total": 1.0}
@@ -182,7 +183,7 @@ def test_every_name_in_the_plan_is_defined_in_the_file_beside_it():
             assert re.search(rf"^(?:class|def) {name}\b|^{name} = ", text, re.MULTILINE), name
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *JOURNAL], ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path):
     links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
     local = [link for link in links if "://" not in link]

@@ -26,7 +26,7 @@ DEPTH_SHARE = 0.15
 # Where the user names no lambda, a turn by this angle alone makes a node. Nodes are cheap (100 KB)
 # and a query asks only the few around it; the closer they are in view, the more of the map's own
 # error they share with it
-# (docs/journal.md).
+# (docs/journal/mapping.md).
 RADIANS_PER_NODE = np.deg2rad(2.0)
 _STEPS = list(product((-1, 0, 1), repeat=3))  # to a cube and those around it
 

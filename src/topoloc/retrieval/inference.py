@@ -1,7 +1,7 @@
 """Running a trained network on single pictures and on batches, in the way that this machine's
 processor does fastest.
 
-What that is was measured (docs/journal.md): bfloat16 where the processor multiplies it in hardware,
+What that is was measured (docs/journal/retrieval.md): bfloat16 where the processor multiplies it in hardware,
 else single precision with the network frozen into TorchScript, whose fused calls save a third of a
 small network's time.
 """

@@ -29,7 +29,7 @@ from topoloc.retrieval.descriptor_kernels import add_residuals, multiply_rows
 _BLOCK = 1024  # vectors whitened at a time
 _MIN_GROUP_SIZE = 8  # images whose mean vector says something of them all
 # of what sets groups apart; all of it costs more where every group covers the whole place
-# (docs/journal.md)
+# (docs/journal/retrieval.md)
 _SUPPRESSED_SHARE = 0.5
 
 
