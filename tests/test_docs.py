@@ -23,6 +23,7 @@ from topoloc.retrieval.coarse import NodeScore
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 CLI = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+RESULTS = (ROOT / "docs" / "results-and-exports.md").read_text(encoding="utf-8")
 MAP_FORMAT = (ROOT / "docs" / "map-format.md").read_text(encoding="utf-8")
 PLAN = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -34,10 +35,10 @@ LOCALIZED = Localization(
 UNREADABLE = NotLocalized("unreadable", detail="which file, and why")
 
 
-def _section(command: str) -> str:
-    """What docs/cli.md says of one command."""
-    match = re.search(rf"^## topoloc {command}$(.*?)(?=^## |\Z)", CLI, re.MULTILINE | re.DOTALL)
-    assert match, f"docs/cli.md has no section '## topoloc {command}'"
+def _section(page: str, title: str) -> str:
+    """The section of a page below a heading of the second level."""
+    match = re.search(rf"^## {title}$(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)
+    assert match, f"no section '## {title}'"
     return match.group(1)
 
 
@@ -56,7 +57,7 @@ def _code_blocks(text: str, language: str) -> list[str]:
 def test_every_command_and_setting_is_in_the_docs(command: str, capsys: pytest.CaptureFixture[str]):
     assert f"topoloc {command}" in README
     settings = _settings(command, capsys)
-    documented = set(re.findall(r"`(--[a-z][\w-]*)", _section(command)))
+    documented = set(re.findall(r"`(--[a-z][\w-]*)", _section(CLI, f"topoloc {command}")))
     assert settings - documented == set()
     assert documented - settings == set(), "documented, but no setting of this command"
 
@@ -85,19 +86,19 @@ def test_commands_in_code_blocks_exist(capsys: pytest.CaptureFixture[str]):
     ["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"],
 )
 def test_every_reason_is_documented(reason: str):
-    assert f"`{reason}`" in _section("localize")
+    assert f"`{reason}`" in _section(RESULTS, "Results")
 
 
 def test_result_and_evaluation_keys_are_documented():
     for key in {**LOCALIZED.to_json("a.png"), **UNREADABLE.to_json("b.png")}:
-        assert f'"{key}"' in _section("localize")
+        assert f'"{key}"' in _section(RESULTS, "Results")
     answers = [
         EvaluatedQuery("a.png", LOCALIZED, Rigid3.identity(), 0),
         EvaluatedQuery("b.png", UNREADABLE, None),
     ]
     evaluation = summarize(answers)
     for key in (*evaluation, *evaluation["recall"]):
-        assert f'"{key}"' in _section("evaluate")
+        assert f'"{key}"' in _section(RESULTS, "Evaluations")
 
 
 def test_every_table_and_column_of_the_map_is_documented():
