@@ -2,9 +2,8 @@
 
     python examples/map_and_localize.py [--map-from SEQ] [--ask SEQ] [--out FILE]
 
-Without arguments it uses the built-in demo: it maps a rendered lab from one stereo lap and localizes
-single images of another. Any recording of docs/recordings.md works. The mapped one needs depth and
-poses.
+Without arguments it maps the demo's rendered lab from one stereo lap and localizes single images of
+another. Any recording of docs/recordings.md works. The mapped one needs depth and poses.
 """
 
 import argparse
