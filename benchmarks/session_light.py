@@ -36,7 +36,6 @@ from topoloc.mapping.sessions import (
     Illumination,
     Session,
     average_illumination,
-    measure_illumination,
 )
 from topoloc.recordings.image_io import read_image, to_grey
 from topoloc.recordings.open import open_sequence
@@ -86,7 +85,7 @@ def _view(picture: np.ndarray, place: int | Rigid3, kind: str) -> View:
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     features = extract_features(to_grey(picture), FeatureConfig(kind=kind))
     return View(
-        features, (picture.shape[1], picture.shape[0]), measure_illumination(picture), place
+        features, (picture.shape[1], picture.shape[0]), Illumination.of_image(picture), place
     )
 
 

@@ -104,9 +104,8 @@ def test_damaged_code_is_made_again(module: Path, kind: str):
 
 
 def test_whether_code_is_kept_can_be_asked(module: Path):
-    asks = (
-        "from topoloc.compiled import is_kept; import own_kernels; print(is_kept(own_kernels.more))"
-    )
+        "from topoloc.compiled import is_cached; import own_kernels;"
+        " print(is_cached(own_kernels.more))"
     assert _run(module, asks)[0].splitlines()[-1] == "False"
     _run(module)
     assert _run(module, asks)[0].splitlines()[-1] == "True"

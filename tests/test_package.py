@@ -202,7 +202,7 @@ def test_every_module_loads_without_extras_but_learned_classifiers_and_figures()
     assert "topoloc.retrieval.network_config" not in learning
     drawing = {
         f"topoloc.apps.report.{name}"
-        for name in ("figures", "map_figure", "report", "weak_parts_figure", "weak_parts_page")
+        for name in ("figures", "map_figure", "report", "weak_regions_figure", "weak_regions_page")
     }
     others = [
         name

@@ -11,10 +11,12 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 import topoloc
+import topoloc.plugin
 from topoloc.apps.cli import all_commands
 from topoloc.apps.cli.settings_file import all_tables, config_class, read_settings
 
@@ -82,14 +84,18 @@ def test_targets_of_make_that_a_page_names_are_there(page: Path):
     )
 
 
-@pytest.mark.parametrize("name", topoloc.__all__)
-def test_every_public_name_is_in_the_reference(name: str):
+@pytest.mark.parametrize("door", [topoloc, topoloc.plugin], ids=lambda door: door.__name__)
+def test_public_names_are_in_the_reference_once_each(door: ModuleType):
+    directives = r"autofunction|autoclass|autoexception"
     described = re.findall(
-        r"^\.\. (?:autofunction|autoclass|autoexception|py:data):: (?:topoloc\.)?(\w+)$",
+        rf"^\.\. (?:{directives}):: {re.escape(door.__name__)}\.(\w+)$",
         _read("api.md"),
         re.MULTILINE,
     )
-    assert described.count(name) == 1
+    page, _, extensions = _read("api.md").partition("(extensions)=")
+    text = extensions if door is topoloc.plugin else page
+    described += re.findall(r"^\.\. py:data:: (\w+)$", text, re.MULTILINE)
+    assert sorted(described) == sorted(door.__all__)
 
 
 def test_settings_that_the_pipeline_names_are_there(capsys: pytest.CaptureFixture[str]):

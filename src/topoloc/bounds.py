@@ -1,8 +1,8 @@
-"""Settings and their bounds, which are declared beside the field: `Annotated[float, Above(0)]`.
+"""Declare the bounds of settings beside the fields: `Annotated[float, Above(0)]`.
 
-`check_bounds` holds what was made in Python, `parse_settings` what was read from a TOML file, a map
-or a stored model. Whatever its bounds, no number may be NaN or infinite, and no whole number that
-has bounds so large that it does not fit into 32 bits.
+`check_bounds` checks values set in Python. `parse_settings` checks values read from a TOML file, a
+map or a stored model. Numbers must be finite, whatever their bounds. A whole number with bounds
+must be at most 2^31 - 1.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ _MAX_INT32 = 2**31 - 1
 
 @dataclass(frozen=True)
 class Above:
-    """Greater than `limit`."""
+    """Require a number greater than `limit`."""
 
     limit: float | int
 
     def is_satisfied(self, number: float | int) -> bool:
+        """Return whether a number is greater than `limit`."""
         return number > self.limit
 
     def __str__(self) -> str:
@@ -39,11 +40,12 @@ class Above:
 
 @dataclass(frozen=True)
 class AtLeast:
-    """`limit` or greater."""
+    """Require a number of `limit` or greater."""
 
     limit: float | int
 
     def is_satisfied(self, number: float | int) -> bool:
+        """Return whether a number is `limit` or greater."""
         return number >= self.limit
 
     def __str__(self) -> str:
@@ -52,12 +54,13 @@ class AtLeast:
 
 @dataclass(frozen=True)
 class Between:
-    """From `least` to `most`, both included."""
+    """Require a number from `least` to `most`, both included."""
 
     least: float | int
     most: float | int
 
     def is_satisfied(self, number: float | int) -> bool:
+        """Return whether a number lies between the bounds or equals one of them."""
         return self.least <= number <= self.most
 
     def __str__(self) -> str:
@@ -68,14 +71,15 @@ Bound = Above | AtLeast | Between
 
 
 def check_bounds(config: Any, name: str | None = None) -> None:
-    """Hold that every value of a configuration (a dataclass, and those in it) is of its type and
-    within its bounds.
+    """Check that each value of a configuration dataclass has its declared type and lies within its
+    bounds. Nested dataclasses are checked too.
 
     Args:
-        name: what the configuration is called in the error; by default its class.
+        name: name of the configuration in the error. Default: its class.
 
     Raises:
-        ConfigError: one is not; the text begins with its key, `BuildConfig.nodes.d_thresh`.
+        ConfigError: a value is invalid. The text begins with its key, such as
+            `BuildConfig.nodes.d_thresh`.
     """
     name = type(config).__name__ if name is None else name
     for key, kind in field_annotations(type(config)).items():
@@ -94,32 +98,32 @@ def parse_settings(
     known: Collection[str] | None = None,
     is_strict: bool = True,
 ) -> T:
-    """The dataclass `of` from the nested values of a TOML or JSON file, each of its type and within
-    its bounds.
+    """Create the dataclass `of` from the nested values of a TOML or JSON file. Types and bounds are
+    checked.
 
     Args:
-        key: what `data` is called in errors.
-        default: what keeps its value where `data` has none; by default that of the class.
-        known: the keys that are proposed instead of one that there is not; by default those of
+        key: name of `data` in errors.
+        default: source of the values that `data` does not contain. Default: the defaults of the
+            class.
+        known: keys among which a similar one is suggested for an unknown key. Default: the keys of
             `of`.
-        is_strict: such a key is an error; else it is left out.
+        is_strict: raise an error for an unknown key instead of ignoring it.
 
     Raises:
-        ConfigError: a key that there is not or that is missing, or a value that cannot be; names
-            the key.
+        ConfigError: a key is unknown or missing, or a value is invalid. The text names the key.
     """
     if not isinstance(data, dict):
         raise ConfigError(f"{key}: a table is expected, [{key}]")
     kinds, known = field_annotations(of), known or list(iter_keys(of, key))
     values = {name: getattr(default, name) for name in kinds} if default is not None else {}
     for name, value in data.items():
-        its_key = f"{key}.{quote_key(name)}"
+        full_key = f"{key}.{quote_key(name)}"
         if name in kinds:
             values[name] = parse_value(
-                kinds[name], value, its_key, values.get(name), known, is_strict
+                kinds[name], value, full_key, values.get(name), known, is_strict
             )
         elif is_strict:
-            raise ConfigError(f"{its_key}: no such setting{suggest_name(its_key, known)}")
+            raise ConfigError(f"{full_key}: no such setting{suggest_name(full_key, known)}")
     required = (
         field.name
         for field in fields(of)  # pyright: ignore[reportArgumentType]
@@ -141,7 +145,8 @@ def parse_value(
     known: Collection[str] | None = None,
     is_strict: bool = True,
 ) -> Any:
-    """One value as its annotation says; arguments and errors as of `parse_settings`."""
+    """Convert one value to its annotated type and check it. Arguments and errors are those of
+    `parse_settings`."""
     plain, may_be_none = strip_annotation(kind)
     if is_dataclass(plain) and not (value is None and may_be_none):
         return parse_settings(plain, value, key, default, known, is_strict)  # pyright: ignore[reportArgumentType]
@@ -152,7 +157,7 @@ def parse_value(
 
 
 def iter_keys(kind: Any, key: str) -> Iterator[str]:
-    """The keys of a dataclass that is called `key`, and of those in it."""
+    """Yield the keys of a dataclass named `key`, and the keys of its nested dataclasses."""
     for name, declared in field_annotations(kind).items():
         yield f"{key}.{name}"
         if is_dataclass(plain := strip_annotation(declared)[0]):
@@ -160,13 +165,13 @@ def iter_keys(kind: Any, key: str) -> Iterator[str]:
 
 
 def suggest_name(name: str, names: Collection[str]) -> str:
-    """The end of an error about a name that there is not."""
+    """Return the end of an error about an unknown name: the most similar known name, if any."""
     near = get_close_matches(name[:100], names, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def quote_key(name: Any) -> str:
-    """A key as it can stand in a line."""
+    """Return a key in a form that fits into a line: as it is, or quoted and shortened."""
     return (
         name
         if re.fullmatch(r"[\w-]{1,60}", name)
@@ -176,13 +181,14 @@ def quote_key(name: Any) -> str:
 
 @cache
 def field_annotations(kind: type) -> dict[str, Any]:
-    """The fields of a dataclass, in their order, with what they are declared as, bounds and all."""
+    """Return the annotation of each field of a dataclass, bounds included, in the order of the
+    fields."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in fields(kind)}
 
 
 def field_bounds(kind: Any) -> list[Bound]:
-    """What an annotation says beside the type."""
+    """Return the bounds in an annotation."""
     return (
         [extra for extra in get_args(kind)[1:] if isinstance(extra, Bound)]
         if get_origin(kind) is Annotated
@@ -191,7 +197,7 @@ def field_bounds(kind: Any) -> list[Bound]:
 
 
 def strip_annotation(kind: Any) -> tuple[Any, bool]:
-    """The type that an annotation names, without bounds and None, and whether None is allowed."""
+    """Return the type in an annotation without its bounds and None, and whether None is allowed."""
     if get_origin(kind) is Annotated:
         kind = get_args(kind)[0]
     if get_origin(kind) in (Union, UnionType):
@@ -201,8 +207,8 @@ def strip_annotation(kind: Any) -> tuple[Any, bool]:
 
 
 def find_violation(value: Any, kind: Any) -> str | None:
-    """Why `value` cannot be that of a field declared as `kind`; None where it can. What is in a
-    nested dataclass is not looked at."""
+    """Return why `value` is invalid for a field declared as `kind`, or None if it is valid. The
+    fields of a nested dataclass are not checked."""
     plain, may_be_none = strip_annotation(kind)
     if value is None and may_be_none:
         return None
@@ -220,7 +226,8 @@ def find_violation(value: Any, kind: Any) -> str | None:
 
 
 def _convert_to_declared(value: Any, plain: Any) -> Any:
-    """What files know no type for: lists that are tuples, whole numbers where any will do."""
+    """Convert types that TOML and JSON lack: lists to tuples, and whole numbers to floats if a
+    float is declared."""
     if get_origin(plain) is tuple and isinstance(value, list):
         items = get_args(plain)
         kinds = [items[0]] * len(value) if items[-1] is ... else [*items, *[None] * len(value)]
@@ -229,7 +236,7 @@ def _convert_to_declared(value: Any, plain: Any) -> Any:
 
 
 def describe_type(plain: Any) -> str:
-    """A bare type, for people."""
+    """Return a readable description of a type."""
     if get_origin(plain) is Literal:
         return "one of " + ", ".join(get_args(plain))
     if get_origin(plain) is tuple:
@@ -276,7 +283,7 @@ def _is_finite(number: float | int) -> bool:
 
 
 def _iter_numbers(value: Any) -> Iterator[Any]:
-    """The numbers in a value; those of numpy as Python's."""
+    """Yield the numbers in a value. NumPy numbers are converted to Python's."""
     if isinstance(value, tuple):
         for item in value:
             yield from _iter_numbers(item)

@@ -1,9 +1,10 @@
-"""Functions compiled by Numba, where their machine code is kept, and how many threads run them.
+"""Compile functions with Numba, cache their machine code, and set the number of threads.
 
-Numba itself refuses, as a module is imported, to compile for a folder that cannot be written, and
-reads no code from one. A container's image is often both: filled as it is built, read-only
-afterwards. Here code is read from wherever it lies and kept where it can be; where that is nowhere,
-it is compiled anew in every process, and one line on stderr says what to do.
+Numba's own cache raises an error at import if the cache folder cannot be written. It also reads no
+code from such a folder. A container's image is often filled while it is built and read-only
+afterwards. Therefore this cache reads code from any folder that has it and writes to the first
+writable one. If no folder is writable, each process compiles again, and one line on stderr suggests
+a remedy.
 """
 
 from __future__ import annotations
@@ -25,18 +26,21 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 _DEFAULT_NUM_THREADS = 2
 
 KERNELS: list[Any] = []
-"""All that were declared by now."""
+"""All kernels declared so far."""
 _configured: list[int] = []
 _thread_local = threading.local()
 _warned_folders: list[str] = []
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorates a function that Numba compiles; `options` are those of `numba.njit`.
+    """Return a decorator that compiles a function with Numba. `options` are those of `numba.njit`.
 
-    It releases the GIL and its machine code is kept. It is never `parallel`: Numba's own threads
-    may be used by one thread of Python alone, while a `Localizer` is shared by several.
-    `features/bands.py` shares rows out to threads instead.
+    A kernel releases the GIL, and its machine code is cached. The option `parallel` is not allowed:
+    only one Python thread may use Numba's own threads, but several threads may share a `Localizer`.
+    `features/parallel.py` distributes rows over threads instead.
+
+    Raises:
+        ValueError: `parallel` is among the options.
     """
     if "parallel" in options:
         raise ValueError("a kernel that several threads call cannot be parallel")
@@ -51,20 +55,22 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def is_cached(compiled: Any) -> bool:
-    """Whether machine code of this kernel lies somewhere, so that its first call takes no time to
-    speak of."""
+    """Return whether the machine code of this kernel is cached, so that its first call compiles
+    nothing."""
     return compiled._cache.is_cached
 
 
 def set_num_threads(number: int) -> None:
-    """At most so many threads work on one query or one frame; while a map is made, each on a
-    mapping image or a node of its own.
+    """Set the maximum number of threads for one query or one frame.
 
-    Unless it is said these are 2, and 1 for the networks of learned coarse localizers. The answers
-    do not depend on it, but for the last digits of such a network's scores. Holds for topoloc in
-    this process and for the libraries that it calls: OpenCV, FAISS, and PyTorch where it is loaded.
-    Of several threads that share a `Localizer`, each uses as many. NumPy's own number is set before
-    it is loaded (`OPENBLAS_NUM_THREADS`; the command line sets 1 where it is not set).
+    While a map is built, each thread processes a mapping image or a node of its own. The default is
+    2 threads, and 1 for the networks of learned coarse localizers. Results do not depend on the
+    number, except for the last digits of the scores of such a network.
+
+    The number holds for topoloc in this process and for OpenCV, FAISS and PyTorch (if it is
+    loaded). If several threads share a `Localizer`, each of them uses this number. NumPy's number
+    of threads must be set before NumPy is loaded, by `OPENBLAS_NUM_THREADS`. The command line sets
+    it to 1 if it is unset.
 
     Raises:
         ValueError: `number` is below 1.
@@ -82,26 +88,20 @@ def set_num_threads(number: int) -> None:
 
 
 def num_threads(default: int = _DEFAULT_NUM_THREADS) -> int:
-    """As `set_num_threads` said, `default` where it was not called; 1 in a thread that is one of
-    several already."""
-    return (
-        1
-        if hasattr(_thread_local, "is_one_of_several")
-        else _configured[0]
-        if _configured
-        else default
-    )
+    """Return the number set by `set_num_threads`, or `default` if it was not called. In a worker
+    thread the number is 1."""
+    return 1 if hasattr(_thread_local, "is_worker") else _configured[0] if _configured else default
 
 
 def mark_worker_thread() -> None:
-    """From now on this thread of Python starts no others: they are all at work on items of their
-    own (`features/bands.py`)."""
-    _thread_local.is_one_of_several = True
+    """Mark this Python thread as one of several workers, so that it starts no further threads
+    (`features/parallel.py`)."""
+    _thread_local.is_worker = True
 
 
 class _KernelCache(NullCache):
-    """The machine code of one function, as Numba asks for it: read from the first folder that has
-    it, kept in the first that takes it."""
+    """Cache the machine code of one function behind Numba's cache interface. Code is read from the
+    first folder that has it and written to the first writable folder."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._caches = [
@@ -123,7 +123,7 @@ class _KernelCache(NullCache):
                 found = folder.load_overload(sig, target_context)
             except OSError:
                 continue
-            except Exception:  # damaged: what unpickling raises then is anybody's guess
+            except Exception:  # a damaged file: unpickling may raise any exception
                 with contextlib.suppress(OSError):
                     folder.flush()
                 continue
@@ -144,7 +144,7 @@ class _KernelCache(NullCache):
 
 
 class _FolderCache(FunctionCache):
-    """Numba's cache in a folder of our choice."""
+    """Run Numba's cache in a given folder."""
 
     def __init__(self, function: Callable[..., Any], folder: str) -> None:
         self._impl_class = type(
@@ -156,15 +156,15 @@ class _FolderCache(FunctionCache):
 
     @property
     def is_cached(self) -> bool:
-        """Whether there is code of the function as it is now."""
+        """Return whether code of the current version of the function exists."""
         try:
             return bool(self._cache_file._load_index())
-        except Exception:  # damaged: what unpickling raises then is anybody's guess
+        except Exception:  # a damaged file: unpickling may raise any exception
             return False
 
 
 class _CacheLocator:
-    """What Numba calls a locator: the folder of a function's code, and what the code is of."""
+    """Implement Numba's locator: the folder of a function's code and the stamp of its source."""
 
     def __init__(self, function: Callable[..., Any], folder: str) -> None:
         self._function, self._folder = function, folder
@@ -188,19 +188,20 @@ class _CacheLocator:
 
 @cache
 def _cache_folders(source: str) -> list[str]:
-    """Where code of functions from the folder `source` may lie: `NUMBA_CACHE_DIR` if that is set,
-    else beside them or the user's own."""
-    apart = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    """Return the folders for the code of functions from the folder `source`. This is
+    `NUMBA_CACHE_DIR` if it is set. Otherwise it is `__pycache__` beside the functions, then the
+    user's cache folder."""
+    subfolder = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     if named := config.CACHE_DIR:  # pyright: ignore[reportAttributeAccessIssue]
-        return [os.path.join(named, apart)]
+        return [os.path.join(named, subfolder)]
     folders = [os.path.join(source, "__pycache__")]
-    with contextlib.suppress(RuntimeError):  # nobody knows a home
+    with contextlib.suppress(RuntimeError):  # the user has no home folder
         folders.append(
             str(
                 Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
                 / "topoloc"
                 / "kernels"
-                / apart
+                / subfolder
             )
         )
     return folders
@@ -208,13 +209,13 @@ def _cache_folders(source: str) -> list[str]:
 
 @cache
 def _source_digest(file: str) -> str:
-    """Of a file and of all kernels beside it, since they call each other."""
+    """Return the digest of a file and of all kernels beside it, because these call each other."""
     files = {Path(file), *Path(file).parent.glob("*_kernels.py")}
     return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(files))).hexdigest()
 
 
 def _warn_not_cached(folders: str) -> None:
-    """Once a process."""
+    """Print the warning once per process."""
     if _warned_folders:
         return
     _warned_folders.append(folders)

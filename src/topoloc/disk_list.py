@@ -1,5 +1,5 @@
-"""A long list in the making whose entries lie on disk, but for those used last: what a map of any
-length is built with."""
+"""Hold a long list with only the entries used last in memory. Maps of any length are built with
+it."""
 
 from __future__ import annotations
 
@@ -21,23 +21,25 @@ from topoloc.errors import TopolocError
 T = TypeVar("T")
 
 DEFAULT_MAX_BYTES = 64_000_000
-"""Of each shelf, where nobody says."""
+"""Default memory budget of each list, bytes."""
 
 
 class DiskList(Sequence[T]):
-    """Entries that stay in memory up to a number of bytes; those used longest ago lie in a
-    temporary file, which ends with this process.
+    """Hold entries in memory up to a number of bytes. The entries used longest ago are moved to a
+    temporary file, which is deleted when the process ends.
 
-    An entry that was changed has to be put back (``shelf[row] = entry``), or the change may be
-    lost. Threads may share a shelf. It is pickled as a list.
+    A changed entry must be assigned again (``entries[row] = entry``), otherwise the change may be
+    lost. Threads may share a list. It is pickled as a plain list.
 
     Args:
-        by_reference: objects that stay in memory in any case; entries that refer to them refer to
-            these same objects when they come back.
+        entries: first entries of the list.
+        max_bytes: memory budget. Default: `DEFAULT_MAX_BYTES`.
+        shared_objects: objects that always stay in memory. Entries that refer to one of them refer
+            to the same object after they are read back.
 
     Raises:
-        TopolocError: the folder of temporary files has no room left; from whatever adds entries or
-            looks at them.
+        TopolocError: the folder of temporary files is full. Any method that reads or adds entries
+            may raise it.
     """
 
     def __init__(
@@ -49,7 +51,7 @@ class DiskList(Sequence[T]):
         self._lock = threading.RLock()
         self._cache: OrderedDict[int, tuple[T, int, bool]] = (
             OrderedDict()
-        )  # by row: entry, bytes, whether the file has it as it is
+        )  # by row: entry, bytes, whether the file holds its current state
         self._length, self._num_bytes, self._max_bytes = (
             0,
             0,
@@ -64,6 +66,7 @@ class DiskList(Sequence[T]):
             self.append(entry)
 
     def append(self, entry: T) -> None:
+        """Add an entry at the end."""
         with self._lock:
             self._length += 1
             self._cache_entry(self._length - 1, entry, False)
@@ -103,8 +106,8 @@ class DiskList(Sequence[T]):
         return row
 
     def _cache_entry(self, row: int, entry: T, is_written: bool) -> None:
-        """In memory, as the entry used last; others give way. An entry beyond the whole budget is
-        written at once."""
+        """Put an entry into memory as the one used last, and evict the oldest entries beyond the
+        budget. An entry larger than the whole budget is written at once."""
         if row in self._cache:
             self._num_bytes -= self._cache.pop(row)[1]
         size = bytes_of(entry, self._reference_ids)
@@ -119,7 +122,7 @@ class DiskList(Sequence[T]):
     def _write(self, row: int, entry: T) -> None:
         with self._convert_disk_errors():
             if self._database is None:
-                # an empty name is a file of nobody else's, gone when it is closed
+                # an empty name creates a private file, deleted when it is closed
                 self._database = sqlite3.connect("", isolation_level=None, check_same_thread=False)
                 for pragma in ("journal_mode = OFF", "synchronous = OFF"):
                     self._database.execute(f"PRAGMA {pragma}")
@@ -169,30 +172,30 @@ class _Unpickler(pickle.Unpickler):
         return self._shared_objects[pid]
 
 
-def bytes_of(value: Any, apart: Container[int] = ()) -> int:
-    """Bytes of the arrays and byte strings in a value, its fields and items, those of mappings too;
-    objects of these `id` do not count."""
-    total, left = 0, [value]
+def bytes_of(value: Any, excluded_ids: Container[int] = ()) -> int:
+    """Return the bytes of the arrays and byte strings in a value, its fields, its items and the
+    values of its dicts. Objects whose `id` is in `excluded_ids` do not count."""
+    total, pending = 0, [value]
     while (
-        left
-    ):  # no recursion: a draft has hundreds of parts, and is counted whenever a picture has seen it
-        one = left.pop()
-        if id(one) in apart:
+        pending
+    ):  # no recursion: a node draft has hundreds of parts and is counted after each of its images
+        item = pending.pop()
+        if id(item) in excluded_ids:
             continue
-        if isinstance(one, np.ndarray):
-            total += one.nbytes
-        elif isinstance(one, bytes):
-            total += len(one)
-        elif isinstance(one, dict):
-            left.extend(one.values())
-        elif isinstance(one, list | tuple):
-            left.extend(one)
+        if isinstance(item, np.ndarray):
+            total += item.nbytes
+        elif isinstance(item, bytes):
+            total += len(item)
+        elif isinstance(item, dict):
+            pending.extend(item.values())
+        elif isinstance(item, list | tuple):
+            pending.extend(item)
         else:
-            left.extend([getattr(one, name) for name in _dataclass_fields(type(one))])
+            pending.extend([getattr(item, name) for name in _dataclass_fields(type(item))])
     return total
 
 
 @functools.cache
 def _dataclass_fields(kind: type) -> tuple[str, ...]:
-    """Of a dataclass; else none."""
+    """Return the field names of a dataclass, or none for any other class."""
     return tuple(kind.__dataclass_fields__) if is_dataclass(kind) else ()

@@ -1,118 +1,120 @@
-"""Known failures, one line each on the command line; anything else is a bug and shows its
-traceback.
+"""Define the known failures, which the command line prints as one line each. Any other exception is
+a bug and shows its traceback.
 
 TopolocError
-├── RecordingError        a recording (or one file of it) that cannot be read or makes no sense
+├── RecordingError            a recording, or one of its files, is unreadable or inconsistent
 │   ├── UnknownFormatError    no format recognises the folder
-│   ├── CalibrationError      no calibration, or one that is not usable
-│   └── UnreadableImageError  an image that is missing, empty, truncated or too large
-├── TrajectoryError       a trajectory file with NaN, bad rotations, or times that match no frame
-│   └── SessionKnownError     a recording that is in the map already
-├── MapError              a map that cannot be opened, read or written
-│   ├── MapVersionError       written by a later topoloc, schema unknown here
-│   ├── EmptyMapError         no node could be built, or the map holds none
-│   ├── UnknownMapError       no map of this name where maps are asked for by name
-│   └── AtlasError            an atlas that cannot be opened, read or written, or two tiles of one
-id │       └── StoreError            an object store that does not answer, or not in time ├──
-WeightsError          weights of a network that are missing, damaged or of another network ├──
-TrainingError         a training that cannot begin or go on: nothing to learn from, a loss that is
-not finite ├── ConfigError           a setting that is unknown, of the wrong type or out of its
-bounds; names the key ├── QueryError            the call of a query is wrong (no camera, camera of
-another image size) ├── ResultError           a result (a JSON line) that is none ├──
-GeoreferenceError     no place on earth, or points that do not say where a map lies on it ├──
-FeatureKindError      features of a kind that there is not, or whose fitted weights are damaged ├──
-ClusterError          a cluster that does not answer, or is of another version ├── ServiceError
-a service that does not answer, or refuses └── MissingExtraError     an optional dependency is not
-installed; names the extra
+│   ├── CalibrationError      the calibration is missing or not usable
+│   └── UnreadableImageError  an image is missing, empty, truncated or too large
+├── TrajectoryError           a trajectory has NaN, bad rotations, or times that match no frame
+│   └── DuplicateSessionError a recording is already in the map
+├── MapError                  a map cannot be opened, read or written
+│   ├── MapVersionError       a later topoloc wrote the map, with an unknown schema
+│   ├── EmptyMapError         no node could be built, or the map has none
+│   ├── MapNotFoundError      no map has the given name
+│   └── AtlasError            an atlas cannot be opened, read or written, or a tile is refused
+│       └── ObjectStoreError  an object store does not answer, or its files cannot be stored here
+├── WeightsError              weights are missing, damaged or of another network
+├── TrainingError             a training cannot start or continue (no data, loss not finite)
+├── ConfigError               a setting is unknown, of the wrong type or out of bounds
+├── QueryError                a query is invalid (no camera, camera of another image size)
+├── ResultError               a JSON line is not a result
+├── GeoreferenceError         no place on earth, or points that fix no georeference
+├── FeatureTypeError          a feature type is unknown, or its fitted weights are damaged
+├── ServiceError              a service does not answer, or refuses the request
+├── ClusterError              a cluster does not answer, or has another version
+└── MissingExtraError         an optional dependency is not installed
 """
 
 
 class TopolocError(Exception):
-    """A failure that the user can understand and mend: its text is one line, saying what and
-    where."""
+    """Report a failure that the user can understand and fix. The text is one line with the problem
+    and its place."""
 
 
 class RecordingError(TopolocError):
-    """A recording that cannot be read."""
+    """Report a recording that cannot be read."""
 
 
 class UnknownFormatError(RecordingError):
-    """No known format recognises this path."""
+    """Report a path that no known format recognises."""
 
 
 class CalibrationError(RecordingError):
-    """Missing or unusable calibration."""
+    """Report a missing or unusable calibration."""
 
 
 class UnreadableImageError(RecordingError):
-    """An image file that is missing, empty, truncated, too large or no image at all."""
+    """Report an image file that is missing, empty, truncated, too large or not an image."""
 
 
 class TrajectoryError(TopolocError):
-    """A trajectory that is malformed or fits no frame of the recording."""
+    """Report a trajectory that is malformed or matches no frame of the recording."""
 
 
 class DuplicateSessionError(TrajectoryError):
-    """A recording that is to join a map and is in it already."""
+    """Report that a recording to be added to a map is already in it."""
 
 
 class MapError(TopolocError):
-    """A map file that cannot be opened, read or written."""
+    """Report a map file that cannot be opened, read or written."""
 
 
 class MapVersionError(MapError):
-    """A map file of a schema that this version does not know."""
+    """Report a map file whose schema this version does not support."""
 
 
 class EmptyMapError(MapError):
-    """A map without a single usable node."""
+    """Report a map without a usable node."""
 
 
 class MapNotFoundError(MapError):
-    """No map of this name."""
+    """Report that no map has the given name."""
 
 
 class AtlasError(MapError):
-    """An atlas that cannot be opened, read or written, or a tile that it cannot take."""
+    """Report an atlas that cannot be opened, read or written, or a tile that it cannot accept."""
 
 
 class ObjectStoreError(AtlasError):
-    """An object store that does not answer, or whose files cannot be kept here: nothing is said of
-    what they hold, and later it may go."""
+    """Report an object store that does not answer, or whose files cannot be stored on this machine.
+    The content of the files is not at fault, and a later attempt may succeed."""
 
 
 class WeightsError(TopolocError):
-    """Weights of a network that are missing, damaged, or those of another network."""
+    """Report network weights that are missing, damaged, or belong to another network."""
 
 
 class TrainingError(TopolocError):
-    """A training that cannot begin or go on."""
+    """Report a training that cannot start or continue."""
 
 
 class ConfigError(TopolocError):
-    """A setting that is unknown, of the wrong type or out of its bounds; the text names its key."""
+    """Report a setting that is unknown, of the wrong type or out of its bounds. The text names its
+    key."""
 
 
 class QueryError(TopolocError):
-    """A query that cannot be asked: no camera, or a camera of another image size."""
+    """Report an invalid query: it has no camera, or a camera of another image size."""
 
 
 class ResultError(TopolocError):
-    """A JSON line that is no result of a query."""
+    """Report a JSON line that is not the result of a query."""
 
 
 class GeoreferenceError(TopolocError):
-    """A place that is none on earth, or points that do not determine where a map lies."""
+    """Report a place that is not on earth, or points that do not determine the place of a map on
+    it."""
 
 
 class FeatureTypeError(TopolocError):
-    """Features of an unknown kind, or fitted weights that cannot be read; the text names the kinds
+    """Report an unknown feature type or unreadable fitted weights. The text names the feature types
     or the file."""
 
 
 class ServiceError(TopolocError):
-    """A service that does not answer, or refuses; `status` is its HTTP status, None where there was
-    no answer."""
+    """Report a service that does not answer or that refuses a request. `status` is its HTTP status,
+    or None without an answer."""
 
     def __init__(self, text: str, status: int | None = None) -> None:
         super().__init__(text)
@@ -120,8 +122,8 @@ class ServiceError(TopolocError):
 
 
 class ClusterError(TopolocError):
-    """A cluster that does not answer, is none, or is of another version."""
+    """Report a cluster that does not answer, is not a cluster, or has another version."""
 
 
 class MissingExtraError(TopolocError):
-    """An optional dependency is missing; the text names the extra that brings it."""
+    """Report a missing optional dependency. The text names the extra that installs it."""

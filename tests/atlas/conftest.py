@@ -3,29 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
-from uuid import uuid4
 
 import pytest
 
+from atlas_fixtures import *  # noqa: F403
 from topoloc.atlas.editing import create_atlas, new_tiles
-from topoloc.localization.map_facts.map_building import build_map
-from topoloc.mapping.build import BuildConfig
-from topoloc.recordings.open import open_sequence
-
-
-@pytest.fixture(scope="session")
-def other_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map of another room, of half as many pairs."""
-    from tiny_world import write_stereo_recording
-
-    folder = tmp_path_factory.mktemp("other")
-    recording = write_stereo_recording(folder / "other", seed=1, indices=[0.0, 2.0, 4.0, 6.0])
-    build_map(open_sequence(str(recording)), BuildConfig(other_kinds=())).save(
-        folder / "other.topo"
-    )
-    return folder / "other.topo"
 
 
 @pytest.fixture(scope="session")
@@ -40,39 +23,3 @@ def atlas(room_map: Path, other_map: Path, tmp_path_factory: pytest.TempPathFact
 def own_atlas(atlas: Path, tmp_path: Path) -> Path:
     """A copy that may be written to."""
     return Path(shutil.copytree(atlas, tmp_path / "campus"))
-
-
-@pytest.fixture(scope="session")
-def s3_server() -> Iterator[str]:
-    """The address of moto's server, which speaks the API of Amazon S3, on this machine."""
-    for needed in ("s3fs", "moto", "flask", "flask_cors"):
-        pytest.importorskip(
-            needed,
-            reason="an S3 server to test on needs: pip install s3fs 'moto[s3]' flask flask-cors",
-        )
-    from moto.server import ThreadedMotoServer  # pyright: ignore[reportMissingImports]
-
-    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{host}:{port}"
-    server.stop()
-
-
-@pytest.fixture
-def s3_bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
-    """A new bucket, `s3://...`; files that are read of it are kept in a folder of the test."""
-    import s3fs  # pyright: ignore[reportMissingImports]
-
-    said = {"AWS_ENDPOINT_URL": s3_server, "AWS_DEFAULT_REGION": "us-east-1"}
-    said |= {
-        "AWS_ACCESS_KEY_ID": "tests",
-        "AWS_SECRET_ACCESS_KEY": "tests",
-        "TOPOLOC_CACHE": str(tmp_path / "cache"),
-    }
-    for name, value in said.items():
-        monkeypatch.setenv(name, value)
-    s3fs.S3FileSystem.clear_instance_cache()
-    name = f"atlas-{uuid4().hex}"
-    s3fs.S3FileSystem().mkdir(name)
-    return f"s3://{name}"

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topoloc.geometry.calibration_check import IntrinsicsDeviation
 from topoloc.geometry.calibration_consistency import (
     MIN_IMAGES,
     MIN_PLACES,
     check_calibration_consistency,
 )
+from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 
 CAMERA = Camera.pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)

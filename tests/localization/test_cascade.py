@@ -18,11 +18,11 @@ from room_stream import room_stream
 from tiny_network import write_network
 from tiny_world import CAMERA
 from topoloc.errors import FeatureTypeError, WeightsError
-from topoloc.features.dense import DenseDescriptors, SingleLevelDescriptors
+from topoloc.features.dense import GridDescriptors, SingleLevelDescriptors
 from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig
 from topoloc.features.features import Features
 from topoloc.geometry.alignment import translation_error
-from topoloc.geometry.calibration_check import CalibrationMismatch, IntrinsicsDeviation
+from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.image_calibration_check import check_image_calibration
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -201,8 +201,8 @@ def test_dense_descriptors_tell_what_is_found_of_what_must_be_in_view(
 ):
     changed("surf", _useless)
     monkeypatch.setattr(
-        DenseDescriptors,
-        "agrees",
+        GridDescriptors,
+        "check_agreement",
         lambda dense, points_img, descriptors: np.full(len(points_img), agrees),
     )
     changed(

@@ -137,7 +137,7 @@ def test_the_number_of_threads_changes_no_byte(
     tiny_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     for number in (1, 3):
-        monkeypatch.setattr("topoloc.compiled._chosen", [number])
+        monkeypatch.setattr("topoloc.compiled._configured", [number])
         topoloc.build_map(topoloc.open_sequence(f"{tiny_recording}@0::2")).save(
             tmp_path / f"{number}.topo"
         )

@@ -45,14 +45,14 @@ def test_a_loaded_map_can_be_saved_again_also_over_itself(saved: Path):
 
 QUERIES_OF_OPENING = """
 import sqlite3, sys
-from topoloc.mapping import file
+from topoloc.mapping import map_file
 from topoloc.mapping.topomap import TopoMetricMap
 connect, asked = sqlite3.connect, []
 def traced(*args, **kwargs):
     database = connect(*args, **kwargs)
     database.set_trace_callback(asked.append)
     return database
-file.sqlite3.connect = traced
+map_file.sqlite3.connect = traced
 topomap = TopoMetricMap.load(sys.argv[1])
 print(asked)
 len(topomap.summaries), topomap.nodes[0]

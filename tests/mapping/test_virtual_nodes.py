@@ -262,14 +262,14 @@ def test_a_loaded_map_keeps_its_sides_when_it_is_saved_again(
 
 QUERIES_OF_OPENING = """
 import sqlite3, sys
-from topoloc.mapping import file
+from topoloc.mapping import map_file
 from topoloc.mapping.topomap import TopoMetricMap
 connect, asked = sqlite3.connect, []
 def traced(*args, **kwargs):
     database = connect(*args, **kwargs)
     database.set_trace_callback(asked.append)
     return database
-file.sqlite3.connect = traced
+map_file.sqlite3.connect = traced
 topomap = TopoMetricMap.load(sys.argv[1])
 print(asked)
 topomap.sides.nodes[1]

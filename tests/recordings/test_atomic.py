@@ -67,7 +67,7 @@ def test_threads_and_processes_that_write_one_file_leave_a_whole_one(tmp_path: P
     assert list(tmp_path.iterdir()) == [path]
 
 
-def begun(path: Path, by: str = "replaced_file") -> tuple[subprocess.Popen[str], Path]:
+def begun(path: Path, by: str = "atomic_write") -> tuple[subprocess.Popen[str], Path]:
     """A process in the middle of writing, and what it writes to."""
     child = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(path), by],
@@ -134,7 +134,7 @@ def test_what_is_tried_out_beside_a_file_goes_also_when_its_process_was_killed(t
         write_bytes(path, b"new")
         assert scratch.read_bytes() == b"tried", "a living process's stays"
     assert list(tmp_path.iterdir()) == [path]
-    killed, left = begun(path, "scratch_file")
+    killed, left = begun(path, "temporary_file")
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
     assert left.is_file()

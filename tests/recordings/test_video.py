@@ -135,7 +135,7 @@ class _Clock:
 def test_a_clock_that_does_not_advance_is_an_error_with_the_frame(
     film: Path, milliseconds: list[float], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(video, "_open", lambda _: _Clock(milliseconds))
+    monkeypatch.setattr(video, "_open_capture", lambda _: _Clock(milliseconds))
     with pytest.raises(
         RecordingError, match=r"frame 2: at 0\.0\d0 s, but the frame before is at 0\.040 s"
     ):
@@ -143,9 +143,9 @@ def test_a_clock_that_does_not_advance_is_an_error_with_the_frame(
 
 
 def test_a_container_without_times_goes_by_its_rate(film: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(video, "_open", lambda _: _Clock([0.0, 0.0, 0.0]))
+    monkeypatch.setattr(video, "_open_capture", lambda _: _Clock([0.0, 0.0, 0.0]))
     assert video._read_times(film, 50.0) == [0, 20_000_000, 40_000_000]
-    monkeypatch.setattr(video, "_open", lambda _: _Clock([0.0, 0.0, 0.0]))
+    monkeypatch.setattr(video, "_open_capture", lambda _: _Clock([0.0, 0.0, 0.0]))
     with pytest.raises(RecordingError, match="rate"):
         video._read_times(film, 0.0)
 
@@ -168,7 +168,7 @@ def test_a_frame_of_another_resolution_is_unreadable_alone(
         def retrieve(self) -> tuple[bool, np.ndarray]:
             return True, np.zeros((96, 128, 3) if self.number >= 2 else (48, 64, 3), np.uint8)
 
-    monkeypatch.setattr(video, "_open", lambda _: Larger())
+    monkeypatch.setattr(video, "_open_capture", lambda _: Larger())
     assert sequence[1].image.shape == (48, 64, 3)
     with pytest.raises(
         UnreadableImageError, match=r"128x96 pixels, but the first frame is of 64x48"

@@ -60,14 +60,14 @@ def test_the_right_picture_is_seen_from_a_baseline_further_right(shooting: Shoot
 def test_frames_are_the_same_in_any_order_and_no_two_share_their_noise(shooting: Shooting):
     noisy = replace(shooting, sensor=SensorConfig(white_balance_error=0.0, vignetting=0.0))
     later_first = [shoot(noisy, index) for index in (3, 2)]
-    parallel_map = [shoot(noisy, index) for index in (2, 3)]
-    assert np.array_equal(later_first[1].left, parallel_map[0].left)
-    assert np.array_equal(later_first[0].left, parallel_map[1].left)
+    in_order = [shoot(noisy, index) for index in (2, 3)]
+    assert np.array_equal(later_first[1].left, in_order[0].left)
+    assert np.array_equal(later_first[0].left, in_order[1].left)
     assert isinstance(noisy.renderer, StripedWall)
     assert len(set(noisy.renderer.seeds)) == 4, "two frames of two pictures"
-    assert parallel_map[0].right is not None
+    assert in_order[0].right is not None
     noise = [picture.astype(int) - quiet for picture, quiet in zip(
-        (parallel_map[0].left, parallel_map[0].right), (shoot(shooting, 2).left, shoot(shooting, 2).right), strict=True  # noqa: E501
+        (in_order[0].left, in_order[0].right), (shoot(shooting, 2).left, shoot(shooting, 2).right), strict=True  # noqa: E501
     )]  # fmt: skip
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.3
 

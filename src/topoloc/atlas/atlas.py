@@ -1,5 +1,4 @@
-"""An atlas read: its manifest as it was at that moment, the files that it names, and the index over
-all its places."""
+"""Open an atlas for reading: a snapshot of its manifest, its files, and the index of all nodes."""
 
 from __future__ import annotations
 
@@ -17,39 +16,49 @@ from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of
 from topoloc.errors import AtlasError
 
 _OBJECT_STORES = "topoloc.apps.stores.object_store"
-"""The module of `ObjectStore`. A string: fsspec is an extra, and stores are an app."""
+"""Module of `ObjectStore`. It is imported by name, because fsspec is an optional extra and the
+module belongs to the apps."""
 
 
 def store_at(where: str) -> Store:
-    """The folder, or the object store, that an atlas lies in. Raises AtlasError,
-    MissingExtraError."""
+    """Return the store of an atlas: a folder, or an object store if the address contains `://`.
+
+    Raises:
+        AtlasError: the store cannot be opened.
+        MissingExtraError: the extra for object stores is not installed.
+    """
     if "://" in where:
         return importlib.import_module(_OBJECT_STORES).ObjectStore(where)
     return FolderStore(Path(where))
 
 
 def is_atlas(where: str) -> bool:
-    """Is this an atlas, and no map?"""
+    """Return whether the path or address is an atlas, not a map."""
     return "://" in where or os.path.isfile(Path(where) / MANIFEST)
 
 
 def absolute_address(where: str) -> str:
-    """Of an atlas, as it is found from any folder."""
+    """Return the address of an atlas as an absolute path, or unchanged for an object store."""
     return where if "://" in where else os.path.abspath(where)
 
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """An atlas as its manifest said when it was read; later writes are not seen. Tiles keep their
-    files while anybody may ask them."""
+    """Hold a snapshot of an atlas. Later writes do not change it.
+
+    The files of its tiles are kept for a while after they are replaced (`GRACE_S` in `editing.py`).
+    """
 
     store: Store
     manifest: Manifest
 
     @staticmethod
     def open(where: str) -> Atlas:
-        """Read the manifest of the atlas there. Raises AtlasError: there is none, or it is
-        damaged."""
+        """Read the manifest of an atlas.
+
+        Raises:
+            AtlasError: there is no atlas, or it is damaged.
+        """
         store = store_at(where)
         data = store.manifest()
         if data is None:
@@ -59,7 +68,11 @@ class Atlas:
         return Atlas(store, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}"))
 
     def tile(self, tile_id: str) -> Tile:
-        """Raises AtlasError where there is no such tile."""
+        """Return the tile with this id.
+
+        Raises:
+            AtlasError: there is no such tile.
+        """
         tile = self.manifest.by_id.get(tile_id)
         if tile is None:
             known = ", ".join(list(self.manifest.by_id)[:8]) or "none"
@@ -69,7 +82,11 @@ class Atlas:
         return tile
 
     def map_path(self, tile: Tile) -> Path:
-        """The tile's map file. Raises AtlasError where it is missing."""
+        """Return the local path of the tile's map file.
+
+        Raises:
+            AtlasError: the file is missing.
+        """
         return self.store.local_path(tile.map.name, tile.map.sha256)
 
     @cached_property
@@ -77,30 +94,34 @@ class Atlas:
         return open_index(self.manifest.tiles, self.places_of, index_folder(self.store.where))
 
     def places_of(self, tile: Tile) -> GlobalDescriptors:
-        """The place vectors of a tile's nodes. Raises AtlasError."""
+        """Return the global descriptors of a tile's nodes.
+
+        Raises:
+            AtlasError: the file is missing or damaged.
+        """
         return load_global_descriptors(
             self.store.local_path(tile.places.name, tile.places.sha256), tile.vocabularies
         )
 
     @property
     def problems(self) -> dict[str, str]:
-        """Why tiles cannot be ranked, by their ids; they are asked last."""
+        """Return the reason for each tile (by id) that cannot be ranked. These tiles are queried
+        last."""
         return self._opened.problems
 
     @property
     def notes(self) -> list[str]:
-        """What was wrong with the files of the index; it answers all the same."""
+        """Return problems with the index files. The index works without these files."""
         return self._opened.notes
 
     @property
     def index(self) -> AtlasIndex:
-        """Of all tiles whose place vectors can be had."""
+        """Return the index of all tiles with readable global descriptors."""
         return self._opened.index
 
 
 def tile_problem(atlas: Atlas, tile: Tile) -> str | None:
-    """What is wrong with the bytes of a tile's files; None where they are those that the manifest
-    names."""
+    """Return the problem with a tile's files, None if they match the manifest."""
     for stored in tile.files:
         try:
             path = atlas.store.local_path(stored.name, stored.sha256)

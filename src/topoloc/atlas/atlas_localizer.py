@@ -1,13 +1,14 @@
-"""Localizing a single image in an atlas: which tiles, in which order, until when.
+"""Localize a single image in an atlas: select tiles, order them, and decide when to stop.
 
-The picture's features are extracted once, whatever number of tiles asks for them. The index ranks
-the tiles (`index.py`) by the cheapest kind of features. A tile that leads by far is asked at once
-by all means (`localization/localizer.py`); else the likeliest are asked at a glance, by retrieval
-alone, until a pose is clear. Where none is, the next kind of features ranks them, and more are
-asked at a glance; the most promising ones by all means until one answers. Last, tiles that look as
-much like the picture as the one that answered must not vouch for a pose as well
-(`tile_results.py`): aliasing grows with the number of places. They are asked as look-alikes within
-a map are: one that agrees with far fewer of the picture's strongest features is left at that.
+The image's features are extracted once for all tiles. The index ranks the tiles (`index.py`) with
+the cheapest feature type. A tile with a large margin is searched exhaustively at once
+(`localization/localizer.py`). Otherwise the likeliest tiles are searched coarse only, by retrieval,
+until a pose is clear. If none is, the next feature type ranks the tiles and more are searched
+coarse only. The most promising ones are then searched exhaustively until one localizes the image.
+
+Last, similar tiles are checked for a rival pose (`tile_results.py`), because perceptual aliasing
+grows with the number of places. They are searched like similar places within a map. A tile is
+skipped if far fewer of the image's strongest features agree with it.
 """
 
 from __future__ import annotations
@@ -39,18 +40,17 @@ from topoloc.retrieval.coarse import Image
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 QueryMode = Literal["by all means", "at a glance", "as a rival"]
-"""How a tile is asked; as a rival of an answer, at a glance, and only where it may be one."""
+"""How a tile is searched: exhaustive, coarse only, or coarse only if it may rival a found pose."""
 
 
 class AtlasLocalizer:
-    """Answers from an atlas as it was when it was opened.
+    """Localize images in a snapshot of an atlas.
 
-    `problems` says of tiles that could not be asked why, by their ids; whoever is asked for them
-    goes on without.
+    `problems` maps the ids of unreadable tiles to the reasons. The other tiles are still searched.
 
     Args:
-        maps: opens the tiles and keeps those used last.
-        warn: told once of each tile that cannot be asked.
+        maps: opens the tiles and caches the most recently used ones.
+        warn: called once for each tile that cannot be searched.
 
     Raises:
         ConfigError: a setting is out of bounds.
@@ -80,14 +80,16 @@ class AtlasLocalizer:
         self._focal = max(tile.focal_px for tile in atlas.manifest.tiles)
 
     def near(self, near: LocationPrior | None, georeferenced_only: bool = False) -> AtlasLocalizer:
-        """One that asks only tiles in reach of where somebody knows the camera to be
-        (`location_prior.py`); a pose that is given is tried, too.
+        """Return a localizer that searches only tiles within a location prior
+        (`location_prior.py`).
+
+        If the prior holds a pose, it is used as the prior pose in these tiles.
 
         Args:
-            placed_only: only tiles that know where on earth they lie.
+            georeferenced_only: use only tiles with a known position on earth.
 
         Raises:
-            AtlasError: no tile is of the world that is named.
+            AtlasError: no tile belongs to the prior's world.
         """
         other = copy.copy(self)
         other._tiles_in_reach = tiles_in_reach(self.atlas.manifest, near, georeferenced_only)
@@ -105,20 +107,21 @@ class AtlasLocalizer:
         t_ns: int | None = None,
         tile_id: str | None = None,
     ) -> Localization | NotLocalized:
-        """Where was this image (grey or RGB, uint8) taken, and in which tile? As
-        `Localizer.localize`; the result's provenance names the tile, in whose world its pose is.
+        """Estimate the pose and the tile of an image (grey or RGB, uint8).
+
+        It works as `Localizer.localize`. The provenance of the result holds the tile. The pose is
+        in the world of that tile.
 
         Args:
-            prior: about where the camera is, in the world of the tile `tile_id`, which is then
-                asked alone.
-            max_ms: after so many milliseconds no further tile or hypothesis is sought, instead of
-                `config.max_ms`.
-            tile_id: only this tile is asked.
+            prior: approximate pose in the world of the tile `tile_id`, which must be given.
+            max_ms: time limit in milliseconds, instead of `config.max_ms`. No further tile or
+                hypothesis is tested after it.
+            tile_id: search only this tile.
 
         Raises:
-            QueryError: the image is no picture of 8 bits, or the camera is of another image size.
+            QueryError: the image is not an 8-bit image, or its size differs from the camera's.
             AtlasError: there is no such tile, a prior comes without one, or no tile can be read.
-            StoreError: the object store does not answer that holds a tile which must be asked.
+            ObjectStoreError: the object store of a required tile does not respond.
         """
         start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
         deadline = float("inf") if limit is None else start + limit / 1e3
@@ -147,25 +150,27 @@ class AtlasLocalizer:
         return result if t_ns is None else with_time(result, t_ns)
 
     def acquire_map(self, tile_id: str) -> CachedMap:
-        """The map of a tile, which stays open until it is given back. Raises AtlasError,
-        MapError."""
+        """Return the map of a tile. It stays open until `release_map`.
+
+        Raises:
+            AtlasError, MapError: the tile is unknown, or its map cannot be read.
+        """
         return self._maps.acquire_map(
             tile_id, self._maps.tile_path(self.atlas, self.atlas.tile(tile_id))
         )
 
     def release_map(self, opened: CachedMap) -> None:
-        """The map that was lent may be closed."""
+        """Release a map from `acquire_map`, so that it may be closed."""
         self._maps.release_map(opened)
 
     def named(
         self, result: Localization | NotLocalized, tile_id: str
     ) -> Localization | NotLocalized:
-        """What a tile's own map says, as the atlas says it: with the tile's name and its place in
-        the atlas, where that is known."""
+        """Return the result of a tile's own map with the tile's id and its pose in the atlas."""
         return self._with_geopose(with_tile(result, self.atlas.tile(tile_id)))
 
     def _with_geopose(self, result: Localization | NotLocalized) -> Localization | NotLocalized:
-        """With the geoposes of tiles that know through others where on earth they lie."""
+        """Add the geopose for tiles that are georeferenced only through other tiles."""
         manifest, tile_id = self.atlas.manifest, result.provenance.tile
         if isinstance(result, NotLocalized):
             alternatives = [self._georeference_alternative(one) for one in result.alternatives]
@@ -191,21 +196,19 @@ class AtlasLocalizer:
         return one if place is None else replace(one, geopose=place.geopose(one.world_from_cam))
 
     def with_provenance(self, result: NotLocalized, t_ns: int | None = None) -> NotLocalized:
-        """What is said of a picture that could not be asked, with its time (nanoseconds)."""
+        """Return the result of an image that was not searched, with its capture time
+        (nanoseconds)."""
         return result if t_ns is None else with_time(result, t_ns)
 
     def rank(self, query_image: QueryImage) -> TileRanking:
-        """The tiles that look most like the picture; behind them those whose places cannot be
-        ranked."""
+        """Return the tiles by similarity to the image, followed by those that cannot be ranked."""
         *_, ranking = self._rankings(query_image, StageClock())
         return ranking
 
     def _rankings(self, query_image: QueryImage, clock: StageClock) -> Iterator[TileRanking]:
-        """As `rank`, by the cheapest kind of features; then by the next as well, until a tile
-        leads."""
-        sizes = (
-            LocalizerConfig()
-        )  # those that tiles reduce a picture by, so that they find its features extracted
+        """Generate rankings with one feature type after another, until one tile has a clear
+        margin."""
+        sizes = LocalizerConfig()  # the same reduction as in tiles, so they reuse the features
         image, reduced_camera = reduce_image(
             query_image.image, query_image.camera, self._focal, sizes.max_finer, sizes.max_side_px
         )
@@ -241,14 +244,13 @@ class AtlasLocalizer:
 
     @cached_property
     def _ranking_feature_types(self) -> list[str]:
-        """The kinds of features that tiles can be ranked by and that can be had here, the cheapest
-        first."""
+        """Return the available feature types that can rank tiles, cheapest first."""
         return [
             kind for kind in FEATURE_TYPES if kind in self.atlas.index.kinds and _is_available(kind)
         ]
 
     def _query_tiles(self, session: AtlasQuerySession, clock: StageClock) -> None:
-        """Ask tiles until one answers; then those that look as much like the picture."""
+        """Search tiles until one localizes the image, then the similar tiles."""
         for number, ranking in enumerate(self._rankings(session.query_image, clock), start=1):
             session.ranking = ranking
             if _ranking_margin(self._readable_tiles(ranking)) < self.config.settled_gap:
@@ -278,12 +280,12 @@ class AtlasLocalizer:
             self._query_tile(session, *max(left, key=session.query_priority))
         while not session.tile_results and (
             left := self._readable_tiles(session.ranking)
-        ):  # those that were likely cannot be read
+        ):  # the likely tiles cannot be read
             self._query_tile(session, *left[0])
         self._query_similar_tiles(session)
 
     def _candidate_tiles(self, session: AtlasQuerySession) -> TileRanking:
-        """Tiles that look not far less like the picture than the best one."""
+        """Return the tiles that are nearly as similar to the image as the best one."""
         ranking = self._readable_tiles(session.ranking)
         return [
             one
@@ -292,15 +294,17 @@ class AtlasLocalizer:
         ]
 
     def _is_promising(self, session: AtlasQuerySession, ranked: tuple[str, float]) -> bool:
-        """Does a glance name a pose there, or does it look more like the picture than any place
-        does? One that is not ranked may."""
+        """Return whether the coarse search found a pose or the tile is similar enough to the image.
+
+        Tiles that cannot be ranked are always promising.
+        """
         return (
             session.query_priority(ranked) >= (0.0, self.config.least_likeness)
             or ranked[0] in self.atlas.problems
         )
 
     def _query_coarse_only(self, session: AtlasQuerySession, num_tiles: int) -> None:
-        """Ask the likeliest tiles at a glance, until a pose is clear."""
+        """Search the likeliest tiles coarse only, until a pose is clear."""
         for tile_id, similarity in self._candidate_tiles(session)[:num_tiles]:
             if session.is_settled or session.is_past_deadline:
                 return
@@ -308,12 +312,14 @@ class AtlasLocalizer:
                 self._query_tile(session, tile_id, similarity, "at a glance")
 
     def _readable_tiles(self, ranking: TileRanking) -> TileRanking:
-        """Without tiles that cannot be read."""
+        """Return the ranking without unreadable tiles."""
         return [one for one in ranking if one[0] not in self.problems]
 
     def _query_similar_tiles(self, session: AtlasQuerySession) -> None:
-        """Tiles that look about as much like the picture as the one that answered, at a glance,
-        where the cheapest test leaves open that they rival it."""
+        """Search tiles that are about as similar to the image as the one that localized it.
+
+        A tile is searched coarse only, if a quick test does not exclude it as a rival.
+        """
         if not session.localized_tiles:
             return
         least = min(answer.similarity for answer in session.localized_tiles) - self.config.alike_gap
@@ -327,7 +333,7 @@ class AtlasLocalizer:
                 self._query_tile(session, tile_id, similarity, "as a rival")
         for one in [
             one for one in session.tile_results.values() if one.is_clear and not one.is_exhaustive
-        ]:  # it may be the answer itself
+        ]:  # one of them may hold the true pose
             self._query_tile(session, one.tile.tile_id, one.similarity)
 
     def _query_tile(
@@ -338,7 +344,7 @@ class AtlasLocalizer:
         mode: QueryMode = "by all means",
         prior: Rigid3 | None = None,
     ) -> None:
-        """Put the picture to a tile; where that cannot be read, the others answer."""
+        """Search the image in a tile. If the tile cannot be read, it is recorded in `problems`."""
         if tile_id in self.problems:
             session.tile_results.pop(tile_id, None)
             return
@@ -363,7 +369,7 @@ class AtlasLocalizer:
                     if mode == "by all means"
                     else query_session.localize_coarse_only()
                 )
-        except ObjectStoreError:  # what the tile would have said nobody knows
+        except ObjectStoreError:  # the tile is fine, but its result is unknown
             raise
         except MapError as error:
             self.problems[tile_id] = str(error)
@@ -376,7 +382,7 @@ class AtlasLocalizer:
 
 
 def _ranking_margin(ranking: TileRanking) -> float:
-    """By how much the likeliest tile leads the next one; infinite of one tile alone."""
+    """Return the similarity margin of the best tile over the second, infinite for a single tile."""
     return ranking[0][1] - ranking[1][1] if len(ranking) > 1 else float("inf")
 
 
@@ -389,8 +395,10 @@ def _is_available(kind: str) -> bool:
 
 
 def _merge_times(session: AtlasQuerySession, clock: StageClock) -> dict[str, float]:
-    """Milliseconds of each stage, of all tiles together; `tiles` is that of ranking them, without
-    the features."""
+    """Return the milliseconds of each stage, summed over all tiles.
+
+    `tiles` is the ranking of tiles, without feature extraction.
+    """
     total = clock.times_ms()
     for _, query_session in session.map_sessions.values():
         for stage, ms in query_session.times_ms.items():

@@ -1,4 +1,4 @@
-"""What the tiles of an atlas have said of one picture so far."""
+"""Collect the results of an atlas's tiles for one query image."""
 
 from __future__ import annotations
 
@@ -12,28 +12,29 @@ from topoloc.localization.query_session import QuerySession
 from topoloc.localization.result import Localization
 
 TileRanking = list[tuple[str, float]]
-"""Tiles with the likeness of their best place, the likeliest first."""
+"""Tiles with the similarity of their best node, likeliest first."""
 
 
 @dataclass(eq=False)
 class AtlasQuerySession:
-    """One picture; others may be asked until the deadline (of `time.perf_counter`)."""
+    """Hold the state of one query. Tiles are searched until the deadline (`time.perf_counter`)."""
 
     query_image: QueryImage
     deadline: float
     ranking: TileRanking = field(default_factory=list)
     tile_results: dict[str, TileResult] = field(default_factory=dict)
     map_sessions: dict[str, tuple[CachedMap, QuerySession]] = field(default_factory=dict)
-    """The questions that tiles were asked, each with the map as it was open then: one that was
-    closed since is asked anew."""
+    """Query sessions by tile, each with its open map. If the map was closed since, a new session
+    starts."""
 
     @property
     def is_past_deadline(self) -> bool:
+        """Return whether the deadline has passed."""
         return time.perf_counter() > self.deadline
 
     @property
     def remaining_ms(self) -> float | None:
-        """Milliseconds that are left; None where there is no limit."""
+        """Return the milliseconds left (at least 1), None without a deadline."""
         return (
             None
             if self.deadline == float("inf")
@@ -42,12 +43,12 @@ class AtlasQuerySession:
 
     @property
     def is_settled(self) -> bool:
-        """Is a pose so well founded that the tile itself asked no further?"""
+        """Return whether a tile found a clear pose."""
         return any(one.is_clear for one in self.tile_results.values())
 
     @property
     def localized_tiles(self) -> list[TileResult]:
-        """The tiles that vouch for a pose when they are asked by all means."""
+        """Return the tiles that localized the image in an exhaustive search."""
         return [
             one
             for one in self.tile_results.values()
@@ -55,8 +56,10 @@ class AtlasQuerySession:
         ]
 
     def can_be_rival(self, query_session: QuerySession) -> bool:
-        """May a further tile's pose come near one of the answers? Where it is known about where the
-        camera is in that tile, it is asked."""
+        """Return whether a further tile's pose may rival one of the found poses.
+
+        It is always True if the prior pose in that tile is known.
+        """
         if query_session.prior is not None:
             return True
         evidence = query_session.compute_best_case_evidence(
@@ -71,12 +74,12 @@ class AtlasQuerySession:
         )
 
     def is_fully_queried(self, tile_id: str) -> bool:
-        """By all means?"""
+        """Return whether the tile was searched exhaustively."""
         return tile_id in self.tile_results and self.tile_results[tile_id].is_exhaustive
 
     def query_priority(self, ranked: tuple[str, float]) -> tuple[float, float]:
-        """Which of several tiles is asked first: the one with the likeliest pose at a glance, then
-        the one that looks most like the picture."""
+        """Return the sort key of a tile: first the probability of its coarse pose, then its
+        similarity."""
         known = self.tile_results.get(ranked[0])
         return max((one.probability for one in known.named), default=0.0) if known else 0.0, ranked[
             1

@@ -1,4 +1,4 @@
-"""How the tiles of an atlas are asked."""
+"""Settings of the search in an atlas."""
 
 from __future__ import annotations
 
@@ -10,32 +10,30 @@ from topoloc.bounds import AtLeast, Between
 
 @dataclass(frozen=True)
 class AtlasConfig:
-    """Which tiles are asked, in which order, and when it is enough."""
+    """Configure the selection and order of tiles and the conditions to stop."""
 
     num_ranked: Annotated[int, Between(1, 1_000_000)] = 64
-    """Tiles that the index names, the likeliest first; no others are asked."""
+    """Number of tiles ranked by the index. No others are searched."""
     settled_gap: Annotated[float, Between(0, 2)] = 0.15
-    """A tile whose best place is so much more like the picture than any other tile's is asked by
-    all means at once; and where no tile leads so by one kind of features, the next kind ranks
-    them."""
+    """Minimum similarity margin of the best tile for an immediate exhaustive search. If no tile has
+    it, the next feature type ranks them."""
     num_glanced_first: Annotated[int, Between(0, 100_000)] = 2
-    """Before the next kind of features ranks them, so many are asked by retrieval alone, at most,
-    until a pose is clear."""
+    """Maximum number of tiles searched coarse only before the next feature type ranks them. The
+    search stops at a clear pose."""
     hopeless_gap: Annotated[float, Between(0, 2)] = 0.25
-    """Tiles whose best place is so much less like the picture than the best tile's are not
-    asked."""
+    """Tiles whose similarity is lower than the best tile's by more than this are not searched."""
     num_glanced: Annotated[int, Between(1, 100_000)] = 8
-    """Where no tile leads, so many are asked by retrieval alone, at most, until a pose is clear;
-    those asked before count."""
+    """Maximum number of tiles searched coarse only with the last feature type, including earlier
+    ones. The search stops at a clear pose."""
     num_asked: Annotated[int, Between(1, 10_000)] = 3
-    """Tiles that are asked by all means, at most, until one answers."""
+    """Maximum number of tiles searched exhaustively, until one localizes the image."""
     least_likeness: Annotated[float, Between(-1, 2)] = 0.33
-    """Any place looks so much like a picture. After the first one, tiles whose best place is less
-    like it are asked by all means only where a glance names a pose."""
+    """Similarity that any place reaches. After the first tile, less similar ones are searched
+    exhaustively only if the coarse search found a pose."""
     alike_gap: Annotated[float, Between(0, 2)] = 0.1
-    """Tiles whose best place is less like the picture than that of the tile that answered by no
-    more than this must not vouch for a pose as well."""
+    """Tiles whose similarity is within this of the tile that localized the image are checked for a
+    rival pose."""
     num_alike: Annotated[int, Between(0, 1000)] = 2
-    """Of these, so many are asked."""
+    """Maximum number of these similar tiles that are checked."""
     max_ms: Annotated[float | None, AtLeast(0)] = None
-    """After so many milliseconds no further tile is asked (None: no limit)."""
+    """Time limit in milliseconds, after which no further tile is searched (None: no limit)."""

@@ -1,11 +1,10 @@
-"""A shard of an atlas's places: those of many tiles by one kind of features, found by codes of 32
-bytes, compared by themselves.
+"""A shard of an atlas's index: the global descriptors of many tiles for one feature type.
 
-FAISS keeps of each place a product-quantised code (half a byte for two of its numbers) in the cell
-of its nearest centre. A query looks into the nearest eighth of the cells (96 at least), and the
-places that look nearest by their codes are compared by their vectors, half floats that stay on the
-disk: only pages that are asked come into memory, and processes share them. One file holds it all,
-with a checksum; it can be made anew at any time.
+FAISS stores a product-quantised code of each descriptor (4 bits for two components) in the cell of
+its nearest centre. A query searches the nearest eighth of the cells, at least 96. The candidates
+nearest by code are then compared by their full vectors. These are half floats in a memory-mapped
+file, so only used pages are loaded and processes share them. One file holds the shard with a
+checksum. It can be rebuilt at any time.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from topoloc.errors import AtlasError
 from topoloc.recordings.atomic import atomic_write
 
 NUM_COMPARED, MAX_COMPARED = 1024, 16_384
-"""Places that are compared by their vectors; where they are of too few tiles, eight times as many,
-up to the second number."""
+"""Number of candidates compared by full vectors. If they belong to too few tiles, it grows by eight
+times, up to the second number."""
 MAX_ROWS_COMPARED = 8_192
-"""Of tiles that have no more places together than this, all are compared."""
+"""Selected tiles with no more descriptors than this are compared exhaustively."""
 _MIN_PROBES, _CELLS_PER_PROBE, _MAX_CELLS = 96, 8, 4096
 _NUM_TRAINING_VECTORS, _CHUNK = 65_536, 65_536
 _MAGIC, _ALIGNMENT = b"topoloc-places-1\n", 4096
@@ -38,8 +37,8 @@ _MAGIC, _ALIGNMENT = b"topoloc-places-1\n", 4096
 
 @dataclass(frozen=True)
 class ShardTile:
-    """A tile in a shard: its id, the checksum of the file that its place vectors are from, and how
-    many they are."""
+    """Describe a tile in a shard: its id, the checksum of its descriptor file, and its number of
+    rows."""
 
     tile_id: str
     sha256: str
@@ -47,13 +46,14 @@ class ShardTile:
 
 
 class DescriptorShard:
-    """Place vectors of some tiles, those of a tile one after the other.
+    """Hold the global descriptors of some tiles, tile after tile.
 
     Args:
-        kind, vocabulary: the kind of features, and the version of the vocabulary that the vectors
-            are by.
-        vectors: unit vectors of all tiles, in their order.
-        codes: FAISS's index over them; made where it is None.
+        kind: the feature type.
+        vocabulary: version of the vocabulary of the vectors.
+        tiles: the tiles, in the order of their vectors.
+        vectors: unit vectors of all tiles.
+        codes: FAISS index of the vectors. None: it is built.
     """
 
     def __init__(
@@ -79,18 +79,21 @@ class DescriptorShard:
 
     @property
     def name(self) -> str:
-        """That of its file: made of what is in it."""
+        """Return the file name, a digest of the contents."""
         contents = json.dumps([self.kind, self.vocabulary, [astuple(tile) for tile in self.tiles]])
         return f"{hashlib.sha256(contents.encode()).hexdigest()[:32]}.index"
 
     def rank(
         self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_selected: Bool[np.ndarray, " t"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        """The tiles (numbers in `tiles`) with the most similar places, up to `num_tiles`, and the
-        similarity of each one's best.
+        """Rank the tiles by their most similar node.
 
         Args:
-            is_asked: of each tile whether it may be named.
+            num_tiles: maximum number of returned tiles.
+            is_selected: mask of the tiles that may be returned.
+
+        Returns:
+            Indices into `tiles`, best first, and the similarity of each tile's best node.
         """
         num_asked, count = int(is_selected.sum()), max(NUM_COMPARED, 16 * num_tiles)
         while True:
@@ -106,8 +109,12 @@ class DescriptorShard:
     def nearest(
         self, vector: Float32[np.ndarray, " d"], count: int, is_selected: Bool[np.ndarray, " t"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        """The rows of about so many of the most similar places of these tiles, the nearest first,
-        and their similarities; of more tiles than few, those that look so by their codes."""
+        """Return the rows of about `count` most similar nodes of the selected tiles, and the
+        similarities.
+
+        The nearest comes first. If the tiles have few rows, all are compared. Otherwise the
+        candidates come from the codes.
+        """
         asked = np.flatnonzero(is_selected)
         num_rows = int((self.bounds[asked + 1] - self.bounds[asked]).sum())
         if num_rows <= MAX_ROWS_COMPARED:
@@ -126,8 +133,10 @@ class DescriptorShard:
         return rows[order], similarities[order]
 
     def _select_tile_rows(self, is_selected: Bool[np.ndarray, " t"]) -> Any:
-        """FAISS's filter for the places of these tiles; the last one is kept, for the next query
-        mostly has the same."""
+        """Return FAISS's filter for the rows of these tiles.
+
+        The last filter is cached, because consecutive queries mostly select the same tiles.
+        """
         key, known = is_selected.tobytes(), self._chosen
         if known is None or known[0] != key:
             bits = np.packbits(np.repeat(is_selected, np.diff(self.bounds)), bitorder="little")
@@ -135,7 +144,11 @@ class DescriptorShard:
         return known[1]
 
     def save(self, folder: Path) -> Path:
-        """Write its file, at once or not at all. Raises OSError."""
+        """Write the file atomically.
+
+        Raises:
+            OSError: it cannot be written.
+        """
         codes = faiss.serialize_index(self._codes)
         facts = {
             "kind": self.kind,
@@ -166,8 +179,11 @@ class DescriptorShard:
 
     @staticmethod
     def open(path: Path) -> DescriptorShard:
-        """A shard as it was saved; its vectors stay on the disk. Raises AtlasError: the file is
-        missing, damaged or another."""
+        """Open a saved shard with memory-mapped vectors.
+
+        Raises:
+            AtlasError: the file is missing, damaged or no shard.
+        """
         try:
             return _opened(path)
         except (
@@ -212,7 +228,7 @@ def _opened(path: Path) -> DescriptorShard:
 
 
 def _build_codes(vectors: Float16[np.ndarray, "n d"]) -> Any:
-    """Cells about the k-means centres of some of the vectors, and all vectors as codes in them."""
+    """Build the FAISS index: k-means cells of a sample, and the codes of all vectors."""
     num_rows, dimension = vectors.shape
     num_cells = max(1, min(round(math.sqrt(num_rows)), _MAX_CELLS))
     num_parts = dimension // 2 if dimension % 2 == 0 else dimension
@@ -238,8 +254,10 @@ def _build_codes(vectors: Float16[np.ndarray, "n d"]) -> Any:
 
 @contextmanager
 def _single_threaded() -> Iterator[None]:
-    """FAISS by this thread alone: its threads wait for each other at full speed, ten times as long
-    where others need the processors."""
+    """Run FAISS in a single thread.
+
+    Its threads busy-wait for each other, which takes ten times as long on a loaded machine.
+    """
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)
     try:

@@ -1,8 +1,8 @@
-"""Tiles added to an atlas and removed from it, by several writers at once.
+"""Add tiles to an atlas and remove them, with several concurrent writers.
 
-Files are put first, under names made of their contents; only the manifest is contended for. A
-writer reads it, makes the next one, and commits that if the manifest is still what it read; else it
-begins anew with the new one. So of two writers neither loses a tile.
+Files are stored first, under names derived from their contents. Only the manifest is shared. A
+writer reads it, makes the next version, and commits it if the manifest is unchanged. Otherwise it
+starts again with the new manifest. So no writer loses a tile of another.
 """
 
 from __future__ import annotations
@@ -30,18 +30,20 @@ from topoloc.recordings.atomic import temporary_file
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 GRACE_S = 3600.0
-"""So long files stay that no manifest names any more: readers may have just read the manifest
-before."""
+"""Seconds for which files without a reference are kept, because readers may still use the previous
+manifest."""
 _MAX_TRIES = 1000
 ManifestEdit = Callable[[Manifest, float], Manifest]
-"""From a manifest to the next one, at this time (seconds of Unix time). May be called several
-times."""
+"""A function from a manifest and the time (Unix seconds) to the next manifest. It may be called
+several times."""
 
 
 @dataclass(frozen=True)
 class NewTile:
-    """A map that becomes a tile of this id, in this world; `recipe` is the digest of what it was
-    made of, where that is known."""
+    """Describe a map file to be added as a tile of this id, in this world.
+
+    `recipe` is the digest of the map's inputs, None if unknown.
+    """
 
     tile_id: str
     path: Path
@@ -52,14 +54,15 @@ class NewTile:
 def new_tiles(
     paths: Sequence[str], tile_id: str | None = None, world: str | None = None
 ) -> list[NewTile]:
-    """Maps by the ids that they get: the names of their files without .topo, or `tile_id`, of one.
+    """Return the map files as new tiles.
 
     Args:
-        world: what the world is called that all of them, and tiles of the atlas, share; each has
-            its own where this is None.
+        tile_id: id of the tile, for a single file. None: the file name without `.topo`.
+        world: name of a world that all of them share, possibly with existing tiles. None: each has
+            its own.
 
     Raises:
-        AtlasError: two get one id, or no tile can be called so.
+        AtlasError: two tiles have the same id, or an id is invalid.
     """
     ids = [tile_id or Path(path).name.removesuffix(".topo") for path in paths]
     tiles = [
@@ -75,7 +78,12 @@ def new_tiles(
 
 
 def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
-    """An atlas of these tiles. Raises AtlasError where there is one already, and as `add_tiles`."""
+    """Create an atlas of these tiles and return its manifest.
+
+    Raises:
+        AtlasError: there is an atlas already, or it cannot be written.
+        MapError: a map is missing, damaged or empty.
+    """
     store = store_at(where)
     exists = AtlasError(f"{where} is an atlas already; `topoloc atlas add` adds to it")
     if store.manifest() is not None:
@@ -95,21 +103,22 @@ def add_tiles(
     grace_s: float = GRACE_S,
     creates: bool = False,
 ) -> Manifest:
-    """The manifest with these tiles, too.
+    """Add tiles and return the new manifest.
 
     Args:
-        replaces: tiles of the same ids are replaced, else they are an error, unless they were made
-            of the same.
-        creates: where no atlas is there, it is made.
+        replaces: replace tiles of the same ids. Otherwise they are an error, unless they have the
+            same recipe.
+        grace_s: seconds for which unreferenced files are kept.
+        creates: create the atlas if there is none.
 
     Raises:
-        AtlasError: no atlas is there, it has a tile of one of these ids, or it cannot be written.
+        AtlasError: there is no atlas, it has a tile of the same id, or it cannot be written.
         MapError: a map is missing, damaged or empty.
     """
     store = store_at(where)
     _check_ids_free(
         _read(store, creates)[1], new, replaces
-    )  # before the work begins, and again with each try
+    )  # before the work, and again with each try
     added = {tile.tile_id: tile for tile in _store_tiles(store, new)}
 
     def with_added(manifest: Manifest, now: float) -> Manifest:
@@ -124,12 +133,13 @@ def add_tiles(
 def replace_tile(
     where: str, new: NewTile, before: Tile, grace_s: float = GRACE_S
 ) -> Manifest | None:
-    """The manifest with a tile whose map was changed since it was `before`, but not its world: its
-    joins stay, as they are by now. None where the tile is gone or its map is another one by now;
-    nothing is changed then.
+    """Replace a tile by a new version of its map in the same world, and return the manifest.
+
+    The joins of the tile are kept in their current state. If the tile was removed or changed since
+    `before`, nothing is changed and None is returned.
 
     Raises:
-        AtlasError: no atlas is there, or it cannot be written.
+        AtlasError: there is no atlas, or it cannot be written.
         MapError: the map is missing, damaged or empty.
     """
     store = store_at(where)
@@ -151,8 +161,11 @@ def replace_tile(
 
 
 def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) -> Manifest:
-    """The manifest without these tiles. Raises AtlasError: no atlas is there, it has no such tile,
-    or cannot be written."""
+    """Remove tiles and return the new manifest.
+
+    Raises:
+        AtlasError: there is no atlas, it has no such tile, or it cannot be written.
+    """
     store = store_at(where)
 
     def without(manifest: Manifest, now: float) -> Manifest:
@@ -170,9 +183,14 @@ def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) 
 def add_joins(
     where: str, joins: Sequence[Join], between: Mapping[str, Tile], grace_s: float = GRACE_S
 ) -> Manifest:
-    """The manifest with these joins, too, which were found between these tiles; those of tiles are
-    left out whose map is gone by now, or another one. Raises AtlasError: no atlas is there, or it
-    cannot be written."""
+    """Add joins and return the new manifest.
+
+    `between` holds the tiles that the joins were computed from. Joins of tiles that were removed or
+    changed since are dropped.
+
+    Raises:
+        AtlasError: there is no atlas, or it cannot be written.
+    """
 
     def with_joins(manifest: Manifest, now: float) -> Manifest:
         there = {
@@ -188,8 +206,11 @@ def add_joins(
 
 
 def store_tile(new: NewTile, store: Store) -> Tile:
-    """What the manifest says of a map; its files are put into the store. Raises MapError,
-    AtlasError."""
+    """Store the files of a map and return its manifest entry.
+
+    Raises:
+        MapError, AtlasError: the map cannot be read or is empty, or the store cannot be written.
+    """
     scratch = temporary_file(Path(tempfile.gettempdir()) / "topoloc-tile.places")
     with TopoMetricMap.load(new.path) as topomap, scratch as places:
         if len(topomap.summaries) == 0:
@@ -218,7 +239,7 @@ def store_tile(new: NewTile, store: Store) -> Tile:
 
 
 def _store_file(store: Store, name: str, path: Path) -> StoredFile:
-    """A file put into the store, under this name and what it holds."""
+    """Store a file under this name and a digest of its contents."""
     sha256 = sha256_of(path)
     stem, _, suffix = name.rpartition(".")
     stored = StoredFile(f"{TILES}/{stem}-{sha256[:12]}.{suffix}", sha256, path.stat().st_size)
@@ -231,23 +252,32 @@ def _store_tiles(store: Store, new: Sequence[NewTile]) -> list[Tile]:
 
 
 def _restore_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> None:
-    """Put those again that were swept just before they were named: old files of the same
-    contents."""
-    names = set(store.ages())
+    """Store files again that another writer removed as unreferenced before the commit."""
+    names = set(store.ages(TILES))
     for one, tile in zip(new, tiles, strict=True):
         if not {stored.name for stored in tile.files} <= names:
             store_tile(one, store)
 
 
+def read_manifest(where: str) -> Manifest:
+    """Return the manifest of an atlas as it is now; an empty one where no atlas is there yet.
+
+    Raises:
+        AtlasError: the manifest is damaged, or the store does not answer.
+        MissingExtraError: the store needs an extra that is not installed.
+    """
+    return _read(store_at(where), creates=True)[1]
+
+
 class _TileChangedError(Exception):
-    """Another writer was faster."""
+    """Signal that another writer changed the tile first."""
 
 
 _UNKNOWN = StoredFile("", "", 0)
 
 
 def _describe_tile(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[str, str]) -> Tile:
-    """All but the files."""
+    """Return the manifest entry of a map with placeholder files."""
     centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
     first_rows = {
         summary.session_id: row for row, summary in reversed(list(enumerate(topomap.summaries)))
@@ -278,8 +308,7 @@ def _geo_box(known: Georeference, centres: np.ndarray) -> tuple[float, float, fl
 
 
 def _read(store: Store, creates: bool = False) -> tuple[bytes | None, Manifest]:
-    """The manifest, as bytes and as what they say; an empty one where there is none yet and it is
-    to be made."""
+    """Read the manifest, as bytes and parsed. It is empty if there is none and `creates` is set."""
     data = store.manifest()
     if data is None and creates:
         return None, Manifest()
@@ -308,10 +337,13 @@ def _check_ids_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) 
 def _commit_change(
     store: Store, change: ManifestEdit, grace_s: float, creates: bool = False
 ) -> Manifest:
-    """Read, change and commit until nobody came in between; then remove what nobody names."""
+    """Read, change and commit the manifest until no other writer interferes.
+
+    Unreferenced files older than `grace_s` are removed afterwards.
+    """
     for _ in range(_MAX_TRIES):
         before, manifest = _read(store, creates)
-        now, ages = time.time(), store.ages()
+        now, ages = time.time(), store.ages(TILES)
         after = change(manifest, now)
         gone = [
             name
@@ -324,7 +356,9 @@ def _commit_change(
         if store.commit(before, after.to_bytes()):
             known = after.files | set(after.retired)
             for name in (
-                name for name, age in store.ages().items() if name not in known and age > grace_s
+                name
+                for name, age in store.ages(TILES).items()
+                if name not in known and age > grace_s
             ):
                 store.remove(name)
             return after

@@ -1,4 +1,4 @@
-"""An atlas judged by truth that is given in one tile's world."""
+"""Evaluate an atlas against ground truth in the world of one tile."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ from topoloc.retrieval.coarse import Image
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedTile:
-    """The whole atlas is asked; `topomap` is the tile's map, whose nodes the truth is compared
-    with."""
+    """Hold an atlas and the tile whose world the ground truth is in.
+
+    The whole atlas is queried. `topomap` is the tile's map, whose nodes are compared with the
+    truth.
+    """
 
     localizer: AtlasLocalizer
     tile_id: str
@@ -24,7 +27,12 @@ class EvaluatedTile:
 
     @staticmethod
     def of(localizer: AtlasLocalizer, tile_id: str) -> EvaluatedTile:
-        """Raises AtlasError: no such tile, or its map is missing; MapError: it is damaged."""
+        """Open the map of the tile.
+
+        Raises:
+            AtlasError: there is no such tile, or its map is missing.
+            MapError: the map is damaged.
+        """
         return EvaluatedTile(
             localizer,
             tile_id,
@@ -34,14 +42,16 @@ class EvaluatedTile:
     def localize(
         self, image: Image, camera: Camera | UncalibratedCamera | None, t_ns: int | None = None
     ) -> Localization | NotLocalized:
-        """As `AtlasLocalizer.localize`."""
+        """Localize an image, see `AtlasLocalizer.localize`."""
         return self.localizer.localize(image, camera, t_ns=t_ns)
 
     def truth_in_result_world(
         self, result: Localization | NotLocalized, world_from_cam: Rigid3
     ) -> Rigid3 | None:
-        """The true pose in the world of the tile that answered; None where the atlas does not know
-        how that lies to this one, so that no pose there is right."""
+        """Return the true pose in the world of the tile of the result.
+
+        None if the transform between the two tiles is unknown. Then no pose there is correct.
+        """
         tile, answered = self.localizer.atlas.tile(self.tile_id), result.provenance.tile
         other = tile if answered is None else self.localizer.atlas.tile(answered)
         other_from_world = other.from_world_of(tile)

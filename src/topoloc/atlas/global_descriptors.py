@@ -1,5 +1,7 @@
-"""A tile's place vectors: what each of its nodes looks like, by the shared vocabularies, from the
-features that the nodes keep."""
+"""Compute the global descriptors of a tile's nodes from their stored features.
+
+They use the shared vocabularies.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +18,16 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 GlobalDescriptors = Mapping[str, Float32[np.ndarray, "_ _"]]
-"""Unit vectors of a tile's nodes by the kind of features."""
+"""Unit vectors of a tile's nodes, by feature type."""
 
 
 def compute_global_descriptors(topomap: TopoMetricMap) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Of all nodes of a map, in their order, by each of its kinds of features that has a shared
-    vocabulary.
+    """Compute the global descriptors of all nodes of a map, in order, by feature type.
+
+    Feature types without a shared vocabulary are skipped.
 
     Raises:
-        AtlasError: none has.
+        AtlasError: no feature type of the map has one.
     """
     vectors = {}
     for kind in topomap.kinds:
@@ -45,7 +48,11 @@ def compute_global_descriptors(topomap: TopoMetricMap) -> dict[str, Float32[np.n
 
 
 def save_global_descriptors(path: Path, vectors: GlobalDescriptors) -> None:
-    """As half floats, each kind an array. Raises OSError."""
+    """Write the descriptors as half floats, one array for each feature type.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     arrays: dict[str, Any] = {kind: rows.astype(np.float16) for kind, rows in vectors.items()}
     with path.open("wb") as file:
         np.savez(file, **arrays)
@@ -54,11 +61,13 @@ def save_global_descriptors(path: Path, vectors: GlobalDescriptors) -> None:
 def load_global_descriptors(
     path: Path, versions: Mapping[str, str]
 ) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """The inverse of `save_global_descriptors`, of vectors by vocabularies of these versions (by
-    kind); other versions than ours are left out.
+    """Read the output of `save_global_descriptors`.
+
+    `versions` holds the vocabulary versions of the vectors by feature type. Vectors of versions
+    other than the installed ones are skipped.
 
     Raises:
-        AtlasError: missing, damaged, or of no vocabulary that this version has.
+        AtlasError: the file is missing or damaged, or no version matches.
     """
     vectors = {}
     try:

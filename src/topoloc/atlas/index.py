@@ -1,5 +1,7 @@
-"""Which tiles is this picture of? One index over the place vectors of all tiles, by each kind of
-features."""
+"""Rank the tiles of an atlas for a query image.
+
+One index for each feature type holds the global descriptors of all tiles.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +20,23 @@ class _TileRanker(Protocol):
     def rank(
         self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_selected: Bool[np.ndarray, " t"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        """The numbers of the tiles with the most similar places, and how similar these are;
-        `is_selected` says of each tile whether it may be named."""
+        """Return the numbers of the tiles with the most similar nodes, and the similarities.
+
+        `is_selected` masks the tiles that may be returned.
+        """
         ...
 
 
 class AtlasIndex:
-    """Ranks tiles by the likeness of their most similar place: those of shards by codes, all others
-    exactly.
+    """Rank tiles by the similarity of their most similar node.
+
+    Nodes in shards are searched by codes, all others exactly.
 
     Args:
-        vectors: the place vectors of each tile that are compared exactly; `tile_ids` says which.
-        shards: further places of these tiles (`descriptor_shard.py`); each with the number in
-            `tile_ids` of each of its tiles, -1 of one that is never named.
+        tile_ids: ids of the tiles.
+        vectors: the global descriptors of each tile that are compared exactly.
+        shards: further descriptors of these tiles (`descriptor_shard.py`). Each shard comes with
+            the index in `tile_ids` of each of its tiles, -1 for tiles that are never returned.
     """
 
     def __init__(
@@ -57,7 +63,7 @@ class AtlasIndex:
 
     @property
     def kinds(self) -> list[str]:
-        """The kinds of features that tiles can be ranked by."""
+        """Return the feature types that can rank tiles."""
         return sorted(self._by_kind)
 
     def rank(
@@ -66,17 +72,16 @@ class AtlasIndex:
         num_tiles: int,
         among: Collection[str] | None = None,
     ) -> list[tuple[str, float]]:
-        """Up to `num_tiles` tiles, the likeliest first, each with the likeness (at most 1) of its
-        best place.
+        """Return up to `num_tiles` tiles, likeliest first, with the similarity (at most 1) of the
+        best node.
 
-        Where the picture was described with several kinds of features, the last one counts that a
-        tile has; how far a tile stays behind the best one by another kind is how far it is taken to
-        be behind by the last.
+        With several feature types, the last one that a tile has counts. A tile without the last
+        type keeps its margin to the best tile by an earlier type.
 
         Args:
-            by_kind: the picture's place vector by each kind that it was described with, the one
-                that tells most the last.
-            among: only these tiles are named; None: all.
+            by_kind: the image's global descriptor by feature type, the most distinctive type last.
+            num_tiles: maximum number of returned tiles.
+            among: ids of the tiles that may be returned. None: all.
         """
         is_selected = (
             self._all
@@ -103,8 +108,10 @@ class AtlasIndex:
         num_tiles: int,
         is_selected: Bool[np.ndarray, " t"],
     ) -> dict[int, float]:
-        """The likeness of the likeliest tiles by one kind of features; a tile lies in one part of
-        the index."""
+        """Return the similarity of the likeliest tiles by one feature type.
+
+        Each tile is in exactly one part of the index.
+        """
         pairs = [part.rank(vector, num_tiles, is_selected) for part in self._by_kind.get(kind, ())]
         found = sorted(
             (
@@ -118,7 +125,7 @@ class AtlasIndex:
 
 
 class _ExactTiles:
-    """The best place of each tile: all are compared, those of a tile stand one after the other."""
+    """Compare all nodes of some tiles exactly. The nodes of a tile are consecutive."""
 
     def __init__(self, vectors: Float32[np.ndarray, "n d"], of_tile: Int[np.ndarray, " n"]) -> None:
         self._vectors = np.ascontiguousarray(vectors)
@@ -136,7 +143,7 @@ class _ExactTiles:
 
 
 class _NumberedShard:
-    """A shard whose tiles go by the numbers of the index; those of none are never named."""
+    """Wrap a shard to use the tile numbers of the index. Tiles numbered -1 are never returned."""
 
     def __init__(self, shard: DescriptorShard, numbers: Int[np.ndarray, " s"]) -> None:
         self._shard, self._numbers = shard, numbers

@@ -1,11 +1,10 @@
-"""The index of an atlas, made once: shards of places in the cache folder, used again as long as
-their tiles are the atlas's.
+"""Store the index of an atlas as shards in the cache folder, and reuse them.
 
-A shard holds tiles by their ids and the checksums of their place vectors. Whoever opens an atlas
-takes the shards that are there, without reading the vectors of their tiles again. Tiles that came
-since are compared exactly while they are few, else they become a shard, together with the small
-ones. Tiles that were removed or replaced stay in their shard unseen, until they are a quarter of
-it. So an index is never older than the manifest, and the cache folder may be emptied at any time.
+A shard holds tiles by id and checksum of their global descriptors. Opening an atlas uses the stored
+shards without reading the descriptors of their tiles again. New tiles are compared exactly while
+they are few. Otherwise they become a shard, together with the small shards. Tiles that were removed
+or replaced stay in their shard but are ignored, until they are a quarter of it. So an index is
+never older than the manifest, and the cache folder may be emptied at any time.
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ from topoloc.features.network_files import cache_folder
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 MAX_EXACT_DESCRIPTORS, SHARD_DESCRIPTORS = 20_000, 1 << 20
-"""So many places that lie in no shard are compared one by one; so many places a shard holds, but
-for those of one tile."""
+"""Maximum number of descriptors outside shards that are compared exactly, and of descriptors in a
+shard. A single tile may exceed the second limit."""
 _MAX_STALE_SHARE, _UNUSED_S = 0.25, 86_400.0
 LoadDescriptors = Callable[[Tile], GlobalDescriptors]
 _Rows = tuple[ShardTile, Float16[np.ndarray, "_ _"]]
@@ -40,7 +39,7 @@ _Rows = tuple[ShardTile, Float16[np.ndarray, "_ _"]]
 
 @dataclass(frozen=True, eq=False)
 class OpenedIndex:
-    """The index; why tiles cannot be ranked, by their ids; and what was wrong with its files."""
+    """Hold the index, the reason for each tile (by id) that cannot be ranked, and file problems."""
 
     index: AtlasIndex
     problems: dict[str, str]
@@ -49,7 +48,7 @@ class OpenedIndex:
 
 @dataclass(frozen=True, eq=False)
 class _LiveShard:
-    """A shard, and which of its tiles count."""
+    """Hold a shard and a mask of its current tiles."""
 
     shard: DescriptorShard
     is_live: list[bool]
@@ -65,7 +64,7 @@ class _LiveShard:
         return sum(tile.num_rows for tile in self.live)
 
     def rows(self) -> list[_Rows]:
-        """The tiles that count, with their vectors."""
+        """Return the current tiles with their vectors."""
         bounds, tiles = self.shard.bounds, enumerate(self.shard.tiles)
         return [
             (tile, self.shard.vectors[bounds[k] : bounds[k + 1]])
@@ -75,20 +74,22 @@ class _LiveShard:
 
 
 def index_folder(where: str) -> Path:
-    """Where the shards of the atlas there lie on this machine."""
+    """Return the local cache folder for the shards of an atlas."""
     place = where if "://" in where else str(Path(where).resolve())
     return cache_folder() / "indexes" / hashlib.sha256(place.encode()).hexdigest()[:16]
 
 
 def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> OpenedIndex:
-    """The index over these tiles by what lies in `folder`; what is lacking there is made, and kept
-    there where that can be written.
+    """Open the index of these tiles from the shards in `folder`.
+
+    Missing shards are built, and stored there if it is writable.
 
     Args:
-        read: the place vectors of a tile; raises AtlasError where they cannot be had.
+        read: loads the global descriptors of a tile. It raises AtlasError if they are not
+            available.
 
     Raises:
-        StoreError: what `read` raised.
+        ObjectStoreError: `read` raised it.
     """
     work = _IndexBuilder(tiles, folder)
     live_shards = {kind: work.live_shards(kind) for kind in work.versions}
@@ -123,7 +124,7 @@ def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> Op
 
 @dataclass(eq=False)
 class _IndexBuilder:
-    """The work of opening an index."""
+    """Build an index from stored shards and missing tiles."""
 
     tiles: Sequence[Tile]
     folder: Path
@@ -143,8 +144,7 @@ class _IndexBuilder:
 
     @cached_property
     def stored(self) -> list[DescriptorShard]:
-        """The shards that lie in the folder, the largest first. One that is damaged is removed, and
-        made anew where it is lacking."""
+        """Return the shards in the folder, largest first. Damaged ones are deleted."""
         shards = list[DescriptorShard]()
         for path in sorted(self.folder.glob("*.index")):
             try:
@@ -156,8 +156,10 @@ class _IndexBuilder:
         return sorted(shards, key=lambda shard: (-len(shard.vectors), shard.name))
 
     def live_shards(self, kind: str) -> list[_LiveShard]:
-        """The shards of this kind most of whose tiles are the atlas's, as they are now; a tile
-        counts in the first one that has it."""
+        """Return the shards of this feature type with at most a quarter of stale rows.
+
+        A tile counts in the first shard that holds it.
+        """
         live_shards, seen = list[_LiveShard](), set[str]()
         for shard in self.stored:
             if (shard.kind, shard.vocabulary) != (kind, self.versions[kind]):
@@ -175,8 +177,10 @@ class _IndexBuilder:
     def load_missing(
         self, live_shards: dict[str, list[_LiveShard]], read: LoadDescriptors
     ) -> dict[str, list[_Rows]]:
-        """The place vectors, by kind, of tiles that lie in no shard of it; as soon as they fill one
-        they are made one of those `live_shards`."""
+        """Load the global descriptors, by feature type, of tiles without a shard.
+
+        When they fill a shard, it is built and added to `live_shards`.
+        """
         known = {
             kind: {tile.tile_id for one in of_kind for tile in one.live}
             for kind, of_kind in live_shards.items()
@@ -196,9 +200,7 @@ class _IndexBuilder:
                 continue
             try:
                 vectors = read(tile)
-            except (
-                ObjectStoreError
-            ):  # says nothing of the tile, and the next one would be waited for as long
+            except ObjectStoreError:  # not a problem of the tile, and the next would wait as long
                 raise
             except AtlasError as error:
                 self.problems[tile.tile_id] = str(error)
@@ -220,8 +222,8 @@ class _IndexBuilder:
     def with_new_shards(
         self, kind: str, live_shards: Sequence[_LiveShard], rest: list[_Rows]
     ) -> list[_LiveShard]:
-        """All of them in shards; those that are less than half full are made one with the rest,
-        which is emptied."""
+        """Return shards of all tiles. Shards less than half full are merged with `rest`, which is
+        emptied."""
         full = [one for one in live_shards if one.num_live >= SHARD_DESCRIPTORS // 2]
         pending = [row for one in live_shards if one not in full for row in one.rows()] + rest
         rest.clear()
@@ -230,8 +232,8 @@ class _IndexBuilder:
         return full
 
     def _new_shard(self, kind: str, pending: list[_Rows]) -> _LiveShard:
-        """A shard of the first of these tiles, as many as it holds, which are taken out of the
-        list."""
+        """Build a shard of the first tiles in `pending`, up to its capacity, and remove them
+        there."""
         sizes = np.cumsum([tile.num_rows for tile, _ in pending])
         count = max(1, int(np.searchsorted(sizes, SHARD_DESCRIPTORS, "right")))
         tiles = [tile for tile, _ in pending[:count]]
@@ -239,8 +241,7 @@ class _IndexBuilder:
         return _LiveShard(self._save_shard(shard), [True] * count)
 
     def _save_shard(self, shard: DescriptorShard) -> DescriptorShard:
-        """As it lies in its file, of which only pages that are asked come into memory; where that
-        cannot be written, as it is."""
+        """Save a shard and return it memory-mapped. If it cannot be written, return it as is."""
         try:
             return DescriptorShard.open(shard.save(self.folder))
         except (OSError, AtlasError) as error:
@@ -252,7 +253,7 @@ class _IndexBuilder:
             return shard
 
     def remove_unused(self, live_shards: dict[str, list[_LiveShard]]) -> None:
-        """Files that nobody has opened for a day; of those used now it is said that they are."""
+        """Delete files that were not used for a day, and update the time stamps of those in use."""
         used = {one.shard.name for of_kind in live_shards.values() for one in of_kind}
         for path in self.folder.glob("*.index"):
             with suppress(OSError):
@@ -263,8 +264,10 @@ class _IndexBuilder:
 
 
 def _take_vectors(pending: list[_Rows], count: int) -> Float16[np.ndarray, "n d"]:
-    """The vectors of the first tiles, which are let go of one by one: they are half of a
-    gigabyte."""
+    """Stack the vectors of the first tiles.
+
+    Each tile's vectors are freed once copied, because they take up to half a gigabyte.
+    """
     num_rows = sum(tile.num_rows for tile, _ in pending[:count])
     stacked, first = np.empty((num_rows, pending[0][1].shape[1]), np.float16), 0
     for number in range(count):

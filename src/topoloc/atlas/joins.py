@@ -1,5 +1,5 @@
-"""How two tiles lie to each other, as pictures of one that the other knows say it; and where a
-world lies among those joined with it."""
+"""Relative poses between tiles, from images of one tile localized in another. Poses in joint
+worlds."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from topoloc.geometry.rigid import Rigid3, skew
 
 @dataclass(frozen=True, eq=False)
 class Join:
-    """Tile `second` lies so to tile `first`: `first_from_second` brings the world of its map into
-    that of the other's.
+    """Hold the relative pose of two tiles.
 
-    `covariance` is that of the left perturbation (m, rad), as the pictures' answers have it;
-    `num_agreeing` pictures of either tile say so. `residual` is by how many sigma all joins
-    together miss it; None of one that contradicts the others and is not used.
+    `first_from_second` transforms the world of the second map into that of the first. `covariance`
+    is that of its left perturbation (m, rad), from the localization results. `num_agreeing` is the
+    number of images of either tile that agree. `residual` is the residual in sigmas after all joins
+    are adjusted together. None: the join contradicts others and is not used.
     """
 
     first: str
@@ -32,6 +32,7 @@ class Join:
     residual: float | None = 0.0
 
     def to_json(self) -> dict[str, Any]:
+        """Return the join as a JSON object."""
         return {
             "first": self.first,
             "second": self.second,
@@ -43,7 +44,11 @@ class Join:
 
     @staticmethod
     def from_json(row: Mapping[str, Any]) -> Join:
-        """The inverse of `to_json`. Raises ValueError, TypeError, KeyError, TrajectoryError."""
+        """Parse the output of `to_json`.
+
+        Raises:
+            ValueError, TypeError, KeyError, TrajectoryError: a value is invalid.
+        """
         residual = row["residual"]
         return Join(
             first=matching(ID, row["first"], "a join's tile"),
@@ -56,16 +61,16 @@ class Join:
 
     @property
     def pair(self) -> tuple[str, str]:
-        """The ids of the tiles."""
+        """Return the ids of the two tiles."""
         return self.first, self.second
 
 
 @dataclass(frozen=True, eq=False)
 class JointPose:
-    """Where a world lies in the one that it shares with others, which has the name, and the
-    coordinates, of one of them.
+    """Hold the pose of a world in its joint world.
 
-    `covariance` is that of the left perturbation of `joint_from_world` (m, rad).
+    The joint world has the name and coordinates of one of the joined worlds. `covariance` is that
+    of the left perturbation of `joint_from_world` (m, rad).
     """
 
     joint: str
@@ -73,6 +78,7 @@ class JointPose:
     covariance: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
 
     def to_json(self) -> dict[str, Any]:
+        """Return the pose as a JSON object."""
         pose = self.joint_from_world.matrix()[:3].tolist()
         return {
             "world": self.joint,
@@ -82,7 +88,11 @@ class JointPose:
 
     @staticmethod
     def from_json(row: Mapping[str, Any]) -> JointPose:
-        """The inverse of `to_json`. Raises ValueError, TypeError, KeyError, TrajectoryError."""
+        """Parse the output of `to_json`.
+
+        Raises:
+            ValueError, TypeError, KeyError, TrajectoryError: a value is invalid.
+        """
         return JointPose(
             joint=matching(ID, row["world"], "a joint world"),
             joint_from_world=parse_pose(row["joint_from_world"], "joint_from_world"),
@@ -95,11 +105,12 @@ class JointPose:
 def sigmas_at(
     point_a: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "6 6"]
 ) -> tuple[float, float]:
-    """One sigma of where a point (m, frame a) lies that a transform brings into a: metres, in the
-    worst direction; and of its turn, radians.
+    """Return the position sigma (metres, worst direction) and rotation sigma (radians) of a
+    transform.
 
     Args:
-        covariance: of the left perturbation of ``a_from_b`` (m, rad).
+        point_a: the transformed point, in metres in frame a.
+        covariance: covariance of the left perturbation of ``a_from_b`` (m, rad).
     """
     moved = np.hstack([np.eye(3), -skew(point_a)])
     metres, radians = (

@@ -1,8 +1,8 @@
-"""Worlds that joins connect brought into one: a pose graph whose nodes are the worlds of tiles.
+"""Merge worlds that are connected by joins, with a pose graph whose nodes are the worlds of tiles.
 
-Each join may be wrong, if seldom: one that contradicts those that more pictures speak for is left
-out. Of two worlds that both know their place on earth none is moved to another place by joins. One
-tile on earth puts there all that are joined with it.
+A join may be wrong, which is rare. One that contradicts joins with more agreeing images is dropped.
+Joins never move a georeferenced world to another place on earth. One georeferenced tile
+georeferences all tiles that are joined with it.
 """
 
 from __future__ import annotations
@@ -30,14 +30,17 @@ if TYPE_CHECKING:
     from topoloc.atlas.manifest import Tile
 
 MAX_WORLD_OFFSET_M = 100.0
-"""Two worlds whose places on earth are known are not joined to lie further from there than this."""
+"""Maximum distance (metres) by which joins may displace a georeferenced world from its known
+position."""
 
 
 def place_tiles(
     tiles: Mapping[str, Tile], joins: Sequence[Join], origin: GeoPoint | None
 ) -> tuple[tuple[Tile, ...], tuple[Join, ...]]:
-    """Tiles in the order of their ids with their places in joint worlds and in the atlas's, and all
-    joins adjusted."""
+    """Return the tiles, sorted by id, with their poses in joint worlds and in the atlas world.
+
+    All adjusted joins are returned as well. `origin` is the origin of the atlas world.
+    """
     ordered = [_place_by_georeference(tiles[tile_id], origin) for tile_id in sorted(tiles)]
     known = {
         tile.world: tile.atlas_from_world
@@ -45,7 +48,7 @@ def place_tiles(
         if tile.atlas_from_world is not None
     }
     all_adjusted = adjust_joins(joins, {tile.tile_id: tile.world for tile in ordered}, known)
-    parallel_map: list[Tile] = []
+    placed: list[Tile] = []
     for tile in ordered:
         joint = all_adjusted.places.get(tile.world)
         pose = tile.atlas_from_world or known.get(tile.world)
@@ -56,13 +59,15 @@ def place_tiles(
             if pose is None or tile.geo_box is not None or origin is None
             else _geo_box(origin, pose, tile.box_world)
         )
-        parallel_map.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
-    return tuple(parallel_map), all_adjusted.joins
+        placed.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
+    return tuple(placed), all_adjusted.joins
 
 
 def _place_by_georeference(tile: Tile, origin: GeoPoint | None) -> Tile:
-    """A tile with what its own georeference says of its place in the atlas's world, which is
-    east-north-up at `origin`, and no more."""
+    """Return a tile with the pose in the atlas world that follows from its own georeference only.
+
+    The atlas world is east-north-up at `origin`.
+    """
     known = tile.georeference
     if known is None or origin is None:
         return replace(tile, atlas_from_world=None, geo_box=None)
@@ -75,7 +80,7 @@ def _place_by_georeference(tile: Tile, origin: GeoPoint | None) -> Tile:
 def _geo_box(
     origin: GeoPoint, atlas_from_world: Rigid3, box_world: Float[np.ndarray, "2 3"]
 ) -> tuple[float, float, float, float]:
-    """Least and largest latitude and longitude of a box's corners."""
+    """Return the minimum and maximum latitude and longitude (degrees) of a box's corners."""
     corners = np.array(list(product(*box_world.T)))
     places = [
         GeoPoint.from_ecef(corner)
@@ -87,8 +92,7 @@ def _geo_box(
 
 @dataclass(frozen=True, eq=False)
 class AdjustedJoins:
-    """Joins with what they are missed by, and where each world lies that they join with another
-    one, by its name."""
+    """Hold the joins with residuals, and the joint pose of each joined world, by name."""
 
     joins: tuple[Join, ...]
     places: Mapping[str, JointPose]
@@ -97,12 +101,12 @@ class AdjustedJoins:
 def adjust_joins(
     joins: Sequence[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]
 ) -> AdjustedJoins:
-    """All joins brought to agree, but for those that contradict others.
+    """Adjust all joins together and drop those that contradict others.
 
     Args:
-        worlds: the name of each tile's world, by the tile's id.
-        atlas_from_worlds: of the worlds that know their place on earth; such a one is what its
-            joint world is named after.
+        worlds: the world name of each tile, by tile id.
+        atlas_from_worlds: poses of the georeferenced worlds. A joint world is named after one of
+            these if it contains one.
     """
     config, kept = (
         PoseGraphConfig(),
@@ -128,9 +132,11 @@ def adjust_joins(
 def _first_inconsistent_join(
     joins: Iterable[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]
 ) -> Join | None:
-    """The first join that, with those before it, says of a world that it lies elsewhere than where
-    on earth it is known to lie. Looked at are those that bring worlds on earth together, for the
-    ways between worlds do not change by further joins that fewer speak for."""
+    """Return the first join that contradicts a georeference, together with the joins before it.
+
+    Only joins that connect two groups with georeferenced worlds are checked. Later joins have fewer
+    agreeing images and do not change the paths between worlds.
+    """
     groups: dict[str, set[str]] = {}
     taken: list[Join] = []
     for join in joins:
@@ -155,7 +161,7 @@ def _first_inconsistent_join(
 def _is_inconsistent(
     groups: Mapping[str, Mapping[str, JointPose]], atlas_from_worlds: Mapping[str, Rigid3]
 ) -> bool:
-    """Does a world lie elsewhere by joins than it is known to?"""
+    """Return whether joins place a world elsewhere than its georeference does."""
     for anchor, group in groups.items():
         for name in group.keys() & atlas_from_worlds.keys():
             apart = (
@@ -168,7 +174,7 @@ def _is_inconsistent(
 
 @dataclass(frozen=True, eq=False)
 class _WorldLink:
-    """From a world to the world `to`: `pose` brings the latter into the former."""
+    """Link a world to the world `to`. `pose` transforms the latter into the former."""
 
     to: str
     pose: Rigid3
@@ -179,8 +185,10 @@ class _WorldLink:
 def _groups(
     joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[str, Rigid3]
 ) -> dict[str, dict[str, JointPose]]:
-    """The worlds that joins connect, by the name of the one that gives them its coordinates; each
-    lies where the ways lead that most pictures speak for."""
+    """Return the groups of joined worlds, by the name of the world that gives the coordinates.
+
+    The pose of each world follows the path with the most agreeing images.
+    """
     links: dict[str, list[_WorldLink]] = {}
     for join in joins:
         one, other, pose = worlds[join.first], worlds[join.second], join.first_from_second
@@ -203,8 +211,10 @@ def _groups(
 def _reachable_worlds(
     anchor: str, links: Mapping[str, Sequence[_WorldLink]]
 ) -> dict[str, JointPose]:
-    """Every world that joins lead to, each time by the join from what is reached that most pictures
-    speak for."""
+    """Return the pose of every world that joins connect to the anchor.
+
+    The next join is always the one with the most agreeing images from the worlds reached so far.
+    """
     places = dict[str, JointPose]()
     queue = [(0, 0, anchor, JointPose(anchor, Rigid3.identity()))]
     count = 0
@@ -236,9 +246,11 @@ def _optimize_worlds(
     anchored: Mapping[str, Rigid3],
     config: PoseGraphConfig,
 ) -> dict[str, JointPose]:
-    """Where each world lies, all joins adjusted; the covariance is that of one way alone, which is
-    no less."""
-    place_tiles = dict[str, JointPose]()
+    """Return the pose of each world after the adjustment of all joins.
+
+    The covariance is that of a single path, which is an upper bound.
+    """
+    places = dict[str, JointPose]()
     for anchor, group in _groups(joins, worlds, anchored).items():
         names = [anchor, *(name for name in group if name != anchor)]
         rows = {name: row for row, name in enumerate(names)}
@@ -246,8 +258,8 @@ def _optimize_worlds(
         poses = [group[name].joint_from_world.inverse() for name in names]
         poses = optimize_pose_graph(poses, edges, config) if len(edges) >= len(names) else poses
         for name, world_from_joint in zip(names, poses, strict=True):
-            place_tiles[name] = replace(group[name], joint_from_world=world_from_joint.inverse())
-    return place_tiles
+            places[name] = replace(group[name], joint_from_world=world_from_joint.inverse())
+    return places
 
 
 def _edge(join: Join, worlds: Mapping[str, str], rows: Mapping[str, int]) -> Edge:

@@ -1,5 +1,4 @@
-"""Where a picture was taken, as far as somebody knows: tiles that are out of reach need not be
-asked."""
+"""Restrict the search in an atlas by an approximate position. Tiles out of reach are skipped."""
 
 from __future__ import annotations
 
@@ -17,11 +16,12 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True)
 class GeoPositionPrior:
-    """Within `radius_m` metres of a latitude and longitude (degrees). Tiles that do not know where
-    on earth they lie are never out of reach.
+    """Hold a position prior: within `radius_m` metres of a latitude and longitude (degrees).
+
+    Tiles without a georeference are always in reach.
 
     Raises:
-        AtlasError: no such place, or no radius.
+        AtlasError: the position or the radius is invalid.
     """
 
     lat: float
@@ -37,7 +37,11 @@ class GeoPositionPrior:
 
     @staticmethod
     def parse(text: str) -> GeoPositionPrior:
-        """Of `LAT,LON,RADIUS_M`. Raises AtlasError."""
+        """Parse `LAT,LON,RADIUS_M`.
+
+        Raises:
+            AtlasError: the text is invalid.
+        """
         try:
             lat, lon, radius_m = (float(part) for part in text.split(","))
         except ValueError:
@@ -53,11 +57,12 @@ class GeoPositionPrior:
 
 @dataclass(frozen=True, eq=False)
 class WorldPositionPrior:
-    """A camera within `radius_m` metres of this pose in the world of this name. Tiles of worlds
-    that lie in no known way to it are out of reach.
+    """Hold a pose prior: within `radius_m` metres of a pose in the named world.
+
+    Tiles of worlds without a known transform to it are out of reach.
 
     Raises:
-        AtlasError: no radius.
+        AtlasError: the radius is invalid.
     """
 
     world: str
@@ -78,14 +83,15 @@ LocationPrior = GeoPositionPrior | WorldPositionPrior
 def tiles_in_reach(
     manifest: Manifest, near: LocationPrior | None, georeferenced_only: bool = False
 ) -> dict[str, Rigid3 | None]:
-    """The ids of the tiles whose nodes' box is in reach, each with the pose that is near in the
-    tile's own world, where one is given.
+    """Return the tiles in reach by id, with the prior pose in the tile's own world or None.
+
+    A tile is in reach if the box of its nodes is.
 
     Args:
-        placed_only: without tiles that do not know where on earth they lie.
+        georeferenced_only: skip tiles without a known position on earth.
 
     Raises:
-        AtlasError: no tile is of the world that is named.
+        AtlasError: no tile belongs to the prior's world.
     """
     is_placed = ~np.isnan(manifest.geo_boxes[:, 0])
     is_candidate = is_placed if georeferenced_only else np.ones_like(is_placed)
@@ -101,12 +107,15 @@ def tiles_in_reach(
 def distances_to_boxes(
     near: GeoPositionPrior, boxes: Float[np.ndarray, "t 4"]
 ) -> Float[np.ndarray, " t"]:
-    """From a place to boxes of latitudes and longitudes (least latitude, longitude, then the
-    largest; degrees), along the ground; 0 to what is NaN."""
+    """Return the ground distances (metres) from a position to boxes of latitude and longitude.
+
+    Each box holds the minimum latitude and longitude, then the maximum ones, in degrees. The
+    distance to a NaN box is 0.
+    """
     lat = np.clip(near.lat, boxes[:, 0], boxes[:, 2])
     turned = near.lon + np.array(
         [[-360.0], [0.0], [360.0]]
-    )  # the same meridian, on either side of 180 degrees
+    )  # handles boxes on either side of 180 degrees
     lon = np.abs(np.clip(turned, boxes[:, 1], boxes[:, 3]) - turned).min(axis=0)
     up, across = np.sin(np.radians(lat - near.lat) / 2.0), np.sin(np.radians(lon) / 2.0)
     along = up**2 + np.cos(np.radians(lat)) * math.cos(math.radians(near.lat)) * across**2

@@ -1,9 +1,8 @@
-"""What an atlas says of itself in `atlas.json`: its tiles, and where each one's files lie. Data
-only, read back with every value checked.
+"""Hold the contents of `atlas.json`: the tiles and their files. Every value is checked when read.
 
-Tiles go by ids that never change. Their files have names made of their contents, so that a tile
-that is replaced is another file and whoever has read a manifest goes on with the files that it
-names. `serial` grows by one with each write.
+Tiles have ids that never change. File names are derived from their contents, so a replaced tile has
+another file. A reader of an older manifest can continue with the files that it lists. `serial`
+grows by one with each write.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.atlas.joins import Join, JointPose
-from topoloc.atlas.joint_worlds import place_tiles as placed_tiles
+from topoloc.atlas.joint_worlds import place_tiles
 from topoloc.atlas.manifest_values import ID, count, matching, number, of
 from topoloc.errors import AtlasError, GeoreferenceError, TrajectoryError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
@@ -35,30 +34,36 @@ _SHA256, _MAP_ID = re.compile(r"[0-9a-f]{64}"), re.compile(r"[0-9a-f]{16}")
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of the atlas: its name below it, SHA-256, and bytes."""
+    """Describe a file of the atlas: its relative name, SHA-256 and size in bytes."""
 
     name: str
     sha256: str
     num_bytes: int
 
     def to_json(self) -> dict[str, Any]:
+        """Return the file as a JSON object."""
         return {"file": self.name, "sha256": self.sha256, "bytes": self.num_bytes}
 
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """A map of the atlas. `places` are its place vectors (`global_descriptors.py`), by vocabularies
-    of these versions, by kind of features.
+    """Describe a map of the atlas.
 
-    `box_world` holds the least and the largest coordinates of its nodes' cameras in the map's own
-    world, metres; `focal_px` the focal length of its finest camera. `georeference` is the map's,
-    `geo_box` the least latitude, longitude and the largest ones, degrees; both None of a map that
-    knows no place on earth. Tiles of one `world` share their coordinates; it is the tile's own id
-    where nobody said so; `joint` says where that world lies among those that pictures join it with
-    (`joins.py`), None where they join it with none. `atlas_from_world` brings the map's world into
-    the atlas's, where that is known, be it through other tiles. `recipe` is a digest of the
-    recording and settings that the map was made of, where it was made for this atlas. `undo` takes
-    the map's last edits back (`map/undo_log.py`), where that can be.
+    Attributes:
+        places: file of the global descriptors (`global_descriptors.py`).
+        vocabularies: versions of their vocabularies, by feature type.
+        focal_px: focal length (pixels) of the map's finest camera.
+        box_world: minimum and maximum coordinates of the nodes' cameras in the map's own world,
+            metres.
+        world: name of the map's world. Tiles of one world share coordinates. The default is the
+            tile's id.
+        georeference: georeference of the map, None if it has none.
+        geo_box: minimum latitude and longitude, then the maximum ones, degrees. None if unknown.
+        joint: pose of the world in its joint world (`joins.py`), None if there is none.
+        atlas_from_world: transform from the map's world to the atlas world. It may come from other
+            tiles. None if unknown.
+        recipe: digest of the recording and settings, if the map was built for this atlas.
+        undo: undo log of the map's last edits (`mapping/undo_log.py`), None if there is none.
     """
 
     tile_id: str
@@ -82,18 +87,18 @@ class Tile:
 
     @property
     def files(self) -> tuple[StoredFile, ...]:
-        """All that the tile consists of."""
+        """Return all files of the tile."""
         return (self.map, self.places) if self.undo is None else (self.map, self.places, self.undo)
 
     @property
     def in_joint_world(self) -> JointPose:
-        """Where the tile's world lies in the joint one; that is its own where no other is joined
-        with it."""
+        """Return the pose of the tile's world in its joint world. Without joins it is the
+        identity."""
         return self.joint or JointPose(self.world, Rigid3.identity())
 
     def from_world_of(self, other: Tile) -> Rigid3 | None:
-        """Brings the world of another tile's map into that of this one, where the atlas knows how
-        they lie to each other."""
+        """Return the transform from the world of another tile's map into this one's, None if
+        unknown."""
         if self.world == other.world:
             return Rigid3.identity()
         here, there = self.in_joint_world, other.in_joint_world
@@ -104,6 +109,7 @@ class Tile:
         return self.atlas_from_world.inverse() @ other.atlas_from_world
 
     def to_json(self) -> dict[str, Any]:
+        """Return the tile as a JSON object."""
         known = self.georeference
         made_of: dict[str, Any] = {} if self.recipe is None else {"recipe": self.recipe}
         if self.joint is not None:
@@ -134,10 +140,13 @@ class Tile:
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """All tiles in the order of their ids. `origin` is the place on earth at which the atlas's own
-    world touches it (east, north, up), None while no tile is georeferenced. `retired` are files
-    that were named before, and when they were given up (seconds of Unix time). `joins` say how
-    tiles lie to each other, those that all together contradict among them."""
+    """Hold all tiles, sorted by id.
+
+    `origin` is the point on earth of the atlas world (east, north, up), None if no tile is
+    georeferenced. `retired` maps files of earlier manifests to the time at which they were dropped
+    (Unix seconds). `joins` holds the relative poses of tiles, including those that contradict
+    others.
+    """
 
     serial: int = 0
     tiles: tuple[Tile, ...] = ()
@@ -147,21 +156,22 @@ class Manifest:
 
     @cached_property
     def by_id(self) -> dict[str, Tile]:
+        """Return the tiles by id."""
         return {tile.tile_id: tile for tile in self.tiles}
 
     @cached_property
     def geo_boxes(self) -> Float[np.ndarray, "t 4"]:
-        """The `geo_box` of each tile, NaN of those that have none."""
+        """Return the `geo_box` of each tile, NaN if it has none."""
         unknown = (math.nan,) * 4
         return np.array([tile.geo_box or unknown for tile in self.tiles], np.float64).reshape(-1, 4)
 
     @cached_property
     def world_boxes(self) -> Float[np.ndarray, "t 2 3"]:
-        """The `box_world` of each tile."""
+        """Return the `box_world` of each tile."""
         return np.array([tile.box_world for tile in self.tiles], np.float64).reshape(-1, 2, 3)
 
     def georeference_of(self, tile: Tile) -> Georeference | None:
-        """Where on earth a tile's world lies: its map's own word, else what follows from other
+        """Return the georeference of a tile: its map's own, or the one that follows from other
         tiles."""
         if tile.georeference is not None or tile.atlas_from_world is None or self.origin is None:
             return tile.georeference
@@ -169,17 +179,19 @@ class Manifest:
 
     @property
     def files(self) -> set[str]:
-        """Names of all files that the tiles consist of."""
+        """Return the names of all files of the tiles."""
         return {stored.name for tile in self.tiles for stored in tile.files}
 
     def with_tiles(
         self, tiles: Mapping[str, Tile], now: float, joins: Sequence[Join] = ()
     ) -> Manifest:
-        """The next one, of these tiles; files that it does not name any more are retired at `now`.
+        """Return the next manifest, with these tiles.
+
+        Files that it does not list any more are retired at `now`.
 
         Args:
-            joins: further ones, of these tiles. Those that are there stay, but for those of tiles
-                whose map is gone or another one.
+            joins: further joins between these tiles. Existing joins stay, unless a tile was removed
+                or its map changed.
         """
         origin = self.origin
         if origin is None:
@@ -191,8 +203,8 @@ class Manifest:
                 ),
                 None,
             )
-        place_tiles, adjusted_joins = placed_tiles(tiles, self._select_joins(tiles, joins), origin)
-        after = Manifest(self.serial + 1, place_tiles, origin, {}, adjusted_joins)
+        placed, adjusted_joins = place_tiles(tiles, self._select_joins(tiles, joins), origin)
+        after = Manifest(self.serial + 1, placed, origin, {}, adjusted_joins)
         retired = dict.fromkeys(self.files, now) | dict(self.retired)
         return replace(
             after,
@@ -202,7 +214,8 @@ class Manifest:
         )
 
     def _select_joins(self, tiles: Mapping[str, Tile], further: Sequence[Join]) -> list[Join]:
-        """Joins between these tiles; of two between the same ones the last."""
+        """Return the joins between these tiles. Of two joins of the same pair the last one
+        counts."""
         same = {
             name
             for name, tile in tiles.items()
@@ -215,7 +228,7 @@ class Manifest:
         ]
 
     def to_bytes(self) -> bytes:
-        """As `atlas.json` holds it."""
+        """Return the contents of `atlas.json`."""
         origin = self.origin
         data = {
             "format": FORMAT,
@@ -232,8 +245,11 @@ class Manifest:
 
     @staticmethod
     def from_bytes(data: bytes, where: str) -> Manifest:
-        """The inverse of `to_bytes`. Raises AtlasError, which says `where`, whatever else the bytes
-        are."""
+        """Parse the output of `to_bytes`.
+
+        Raises:
+            AtlasError: the bytes are not a valid manifest. The message contains `where`.
+        """
         try:
             return _parse_manifest(json.loads(data))
         except (
@@ -256,7 +272,11 @@ class Manifest:
 
 
 def check_tile_id(tile_id: str) -> None:
-    """Raises AtlasError where no tile can be called so."""
+    """Check a tile id.
+
+    Raises:
+        AtlasError: the id is invalid.
+    """
     if not ID.fullmatch(tile_id):
         raise AtlasError(
             f"no tile can be called {tile_id[:80]!r}: at most 100 letters, digits, `_`, `-` and"

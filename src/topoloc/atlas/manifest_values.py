@@ -1,5 +1,4 @@
-"""Values of a manifest, checked: each raises ValueError, whose text says `what` it is that is
-wrong."""
+"""Check the values of a manifest. Each function raises ValueError with the name of the value."""
 
 from __future__ import annotations
 
@@ -13,42 +12,46 @@ from jaxtyping import Float
 from topoloc.geometry.rigid import Rigid3
 
 ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-"""What a tile, or a world, may be called."""
+"""Pattern of tile ids and world names."""
 _MAX_METRES = 1e8
 
 T = TypeVar("T")
 
 
 def of(kind: type[T], value: Any, what: str) -> T:
-    """A value of this type."""
+    """Return a value that must have this type."""
     if not isinstance(value, kind):
         raise ValueError(f"{what} is no {kind.__name__}")
     return value
 
 
 def matching(pattern: re.Pattern[str], value: Any, what: str) -> str:
-    """A text of this pattern, whole."""
+    """Return a text that must match the whole pattern."""
     if not isinstance(value, str) or not pattern.fullmatch(value):
         raise ValueError(f"{what} cannot be {str(value)[:80]!r}")
     return value
 
 
 def count(value: Any, what: str) -> int:
-    """A whole number from 0 on that every reader of JSON keeps."""
+    """Return a non-negative integer below 2**53, which every JSON reader represents exactly."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**53:
         raise ValueError(f"{what} is no count")
     return value
 
 
 def number(value: Any, what: str) -> float:
-    """A finite number."""
+    """Return a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{what} is no finite number")
     return float(value)
 
 
 def parse_pose(rows: Any, what: str) -> Rigid3:
-    """A pose (3x4) of a manifest. Raises ValueError, TrajectoryError."""
+    """Parse a 3x4 pose.
+
+    Raises:
+        ValueError, TrajectoryError: it is no pose.
+    """
     matrix = np.array(rows, np.float64)
     pose = Rigid3.from_matrix(matrix)
     if np.abs(pose.translation).max() > _MAX_METRES:
@@ -57,8 +60,11 @@ def parse_pose(rows: Any, what: str) -> Rigid3:
 
 
 def parse_covariance(rows: Any, what: str, is_definite: bool) -> Float[np.ndarray, "6 6"]:
-    """A covariance (6x6) of a manifest, which is exactly symmetric afterwards. Raises
-    ValueError."""
+    """Parse a 6x6 covariance and make it exactly symmetric.
+
+    Raises:
+        ValueError: it is no covariance.
+    """
     matrix = np.array(rows, np.float64)
     if (
         matrix.shape != (6, 6)

@@ -1,12 +1,12 @@
-"""Maps by their names: opened when they are asked for, closed when there are too many, replaced
-when their file is.
+"""Cache open maps by name.
 
-A map's name is that of its file without `.topo`; of an atlas's tile, its id. Tiles of object stores
-are files of this machine when they are opened; how they come here is said by who makes the
-`MapCache`. A file is looked at before each request: another one in its place is opened, and the one
-before is let go of when the last request that uses it is answered. What is kept of nodes has a
-budget of its own (`map/memory.py`); here a map counts by the bytes of its file, which no open map
-exceeds apart from its nodes.
+Maps are opened on demand, closed if they take too much memory, and reopened if their file changes.
+
+A map's name is its file name without `.topo`, or the tile id in an atlas. Tiles in object stores
+are local files once opened. The `tile_path` of the `MapCache` fetches them. The file is checked
+before each request. If it was replaced, the new one is opened, and the old one is closed after its
+last request. Cached nodes have a memory budget of their own (`mapping/node_cache.py`). Here a map
+counts with its file size, which bounds the memory of an open map without its nodes.
 """
 
 from __future__ import annotations
@@ -29,14 +29,13 @@ from topoloc.mapping.topomap import TopoMetricMap
 SUFFIX = ".topo"
 OpenLocalizer = Callable[[TopoMetricMap], Localizer]
 TilePath = Callable[[Atlas, Tile], Path]
-"""The map file of a tile, on this machine; raises AtlasError, or whatever tells that it is not here
-yet."""
+"""A function that returns the local map file of a tile. It raises AtlasError, or another exception
+if the file is not available yet."""
 
 
 @dataclass(eq=False)
 class CachedMap:
-    """An open map, as it is shared by all who ask it; `stamp` is that of its file when it was
-    opened."""
+    """Hold an open map, shared by all its users. `stamp` is the file's stamp when it was opened."""
 
     name: str
     path: Path
@@ -47,13 +46,17 @@ class CachedMap:
 
     @property
     def num_bytes(self) -> int:
+        """Return the size of the map file, bytes."""
         return self.stamp[1]
 
 
 @dataclass(eq=False)
 class _CacheEntry:
-    """Where one map stands; its lock is held while the map is opened, so that it is opened once and
-    nobody else waits."""
+    """Hold one map of the cache.
+
+    Its lock is held while the map is opened, so that it is opened once and other maps are not
+    blocked.
+    """
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     opened: CachedMap | None = None
@@ -61,24 +64,23 @@ class _CacheEntry:
 
 @dataclass(frozen=True)
 class _MapSource:
-    """A map by the name of its file; of a tile, with its atlas."""
+    """Describe the source of a map: its file, and the atlas if it is a tile."""
 
     where: str
     tile: tuple[Atlas, Tile] | None = field(default=None, compare=False)
 
 
 class MapCache:
-    """The maps of these files, folders and atlases, which may lie in object stores.
+    """Cache the maps of files, folders and atlases. Atlases may be in object stores.
 
     Args:
-        max_bytes: open maps are closed, those used longest ago first, while they have more bytes
-            than this. One in use is never closed.
-        tile_path: how tiles become files of this machine; by itself they are fetched while their
-            caller waits.
+        max_bytes: memory limit. Open maps that are not in use are closed above it, least recently
+            used first.
+        tile_path: returns the local file of a tile. The default fetches it while the caller waits.
 
     Raises:
-        MapError: a path is missing, an atlas is damaged, or two files have one name.
-        StoreError: the store of an atlas does not answer.
+        MapError: a path is missing, an atlas is damaged, or two files have the same name.
+        ObjectStoreError: the store of an atlas does not respond.
     """
 
     def __init__(
@@ -90,9 +92,7 @@ class MapCache:
     ) -> None:
         self._open_localizer, self._max_bytes, self.tile_path = open_localizer, max_bytes, tile_path
         self._lock = threading.Lock()
-        self._entries: OrderedDict[str, _CacheEntry] = (
-            OrderedDict()
-        )  # the one used last is the last
+        self._entries: OrderedDict[str, _CacheEntry] = OrderedDict()  # least recently used first
         for source in sources:
             if "://" not in source and not os.path.exists(source):
                 raise MapError(f"{source}: no such map")
@@ -103,10 +103,10 @@ class MapCache:
         self.names()
 
     def names(self) -> list[str]:
-        """Of all maps, as they are there now; no object store is asked.
+        """Return the names of all current maps. No object store is queried.
 
         Raises:
-            MapError: two files have one name.
+            MapError: two files have the same name.
         """
         return list(self._found())
 
@@ -131,21 +131,22 @@ class MapCache:
 
     @property
     def num_bytes(self) -> int:
-        """Bytes of the maps that are open."""
+        """Return the total bytes of the open maps."""
         with self._lock:
             return sum(entry.opened.num_bytes for entry in self._entries.values() if entry.opened)
 
     @property
     def num_open(self) -> int:
+        """Return the number of open maps."""
         with self._lock:
             return sum(entry.opened is not None for entry in self._entries.values())
 
     @contextmanager
     def use_map(self, name: str, path: Path | None = None) -> Iterator[CachedMap]:
-        """The map of this name, which stays open meanwhile; of the file `path`, where it is given.
+        """Open the map of this name for the context, from the file `path` if it is given.
 
         Raises:
-            UnknownMapError: there is no such map.
+            MapNotFoundError: there is no such map.
             MapError: its file is missing or damaged.
         """
         opened = self.acquire_map(name, path)
@@ -155,7 +156,7 @@ class MapCache:
             self.release_map(opened)
 
     def acquire_map(self, name: str, path: Path | None = None) -> CachedMap:
-        """As `use_map`, until it is given back."""
+        """Open a map as `use_map` does. It stays open until `release_map`."""
         path = path or self._path_of(name)
         with self._lock:
             entry = self._entries.setdefault(name, _CacheEntry())
@@ -173,6 +174,7 @@ class MapCache:
         return opened
 
     def release_map(self, opened: CachedMap) -> None:
+        """Release a map from `acquire_map`. A retired map is closed after its last user."""
         with self._lock:
             opened.num_users -= 1
             is_last = opened.is_retired and opened.num_users == 0
@@ -180,7 +182,7 @@ class MapCache:
             opened.localizer.topomap.close()
 
     def close(self) -> None:
-        """Let go of all maps; those in use when they are given back."""
+        """Close all maps. Maps in use are closed when they are released."""
         with self._lock:
             opened = [entry.opened for entry in self._entries.values()]
             self._entries.clear()
@@ -210,7 +212,7 @@ class MapCache:
             for entry in self._entries.values():
                 if total <= self._max_bytes:
                     break
-                if not entry.lock.acquire(blocking=False):  # somebody opens or takes it right now
+                if not entry.lock.acquire(blocking=False):  # another thread is opening it
                     continue
                 opened = entry.opened
                 if opened is not None and opened.num_users == 0:
@@ -231,8 +233,11 @@ class MapCache:
 
 
 def _file_stamp(path: Path) -> tuple[int, ...]:
-    """Of a file as it is now: another one in its place has another stamp. Raises MapError where it
-    is gone."""
+    """Return a stamp of a file that changes if the file is replaced.
+
+    Raises:
+        MapError: the file is missing.
+    """
     with suppress(OSError):
         status = path.stat()
         return status.st_mtime_ns, status.st_size, status.st_ino

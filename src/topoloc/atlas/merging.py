@@ -1,4 +1,4 @@
-"""Atlases and maps made one atlas: every tile as it is, with the joins between them."""
+"""Merge atlases and maps into one atlas, with all tiles and joins unchanged."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from topoloc.errors import AtlasError
 
 
 def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
-    """A new atlas at `where` of the tiles of all sources, atlases or map files. A map that two of
-    them hold under one id is one tile. Worlds of different sources are different ones, whatever
-    they are called.
+    """Create an atlas at `where` from the tiles of all sources (atlases or map files).
+
+    A map with the same id in two sources becomes one tile. Worlds of different sources stay
+    distinct, even if they have the same name.
 
     Raises:
-        AtlasError: an atlas is there already; two tiles of one id hold different maps; a file of a
-            tile is missing or another; nothing can be written.
+        AtlasError: there is an atlas already, two tiles of one id hold different maps, a tile's
+            file is missing or wrong, or the atlas cannot be written.
         MapError: a map is missing, damaged or empty.
     """
     store = store_at(where)
@@ -65,8 +66,10 @@ def _check_same(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile
 
 
 def _with_unique_worlds(known: Mapping[str, Tile], added: Mapping[str, Tile]) -> dict[str, Tile]:
-    """Tiles whose worlds are called as none of those that are known; but for worlds that a tile of
-    both lies in, which are the same."""
+    """Rename the worlds of added tiles so that they differ from the known ones.
+
+    A world with a tile in both is the same world and gets the known name.
+    """
     same = {added[tile_id].world: known[tile_id].world for tile_id in known.keys() & added.keys()}
     taken = {tile.world for tile in known.values()}
     names = dict[str, str]()

@@ -1,8 +1,8 @@
-"""Tiles that lie in one world, and where: those whose places to each other the atlas knows."""
+"""Group the tiles of an atlas by common world, with their poses in it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from topoloc.atlas.atlas import Atlas
@@ -15,7 +15,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 @dataclass(frozen=True, eq=False)
 class PlacedTile:
-    """A tile, and the way from its map's world into the one that it shares."""
+    """Hold a tile and the transform from its map's world to the shared one."""
 
     tile: Tile
     world_from_map: Rigid3
@@ -23,26 +23,56 @@ class PlacedTile:
 
 @dataclass(frozen=True, eq=False)
 class SharedWorld:
-    """Tiles in the order of their ids. The world is the atlas's own, east-north-up, of tiles that
-    know where on earth they lie; else the joint world of joined ones, or what tiles of one world
-    share. `georeference` is None where no place on earth is known."""
+    """Hold the tiles of one world, sorted by id.
+
+    For georeferenced tiles it is the atlas world (east-north-up). Otherwise it is a joint world, or
+    a world that several tiles share. `georeference` is None if it is unknown.
+    """
 
     tiles: tuple[PlacedTile, ...]
     georeference: Georeference | None
 
     @property
     def num_nodes(self) -> int:
+        """Return the number of nodes of all tiles."""
         return sum(placed.tile.num_nodes for placed in self.tiles)
 
     def world_from_map_of(self, tile_id: str | None) -> Rigid3 | None:
-        """None of a tile that lies in no such world, or in another one."""
+        """Return the transform from a tile's map to this world, None for a tile of another
+        world."""
         return next(
             (placed.world_from_map for placed in self.tiles if placed.tile.tile_id == tile_id), None
         )
 
+    def open_tiles(
+        self, atlas: Atlas, warn: Callable[[str], None]
+    ) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
+        """Iterate over tiles with their maps. Each map is open during its iteration.
+
+        A tile that cannot be read is skipped with a warning.
+
+        Raises:
+            AtlasError: no tile can be read.
+            ObjectStoreError: the store does not respond.
+        """
+        num_opened = 0
+        for one in self.tiles:
+            try:
+                topomap = TopoMetricMap.load(atlas.map_path(one.tile))
+            except ObjectStoreError:
+                raise
+            except MapError as error:
+                warn(f"tile {one.tile.tile_id} is left out: {error}")
+                continue
+            num_opened += 1
+            with topomap:
+                yield one, topomap
+        if num_opened == 0:
+            raise AtlasError(f"no tile of the atlas {atlas.store.where} can be read")
+
 
 def group_shared_worlds(manifest: Manifest) -> list[SharedWorld]:
-    """All tiles by the worlds that they share, the one of most nodes first."""
+    """Return all tiles grouped by world, the world with the most nodes first."""
     groups: dict[str | None, list[PlacedTile]] = {}
     for tile in manifest.tiles:
         joint, pose = tile.in_joint_world, tile.atlas_from_world
@@ -58,31 +88,5 @@ def group_shared_worlds(manifest: Manifest) -> list[SharedWorld]:
 
 
 def world_of_tile(manifest: Manifest, tile: Tile) -> SharedWorld:
-    """A tile alone, in the world of its map."""
+    """Return a single tile in the world of its own map."""
     return SharedWorld((PlacedTile(tile, Rigid3.identity()),), manifest.georeference_of(tile))
-
-
-def iter_open_tiles(
-    atlas: Atlas, placed: Sequence[PlacedTile], warn: Callable[[str], None]
-) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
-    """Tiles with their maps, each open for its turn. One that cannot be read is left out, and
-    `warn` told of it.
-
-    Raises:
-        AtlasError: none can be read.
-        StoreError: the store does not answer.
-    """
-    num_opened = 0
-    for one in placed:
-        try:
-            topomap = TopoMetricMap.load(atlas.map_path(one.tile))
-        except ObjectStoreError:
-            raise
-        except MapError as error:
-            warn(f"tile {one.tile.tile_id} is left out: {error}")
-            continue
-        num_opened += 1
-        with topomap:
-            yield one, topomap
-    if num_opened == 0:
-        raise AtlasError(f"no tile of the atlas {atlas.store.where} can be read")

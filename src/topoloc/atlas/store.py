@@ -1,9 +1,8 @@
-"""Where an atlas lies: files that are written once, and one manifest that is replaced only by who
-has read the one before.
+"""Store the files of an atlas: immutable files, and one manifest with compare-and-swap updates.
 
-In a folder the manifest is `atlas.json`. Writers take turns by a lock (`flock`, which ends with its
-process) and look, while they hold it, whether the manifest is still the one that they read; a
-reader sees the old one or the new one, whole.
+In a folder the manifest is `atlas.json`. Writers hold a lock (`flock`, released when the process
+ends) and check that the manifest is still the one that they read. A reader sees either the old or
+the new manifest, never a part.
 """
 
 from __future__ import annotations
@@ -28,60 +27,79 @@ except ImportError:  # Windows
 
 MANIFEST = "atlas.json"
 _LOCK = ".atlas.lock"
-_CHUNK = 1 << 20
 
 
 @runtime_checkable
 class Store(Protocol):
-    """Files by their names, and the manifest; `where` is what people call it."""
+    """Store files by name, and the manifest. `where` is the address in messages."""
 
     where: str
 
     def manifest(self) -> bytes | None:
-        """As it is now; None where there is none. Raises AtlasError."""
+        """Return the current manifest, None if there is none.
+
+        Raises:
+            AtlasError: it cannot be read.
+        """
         ...
 
     def version(self) -> Hashable | None:
-        """What is another one after each write of the manifest, and cheaper to ask for; None where
-        there is none. Raises AtlasError."""
+        """Return a value that changes with each write of the manifest, None if there is none.
+
+        It is cheaper than reading the manifest.
+
+        Raises:
+            AtlasError: it cannot be read.
+        """
         ...
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
-        """Replace the manifest, if it is still `before`; else nothing is changed and False
-        returned. Raises AtlasError."""
+        """Replace the manifest if it is still `before`. Otherwise return False and change nothing.
+
+        Raises:
+            AtlasError: it cannot be written.
+        """
         ...
 
     def put(self, name: str, path: Path) -> None:
-        """Keep a copy of a file under a name that is made of its contents; one that is there
-        already counts as written now."""
+        """Store a copy of a file under a name derived from its contents. An existing file gets age
+        0."""
         ...
 
     def local_path(self, name: str, sha256: str) -> Path:
-        """A file of this machine with these contents. Raises AtlasError where it is missing or
-        another, StoreError where nobody answers."""
+        """Return a local file with these contents.
+
+        Raises:
+            AtlasError: the file is missing or differs.
+            ObjectStoreError: the store does not respond.
+        """
         ...
 
     def cached(self, name: str, sha256: str) -> Path | None:
-        """As `local_path`, if nothing need be fetched for it; else None. Raises AtlasError where it
-        is missing."""
+        """Return `local_path` if nothing must be fetched, None otherwise.
+
+        Raises:
+            AtlasError: the file is missing.
+        """
         ...
 
-    def ages(self) -> dict[str, float]:
-        """Seconds since each file was put."""
+    def ages(self, folder: str) -> dict[str, float]:
+        """Return the seconds since each file of a folder of the store was stored, by name."""
         ...
 
     def remove(self, name: str) -> None:
-        """Let a file go; nothing where it is gone."""
+        """Delete a file, if it exists."""
         ...
 
 
 class FolderStore:
-    """A folder of this machine, or one that is mounted."""
+    """Store an atlas in a local or mounted folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.where = folder, str(folder)
 
     def manifest(self) -> bytes | None:
+        """See `Store.manifest`."""
         try:
             return (self.folder / MANIFEST).read_bytes()
         except (FileNotFoundError, NotADirectoryError):
@@ -92,12 +110,14 @@ class FolderStore:
             ) from None
 
     def version(self) -> Hashable | None:
+        """See `Store.version`."""
         with suppress(OSError):
             status = (self.folder / MANIFEST).stat()
             return status.st_mtime_ns, status.st_size, status.st_ino
         return None
 
     def commit(self, before: bytes | None, after: bytes) -> bool:
+        """See `Store.commit`."""
         with self._lock():
             if self.manifest() != before:
                 return False
@@ -109,6 +129,7 @@ class FolderStore:
         return True
 
     def put(self, name: str, path: Path) -> None:
+        """See `Store.put`."""
         target = self.folder / name
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -122,29 +143,33 @@ class FolderStore:
             raise AtlasError(f"cannot write {target}: {error.strerror}") from error
 
     def local_path(self, name: str, sha256: str) -> Path:
+        """See `Store.local_path`."""
         path = self.folder / name
         if not path.is_file():
             raise AtlasError(f"{path} is missing")
         return path
 
     def cached(self, name: str, sha256: str) -> Path | None:
+        """See `Store.cached`."""
         return self.local_path(name, sha256)
 
-    def ages(self) -> dict[str, float]:
+    def ages(self, folder: str) -> dict[str, float]:
+        """See `Store.ages`."""
         now, ages = time.time(), dict[str, float]()
         with suppress(OSError):
-            for entry in os.scandir(self.folder / TILES):
+            for entry in os.scandir(self.folder / folder):
                 if entry.is_file() and not entry.name.startswith("."):
-                    ages[f"{TILES}/{entry.name}"] = now - entry.stat().st_mtime
+                    ages[f"{folder}/{entry.name}"] = now - entry.stat().st_mtime
         return ages
 
     def remove(self, name: str) -> None:
+        """See `Store.remove`."""
         with suppress(FileNotFoundError):
             (self.folder / name).unlink()
 
     @contextmanager
     def _lock(self) -> Iterator[None]:
-        """One writer at a time; the lock of a process that ended is free."""
+        """Hold the writer lock. The operating system frees the lock of a terminated process."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
@@ -152,9 +177,7 @@ class FolderStore:
             raise AtlasError(f"cannot write {self.folder}: {error.strerror}") from None
         try:
             if fcntl is not None:
-                with suppress(
-                    OSError
-                ):  # a file system without locks: then two writers at once may lose one's tiles
+                with suppress(OSError):  # without locks, concurrent writers may lose tiles
                     fcntl.flock(descriptor, fcntl.LOCK_EX)
             yield
         finally:
@@ -162,12 +185,13 @@ class FolderStore:
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file, in hexadecimal digits. Raises AtlasError."""
-    digest = hashlib.sha256()
+    """Return the SHA-256 of a file, in hexadecimal digits.
+
+    Raises:
+        AtlasError: the file cannot be read.
+    """
     try:
         with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                digest.update(chunk)
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise AtlasError(f"cannot read {path}: {error.strerror}") from None
-    return digest.hexdigest()

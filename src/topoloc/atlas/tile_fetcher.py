@@ -1,9 +1,8 @@
-"""Tiles of object stores on their way to this machine, beside those who ask for them: nobody who
-answers pictures waits for a store.
+"""Fetch tiles from object stores in background threads, so that no query thread waits for a store.
 
-Whoever asks for a tile that is not here yet is told so (`TilePending`), may wait for it elsewhere,
-and asks again. A tile is fetched once however many ask for it. It is waited for only so long; it
-goes on coming, for those who ask later.
+A caller that needs a missing tile gets `TilePending`. It may wait for the fetch elsewhere and try
+again. A tile is fetched once for any number of callers. After a timeout callers get an error, but
+the fetch continues for later ones.
 """
 
 from __future__ import annotations
@@ -19,15 +18,18 @@ from topoloc.atlas.manifest import Tile
 from topoloc.errors import ObjectStoreError
 
 _MAX_CONCURRENT_FETCHES = 16
-"""Tiles of one store; the store of another atlas is fetched from all the same."""
+"""Maximum number of concurrent fetches from one store. Other stores are not affected."""
 _RETRY_AFTER_S = 5.0
-"""So long a store that failed is not asked for the same tile again."""
+"""Seconds before a failed fetch of a tile is repeated."""
 
 
 @dataclass(eq=False)
 class TileFetch:
-    """A tile on its way, from `where`; `future` gets its result, the file or why there is none, and
-    never raises. It is waited for `deadline` then (`time.monotonic`)."""
+    """Hold a running fetch from the store `where`.
+
+    `future` receives the file or the exception as its result and never raises. Callers wait for it
+    until `deadline` (`time.monotonic`).
+    """
 
     where: str
     deadline: float
@@ -36,11 +38,12 @@ class TileFetch:
 
     @property
     def is_stale(self) -> bool:
+        """Return whether the fetch ended so long ago that it may be repeated."""
         return time.monotonic() > self.finished_at + _RETRY_AFTER_S
 
 
 class TilePending(Exception):
-    """The tile is on its way; whoever asked may ask again when the fetch has ended."""
+    """Signal that the tile is being fetched. The caller may try again when the fetch has ended."""
 
     def __init__(self, fetch: TileFetch) -> None:
         super().__init__(f"a tile of {fetch.where} is on its way")
@@ -48,10 +51,10 @@ class TilePending(Exception):
 
 
 class TileFetcher:
-    """What is being fetched for one process.
+    """Manage the fetches of one process.
 
     Args:
-        wait_s: so many seconds a tile is waited for.
+        wait_s: timeout of a fetch, seconds.
     """
 
     def __init__(self, wait_s: float) -> None:
@@ -59,12 +62,13 @@ class TileFetcher:
         self._fetches: dict[tuple[str, str], TileFetch] = {}
 
     def path(self, atlas: Atlas, tile: Tile) -> Path:
-        """The tile's map file, if it is on this machine; else it is fetched from now on.
+        """Return the tile's map file if it is local. Otherwise start to fetch it.
 
         Raises:
-            TileAwaited: it is on its way.
-            StoreError: it has been for too long, the store does not answer, or too many others are.
-            AtlasError: it is missing, or not what was added.
+            TilePending: the tile is being fetched.
+            ObjectStoreError: the fetch timed out, the store does not respond, or too many fetches
+                run.
+            AtlasError: the file is missing or differs from the manifest.
         """
         cached = atlas.store.cached(tile.map.name, tile.map.sha256)
         if cached is not None:
@@ -83,7 +87,7 @@ class TileFetcher:
         raise TilePending(fetch)
 
     def _fetch(self, atlas: Atlas, tile: Tile) -> TileFetch:
-        """The one that is under way, or has just failed; else a new one."""
+        """Return the running or recently failed fetch of a tile, or start a new one."""
         where, key = atlas.store.where, (atlas.store.where, tile.map.name)
         with self._lock:
             self._fetches = {
@@ -110,7 +114,7 @@ def _run_fetch(fetch: TileFetch, atlas: Atlas, tile: Tile) -> None:
     outcome: Path | Exception
     try:
         outcome = atlas.map_path(tile)
-    except Exception as error:  # told to those who ask
+    except Exception as error:  # raised again in the callers
         outcome = error
     fetch.finished_at = time.monotonic()
     fetch.future.set_result(outcome)

@@ -1,10 +1,9 @@
-"""What several tiles say of one picture, heard together.
+"""Merge the results of several tiles for one image.
 
-Each tile weighs its own poses and knows nothing of the others. A pose is believed only where it
-leads every pose of every other tile that was asked, by the same evidence and by as much as two
-poses of one map must be apart (`localization/belief.py`). Else the picture is ambiguous, and the
-alternatives name their tiles. Where the atlas knows how two tiles lie to each other, poses that are
-the same one are no rivals.
+Each tile ranks only its own poses. A pose is reported only if it leads every pose of every other
+queried tile by the margin required within one map (`localization/belief.py`). Otherwise the image
+is ambiguous, and the alternatives name their tiles. If the transform between two tiles is known,
+equal poses are not rivals.
 """
 
 from __future__ import annotations
@@ -23,14 +22,16 @@ from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weigh
 from topoloc.localization.result import Alternative, Localization, NotLocalized, R
 
 _SAME_METRES, _SAME_DEG = 1.0, 5.0
-_SIGMAS = 3.0  # of a join, which add to these; at most as much again
+_SIGMAS = 3.0  # sigmas of a join, added to these limits, at most doubling them
 _MIN_ALTERNATIVE_RATIO = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class TileResult:
-    """What a tile said: its result, and each pose that this names. `is_exhaustive`: was it asked by
-    all means?"""
+    """Hold the result of a tile and each reported pose.
+
+    `is_exhaustive` is True after an exhaustive search. `similarity` is the tile's rank score.
+    """
 
     tile: Tile
     result: Localization | NotLocalized
@@ -40,7 +41,7 @@ class TileResult:
 
     @property
     def is_clear(self) -> bool:
-        """Is its pose so well founded that the map itself asked no further?"""
+        """Return whether the tile's pose is clear."""
         result = self.result
         return (
             isinstance(result, Localization)
@@ -49,8 +50,11 @@ class TileResult:
 
 
 def merge_tile_results(tile_results: Sequence[TileResult]) -> Localization | NotLocalized:
-    """The answer of several tiles; the first one of a tile speaks for it. Of refusals the one that
-    found most."""
+    """Merge the results of several tiles into one.
+
+    The first reported pose of a tile represents it. If no tile localized the image, the most
+    informative refusal is returned.
+    """
     reported_poses = [(one.tile, pose) for one in tile_results for pose in one.named]
     found = [
         one for one in tile_results if isinstance(one.result, Localization) and one.is_exhaustive
@@ -76,8 +80,8 @@ def merge_tile_results(tile_results: Sequence[TileResult]) -> Localization | Not
 
 
 def is_negligible_rival(evidence: Evidence, features: str, answer: Localization) -> bool:
-    """Would a pose of another tile with this evidence be too improbable beside the answer to be
-    named as an alternative?"""
+    """Return whether a pose with this evidence is too improbable to be reported as an
+    alternative."""
     weights = load_fitted_weights(features)
     log_odds = compute_log_odds(evidence, weights)
     is_alike = features == answer.provenance.features and not answer.is_from_virtual_views
@@ -92,7 +96,7 @@ def is_negligible_rival(evidence: Evidence, features: str, answer: Localization)
 def _rivals_of(
     one: TileResult, reported_poses: Sequence[tuple[Tile, Localization]]
 ) -> list[tuple[Tile, Localization]]:
-    """The poses of other tiles that are not the same as the one of this tile."""
+    """Return the poses of other tiles that differ from the pose of this tile."""
     return [
         (tile, pose)
         for tile, pose in reported_poses
@@ -103,7 +107,7 @@ def _rivals_of(
 def _ambiguous_result(
     best: TileResult, rivals: Sequence[tuple[Tile, Localization]], log_odds_margins: Sequence[float]
 ) -> NotLocalized:
-    """It is one of these; how probable each is, beside "nowhere"."""
+    """Return an ambiguous result with the probability of each alternative."""
     assert isinstance(best.result, Localization)
     others = (
         (1.0 / max(best.result.probability, 1e-6))
@@ -139,8 +143,7 @@ def _ambiguous_result(
 
 
 def _best_refusal(tile_results: Sequence[TileResult]) -> NotLocalized:
-    """That of the tile that knows most of the picture: one that has alternatives, or the most
-    inliers."""
+    """Return the most informative refusal: one with alternatives, or with the most inliers."""
     refused = [one for one in tile_results if isinstance(one.result, NotLocalized)]
     best = max(
         refused,
@@ -158,7 +161,7 @@ def _best_refusal(tile_results: Sequence[TileResult]) -> NotLocalized:
 
 
 def with_tile(result: R, tile: Tile) -> R:
-    """A tile's answer with its name, and the pose in the atlas's world where that is known."""
+    """Add the tile's id to a result, and the pose in the atlas and joint world if known."""
     pose, joint_pose, joint = None, None, None if tile.joint is None else tile.joint.joint
     if isinstance(result, Localization) and tile.atlas_from_world is not None:
         pose = tile.atlas_from_world @ result.world_from_cam
@@ -174,9 +177,11 @@ def with_tile(result: R, tile: Tile) -> R:
 
 
 def _log_odds_margin(a: Localization, b: Localization) -> float:
-    """By how much one pose is likelier than another of another tile, in logarithms of odds: by
-    their strengths, which tell twins apart, where features of one kind speak for both, else by the
-    odds of each."""
+    """Return the log-odds margin of a pose over a pose of another tile.
+
+    It is the difference of rival scores, which separate similar places, if both use the same
+    feature type. Otherwise, or for virtual views, it is the difference of log-odds.
+    """
     is_alike = a.provenance.features == b.provenance.features and not (
         a.is_from_virtual_views or b.is_from_virtual_views
     )
@@ -184,14 +189,14 @@ def _log_odds_margin(a: Localization, b: Localization) -> float:
 
 
 def _rival_score(result: Localization) -> float:
-    """As of `belief.lead`."""
+    """Return the rival score of a pose, as in `belief.log_odds_margin`."""
     if result.evidence is None or result.is_from_virtual_views:
         return _log_odds(result)
     return compute_rival_score(result.evidence, _log_odds(result), _weights(result).rivals)
 
 
 def _log_odds(result: Localization) -> float:
-    """Of the pose against "nowhere"."""
+    """Return the log-odds of the pose against "not in the map"."""
     if result.evidence is None:
         return math.log(max(result.probability, 1e-9) / max(1.0 - result.probability, 1e-9))
     return compute_log_odds(result.evidence, _weights(result))
@@ -202,8 +207,10 @@ def _weights(result: Localization) -> FittedWeights:
 
 
 def _is_same_pose(tile: Tile, pose: Localization, other: Tile, other_pose: Localization) -> bool:
-    """Do poses of two tiles say the same, as far as the atlas knows how these lie to each other? Of
-    tiles that are joined this is known within the joins' sigmas."""
+    """Return whether poses of two tiles are the same, if the transform between the tiles is known.
+
+    For joined tiles the tolerance includes the sigmas of the joins.
+    """
     world_from_other = tile.from_world_of(other)
     if world_from_other is None:
         return False
@@ -218,8 +225,10 @@ def _is_same_pose(tile: Tile, pose: Localization, other: Tile, other_pose: Local
 
 
 def _join_sigmas(tile: Tile, pose: Localization, other: Tile) -> tuple[float, float]:
-    """How certain the way from one tile to another is at this pose of the first: metres and
-    radians; 0 where it is no matter of joins."""
+    """Return the sigmas of the transform between two tiles at a pose: metres and radians.
+
+    They are 0 if no join is involved.
+    """
     here, there = tile.joint, other.joint
     if tile.world == other.world or here is None or there is None or here.joint != there.joint:
         return 0.0, 0.0

@@ -1,9 +1,8 @@
-"""An atlas that others write to while it is asked for long: opened anew when its manifest was
-written again.
+"""Reopen an atlas when its manifest changes, for long-running readers.
 
-In a folder whoever asks looks at the manifest file. An object store may take a minute to say that
-nothing is new, so there somebody looks now and then (`look`), beside those who ask; they go on with
-what was opened before, also while the store is silent.
+In a folder each access checks the manifest file. An object store may take a minute to respond.
+There `look` is called now and then in the background, and readers continue with the last version,
+even while the store does not respond.
 """
 
 from __future__ import annotations
@@ -16,11 +15,12 @@ from topoloc.errors import AtlasError
 
 
 class WatchedAtlas:
-    """The atlas there, as its manifest is now.
+    """Hold the current version of an atlas.
 
     Raises:
-        AtlasError: there is none, or it is damaged; StoreError where its store does not answer.
-        MissingExtraError: as `store_at`.
+        AtlasError: there is no atlas, or it is damaged.
+        ObjectStoreError: its store does not respond.
+        MissingExtraError: the extra for object stores is not installed.
     """
 
     def __init__(self, where: str) -> None:
@@ -31,8 +31,11 @@ class WatchedAtlas:
         self.look()
 
     def now(self) -> Atlas:
-        """Of a folder by its manifest as it is; of an object store by the one that was seen last,
-        at once. Raises AtlasError."""
+        """Return the current atlas of a folder, or the last seen version of an object store.
+
+        Raises:
+            AtlasError: the atlas cannot be read.
+        """
         if not self.is_remote:
             with self._lock:
                 self.look()
@@ -40,11 +43,13 @@ class WatchedAtlas:
         return self._atlas
 
     def look(self) -> bool:
-        """Is another manifest there than the one before? Its atlas is the one from now on, where it
-        can be opened. One caller at a time.
+        """Open the atlas again if its manifest changed, and return whether it did.
+
+        Only one thread may call it at a time.
 
         Raises:
-            AtlasError: it cannot, or is gone; StoreError where the store does not answer.
+            AtlasError: the atlas is gone or damaged.
+            ObjectStoreError: the store does not respond.
         """
         version = self._store.version()
         if version is None:
@@ -53,6 +58,6 @@ class WatchedAtlas:
             return False
         atlas = Atlas.open(self.where)
         if self.is_remote:
-            _ = atlas.index  # its files are fetched now, and not while somebody waits
+            _ = atlas.index  # fetches the index files now, not during a query
         self._version, self._atlas = version, atlas
         return True

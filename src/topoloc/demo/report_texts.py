@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from topoloc import EvaluatedQuery
 from topoloc.apps.report.report_tables import PublishedResult, ReportTexts
-from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION
 
 PAPER_LAB = ("the paper's Lab, by day", 0.0202, 0.35)
 DAY, NIGHT = "day", "night"
@@ -64,7 +64,7 @@ def describe_night(evaluation: dict[str, Any]) -> str:
         return text + " No pose is wrong."
     return (
         text + f" {false} {'pose is' if false == 1 else 'poses are'} wrong by more than"
-        f" {MAX_TRANSLATION:g} m or {MAX_ROTATION_DEG:g} degrees."
+        f" {EvaluatedQuery.MAX_TRANSLATION:g} m or {EvaluatedQuery.MAX_ROTATION_DEG:g} degrees."
     )
 
 

@@ -1,10 +1,10 @@
-"""How good are these answers? Errors against truth, recall, false accepts."""
+"""Evaluate localization results: errors against ground truth, recall and false accepts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,21 +14,23 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized, pose_to_json
 from topoloc.recordings.frame import Image
 
-# A query counts as recalled when its pose is within both (metres, degrees), of all queries.
+# A query is recalled if its pose error is within both (metres, degrees). Recall counts all queries.
 RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-# An answer further off than both allow is a false accept: a wrong place, not a poor pose.
+# A result with an error above either limit is a false accept: a wrong place, not an inaccurate
+# pose.
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedQuery:
-    """A query with its result and its truth, which is None for an image from elsewhere: any pose
-    given for that is false.
+    """Hold a query with its result and its ground truth. The ground truth is None for an out-of-map
+    image, for which any pose is false.
 
-    `read_image` reads the picture once more, for who wants to look at it: answers hold no pictures.
-    `camera` is what it was taken with. `neighbour_ids` are the nodes that are as good as the
-    nearest one: see `find_neighbour_ids`. `is_in_other_world`: the pose is in a world of which the
-    truth says nothing, that of another tile of an atlas, and so it is false.
+    - `read_image` reads the image again, because results hold no images.
+    - `camera` is the query's camera model.
+    - `neighbour_ids` are nodes as good as the nearest one, see `find_neighbour_ids`.
+    - `is_in_other_world` is True if the pose is in the world of another atlas tile without a known
+      transform. The pose then counts as false.
     """
 
     query: str
@@ -41,10 +43,13 @@ class EvaluatedQuery:
     neighbour_ids: frozenset[int] = frozenset()
     is_in_other_world: bool = False
 
+    MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
+    MAX_ROTATION_DEG: ClassVar[float] = MAX_ROTATION_DEG
+
     @property
     def translation_m(self) -> float:
-        """Distance from the truth, metres; NaN where there is no pose or no truth, or truth says
-        nothing of its world."""
+        """Return the distance from the ground truth in metres. NaN without a pose or ground truth
+        in the same world."""
         if (
             isinstance(self.result, NotLocalized)
             or self.world_from_cam is None
@@ -55,8 +60,8 @@ class EvaluatedQuery:
 
     @property
     def rotation_deg(self) -> float:
-        """Angle from the truth, degrees; NaN where there is no pose or no truth, or truth says
-        nothing of its world."""
+        """Return the angle from the ground truth in degrees. NaN without a pose or ground truth in
+        the same world."""
         if (
             isinstance(self.result, NotLocalized)
             or self.world_from_cam is None
@@ -67,15 +72,19 @@ class EvaluatedQuery:
 
     @property
     def is_false_accept(self) -> bool:
+        """Return whether the result has a pose that is wrong: out of map, in another world, or
+        beyond the error limits."""
         if isinstance(self.result, NotLocalized):
             return False
         if self.world_from_cam is None or self.is_in_other_world:
             return True
-        return self.translation_m > MAX_TRANSLATION or self.rotation_deg > MAX_ROTATION_DEG
+        return (
+            self.translation_m > self.MAX_TRANSLATION or self.rotation_deg > self.MAX_ROTATION_DEG
+        )
 
     def to_json(self) -> dict[str, Any]:
-        """The result's line, with its recording and its truth, which is null for an image from
-        elsewhere."""
+        """Return the result's JSON with its recording and its ground truth, which is null for an
+        out-of-map image."""
         truth = None if self.world_from_cam is None else pose_to_json(self.world_from_cam)
         return self.result.to_json(self.query) | {
             "recording": self.recording,
@@ -84,7 +93,7 @@ class EvaluatedQuery:
 
 
 def group_by_recording(answers: Sequence[EvaluatedQuery]) -> dict[str, list[EvaluatedQuery]]:
-    """The answers of each recording, in the order in which the recordings were asked first."""
+    """Group the results by recording, in the order of the recordings' first queries."""
     groups: dict[str, list[EvaluatedQuery]] = {}
     for answer in answers:
         groups.setdefault(answer.recording, []).append(answer)
@@ -92,10 +101,10 @@ def group_by_recording(answers: Sequence[EvaluatedQuery]) -> dict[str, list[Eval
 
 
 def summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
-    """The evaluation as JSON, of all answers together and, under "recordings", of each recording
-    alone.
+    """Return the evaluation as JSON, of all results and, under "recordings", of each recording.
 
-    Counts, medians over what was localized, recall over all queries that have a truth.
+    It contains counts, medians over localized queries, and recall over all queries with ground
+    truth.
     """
     rows = [
         {"name": name} | _summarize(group) for name, group in group_by_recording(answers).items()
@@ -151,7 +160,7 @@ def _median(values: np.ndarray) -> float | None:
 
 
 def format_length(metres: float, digits: int | None = None) -> str:
-    """Metres for people: in cm below one."""
+    """Format metres for display, in cm below one metre."""
     if metres >= 1.0:
         return f"{metres:.{2 if digits is None else digits}f} m"
     return f"{100 * metres:.{(2 if metres < 0.1 else 1) if digits is None else digits}f} cm"

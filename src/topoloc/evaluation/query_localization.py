@@ -1,4 +1,4 @@
-"""Ask a map about recordings whose truth is known."""
+"""Localize recordings with ground truth in a map."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 
-# A node this many times D_thresh away, or nearer, sees the query's view as the nearest one does.
+# A node within this many D_thresh counts as a neighbour of the query.
 NEIGHBOUR_RADIUS = 1.5
 
 
 QueriedMap = Localizer | EvaluatedTile
-"""A map, or an atlas that is judged in the world of one tile."""
+"""A map, or an atlas evaluated in the world of one tile."""
 
 
 def localize_queries(
@@ -34,17 +34,20 @@ def localize_queries(
     label: str | None = None,
     frames: Sequence[int] | None = None,
 ) -> list[EvaluatedQuery]:
-    """Localize every frame whose pose is known; only the left (or colour) picture is shown to the
-    localizer.
+    """Localize every frame with a known pose. The localizer receives only the left (or colour)
+    image.
 
     Args:
-        map_from_truth: the recording's world given in the map's, where the two differ.
-        label: what the answers call the recording, by default its name.
-        frames: these alone, in this order; their poses are known.
+        localizer: the localizer of the map, or an evaluated tile.
+        sequence: the recording.
+        map_from_truth: the transform from the recording's world to the map's, if they differ.
+        progress: is called with the label, frames done and all frames.
+        label: the name of the recording in the results. Defaults to its own name.
+        frames: localize only these frames, in this order. Their poses must be known.
 
     Raises:
-        TrajectoryError: the recording holds no truth.
-        CalibrationError: it holds no camera.
+        TrajectoryError: the recording has no ground truth.
+        CalibrationError: the recording has no camera model.
     """
     nodes = NodePoses.of([summary.world_from_cam for summary in localizer.topomap.summaries])
     lambda_rot = localizer.topomap.config.lambda_rot
@@ -82,13 +85,17 @@ def localize_out_of_map(
     label: str | None = None,
     frames: Sequence[int] | None = None,
 ) -> list[EvaluatedQuery]:
-    """Show the localizer images that were not taken in the map: every pose that it gives is false.
+    """Localize out-of-map images. Every pose of the results is false.
 
     Args:
-        frames: these alone, in this order.
+        localizer: the localizer of the map, or an evaluated tile.
+        sequence: the recording.
+        progress: is called with the label, frames done and all frames.
+        label: the name of the recording in the results. Defaults to its own name.
+        frames: localize only these frames, in this order.
 
     Raises:
-        CalibrationError: the recording holds no camera.
+        CalibrationError: the recording has no camera model.
     """
     label, frames = label or sequence.name, range(len(sequence)) if frames is None else frames
     answers = []
@@ -112,7 +119,7 @@ def localize_out_of_map(
 
 
 def find_frames_with_truth(sequence: StereoSequence) -> list[int]:
-    """The frames whose pose is known. Raises TrajectoryError where there is none."""
+    """Return the frames with a known pose. Raises TrajectoryError if there are none."""
     frames = [i for i, pose in enumerate(sequence.poses) if pose is not None]
     if not frames:
         raise TrajectoryError(f"{sequence.name}: no frame has a known pose to judge against")
@@ -120,15 +127,15 @@ def find_frames_with_truth(sequence: StereoSequence) -> list[int]:
 
 
 def create_image_reader(sequence: StereoSequence, index: int) -> Callable[[], Image]:
-    """Reads the picture of a frame once more."""
+    """Return a function that reads the image of a frame again."""
     return lambda: sequence[index].image
 
 
 def find_neighbour_ids(
     topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]
 ) -> frozenset[int]:
-    """Ids of the nodes next to the nearest one along the route, and within 1.5 D_thresh, given
-    D_total to each (metres, Eq. 1)."""
+    """Return the ids of nodes connected to the nearest node by an edge, and of nodes within 1.5
+    D_thresh. `distances` holds D_total to each node (metres, Eq. 1)."""
     nearest = topomap.summaries[int(np.argmin(distances))].node_id
     along = {edge.target_id for edge in topomap.edges if edge.source_id == nearest}
     along |= {edge.source_id for edge in topomap.edges if edge.target_id == nearest}
@@ -137,8 +144,8 @@ def find_neighbour_ids(
 
 
 def _to_answered_world(localizer: QueriedMap, answer: EvaluatedQuery) -> EvaluatedQuery:
-    """Where another tile of an atlas answered: with the truth in that one's world; which of its
-    nodes is nearest is not asked."""
+    """Transform the ground truth to the world of the tile in the result, if it is another tile of
+    an atlas. The nearest node is then not evaluated."""
     if (
         isinstance(localizer, Localizer)
         or answer.world_from_cam is None

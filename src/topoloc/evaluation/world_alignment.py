@@ -1,8 +1,7 @@
-"""Truth and map in different worlds: answers that agree with each other, and whose errors one rigid
-transform explains.
+"""Detect ground truth in another world than the map: one rigid transform explains the errors.
 
-Recordings of one place often have worlds of their own. Errors of 20 degrees then say nothing of the
-answers; what they would be in one world is offered beside them, never in their place.
+Recordings of one place often have different worlds, and their pose errors are then meaningless. The
+errors after alignment are reported in addition. They never replace the original errors.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 
 _MIN_ANSWERS = 5
-_MIN_ERROR = 1.0  # of errors weighed as below; smaller ones need no explanation
+_MIN_ERROR = 1.0  # in normalized errors; smaller errors need no explanation
 _POSITION_SCALE_M, _ROTATION_SCALE = 0.25, np.deg2rad(2.0)
 _MAX_SHARE = 0.2
 _GATE = 3.0
@@ -28,8 +27,8 @@ _GATE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class WorldFit:
-    """`map_from_truth` by the answers to one recording; medians of the errors that are left, of
-    `num_answers` of `num_localized`."""
+    """Hold `map_from_truth` of one recording, fitted to `num_answers` of `num_localized` results,
+    and the medians of the remaining errors."""
 
     recording: str
     map_from_truth: Rigid3
@@ -39,6 +38,7 @@ class WorldFit:
     num_localized: int
 
     def to_json(self) -> dict[str, Any]:
+        """Return the fit as JSON."""
         return {
             "recording": self.recording,
             "map_from_truth": self.map_from_truth.matrix().tolist(),
@@ -50,11 +50,11 @@ class WorldFit:
 
 
 def fit_worlds(answers: Sequence[EvaluatedQuery]) -> WorldFit | None:
-    """The transform that explains the errors of one recording's answers; None where they are small
-    already, or none explains most of them.
+    """Fit the transform that explains the errors of one recording's results. Return None if the
+    errors are small already or no transform explains most of them.
 
-    Each answer proposes one; the one that leaves the least median error is refined by the answers
-    that agree with it.
+    Each result proposes a transform. The one with the smallest median error is refined on the
+    results that agree with it.
     """
     pairs = [
         (a.result.world_from_cam, a.world_from_cam)
@@ -88,7 +88,7 @@ def fit_worlds(answers: Sequence[EvaluatedQuery]) -> WorldFit | None:
 def _normalized_errors(
     map_from_truth: Rigid3, pairs: Sequence[tuple[Rigid3, Rigid3]]
 ) -> Float[np.ndarray, " n"]:
-    """Of each answer, 1 for 25 cm or 2 degrees."""
+    """Return the error of each result, 1 for 25 cm or 2 degrees."""
     moved = [(found, map_from_truth @ true) for found, true in pairs]
     return np.array(
         [

@@ -1,9 +1,9 @@
-"""A network's descriptors of a whole picture, and how far they agree with map points where these
-must be seen.
+"""Hold a network's dense descriptors of a whole image and compare them with map points at their
+projections.
 
-A key point must be found anew to speak for a pose, and in rain or by night most are not. What a
-network says of every few pixels needs no finding: where a pose is right, the descriptor most like
-the map point's, of all around, lies where the point must be seen.
+A key point supports a pose only if it is detected again. In rain or at night most key points are
+not. Dense descriptors need no detection. If a pose is right, the most similar descriptor around a
+map point's projection lies at the projection itself.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from topoloc.features.learned_kernels import (
     sample_levels,
 )
 
-_RADIUS = 4  # grid steps to each side among which the most similar descriptor is sought
+_RADIUS = 4  # grid steps to each side in which the most similar descriptor is searched
 
 
-class DenseDescriptors(ABC):
-    """One descriptor each `stride_px` pixels; that of pixel (x, y) lies at column (x + 0.5) /
-    stride_px - 0.5."""
+class GridDescriptors(ABC):
+    """Hold one descriptor every `stride_px` pixels. The descriptor of pixel (x, y) lies at column
+    (x + 0.5) / stride_px - 0.5, and rows likewise."""
 
     stride_px: float
 
     @property
     @abstractmethod
     def size(self) -> int:
-        """Numbers a descriptor."""
+        """Return the length of a descriptor."""
 
     @abstractmethod
     def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
-        """Descriptors of unit length between those of the grid, bilinear."""
+        """Return descriptors of unit length at these pixels, interpolated bilinearly."""
 
     @abstractmethod
     def _normalized_grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        """All of the grid, of unit length."""
+        """Return the whole grid with descriptors of unit length."""
 
     @cached_property
     def _grid(self) -> Float32[np.ndarray, "rows columns d"]:
@@ -52,8 +52,11 @@ class DenseDescriptors(ABC):
     def check_agreement(
         self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]
     ) -> Bool[np.ndarray, " n"]:
-        """Is the descriptor most like each of these, of all within 4 grid steps to each side of its
-        point, at most one step off?"""
+        """Return for each point whether its best match lies at its projection.
+
+        The most similar descriptor is searched within 4 grid steps to each side. It must lie at
+        most one grid step from the point.
+        """
         return is_local_best_match(
             self._grid,
             points_img.astype(np.float32),
@@ -64,17 +67,19 @@ class DenseDescriptors(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class SingleLevelDescriptors(DenseDescriptors):
-    """As most networks give them: one plane a number, not of unit length."""
+class SingleLevelDescriptors(GridDescriptors):
+    """Hold the output of most networks: one plane per component, not of unit length."""
 
     planes: Float32[np.ndarray, "d rows columns"]
     stride_px: float
 
     @property
     def size(self) -> int:
+        """Return the length of a descriptor."""
         return self.planes.shape[0]
 
     def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+        """Return descriptors of unit length at these pixels, interpolated bilinearly."""
         return sample_descriptors(self.planes, points_img, np.float32(self.stride_px))
 
     def _normalized_grid(self) -> Float32[np.ndarray, "rows columns d"]:
@@ -82,10 +87,13 @@ class SingleLevelDescriptors(DenseDescriptors):
 
 
 @dataclass(frozen=True, eq=False)
-class TwoLevelDescriptors(DenseDescriptors):
-    """As a network gives them that only ever adds two levels up: `coarse`, enlarged to twice its
-    rows and columns (bilinear), and `fine` times `weights`. Both are linear, and far fewer
-    descriptors are asked for than there are: so they are added up where they are."""
+class TwoLevelDescriptors(GridDescriptors):
+    """Hold two levels whose sum is the descriptors: `coarse`, enlarged bilinearly to twice its rows
+    and columns, and `fine` times `weights`.
+
+    Both operations are linear, and few descriptors of the grid are sampled. So the sum is computed
+    only at the sampled points.
+    """
 
     coarse: Float32[np.ndarray, "half_rows half_columns d"]
     fine: Float32[np.ndarray, "rows columns k"]
@@ -94,9 +102,11 @@ class TwoLevelDescriptors(DenseDescriptors):
 
     @property
     def size(self) -> int:
+        """Return the length of a descriptor."""
         return self.coarse.shape[2]
 
     def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+        """Return descriptors of unit length at these pixels, interpolated bilinearly."""
         return sample_levels(
             self.coarse, self.fine, self.weights, points_img, np.float32(self.stride_px)
         )

@@ -1,7 +1,6 @@
-"""From an image to its features, by name: the one place where a kind of key point meets a
-normalisation.
+"""Extract the features of an image with a feature type and a normalisation, both chosen by name.
 
-Maps and the queries put to them must be made with the same `FeatureConfig`: a map stores its own.
+A map and its queries must use the same `FeatureConfig`. Each map stores its own.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from topoloc.features.patch_normalization import PatchNormalizationConfig, patch
 NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
     "none": None,
     "paper": PatchNormalizationConfig.paper(),
-    # Wider than most key points, so that their shape survives; a noise floor, so that plain walls
-    # stay plain.
+    # The window is wider than most key points, so that it keeps their shape. The noise floor keeps
+    # textureless walls plain.
     "wide": PatchNormalizationConfig(window_px=65, epsilon=24.0),
 }
 
@@ -27,11 +26,13 @@ NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
 def extract_features(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None
 ) -> Features:
-    """The features of a grey image, strongest first; the same for any `num_threads`. Without dense
-    descriptors, which would fill the memory where features of many images are held.
+    """Return the features of a grey image, strongest first. They are the same for any
+    `num_threads`.
+
+    Dense descriptors are dropped: they would fill the memory if features of many images are held.
 
     Raises:
-        FeatureKindError: there is no such kind.
+        FeatureTypeError: the feature type is unknown.
     """
     return replace(
         extract_from_normalized(normalize_image(image, config, num_threads), config, num_threads),
@@ -42,7 +43,8 @@ def extract_features(
 def normalize_image(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None
 ) -> UInt8[np.ndarray, "h w"]:
-    """First step of `extract_features`: the picture that key points are sought in."""
+    """Return the normalised image in which key points are detected. This is the first step of
+    `extract_features`."""
     normalization = NORMALIZATIONS[
         config.normalization or find_feature_type(config.kind).normalization
     ]
@@ -52,5 +54,6 @@ def normalize_image(
 def extract_from_normalized(
     normalized: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None = None
 ) -> Features:
-    """Second step of `extract_features`: the features of what `normalize_image` gave."""
+    """Return the features of an image from `normalize_image`, with dense descriptors if the feature
+    type has them. This is the second step of `extract_features`."""
     return find_feature_type(config.kind).extract(normalized, config, num_threads)

@@ -1,10 +1,10 @@
-"""The kinds of local features that a map may be made of, in one table: all that differs between
-them stands here.
+"""List the local feature types of maps in one table, with everything in which they differ.
 
-A kind is added by one entry in `FEATURE_TYPES`: how a picture gives its features, and the
-thresholds with which they are matched. What makes its answers honest is fitted and kept beside the
-code that uses it (`localization/fitted_weights.py`); until then its answers say that their
-probability is not calibrated.
+One entry in `FEATURE_TYPES` adds a type: its extraction function and its matching thresholds. The
+weights that calibrate its probabilities are fitted separately and stored with the code that uses
+them (`localization/fitted_weights.py`). Without them, results are marked as not calibrated.
+
+The extraction code of a type is loaded when it is used: OpenCV, Numba or ONNX Runtime with it.
 """
 
 from __future__ import annotations
@@ -19,41 +19,40 @@ from jaxtyping import UInt8
 from topoloc.bounds import AtLeast, Between
 from topoloc.errors import FeatureTypeError
 from topoloc.features.features import Features
-from topoloc.features.learned import LearnedConfig, check_network, extract_learned
-from topoloc.features.sift import SiftConfig, extract_sift
-from topoloc.features.surf import DESCRIPTOR_LENGTH, SurfConfig, extract_surf
 
 Normalization = Literal["none", "paper", "wide"]
 
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Which features an image gives. Plain values only: it is stored in the map and built again
-    from them."""
+    """Hold the settings of feature extraction. A map stores these plain values and creates the
+    configuration from them again."""
 
     kind: str = "surf"
-    """Local features of the map, and of every query to it: a name in `FEATURE_TYPES`."""
+    """Feature type of the map and of its queries: a name in `FEATURE_TYPES`."""
     normalization: Normalization | None = None
-    """`none`. `paper`: 17x17 windows and no noise floor. `wide`: 65x65 windows and a floor of 24
-    grey levels, which keeps what the paper's form gains when the light changes and loses little
-    where it does not. Unset: what suits the kind."""
+    """Patch normalisation of the image. `none`: no normalisation. `paper`: 17x17 windows without a
+    noise floor. `wide`: 65x65 windows and a floor of 24 grey levels. `wide` keeps the gain of
+    `paper` under changed light and loses little under unchanged light. Unset: the default of the
+    feature type."""
     max_features: Annotated[int, Between(1, 100_000)] = 1000
-    """The strongest are kept."""
+    """Number of features to keep, strongest first."""
     hessian_threshold: Annotated[float, AtLeast(0)] = 20.0
-    """Of SURF, for images of 0..255. Low on purpose: a fixed one is a threshold on contrast, and
-    finds next to nothing in a dark picture."""
+    """Detection threshold of SURF for images of 0..255. The default is low on purpose: a fixed
+    threshold depends on contrast, and a high one finds almost nothing in a dark image."""
     contrast_threshold: Annotated[float, AtLeast(0)] = 0.01
-    """The same of SIFT, as OpenCV's."""
+    """Detection threshold of SIFT, as in OpenCV."""
 
 
 @dataclass(frozen=True)
 class GuidedThresholds:
-    """Which key point near the place where a map point must be seen is that point.
+    """Hold the thresholds for matching a map point to a key point near its projection.
 
-    min_similarity: least scalar product of the two descriptors; min_margin: by how much the best
-    key point must lead the next one. max_scale: largest ratio of a key point's size to the one
-    expected, or the other way round; max_turn: largest difference of its orientation from the one
-    expected, radians.
+    Args:
+        min_similarity: minimum scalar product of the two descriptors.
+        min_margin: minimum lead of the best key point over the next one.
+        max_scale: maximum ratio of a key point's size to the expected size, or its inverse.
+        max_turn: maximum difference of its orientation from the expected one, radians.
     """
 
     min_similarity: float
@@ -64,21 +63,27 @@ class GuidedThresholds:
 
 @dataclass(frozen=True)
 class FeatureType:
-    """A kind of local feature.
+    """Describe a local feature type.
 
-    extract: gives the features of a grey uint8 picture, strongest first, with these settings on so
-    many threads. Descriptors must have unit length: they are compared by their scalar product.
-    normalization: what is done to the picture first, unless the settings say otherwise.
-    descriptor_scale: a map file keeps a descriptor's numbers times this as signed bytes; what
-    exceeds 127 (at 200: 0.63) is clipped. has_scale, has_angle: do `Features.sizes_px` and `angles`
-    follow the picture? Where they do not, all are the same, and matching does not look at them.
-    sigma_px: standard deviation (pixels) of a matched key point along x and along y. ratio: a match
-    must be nearer than this times its nearest rival; wall_ratio, of walls seen from the side, which
-    repeat themselves. position_weight: how much a feature's place in the picture counts beside its
-    descriptor where pictures are ranked (`places/vlad.py`). network: what gives the features, if a
-    network does (`network_files.py`). sides: the kind that describes views to the sides
-    (`virtual_views.py`) of a map of this one, if that is another. guided: thresholds for key points
-    near their projection; distant: far from it, where the pose is only that of a node nearby.
+    Args:
+        extract: function that returns the features of a grey uint8 image, strongest first, for
+            given settings and number of threads. Descriptors must have unit length, because they
+            are compared by their scalar product.
+        guided: thresholds for key points near their projection.
+        distant: thresholds for key points far from it, if the pose is only that of a nearby node.
+        normalization: default normalisation of the image, see `FeatureConfig`.
+        descriptor_scale: a map file stores each component times this number as a signed byte.
+            Values above 127 (0.63 at a scale of 200) are clipped.
+        has_scale, has_angle: whether `Features.sizes_px` and `angles` vary with the image. If not,
+            they are constant and matching ignores them.
+        sigma_px: standard deviation of a matched key point along x and along y, pixels.
+        ratio: threshold of the ratio test against the nearest rival.
+        virtual_view_ratio: the same for virtual views, whose features repeat more often.
+        position_weight: weight of a feature's image position beside its descriptor in image
+            retrieval (`retrieval/vlad.py`).
+        network: name of the network that computes the features, if any (`network_files.py`).
+        sides: feature type of the virtual views of a map (`virtual_views.py`), if it differs from
+            this one.
     """
 
     name: str
@@ -99,13 +104,15 @@ class FeatureType:
 
     @property
     def virtual_view_type(self) -> str:
-        """The kind by which views to the sides are described in maps of this one."""
+        """Return the name of the feature type for virtual views in maps of this type."""
         return self.sides or self.name
 
 
 def _extract_surf(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
 ) -> Features:
+    from topoloc.features.surf import SurfConfig, extract_surf
+
     settings = SurfConfig(
         hessian_threshold=config.hessian_threshold,
         max_features=config.max_features,
@@ -117,6 +124,8 @@ def _extract_surf(
 def _extract_sift(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
 ) -> Features:
+    from topoloc.features.sift import SiftConfig, extract_sift
+
     return extract_sift(
         image,
         SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold),
@@ -126,11 +135,14 @@ def _extract_sift(
 def _learned_feature_type(
     network: str, descriptor_size: int, min_score: float, sides: str | None = None
 ) -> FeatureType:
-    """A kind whose features a network gives: no size, no angle, and the picture as it is."""
+    """Return a feature type computed by a network: without size and angle, on the image without
+    normalisation."""
 
     def extract(
         image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
     ) -> Features:
+        from topoloc.features.learned import LearnedConfig, extract_learned
+
         return extract_learned(
             image,
             LearnedConfig(network, descriptor_size, config.max_features, min_score, num_threads),
@@ -155,7 +167,7 @@ def _learned_feature_type(
 SURF = FeatureType(
     "surf",
     _extract_surf,
-    DESCRIPTOR_LENGTH,
+    64,
     guided=GuidedThresholds(min_similarity=0.75, min_margin=0.03, max_scale=1.6, max_turn=0.6),
     distant=GuidedThresholds(min_similarity=0.8, min_margin=0.02, max_scale=1.5, max_turn=0.35),
 )
@@ -168,22 +180,22 @@ LEARNED_TYPES = (
     _learned_feature_type("edgepoint2-e64", 64, min_score=0.0067),
     _learned_feature_type("xfeat", 64, min_score=0.05),
 )
-"""The first one is what is meant by learned features where none are named."""
+"""Learned feature types. The first one is the default."""
 
 FEATURE_TYPES: dict[str, FeatureType] = {kind.name: kind for kind in (SURF, SIFT, *LEARNED_TYPES)}
 
 _VIRTUAL_VIEW_TYPES = {
     "topoloc-net-sides": _learned_feature_type("topoloc-net-sides", 64, min_score=0.0067)
 }
-"""Those of side views alone, which no map is made of: `topoloc-net`, taught further on walls that
-are seen from their two ends."""
+"""Feature types for virtual views only. `topoloc-net-sides` is `topoloc-net`, trained further on
+walls seen from both directions. No map is made of them."""
 
 
 def find_feature_type(name: str) -> FeatureType:
-    """The kind of this name, also one of side views.
+    """Return the feature type of this name, including types for virtual views.
 
     Raises:
-        FeatureKindError: there is none.
+        FeatureTypeError: the name is unknown.
     """
     kind = FEATURE_TYPES.get(name) or _VIRTUAL_VIEW_TYPES.get(name)
     if kind is None:
@@ -194,23 +206,24 @@ def find_feature_type(name: str) -> FeatureType:
 
 
 def default_learned_type() -> str:
-    """The learned features that are taken where the user names none: those whose answers are
-    calibrated.
+    """Return the default learned feature type, whose results are calibrated.
 
     Raises:
-        MissingExtraError, WeightsError: what their network needs is not here.
+        MissingExtraError, WeightsError: a requirement of its network is missing.
     """
     check_available(LEARNED_TYPES[0].name)
     return LEARNED_TYPES[0].name
 
 
 def check_available(name: str) -> None:
-    """Can features of this kind be had here?
+    """Check that features of this type can be computed on this installation.
 
     Raises:
-        FeatureKindError: there is no such kind.
-        MissingExtraError, WeightsError: what its network needs is not there.
+        FeatureTypeError: the feature type is unknown.
+        MissingExtraError, WeightsError: a requirement of its network is missing.
     """
     network = find_feature_type(name).network
     if network is not None:
+        from topoloc.features.learned import check_network
+
         check_network(network)

@@ -1,27 +1,50 @@
-"""The currency between the feature steps: key points with descriptors, and matches between two sets
-of them."""
+"""Define the data exchanged between the feature steps: key points with descriptors, and matches
+between two sets of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Int32, Shaped
-
-from topoloc.features.dense import DenseDescriptors
+from jaxtyping import Bool, Float, Float32, Int32, Shaped
 
 _ARRAY_FIELDS = ("points_img", "sizes_px", "angles", "responses", "descriptors")
 
 
+@runtime_checkable
+class DenseDescriptors(Protocol):
+    """The interface of dense descriptors of an image (`dense.py` implements it)."""
+
+    stride_px: float
+
+    @property
+    def size(self) -> int:
+        """Return the length of a descriptor."""
+        ...
+
+    def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
+        """Return descriptors of unit length at these pixels, interpolated bilinearly."""
+        ...
+
+    def check_agreement(
+        self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Return for each point whether its best match lies at its projection."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Local features of one image, strongest first.
+    """Hold the local features of one image, strongest first.
 
-    points_img are pixels (centre of the top-left pixel at (0, 0)); sizes_px the diameter of the
-    neighbourhood described; angles in radians from +x towards +y (clockwise on the screen), 0 for
-    upright ones; descriptors have unit length. Of a network also what it says of the whole picture,
-    which a part of the features is without, and no node keeps: `cells` is what it saw in each cell,
-    where the network has such, `dense` its descriptors each few pixels.
+    points_img are pixels (centre of the top-left pixel at (0, 0)). sizes_px are diameters of the
+    described neighbourhoods. angles are radians from +x towards +y (clockwise on the screen), 0 for
+    upright features. descriptors have unit length.
+
+    Features of a network may include outputs for the whole image. `cells` holds the mean network
+    output of each image cell. `dense` holds the dense descriptors. `select` and `concatenate` drop
+    both, and nodes do not store them.
     """
 
     points_img: Float32[np.ndarray, "n 2"]
@@ -36,11 +59,12 @@ class Features:
         return len(self.points_img)
 
     def select(self, rows: Shaped[np.ndarray, " m"]) -> Features:
-        """The features of these rows (indices or a boolean mask)."""
+        """Return the features of these rows (indices or a boolean mask)."""
         return Features._from_arrays([getattr(self, name)[rows] for name in _ARRAY_FIELDS])
 
     @staticmethod
     def concatenate(parts: list[Features]) -> Features:
+        """Return the features of all parts, in their order. There must be at least one part."""
         return Features._from_arrays(
             [np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAY_FIELDS]
         )
@@ -52,6 +76,7 @@ class Features:
 
     @staticmethod
     def empty(dimension: int) -> Features:
+        """Return no features, with descriptors of this length."""
         zero = np.zeros(0, np.float32)
         return Features(
             np.zeros((0, 2), np.float32), zero, zero, zero, np.zeros((0, dimension), np.float32)
@@ -60,8 +85,8 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pairs of rows: `query_idx[k]` of the one set goes with `train_idx[k]` of the other, at this
-    descriptor distance."""
+    """Hold matched pairs of rows: `query_idx[k]` of one set matches `train_idx[k]` of the other, at
+    this descriptor distance."""
 
     query_idx: Int32[np.ndarray, " m"]
     train_idx: Int32[np.ndarray, " m"]

@@ -1,11 +1,11 @@
-"""Learned local features: a network reads the whole picture once and gives a score for every pixel
-and a descriptor for every few.
+"""Extract learned local features: one network run on the whole image yields a score per pixel and
+coarser descriptors.
 
-All networks come as ONNX files of one form and run in ONNX Runtime: grey in [0, 1] goes in, its
-sides multiples of 32; out come the score of each pixel being a key point, and descriptors on a
-coarser grid; of some networks also a level by which places are known again. Key points are the
-maxima of the scores, the strongest to a fraction of a pixel by a parabola through each and its
-neighbours.
+All networks are ONNX files of one form and run in ONNX Runtime. The input is grey in [0, 1], with
+sides that are multiples of 32. The outputs are a key point score per pixel and descriptors on a
+coarser grid. Some networks also return a level for image retrieval. Key points are the local maxima
+of the scores. The strongest ones are refined to subpixels with a parabola through the neighbouring
+scores.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from jaxtyping import Float32, UInt8
 
 from topoloc import compiled
 from topoloc.errors import WeightsError
-from topoloc.features.dense import DenseDescriptors, SingleLevelDescriptors, TwoLevelDescriptors
+from topoloc.features.dense import GridDescriptors, SingleLevelDescriptors, TwoLevelDescriptors
 from topoloc.features.features import Features
 from topoloc.features.learned_kernels import find_maxima, refine_subpixel
 from topoloc.features.network_files import NetworkInfo, find_network, open_network
 
 _SIDE_MULTIPLE = 32
 _BORDER_PX = 4
-_CELLS = (4, 6)  # rows and columns of the picture that places are known by
+_CELLS = (4, 6)  # rows and columns of image cells, for image retrieval
 KEY_POINT_SIZE_PX = 16.0
-"""The size that all these key points are said to have."""
+"""Constant size of all learned key points, pixels."""
 
 
 @dataclass(frozen=True)
 class LearnedConfig:
-    """Which network, and how many of its key points.
+    """Select a network and the number of its key points.
 
-    min_score: key points score more than this.
+    Args:
+        min_score: key points must have a higher score.
+        num_threads: threads of the network. Default: the number of `set_num_threads`.
     """
 
     network: str
@@ -48,11 +50,12 @@ class LearnedConfig:
 
 
 def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> Features:
-    """Key points and descriptors of a grey image, strongest first; without size and angle.
+    """Return key points and descriptors of a grey image, strongest first. Size and angle are
+    constant.
 
     Raises:
         MissingExtraError: ONNX Runtime is not installed.
-        WeightsError: the network's file is missing, damaged or another network's.
+        WeightsError: the network's file is missing, damaged or of another network.
     """
     height, width = image.shape
     network_output = run_network(image, config.network, config.num_threads)
@@ -69,11 +72,11 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
         np.full(len(order), KEY_POINT_SIZE_PX, np.float32),
         np.zeros(len(order), np.float32),
     )
-    of_picture = (height / scores.shape[0], width / scores.shape[1])
+    image_fractions = (height / scores.shape[0], width / scores.shape[1])
     cells = (
         None
         if network_output.places is None
-        else compute_cell_means(network_output.places, *of_picture)
+        else compute_cell_means(network_output.places, *image_fractions)
     )
     return Features(points_img, sizes, angles, found[order], dense.sample(points_img), cells, dense)
 
@@ -81,8 +84,8 @@ def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> F
 def compute_cell_means(
     level: Float32[np.ndarray, "c h w"], height_share: float, width_share: float
 ) -> Float32[np.ndarray, "rows columns c"]:
-    """Means of a network's level over a grid of cells, of that share of its rows and columns that
-    the picture fills."""
+    """Return the means of a network level over a grid of 4 x 6 cells. Only the fraction of rows and
+    columns that the image covers is used, without the padding."""
     for axis, share, count in ((1, height_share, _CELLS[0]), (2, width_share, _CELLS[1])):
         length = max(1, round(level.shape[axis] * share))
         starts = np.arange(count) * length // count
@@ -93,24 +96,25 @@ def compute_cell_means(
 
 
 def check_network(network: str) -> None:
-    """Is the network there? Raises as `extract_learned`."""
+    """Check that the network can be opened. Raises the errors of `extract_learned`."""
     _open_session(network, find_network(network))
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkOutput:
-    """Scores of the pixels, descriptors, and the level by which places are known again, where the
+    """Hold the pixel scores, the dense descriptors, and the level for image retrieval if the
     network has one."""
 
     scores: Float32[np.ndarray, "padded_h padded_w"]
-    dense: DenseDescriptors
+    dense: GridDescriptors
     places: Float32[np.ndarray, "c level_h level_w"] | None
 
 
 def run_network(
     image: UInt8[np.ndarray, "h w"], network: str, num_threads: int | None = None
 ) -> NetworkOutput:
-    """What a network says of a picture, which is continued by its border to the sides asked."""
+    """Run a network on an image. The image is padded with its border pixels to sides that are
+    multiples of 32."""
     height, width = image.shape
     padding = [(0, -side % _SIDE_MULTIPLE) for side in (height, width)]
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
@@ -122,15 +126,18 @@ def run_network(
         os.getpid(),
     )
     names = [output.name for output in session.get_outputs()]
-    of = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
-    scores, places = of["scores"][0, 0], of.get("places")
-    if "coarse" in of:
+    outputs = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
+    scores, places = outputs["scores"][0, 0], outputs.get("places")
+    if "coarse" in outputs:
         dense = TwoLevelDescriptors(
-            of["coarse"][0], of["fine"][0], of["fine_weights"], len(scores) / of["fine"].shape[1]
+            outputs["coarse"][0],
+            outputs["fine"][0],
+            outputs["fine_weights"],
+            len(scores) / outputs["fine"].shape[1],
         )
     else:
         dense = SingleLevelDescriptors(
-            of["descriptors"][0], len(scores) / of["descriptors"].shape[2]
+            outputs["descriptors"][0], len(scores) / outputs["descriptors"].shape[2]
         )
     return NetworkOutput(scores, dense, None if places is None else places[0])
 
@@ -139,10 +146,10 @@ def run_network(
 def _session_for_size(
     network: str, path: Path, num_threads: int, size: tuple[int, int], process_id: int
 ) -> Any:
-    """The network made ready for pictures of one size, in some 10 ms, after which each takes 0.8 of
-    the time; a forked child makes its own.
+    """Return a session prepared for images of one size. The preparation takes some 10 ms, and each
+    image then takes 0.8 of the time. A forked child creates its own session.
 
-    Each holds some 100 bytes a pixel, so few are kept.
+    Each session holds some 100 bytes per pixel, so only a few are kept.
     """
     return _check_network_name(network, path, *open_network(path, num_threads, size))
 
@@ -153,7 +160,7 @@ def _open_session(network: str, path: Path) -> Any:
 
 
 def close_networks() -> None:
-    """Let go of all networks that are open; the next picture opens its own again."""
+    """Close all open networks. They are opened again when needed."""
     _session_for_size.cache_clear()
     _open_session.cache_clear()
 

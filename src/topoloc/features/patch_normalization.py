@@ -1,7 +1,7 @@
-"""Patch normalisation: every pixel by the mean and standard deviation of its own neighbourhood.
+"""Normalise each pixel by the mean and standard deviation of its neighbourhood.
 
 The paper, section III-C: ``N(p) = (I(p) - mu_P) / (sigma_P + epsilon)`` in 17x17 windows, before
-the key points, which makes the features outlive a change of lighting (Zhang and Kleeman, 2009).
+key points are detected. Features then survive changes of lighting (Zhang and Kleeman, 2009).
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from topoloc.features.patch_normalization_kernels import normalize_band
 
 @dataclass(frozen=True)
 class PatchNormalizationConfig:
-    """How to normalise; `PatchNormalizationConfig.paper` is the paper's own form."""
+    """Hold the settings of patch normalisation. `PatchNormalizationConfig.paper` is the paper's
+    form."""
 
     window_px: Annotated[int, Between(3, 127)] = 17
     """Side of the window, odd."""
     epsilon: Annotated[float, AtLeast(0)] = 1e-3
-    """Grey levels added to sigma: tiny as in the paper it only prevents the division by zero, a few
-    grey levels keep plain surfaces from becoming amplified sensor noise."""
+    """Grey levels added to sigma. A tiny value, as in the paper, only prevents a division by zero.
+    A few grey levels also prevent that sensor noise of plain surfaces is amplified."""
     shape: Literal["square", "round"] = "square"
-    """`square` weighs all pixels of the window alike, `round` is the box of half the width applied
-    twice, a pyramid-like bell of the same support without the axis-parallel ringing."""
+    """`square` weighs all pixels of the window equally. `round` applies a box of half the width
+    twice: a bell of the same support, without axis-parallel ringing."""
     gain: Annotated[float, Above(0)] = 40.0
-    """Grey levels of the result a unit of N, which is mapped to 128 + gain N and clipped."""
+    """Grey levels of the result per unit of N, which is mapped to 128 + gain N and clipped."""
 
     def __post_init__(self) -> None:
         largest = 127 if self.shape == "square" else 37  # sums of squares stay within 32 bits
@@ -47,11 +48,12 @@ class PatchNormalizationConfig:
 
     @staticmethod
     def paper() -> PatchNormalizationConfig:
-        """Square 17x17 windows, epsilon a mere guard against division by zero."""
+        """Return the paper's form: square 17x17 windows, with epsilon only against a division by
+        zero."""
         return PatchNormalizationConfig(window_px=17, epsilon=1e-3, shape="square")
 
     def box_sizes(self) -> tuple[int, int]:
-        """Sides of the two boxes that are applied one after the other; together they reach over
+        """Return the sides of the two boxes applied one after the other. Together they cover
         `window_px`."""
         if self.shape == "square":
             return self.window_px, 1
@@ -64,10 +66,10 @@ def patch_normalize(
     config: PatchNormalizationConfig,
     num_threads: int | None = None,
 ) -> UInt8[np.ndarray, "h w"]:
-    """The normalised image N as 8 bit: 128 + gain N, rounded, clipped to 0 .. 255.
+    """Return the normalised image N as 8 bit: 128 + gain N, rounded and clipped to 0 .. 255.
 
-    The picture is reflected at its borders (the border row itself not repeated). Where sigma +
-    epsilon is 0, N is 0. The result is the same, byte for byte, for any `num_threads`.
+    The image is reflected at its borders without repeating the border row. If sigma + epsilon is 0,
+    N is 0. The result is byte-identical for any `num_threads`.
     """
     first_box, second_box = config.box_sizes()
     radius = config.window_px // 2

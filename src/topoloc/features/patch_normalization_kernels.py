@@ -1,4 +1,4 @@
-"""Numba kernel of `patch_normalization`: one band of rows, by sliding sums."""
+"""Implement the Numba kernel of `patch_normalization`: one band of rows by sliding sums."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from topoloc.compiled import kernel
 
 @kernel()
 def _sliding_sum(values, width, out):
-    """out[x] = the sum of values[x : x + width]."""
+    """Compute out[x] = sum of values[x : x + width]."""
     total = np.int32(0)
     for x in range(width - 1):
         total += values[x]
@@ -19,8 +19,8 @@ def _sliding_sum(values, width, out):
 
 @kernel(error_model="numpy")
 def _normalize_row(centre, sums, sums_sq, weight, floor, gain, out):
-    """128 + gain (I - mean) / (sigma + epsilon), numerator and denominator times the window's
-    weight."""
+    """Compute 128 + gain (I - mean) / (sigma + epsilon). Numerator and denominator are multiplied
+    by the window's weight."""
     for x in range(out.shape[0]):
         total = np.float64(sums[x])
         spread = np.sqrt(np.float32(weight * np.float64(sums_sq[x]) - total * total))
@@ -34,12 +34,12 @@ def _normalize_row(centre, sums, sums_sq, weight, floor, gain, out):
 
 @kernel(error_model="numpy")
 def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsilon, gain):
-    """Rows [first_row, last_row) of `out`, from the image padded on each side by (first_box +
-    second_box) / 2 - 1.
+    """Write rows [first_row, last_row) of `out`. The image is padded on each side by (first_box +
+    second_box) / 2 - 1 pixels.
 
-    The window is a box of `first_box` pixels a side smoothed by one of `second_box` (1: the box
-    alone). All sums are integers and thus the same wherever a band begins; grey levels are taken
-    about 128 to keep them within 32 bits.
+    The window is a box of `first_box` pixels a side, smoothed by a box of `second_box` pixels (1:
+    no smoothing). All sums are integers, so the result does not depend on the start of a band. Grey
+    levels are taken relative to 128 to keep the sums within 32 bits.
     """
     padded_width = padded.shape[1]
     inner_width = padded_width - first_box + 1

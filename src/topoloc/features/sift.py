@@ -1,5 +1,5 @@
-"""SIFT (Lowe, 2004), OpenCV's, as `Features`; by default with RootSIFT descriptors (Arandjelovic
-and Zisserman, 2012)."""
+"""Extract OpenCV's SIFT (Lowe, 2004) as `Features`, by default with RootSIFT descriptors
+(Arandjelovic and Zisserman, 2012)."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from topoloc.features.features import Features
 
 @dataclass(frozen=True)
 class SiftConfig:
-    """OpenCV's settings under their own names."""
+    """Hold OpenCV's settings under their own names."""
 
     max_features: Annotated[int, Between(0, 100_000)] = 2000
-    """The strongest are kept; 0 keeps all."""
+    """Number of features to keep, strongest first. 0 keeps all."""
     contrast_threshold: Annotated[float, AtLeast(0)] = 0.02
-    """As OpenCV's."""
+    """Contrast threshold, as in OpenCV."""
     edge_threshold: Annotated[float, Above(0)] = 10.0
-    """As OpenCV's."""
+    """Edge threshold, as in OpenCV."""
     sigma: Annotated[float, Above(0)] = 1.6
-    """As OpenCV's: blur of the first image of an octave, pixels."""
+    """Blur of the first image of an octave, pixels, as in OpenCV."""
     num_octave_layers: Annotated[int, Between(1, 16)] = 3
-    """As OpenCV's."""
+    """Layers per octave, as in OpenCV."""
     root: bool = True
-    """Descriptors are L1-normalised and their square root is taken, so that their distance is
-    Hellinger's."""
+    """Take the square root of L1-normalised descriptors, so that their distance is Hellinger's."""
 
 
 def extract_sift(image: UInt8[np.ndarray, "h w"], config: SiftConfig) -> Features:
-    """Key points and 128-d descriptors of a grey image, strongest first."""
+    """Return key points and 128-d descriptors of a grey image, strongest first."""
     detector = cv2.SIFT_create(  # pyright: ignore[reportAttributeAccessIssue]  # missing in the stubs of OpenCV 5
         nfeatures=config.max_features,
         nOctaveLayers=config.num_octave_layers,
@@ -48,7 +47,7 @@ def extract_sift(image: UInt8[np.ndarray, "h w"], config: SiftConfig) -> Feature
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float32)
     order = np.argsort(-table[:, 4], kind="stable")
     if config.max_features:
-        order = order[: config.max_features]  # OpenCV keeps all that tie with the last
+        order = order[: config.max_features]  # OpenCV keeps all features that tie with the last
     table, descriptors = table[order], descriptors[order].astype(np.float32)
     descriptors /= np.maximum(
         np.linalg.norm(descriptors, ord=1 if config.root else 2, axis=1, keepdims=True), 1e-6

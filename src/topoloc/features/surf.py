@@ -1,17 +1,17 @@
-"""SURF: speeded-up robust features, our own, on two CPU cores and without a build of OpenCV's
-non-free modules.
+"""Extract SURF (speeded-up robust features) with an own implementation, without OpenCV's non-free
+modules.
 
 H. Bay, T. Tuytelaars, L. Van Gool, "SURF: Speeded Up Robust Features", ECCV 2006; with A. Ess, CVIU
-110(3), 2008. Filter sizes, sampling, orientation window and the order of a descriptor's numbers are
-those of OpenCV's implementation: key points have the same places and sizes, and descriptors of
-either can be matched with the other's.
+110(3), 2008. Filter sizes, sampling, orientation window and order of descriptor components are
+those of OpenCV's implementation. Key points have the same positions and sizes, and descriptors of
+both implementations can be matched with each other.
 
 Patents: the method (not any one implementation) was patented by its authors' employers, KU Leuven
-and ETH Zurich, with Toyota Motor Europe: US 8,165,401, granted in 2012, and EP 2 027 558, of the
-international application WO 2007/128452, with a priority of 2006. Terms of twenty years from filing
-end, nominally, in 2026 or 2027, and differ from country to country; whether one is still in force
-where you are has not been checked here, and this is not legal advice. Where it matters, choose SIFT
-(`topoloc.features.sift`): its patent, US 6,711,293, expired in March 2020.
+and ETH Zurich, with Toyota Motor Europe. The patents are US 8,165,401, granted in 2012, and EP 2
+027 558, of the international application WO 2007/128452 with a priority of 2006. Terms of twenty
+years from filing end nominally in 2026 or 2027 and differ between countries. Whether a patent is
+still in force in your country has not been checked here, and this is not legal advice. If this
+matters, choose SIFT (`topoloc.features.sift`). Its patent, US 6,711,293, expired in March 2020.
 """
 
 from __future__ import annotations
@@ -30,35 +30,33 @@ from topoloc.features.surf_descriptor_kernels import describe, orient, smooth_ro
 from topoloc.features.surf_detector_kernels import detect_band, integral_image, split_columns
 
 DESCRIPTOR_LENGTH = 64
-MIN_FILTER_PX = 9  # whose sigma is 1.2 pixels (Bay et al. 2008, 3.3)
+MIN_FILTER_PX = 9  # this filter has a sigma of 1.2 pixels (Bay et al. 2008, 3.3)
 FILTER_INCREMENT_PX = 6
 SIGMA_PER_FILTER_PX = 1.2 / MIN_FILTER_PX
 PATCH_SAMPLES = 21
 # 32-bit sums hold a filter response up to this side (whole box 1 by 5/9 of it, values of 255).
 MAX_FILTER_PX = 3600
-# Sample spacings in pixels, from that of the smallest key points on, for which smoothed images are
-# made.
+# Sample spacings in pixels for which smoothed images are made, from the smallest key points on.
 LEVEL_RATIO = 1.2
 LEVEL_SPACINGS = 1.4 * LEVEL_RATIO ** np.arange(33)
 
 
 @dataclass(frozen=True)
 class SurfConfig:
-    """What to detect."""
+    """Hold the settings of SURF."""
 
     hessian_threshold: Annotated[float, AtLeast(0)] = 400.0
-    """For images of 0..255, as OpenCV's."""
+    """Threshold of the Hessian's determinant for images of 0..255, as in OpenCV."""
     num_octaves: Annotated[int, Between(1, 8)] = 4
-    """Octaves of filters, each of twice the size."""
+    """Octaves of filters, each twice as large as the one before."""
     num_layers: Annotated[int, Between(1, 64)] = 3
-    """Layers kept of each octave."""
+    """Layers of each octave in which maxima are detected."""
     upright: bool = False
-    """All orientations are 0: for cameras that never roll."""
+    """Set all orientations to 0, for cameras that never roll."""
     max_features: Annotated[int, Between(0, 100_000)] = 2000
-    """The strongest are kept."""
+    """Number of features to keep, strongest first."""
     num_threads: Annotated[int | None, Between(1, 1024)] = None
-    """Threads; the features are the same for any number. Unset: as many as `set_num_threads`
-    said."""
+    """Threads. The features are the same for any number. Unset: the number of `set_num_threads`."""
 
     def __post_init__(self) -> None:
         counts = (
@@ -81,10 +79,10 @@ class SurfConfig:
 
 
 def extract_surf(image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfig()) -> Features:
-    """The strongest SURF key points of a grey image, strongest first, with descriptors (n, 64) of
-    unit length.
+    """Return the strongest SURF key points of a grey image, strongest first, with descriptors (n,
+    64) of unit length.
 
-    Upright key points have angle 0; their windows are read as OpenCV's are, turned by 270 degrees.
+    Upright key points have angle 0. As in OpenCV, their windows are sampled turned by 270 degrees.
     The result is the same for any number of threads.
     """
     integral = integral_image(np.ascontiguousarray(image))
@@ -100,25 +98,25 @@ def extract_surf(image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfi
 
 
 def _filter_sizes(octave: int, num_layers: int) -> Int64[np.ndarray, " layers"]:
-    """Filter sizes of an octave in pixels, with the layer below and the one above those in which
-    maxima are sought."""
+    """Return the filter sizes of an octave in pixels. They include one layer below and one above
+    the layers in which maxima are searched."""
     return (MIN_FILTER_PX + FILTER_INCREMENT_PX * np.arange(num_layers + 2)) << octave
 
 
 def _pattern_edges(sizes: Int64[np.ndarray, " layers"]) -> Int64[np.ndarray, "layers 10"]:
-    """Where the lobes of a 9x9 second-derivative pattern begin and end when it is scaled to each
-    size, in pixels."""
+    """Return the edges of the lobes of a 9x9 second-derivative pattern scaled to each size, in
+    pixels."""
     return np.rint(
         np.outer((sizes / MIN_FILTER_PX).astype(np.float32), np.arange(10, dtype=np.float32))
     ).astype(np.int64)
 
 
 def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32[np.ndarray, "m 4"]:
-    """Maxima of the Hessian's determinant: rows x, y, size, response."""
+    """Return the maxima of the Hessian's determinant: rows x, y, size, response."""
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
 
-    # A maximum needs filters below and above its own: an octave whose third does not fit into the
-    # image holds none.
+    # A maximum needs filters below and above its own. An octave whose third filter does not fit
+    # into the image has none.
     sizes = {
         octave: _filter_sizes(octave, config.num_layers) for octave in range(config.num_octaves)
     }
@@ -149,7 +147,7 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
         return -(-(width + 1) // step) * step
 
     def largest_split(part_rows: int) -> int:
-        """Numbers in the largest band of reordered sums, of all octaves but the first."""
+        """Return the size of the largest band of reordered sums over all octaves but the first."""
         return max(
             (
                 (part_rows + 3 * (1 << o) + 2 * int(e[-1, -1])) * split_width(1 << o)
@@ -160,18 +158,18 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
         )
 
     num_parts, threshold = config.num_threads or num_threads(), np.float32(config.hessian_threshold)
-    # Allocated here, not in the threads: the allocator gives a helper thread's memory back to the
+    # Allocated here, not in the threads: the allocator returns the memory of a worker thread to the
     # system after each call.
     scratch = np.empty((num_parts, largest_split(-(-height // num_parts))), np.int32)
     found: dict[tuple[int, int], Float32[np.ndarray, "m 4"]] = {}
     parallel_for_rows(detect_part, num_parts, num_parts)
-    # By octave, then row: the order, and so the ranking of equal responses, does not depend on the
-    # number of parts.
+    # Sorted by octave, then row: so the order of equal responses does not depend on the number of
+    # parts.
     return np.concatenate([found[key] for key in sorted(found)])
 
 
 def _part_bounds(num_rows: int, part: int, num_parts: int) -> tuple[int, int]:
-    """First row and the one after the last of a part."""
+    """Return the first row of a part and the row after its last one."""
     return num_rows * part // num_parts, num_rows * (part + 1) // num_parts
 
 
@@ -184,8 +182,8 @@ def _select_part(
 
 @dataclass(frozen=True)
 class _Level:
-    """A smoothed image of every step-th pixel; pixel (0, 0) is at (offset, offset) of the image,
-    `share` as in `smooth_rows`."""
+    """Hold a smoothed image of every step-th pixel. Its pixel (0, 0) is at (offset, offset) of the
+    image. `share` is that of `smooth_rows`."""
 
     pixels: Float32[np.ndarray, "lh lw"]
     step: int
@@ -198,11 +196,11 @@ class _Level:
 
 
 def _empty_level(integral: Int32[np.ndarray, "h1 w1"], spacing: float) -> _Level:
-    """A level, yet to be filled, that read bilinearly is as smooth as the image averaged over
-    windows of `spacing` pixels.
+    """Return an empty level. Once filled and read bilinearly, it is as smooth as the image averaged
+    over windows of `spacing` pixels.
 
-    Bilinear reads have a variance of step^2 / 6 on the mean, on top of a box's (side^2 - 1) / 12.
-    What OpenCV does has (spacing^2 + 1) / 12 + 1 / 6: it reads the image bilinearly, then averages.
+    Bilinear reads have a mean variance of step^2 / 6, on top of a box's (side^2 - 1) / 12. OpenCV
+    reads the image bilinearly, then averages. This has a variance of (spacing^2 + 1) / 12 + 1 / 6.
     """
     step = 1 << max(int(np.log2(spacing / 2.2)), 0)
     side = float(np.sqrt(spacing**2 + 4 - 2 * step**2))
@@ -218,7 +216,7 @@ def _describe(
     scales: Float32[np.ndarray, " n"],
     config: SurfConfig,
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 64"]]:
-    """Angles in radians and descriptors of key points at these scales (sigma, pixels)."""
+    """Return angles in radians and descriptors of key points at these scales (sigma, pixels)."""
     num_parts = config.num_threads or num_threads()
     angles = np.zeros(len(points), np.float32)
     descriptors = np.empty((len(points), DESCRIPTOR_LENGTH), np.float32)
@@ -250,7 +248,7 @@ def _describe(
                 descriptors,
             )
 
-    # From the top of the image down, so that a thread finds what it reads in its own core's cache.
+    # From the top of the image down, so that the reads of a thread stay in its core's cache.
     rows_by_y = np.argsort(points[:, 1], kind="stable")
     parallel_for_rows(prepare_part, num_parts, num_parts)
     directions = np.full_like(angles, 1.5 * np.pi) if config.upright else angles

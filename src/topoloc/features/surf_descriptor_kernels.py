@@ -1,4 +1,5 @@
-"""Numba kernels of `surf`, second half: orientation and descriptor of each key point."""
+"""Implement the Numba kernels of `surf`, second half: orientation and descriptor of each key
+point."""
 
 import numpy as np
 
@@ -6,7 +7,7 @@ from topoloc.compiled import kernel
 
 PATCH_SIZE = 20  # samples a side of the described window, in units of the key point's scale s
 ORIENTATION_RADIUS = 6  # in units of s
-SECTOR_DEG = 5  # by which the window of the orientation slides
+SECTOR_DEG = 5  # step of the sliding orientation window
 WINDOW_SECTORS = 12
 
 
@@ -17,8 +18,8 @@ def _gaussian(length, sigma):
 
 
 def _orientation_samples():
-    """Rows (x, y, weight) of the samples within 6 s of the key point, in units of s; weights of a
-    Gaussian of 2.5 s."""
+    """Return rows (x, y, weight) of the samples within 6 s of the key point, in units of s. Weights
+    are from a Gaussian of 2.5 s."""
     radius = ORIENTATION_RADIUS
     x, y = np.meshgrid(
         np.arange(-radius, radius + 1), np.arange(-radius, radius + 1), indexing="ij"
@@ -33,8 +34,8 @@ ORIENTATION_SAMPLES = _orientation_samples()
 GRID_ROWS, GRID_COLUMNS = (
     np.indices((PATCH_SIZE + 1, PATCH_SIZE + 1)).reshape(2, -1).astype(np.float32)
 )
-# Padded with zeros to whole vectors of eight numbers: what lies beyond a row is read and counts
-# nothing.
+# Padded with zeros to whole vectors of eight numbers: values beyond a row are read with weight
+# zero.
 PADDED_SIZE = 24
 PATCH_WEIGHTS = np.zeros((PATCH_SIZE, PADDED_SIZE), np.float32)
 PATCH_WEIGHTS[:, :PATCH_SIZE] = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(PATCH_SIZE, 3.3))
@@ -42,10 +43,10 @@ PATCH_WEIGHTS[:, :PATCH_SIZE] = np.outer(_gaussian(PATCH_SIZE, 3.3), _gaussian(P
 
 @kernel(fastmath=True, error_model="numpy")
 def smooth_rows(integral, box, share, step, level, first, last):
-    """Rows [first, last) of `level`: at every step-th pixel `share` of the mean over box x box, the
-    rest over box + 2 a side.
+    """Write rows [first, last) of `level`. Each pixel, at every step-th image pixel, mixes two
+    means: `share` of the mean over box x box, and the rest over a box of side box + 2.
 
-    Pixel (0, 0) of the level is where the larger box touches the upper left corner of the image.
+    At pixel (0, 0) of the level the larger box touches the upper left corner of the image.
     """
     inner = np.float32(share / (box * box))
     outer = np.float32((1 - share) / ((box + 2) * (box + 2)))
@@ -65,8 +66,8 @@ def smooth_rows(integral, box, share, step, level, first, last):
             columns_inner[1:],
             columns_inner[1 + box :],
         )
-        # The whole line although every step-th of it is kept: only reads without a stride
-        # vectorise.
+        # Compute the whole line although only every step-th pixel is kept: only reads without a
+        # stride vectorise.
         target = level[i] if step == 1 else line
         for x in range(line.shape[0]):
             target[x] = (
@@ -80,11 +81,11 @@ def smooth_rows(integral, box, share, step, level, first, last):
 
 @kernel(fastmath=True, error_model="numpy")
 def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradients):
-    """Fill gradients (2, n) with the weighted Haar responses (side about 4 s) around a key point,
-    zero beyond the image.
+    """Fill gradients (2, n) with the weighted Haar responses (side about 4 s) around a key point.
+    They are zero beyond the image.
 
-    corners and weights (n,) are scratch space: first the places of all windows, in a loop that
-    vectorises, then their sums.
+    corners and weights (n,) are scratch space. A first loop, which vectorises, computes the places
+    of all windows. A second one computes their sums.
     """
     stride = np.int32(integral.shape[1])
     half = np.int32(np.rint(np.float32(2.0) * scale))
@@ -120,10 +121,10 @@ def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradien
 
 @kernel(fastmath=True, error_model="numpy")
 def _sectors(gradients, sectors, first_degree):
-    """The sector of each gradient's direction, rounded to whole degrees; first_degree (2, n)
-    repeats those at a sector's first.
+    """Compute the sector of each gradient's direction, rounded to whole degrees. `first_degree` (2,
+    n) repeats the gradients at a sector's first degree.
 
-    The arc tangent is a polynomial, good to 0.001 degrees, and without branches, so that the loop
+    The arc tangent is a polynomial, exact to 0.001 degrees and without branches, so that the loop
     vectorises.
     """
     for k in range(sectors.shape[0]):
@@ -150,11 +151,11 @@ def _sectors(gradients, sectors, first_degree):
 
 @kernel(fastmath=True, error_model="numpy")
 def _dominant_angle(gradients, sectors, first_degree, sums, threes, windows):
-    """The direction of the longest sum of gradients within any window of 60 degrees (Bay et al.
-    2008, 4.1).
+    """Return the direction of the longest sum of gradients within any window of 60 degrees (Bay et
+    al. 2008, 4.1).
 
     Windows are centred on multiples of 5 degrees and open, 59 whole degrees wide: twelve sectors
-    less the first degree.
+    without the first degree.
     """
     num_sectors = windows.shape[1]
     sums[:] = 0
@@ -182,7 +183,7 @@ def _dominant_angle(gradients, sectors, first_degree, sums, threes, windows):
 
 @kernel(error_model="numpy")
 def orient(integral, points, scales, rows, angles):
-    """Fill angles[rows] of the key points at points[rows] (x, y) of scales[rows]."""
+    """Fill angles[rows] for the key points at points[rows] (x, y) with scales[rows]."""
     num_samples, num_sectors = ORIENTATION_SAMPLES.shape[1], 360 // SECTOR_DEG
     corners, sectors = np.empty(num_samples, np.int32), np.empty(num_samples, np.int32)
     weights = np.empty(num_samples, np.float32)
@@ -203,7 +204,7 @@ def orient(integral, points, scales, rows, angles):
 
 @kernel(fastmath=True, error_model="numpy")
 def _sample_patch(level, origin_x, origin_y, step_x, step_y, indices, fractions, patch):
-    """Bilinear samples of `level` on the grid origin + column * (step_x, step_y) + row * (-step_y,
+    """Sample `level` bilinearly on the grid origin + column * (step_x, step_y) + row * (-step_y,
     step_x), clamped to the image."""
     stride = np.int32(level.shape[1])
     max_left, max_top = np.int32(level.shape[1] - 2), np.int32(level.shape[0] - 2)
@@ -228,8 +229,8 @@ def _sample_patch(level, origin_x, origin_y, step_x, step_y, indices, fractions,
 
 @kernel(fastmath=True, error_model="numpy")
 def _describe_patch(patch, sums, descriptor):
-    """Sums of dx, dy, |dx|, |dy| in 4x4 cells of the (21, 21) patch, Gaussian-weighted, to unit
-    length (Bay et al. 2008, 4.2)."""
+    """Compute the descriptor of a (21, 21) patch: Gaussian-weighted sums of dx, dy, |dx|, |dy| in
+    4x4 cells, scaled to unit length (Bay et al. 2008, 4.2)."""
     side = PATCH_SIZE + 1
     cell = PATCH_SIZE // 4
     square = np.float32(0.0)

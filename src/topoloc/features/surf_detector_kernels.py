@@ -1,8 +1,8 @@
-"""Numba kernels of `surf`, first half: integral image, determinant of the Hessian, maxima over
-place and scale.
+"""Implement the Numba kernels of `surf`, first half: integral image, determinant of the Hessian,
+maxima over position and scale.
 
-All sums live in int32 that may wrap: a difference of wrapped sums is still right as long as the box
-itself fits.
+All sums are int32 and may wrap. The difference of wrapped sums is still right if the box itself
+fits.
 """
 
 import numpy as np
@@ -12,7 +12,8 @@ from topoloc.compiled import kernel
 
 @kernel()
 def integral_image(image):
-    """(h + 1, w + 1) int32, modulo 2^32: entry (y, x) is the sum of image[:y, :x]."""
+    """Return the integral image, (h + 1, w + 1) int32 modulo 2^32. Entry (y, x) is the sum of
+    image[:y, :x]."""
     height, width = image.shape
     integral = np.empty((height + 1, width + 1), np.int32)
     integral[0] = 0
@@ -32,10 +33,10 @@ def integral_image(image):
 
 @kernel()
 def split_columns(integral, step, first, split):
-    """Fill `split` with rows of the integral image from `first` on, columns reordered: those at 0,
-    step, 2 step, ..., then 1, 1 + step, ...
+    """Fill `split` with rows of the integral image from `first` on, with reordered columns: those
+    at 0, step, 2 step, ..., then 1, 1 + step, ...
 
-    What a filter bank sampled at every step-th pixel reads is then contiguous, so that its loops
+    The reads of a filter bank sampled at every step-th pixel are then contiguous, so that its loops
     vectorise.
     """
     width, phase_length = integral.shape[1], split.shape[1] // step
@@ -51,10 +52,10 @@ def split_columns(integral, step, first, split):
 # from the compiler's cache.
 @kernel(error_model="numpy")
 def _hessian_row(sums, top, edges, columns, rows, out):
-    """Determinants of one row of filters with their upper edge at row `top` of `sums`.
+    """Compute the determinants of one row of filters with their upper edge at row `top` of `sums`.
 
-    edges are the ten edge positions of the pattern in pixels, columns the places where
-    `split_columns` put them.
+    edges are the ten edge positions of the pattern in pixels. columns are their places after
+    `split_columns`.
     """
     rows_xx, rows_yy, rows_xy = rows[0], rows[1], rows[2]
     i0, i1, i2, i3, i4 = (
@@ -66,7 +67,7 @@ def _hessian_row(sums, top, edges, columns, rows, out):
     )
     i5, i6, i7 = sums[top + edges[5]], sums[top + edges[6]], sums[top + edges[7]]
     i8, i9 = sums[top + edges[8]], sums[top + edges[9]]
-    # A second derivative is the whole box less three times its middle third: two boxes in place of
+    # A second derivative is the whole box minus three times its middle third: two boxes instead of
     # three.
     for x in range(rows.shape[1]):
         rows_xx[x] = np.int32(i7[x] - i2[x])
@@ -98,8 +99,8 @@ def _hessian_row(sums, top, edges, columns, rows, out):
 
 @kernel(fastmath=True, error_model="numpy")
 def _mark_candidates(below, up, mid, down, above, first, last, threshold, marks):
-    """marks[j] = 1 where mid[j] exceeds the threshold and six of its 26 neighbours: a cheap sieve
-    that vectorises."""
+    """Set marks[j] = 1 if mid[j] exceeds the threshold and six of its 26 neighbours. This cheap
+    filter vectorises."""
     count = last - first
     centre, left, right = mid[first:last], mid[first - 1 : last - 1], mid[first + 1 : last + 1]
     north, south, smaller, larger = (
@@ -132,8 +133,8 @@ def _is_maximum(ring, layer, up, mid, down, j):
 
 @kernel(error_model="numpy")
 def _refine(ring, layer, up, mid, down, j):
-    """The vertex (x, y, scale) of the quadratic through the 27 determinants, in grid units; ok is
-    False beyond one unit."""
+    """Return (ok, x, y, scale): the vertex of the quadratic through the 27 determinants, in grid
+    units. ok is False beyond one unit."""
     below, here, above = ring[layer - 1], ring[layer], ring[layer + 1]
     value = np.float64(here[mid, j])
     gx = (here[mid, j + 1] - here[mid, j - 1]) * 0.5
@@ -158,8 +159,8 @@ def _refine(ring, layer, up, mid, down, j):
 
 @kernel(error_model="numpy")
 def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, count):
-    """Append the maxima of row i of this layer to `found` (x, y, size, response); returns the
-    (grown) array and its count."""
+    """Append the maxima of row i of this layer to `found` (x, y, size, response). Return the array,
+    enlarged if necessary, and its count."""
     num_columns = ring.shape[2]
     margin = sizes[layer + 1] // 2 // step + 1
     up, mid, down = (i - 1) % 3, i % 3, (i + 1) % 3
@@ -206,12 +207,12 @@ def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, co
 
 @kernel(error_model="numpy")
 def detect_band(sums, sums_top, height, width, edges, columns, step, first, last, threshold):
-    """Maxima (m, 4) = x, y, size, response in rows [first, last) of an octave's grid (every step-th
-    pixel).
+    """Return the maxima (m, 4) = x, y, size, response in rows [first, last) of an octave's grid
+    (every step-th pixel).
 
-    sums are the rows from `sums_top` on of the integral image of a (height, width) image, as
-    `split_columns` orders them. edges and columns (n, 10) describe the filters of the octave's n
-    layers. Only three rows of each layer are ever held.
+    sums are rows of the integral image of a (height, width) image from `sums_top` on, ordered by
+    `split_columns`. edges and columns (n, 10) describe the filters of the octave's n layers. Only
+    three rows of each layer are in memory at a time.
     """
     sizes = edges[:, 9].copy()
     num_layers, num_rows, num_columns = sizes.shape[0], height // step, width // step

@@ -1,11 +1,10 @@
-"""What a camera sees of the walls along its way, as if it stood before them.
+"""Render virtual views of the walls along a camera's path, as if the camera faced them.
 
-Whoever walks back along a corridor sees its walls again, but under the opposite slant: no local
-feature survives that. A camera that is turned without being moved sees the same rays, so its
-picture follows from the first one without any depth (a homography; for a lens with distortion, its
-own mapping). Turned by a right angle to the left and to the right, it looks straight at walls,
-facades and shelves that run along the way, and shows them without slant, the same from either
-direction.
+On the way back along a corridor, a camera sees the walls under the opposite slant. No local feature
+survives this change. A camera that only rotates sees the same rays. So its image follows from the
+original one without depth, by a homography or by the mapping of a distorted lens. Turned by 90
+degrees to the left and to the right, the camera faces walls, facades and shelves along the path. It
+sees them without slant, and alike from both directions.
 """
 
 from __future__ import annotations
@@ -26,28 +25,29 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True)
 class VirtualViewConfig:
-    """How much of the walls is looked at. Tangents are those of angles off the side camera's axis:
-    1 is 45 degrees ahead."""
+    """Hold the field of view of the virtual views. Tangents are of angles off the virtual camera's
+    axis: 1 is 45 degrees ahead."""
 
     farthest: Annotated[float, Between(0.1, 10)] = 3.0
-    """Farther ahead walls are too slanted to be seen well."""
+    """Largest tangent ahead. Walls farther ahead are too slanted to be seen well."""
     half_height: Annotated[float, Between(0.1, 10)] = 0.9
-    """How far up and down."""
+    """Largest tangent up and down."""
     nearest: Annotated[float, Between(0.1, 10)] = 1.5
-    """A lens so narrow that it sees nothing nearer than this has no side views."""
+    """A camera whose field of view begins beyond this tangent is too narrow and has no virtual
+    views."""
     max_side_px: Annotated[int, Between(64, 4096)] = 700
-    """The longer side of a side view, at most."""
+    """Maximum length of the longer side of a virtual view."""
     margin_px: Annotated[int, Between(0, 1000)] = 8
-    """Features nearer than this to the border of what the picture holds are none."""
+    """Features nearer than this to the border of the rendered area are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
 class VirtualView:
-    """A pinhole camera in the same place, turned to the side, and where in the picture each of its
-    pixels lies.
+    """Hold a pinhole camera at the same place, turned to the side, and the image pixel of each of
+    its pixels.
 
-    `points_img` are the picture's pixels of the side camera's, NaN where the picture does not
-    reach; `inside` is True where a feature lies well within what it holds.
+    `points_img` are the pixels of the image for the pixels of the virtual camera, NaN outside the
+    camera's field. `inside` is True at pixels well within the image, where features are kept.
     """
 
     name: str
@@ -57,13 +57,14 @@ class VirtualView:
     inside: Bool[np.ndarray, "a b"]
 
     def virtual_from_world(self, cam_from_world: Rigid3) -> Rigid3:
-        """The pose of the side camera (side_from_world), of that of the picture's camera."""
+        """Return the pose of the virtual camera (virtual_from_world) from that of the image's
+        camera."""
         return self.cam_from_virtual.inverse() @ cam_from_world
 
     def picture(self, grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "a b"]:
-        """What the side camera sees. Beyond the picture its border goes on, which makes no edges of
-        its own."""
-        # None is right here, whatever the stubs say: OpenCV 5 takes an empty second map for a map.
+        """Return the image of the virtual camera. Beyond the original image its border is repeated,
+        which adds no edges."""
+        # None is right here despite the stubs: OpenCV 5 takes an empty array for a second map.
         return cv2.remap(
             grey,
             self.points_img,
@@ -73,13 +74,12 @@ class VirtualView:
         )
 
     def select_inside(self, features: Features) -> Features:
-        """The features that lie in what the picture holds, with the dense descriptors of all of
-        it."""
+        """Return the features inside the rendered area. All dense descriptors are kept."""
         columns, rows = np.rint(features.points_img).astype(int).T
         return replace(features.select(self.inside[rows, columns]), dense=features.dense)
 
     def to_image_pixels(self, features: Features, camera: Camera) -> Features:
-        """The same features at the pixels of the picture itself, which `camera` took."""
+        """Return the same features at the pixels of the original image, taken by `camera`."""
         rays = (
             self.camera.rays_from_img(features.points_img.astype(np.float64))
             @ self.cam_from_virtual.rotation.T
@@ -89,7 +89,8 @@ class VirtualView:
 
 @lru_cache(maxsize=8)
 def make_virtual_views(camera: Camera, config: VirtualViewConfig) -> tuple[VirtualView, ...]:
-    """The views to the left and to the right; none where the lens is too narrow for that."""
+    """Return the virtual views to the left and to the right, without those for which the field of
+    view is too narrow."""
     views = (
         _make_virtual_view(camera, name, sign, config)
         for name, sign in (("left", -1.0), ("right", 1.0))
@@ -100,8 +101,8 @@ def make_virtual_views(camera: Camera, config: VirtualViewConfig) -> tuple[Virtu
 def _make_virtual_view(
     camera: Camera, name: str, sign: float, config: VirtualViewConfig
 ) -> VirtualView | None:
-    """`sign` is that of x in the camera's frame; the side camera's own x axis points ahead on the
-    left, back on the right."""
+    """Return one virtual view, or None. `sign` is that of x in the camera's frame. The virtual
+    camera's x axis points ahead on the left and back on the right."""
     cam_from_virtual = Rigid3(
         np.array([[0.0, 0.0, sign], [0.0, 1.0, 0.0], [-sign, 0.0, 0.0]]), np.zeros(3)
     )
@@ -112,8 +113,8 @@ def _make_virtual_view(
     extent = np.array([config.farthest - nearest, 2.0 * config.half_height])
     focal *= min(1.0, config.max_side_px / (focal * extent.max()))
     width, height = np.maximum(np.rint(focal * extent), 1).astype(int)
-    # x is ahead on the left and back on the right: the picture lies on the one or the other side of
-    # the axis
+    # x points ahead on the left and back on the right, so the image lies on one side of the axis or
+    # on the other
     cx = -focal * nearest if sign < 0 else focal * config.farthest
     virtual = Camera.pinhole(int(width), int(height), focal, focal, cx, focal * config.half_height)
     points_img = _points_img(camera, virtual, cam_from_virtual)
@@ -127,8 +128,8 @@ def _make_virtual_view(
 
 
 def _max_tangent(camera: Camera, sign: float) -> float:
-    """How far to the side the lens sees; what it sees behind itself, at the ends of its rows, has
-    no tangent and does not count."""
+    """Return the largest tangent to the side in the camera's field of view. Rays behind the camera,
+    at the ends of its rows, have no tangent and are ignored."""
     row = np.column_stack(
         [np.arange(camera.width, dtype=np.float64), np.full(camera.width, camera.cy)]
     )

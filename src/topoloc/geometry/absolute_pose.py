@@ -1,10 +1,9 @@
-"""The pose of a camera from matches of its pixels with points of the world: robust PnP, and how far
-to trust it.
+"""Estimate a camera pose and its covariance from 2-D/3-D matches: robust PnP.
 
-`method="poselib"`: PoseLib's LO-RANSAC with P3P (Persson and Nordberg, 2018;
-https://github.com/PoseLib/PoseLib), PROSAC ordering (Chum and Matas, 2005) where priorities are
-given, then a robust refinement that weighs every match by the uncertainty of both its pixel and its
-point. `method="opencv"`: the paper's own variant, section III-B: OpenCV's RANSAC with EPnP and
+`method="poselib"` runs PoseLib's LO-RANSAC with P3P (Persson and Nordberg, 2018;
+https://github.com/PoseLib/PoseLib). It uses PROSAC ordering (Chum and Matas, 2005) if priorities
+are given. A robust refinement then weighs each match by the uncertainty of its pixel and of its
+point. `method="opencv"` is the paper's method, section III-B: OpenCV's RANSAC with EPnP and
 Levenberg-Marquardt refinement on the inliers.
 """
 
@@ -26,53 +25,52 @@ from topoloc.geometry.rigid import Rigid3
 _Array = np.ndarray
 _MIN_POINTS = 4
 _MAX_THRESHOLD_SCALE = 3.0
-# OpenCV draws five points a sample and refines no candidate: what PoseLib does in milliseconds
-# would take it a second.
+# OpenCV draws five points per sample and refines no candidate. It would need a second for the
+# iterations that PoseLib runs in milliseconds.
 _OPENCV_MAX_ITERATIONS = 1000
 _OPENCV_CONFIDENCE = 0.99  # its default
 _MAX_SCALE_STEPS = 30
 CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
-# What Cauchy's weights w do to Gaussian residuals r of two dimensions, so that the covariance is
-# not biased by them: E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the
-# M-estimator's variance over
-# the inverse of its information.
+# Effect of Cauchy's weights w on Gaussian residuals r of two dimensions, to correct the covariance
+# for it: E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance
+# over the inverse of its information.
 _MEAN_WEIGHTED_SQUARE = 0.6302
 _ESTIMATOR_VARIANCE = 0.8265
 
 
 @dataclass(frozen=True)
 class AbsolutePoseConfig:
-    """How a pose is found from 2-D/3-D matches."""
+    """Hold the settings of pose estimation from 2-D/3-D matches."""
 
     method: Literal["poselib", "opencv"] = "poselib"
-    """PoseLib's RANSAC, or OpenCV's, which ends at 1000 iterations or a confidence of 0.99 and
-    takes no seed. Of a camera that nobody has calibrated always PoseLib's."""
+    """PoseLib's RANSAC, or OpenCV's, which stops at 1000 iterations or a confidence of 0.99 and has
+    no seed. For an uncalibrated camera PoseLib is always used."""
     max_reprojection_error_px: Annotated[float, Above(0)] = 4.0
-    """Matches that miss by less are inliers. With poselib the uncertainty of a point, projected,
-    widens it up to threefold: in proportion to the standard deviation that it adds to
-    `sigma_px`."""
+    """Inlier threshold. With poselib the projected uncertainty of a point widens it up to
+    threefold, in proportion to the standard deviation that it adds to `sigma_px`."""
     sigma_px: Annotated[float | None, Above(0)] = None
-    """Standard deviation of a matched key point along x and along y. Unset: that of the kind of
-    features, or one pixel."""
+    """Standard deviation of a matched key point along x and along y. Unset: that of the feature
+    type, or one pixel."""
     max_iterations: Annotated[int, Between(1, 1_000_000)] = 3000
-    """Of RANSAC, at most."""
+    """Maximum number of RANSAC iterations."""
     min_iterations: Annotated[int, Between(0, 1_000_000)] = 50
-    """Of RANSAC, at least."""
+    """Minimum number of RANSAC iterations."""
     confidence: Annotated[float, Between(0, 1)] = 0.999
-    """RANSAC ends where it is so sure that no better pose is left."""
+    """RANSAC stops at this probability that no better pose is left."""
     max_refinement_steps: Annotated[int, Between(0, 1000)] = 10
-    """Of the least squares on the inliers."""
+    """Maximum number of least-squares steps on the inliers."""
     seed: Annotated[int, Between(0, 1_000_000_000)] = 0
-    """Of RANSAC's samples."""
+    """Seed of RANSAC's samples."""
 
     @property
     def key_point_sigma_px(self) -> float:
+        """Return `sigma_px`, or one pixel if it is unset."""
         return 1.0 if self.sigma_px is None else self.sigma_px
 
 
 @dataclass(frozen=True, eq=False)
 class AbsolutePose:
-    """A pose with its inliers among n matches; `covariance` is of the left perturbation
+    """Hold a pose and its inliers among n matches. `covariance` is of the left perturbation
     (translation, rotation; m, rad)."""
 
     cam_from_world: Rigid3
@@ -82,7 +80,8 @@ class AbsolutePose:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """The usable matches; pixels also on the plane z = 1, with their covariance there."""
+    """Hold the usable matches: pixels, their coordinates and covariances on the plane z = 1, and
+    world points."""
 
     points_img: Float[np.ndarray, "n 2"]
     normalized: Float[np.ndarray, "n 2"]
@@ -99,8 +98,8 @@ class Matches:
         camera: Camera,
         sigma_px: float,
     ) -> Matches:
-        """Pixels, with what they are on the plane z = 1 and their standard deviation, of world
-        points (metres) and their covariances."""
+        """Create matches from pixels, their coordinates on the plane z = 1, world points (metres)
+        and the points' covariances (m^2). `sigma_px` is the standard deviation of the pixels."""
         to_normalized = sigma_px * camera.normalized_jacobian(normalized)
         return Matches(
             points_img=np.ascontiguousarray(points_img, dtype=np.float64),
@@ -113,7 +112,7 @@ class Matches:
     def kernel_args(
         self, cam_from_world: Rigid3
     ) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array]:
-        """What all kernels take."""
+        """Return the arguments that all kernels share."""
         rotation, translation = (
             np.ascontiguousarray(cam_from_world.rotation),
             np.ascontiguousarray(cam_from_world.translation),
@@ -138,15 +137,18 @@ def estimate_absolute_pose(
     priorities: Float[np.ndarray, " n"] | None = None,
     start: Rigid3 | None = None,
 ) -> AbsolutePose | None:
-    """cam_from_world from n matches of pixels with world points (metres); None where no pose
-    follows from them.
+    """Return cam_from_world from n matches of pixels with world points (metres), or None if no pose
+    is found.
 
     Args:
-        point_covariances: of the world points, in the world frame (m^2); exact points without it.
-        priorities: larger is likelier right; RANSAC tries these first (not with OpenCV).
-        start: a pose that is nearly right already: it is refined, and no other one is sought.
+        point_covariances: covariances of the world points in the world frame (m^2). Default: exact
+            points.
+        priorities: larger values are more likely right, and RANSAC samples them first (not with
+            OpenCV).
+        start: an approximate pose. It is refined, and no other pose is searched.
 
-    Matches with a value that is not finite are outliers. The same input gives the same bytes.
+    Matches with a value that is not finite are outliers. The same input gives a byte-identical
+    result.
     """
     config = config or AbsolutePoseConfig()
     normalized = camera.normalized_from_img(points_img)
@@ -182,8 +184,8 @@ def estimate_absolute_pose(
 def _solve_with_poselib(
     matches: Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool
 ) -> Rigid3 | None:
-    # A pinhole of the same focal length in pixels that are already undistorted: thresholds keep
-    # their meaning, and every model works alike. PoseLib adds no half pixel of its own.
+    # PoseLib gets a pinhole of the same focal length and undistorted pixels. So thresholds keep
+    # their meaning and all camera models work alike. PoseLib adds no half pixel of its own.
     undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     found = estimate_pose_ransac(undistorted, matches.points_world, camera, config, is_sorted)
     return _refine_on_inliers(found[0], matches, camera, config) if found else None
@@ -196,13 +198,14 @@ def estimate_pose_ransac(
     config: AbsolutePoseConfig,
     is_sorted: bool = False,
 ) -> tuple[Rigid3, int, float] | None:
-    """PoseLib's RANSAC alone, on n finite matches of pixels without distortion: cam_from_world, how
-    many it misses by less than the threshold, and the sum of all squared errors (px^2), each at
-    most the threshold's; None where the samples gave no pose. The points' uncertainty does not
-    count.
+    """Run only PoseLib's RANSAC on n finite matches of undistorted pixels.
+
+    Return cam_from_world, the number of inliers, and the sum of squared errors (px^2), each limited
+    to the squared threshold. Return None if the samples give no pose. The uncertainty of the points
+    is ignored.
 
     Args:
-        is_sorted: the first matches are the likeliest right.
+        is_sorted: the matches are sorted, most likely right first.
     """
     pinhole = {
         "model": "PINHOLE",
@@ -215,7 +218,7 @@ def estimate_pose_ransac(
         "max_iterations": config.max_iterations,
         "min_iterations": config.min_iterations,
         "success_prob": config.confidence,
-        # PoseLib's own 3 triples the time; its local optimisation finds as many poses without
+        # PoseLib's default of 3 triples the time without more poses, thanks to local optimisation
         "dyn_num_trials_mult": 1.0,
         "progressive_sampling": is_sorted,
         "seed": config.seed,
@@ -236,7 +239,7 @@ def estimate_pose_ransac(
 def _refine_on_inliers(
     cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig
 ) -> Rigid3 | None:
-    for _ in range(2):  # the second time with the inliers of the first
+    for _ in range(2):  # the second pass uses the inliers of the first
         inliers = select_inliers(cam_from_world, matches, camera, config)
         if not is_non_collinear(matches.points_world[inliers]):
             return None
@@ -247,7 +250,7 @@ def _refine_on_inliers(
 def refine_pose(
     cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"], max_steps: int
 ) -> Rigid3:
-    """The pose at which the active matches fit best, from one nearby."""
+    """Return the pose that fits the active matches best, starting from a nearby pose."""
     rotation, translation = refine(
         *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, max_steps
     )
@@ -257,7 +260,7 @@ def refine_pose(
 def _solve_with_opencv(
     matches: Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool
 ) -> Rigid3 | None:
-    del is_sorted  # OpenCV's RANSAC knows no order
+    del is_sorted  # OpenCV's RANSAC has no ordering
     undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     try:
         found, rotation, translation, idx = cv2.solvePnPRansac(
@@ -313,10 +316,10 @@ def _with_covariance(
 
 
 def _estimate_noise_scale(squares: Float[np.ndarray, " n"]) -> float:
-    """How many times larger than assumed the noise is, at least 1, of squared whitened residuals
-    (Huber's proposal 2, 1964).
+    """Return the factor by which the noise exceeds its assumed standard deviation, from squared
+    whitened residuals (Huber's proposal 2, 1964).
 
-    Never below 1: that few matches fit well is chance, or the fit itself.
+    It is at least 1. If few matches fit well, this is due to chance or to the fit itself.
     """
     num_free = max(2 * len(squares) - 6, 1)
     variance = 1.0
@@ -332,7 +335,8 @@ def _estimate_noise_scale(squares: Float[np.ndarray, " n"]) -> float:
 
 
 def _invert_information(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] | None:
-    """Its inverse, None where it does not fix all six degrees of freedom."""
+    """Return the inverse of an information matrix, or None if it does not fix all six degrees of
+    freedom."""
     diagonal = np.sqrt(np.diag(information))
     if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
         return None
@@ -346,18 +350,17 @@ def _invert_information(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarr
 def select_inliers(
     cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig
 ) -> Bool[np.ndarray, " n"]:
-    """The matches that this pose explains: by the threshold, and, of uncertain points, by what they
-    may miss it by."""
+    """Return the inliers of a pose. With poselib the threshold is widened for uncertain points."""
     errors_px = np.linalg.norm(
         camera.img_from_cam(cam_from_world.apply(matches.points_world)) - matches.points_img, axis=1
     )
     limit_px = (
         config.max_reprojection_error_px
-    )  # NaN, behind the camera or outside its field, is not below it
+    )  # NaN, for points behind the camera or outside its field, is not below the limit
     if config.method == "opencv" or len(matches.point_covariances) == 0:
         return errors_px <= limit_px
-    # A plain threshold would cut the errors of uncertain points short, and what is left would look
-    # too precise.
+    # A plain threshold would truncate the errors of uncertain points, and the rest would look too
+    # precise.
     squares = squared_errors(*matches.kernel_args(cam_from_world))
     return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (
         errors_px <= _MAX_THRESHOLD_SCALE * limit_px
@@ -365,7 +368,7 @@ def select_inliers(
 
 
 def is_non_collinear(points: Float[np.ndarray, "n 3"]) -> bool:
-    """At least four points, not all on a line."""
+    """Return whether there are at least four points, not all on one line."""
     if len(points) < _MIN_POINTS:
         return False
     centred = points - points.mean(axis=0)

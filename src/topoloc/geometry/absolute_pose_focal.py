@@ -1,10 +1,10 @@
-"""Pose and focal length together, for cameras that nobody has calibrated.
+"""Estimate pose and focal length together, for uncalibrated cameras.
 
-RANSAC is run with a handful of focal lengths a quarter apart, and no longer than it takes to beat
-the best so far: at an inlier threshold of some pixels the nearest of them is near enough to find
-the inliers. From the best ones, Gauss-Newton refines the pose's six numbers and the logarithm of
-the focal length together. What is not known of the focal length and of the principal point, which
-is taken to be in the middle, is added to the pose's covariance.
+RANSAC runs with a few focal lengths in steps of 1.25. Each run is no longer than needed to beat the
+best one so far. At an inlier threshold of several pixels, the nearest focal length is near enough
+to find the inliers. From the best results, Gauss-Newton refines the pose and the logarithm of the
+focal length together. The uncertainty of the focal length and of the principal point, assumed in
+the image centre, is added to the pose's covariance.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 _FiniteMatches = tuple[
     Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]
 ]
-"""Pixels, points of the world (metres) and their covariances (m^2)."""
+"""Pixels, world points (metres) and their covariances (m^2)."""
 
 _FOCAL_STEP = 1.25
-_MIN_INLIERS = 4  # any sample agrees with three
-# Of RANSAC for each focal length: where one match in four is right, all of them miss it once in a
-# hundred times. The focal lengths beside the right one find most of its inliers too, by samples of
+_MIN_INLIERS = 4  # the three matches of a sample always agree
+# RANSAC iterations for each focal length. If one match in four is right, all samples are wrong once
+# in a hundred times. The neighbouring focal lengths find most of the inliers too, with samples of
 # their own.
 _MAX_ITERATIONS = 300
-# The best is not always next to the right focal length where few matches are right; a third start
-# helps no more.
+# The best start is not always next to the right focal length if few matches are right. A third
+# start does not help.
 _MAX_STARTS = 2
-# Inliers of a focal length far off are few, and gather over some rounds: five mostly; one picture
-# of a street took more, and was 2.7 m wrong without them.
+# A wrong focal length has few inliers, and more are added over some rounds, mostly five. Some
+# images need more rounds and would be wrong by metres without them.
 _MAX_ROUNDS = 20
-# How far the principal point lies from the middle (standard deviation, of the longer side); it
-# trades places with a rotation.
+# Standard deviation of the principal point from the image centre, as a fraction of the longer
+# side. Its shift is nearly equivalent to a rotation.
 _PRINCIPAL_POINT_SIGMA = 0.01
-# Weak prior on the logarithm of the focal length (standard deviation): without it, what is seen of
-# a wall alone fixes none.
+# Weak prior on the logarithm of the focal length (standard deviation). Without it, points of a
+# single wall do not fix the focal length.
 _LOG_FOCAL_SIGMA = 0.7
 
 
@@ -65,15 +65,14 @@ def estimate_pose_and_focal(
     point_covariances: Float[np.ndarray, "n 3 3"],
     start: tuple[Rigid3, Camera] | None = None,
 ) -> tuple[AbsolutePose, Camera] | None:
-    """cam_from_world and the camera, from n matches of pixels with world points (metres); None
-    where none follows from them.
+    """Return cam_from_world and the camera, from n matches of pixels with world points (metres).
+    Return None if no pose is found.
 
     Args:
-        start: a pose and a camera that are nearly right already: they are refined, and no others
-            are sought.
+        start: an approximate pose and camera. They are refined, and no others are searched.
 
-    The focal length found lies in `uncalibrated`'s range. The covariance is that of the pose
-    whatever the focal length.
+    The focal length lies in the range of `uncalibrated`. The covariance of the pose includes the
+    uncertainty of the focal length.
     """
     usable = (
         np.isfinite(points_img).all(axis=1)
@@ -121,8 +120,8 @@ def estimate_pose_and_focal(
 def _search_focal_lengths(
     finite: _FiniteMatches, uncalibrated: UncalibratedCamera, config: AbsolutePoseConfig
 ) -> list[tuple[Rigid3, Camera]]:
-    """Poses with the focal lengths that explain most; the middle ones are tried first: a right one
-    makes the rest short."""
+    """Return the poses and focal lengths with the smallest errors. Focal lengths in the middle are
+    tried first, because a right one shortens the remaining runs."""
     points_img, points_world, _ = finite
     if len(points_img) < _MIN_INLIERS:
         return []
@@ -154,13 +153,13 @@ def _search_focal_lengths(
             most = max(most, num_inliers)
     found.sort(
         key=lambda one: one[0]
-    )  # where most is far and flat, all focal lengths find it: their counts are alike, the errors are not  # noqa: E501
+    )  # distant and flat scenes give similar inlier counts at all focal lengths, but not errors
     return [(cam_from_world, camera) for _, cam_from_world, camera in found[:_MAX_STARTS]]
 
 
 def _num_ransac_iterations(share: float, confidence: float) -> int:
-    """So many samples of three hit right matches alone once, at this confidence, where this share
-    is right."""
+    """Return the number of samples of three after which one contains only right matches, at this
+    confidence. `share` is the inlier ratio."""
     return max(
         1, math.ceil(math.log(max(1.0 - confidence, 1e-9)) / math.log1p(-(min(share, 0.99) ** 3)))
     )
@@ -172,8 +171,8 @@ def _refine_pose_and_focal(
     uncalibrated: UncalibratedCamera,
     config: AbsolutePoseConfig,
 ) -> tuple[int, Rigid3, Camera] | None:
-    """The pose and the camera that fit the inliers best, and how many these are; they are chosen
-    anew each round."""
+    """Return the number of inliers, and the pose and camera that fit them best. Each round selects
+    the inliers again."""
     cam_from_world, camera = start
     num_inliers = 0
     for _ in range(_MAX_ROUNDS):
@@ -224,8 +223,8 @@ def _normal_equations(
     camera: Camera,
     uncalibrated: UncalibratedCamera,
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
-    """Gauss-Newton's, by the left perturbation of the pose and the logarithm of the focal length,
-    with the prior on that."""
+    """Return Gauss-Newton's information and gradient for the left perturbation of the pose and the
+    logarithm of the focal length. They include the prior on the focal length."""
     information, gradient, *_ = normal_equations(
         *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, 7
     )
@@ -238,8 +237,8 @@ def _normal_equations(
 def _add_focal_uncertainty(
     covariance: Float[np.ndarray, "6 6"], information: Float[np.ndarray, "7 7"]
 ) -> Float[np.ndarray, "6 6"]:
-    """The pose's covariance at a fixed focal length, and what the focal length's own uncertainty
-    adds to it."""
+    """Return the pose's covariance, increased from that at a fixed focal length by the uncertainty
+    of the focal length."""
     by_focal = -np.linalg.solve(information[:6, :6], information[:6, 6])
     scale = float(np.trace(covariance @ information[:6, :6])) / 6.0
     variance = scale / max(information[6, 6] + float(information[:6, 6] @ by_focal), 1e-12)
@@ -249,8 +248,8 @@ def _add_focal_uncertainty(
 def _principal_point_covariance(
     points_world: Float[np.ndarray, "n 3"], pose: AbsolutePose, camera: Camera
 ) -> Float[np.ndarray, "6 6"]:
-    """What a principal point away from the middle adds to the pose's covariance: the pose moves so
-    as to shift all pixels alike."""
+    """Return the covariance that an uncertain principal point adds to the pose. A shift of all
+    pixels moves the pose."""
     x, y, z = pose.cam_from_world.apply(points_world).T
     u, v, w = x / z, y / z, 1.0 / z
     zero = np.zeros_like(u)

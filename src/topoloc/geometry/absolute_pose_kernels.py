@@ -1,5 +1,5 @@
-"""Compiled inner loops of `absolute_pose` and `clustered_errors`: one pass over the points a call,
-no allocation a point."""
+"""Implement the inner loops of `absolute_pose` and `clustered_errors`. Each call passes over the
+points once, without an allocation per point."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from topoloc.compiled import kernel
 def _whiten_residual(
     rotation, translation, normalized, covariances, points_world, point_covariances, i
 ):
-    """(u, v, 1/z, e, S^-1, e' S^-1 e) of match i, with e = projected - observed on the plane z = 1;
-    the last is infinite behind.
+    """Return (u, v, 1/z, e, S^-1, e' S^-1 e) of match i, with e = projected - observed on the plane
+    z = 1. The last value is infinite for a point behind the camera.
 
-    S = the pixel's covariance + D R P R' D' with D the projection's derivative and P the point's
-    covariance, absent if there are none. Rows are not taken out of the arrays: a view of each would
-    cost more than the arithmetic.
+    S is the pixel's covariance + D R P R' D', with the projection's derivative D and the point's
+    covariance P. Without point covariances, only the first term is used. Elements are read one by
+    one, because a view of each row would cost more than the arithmetic.
     """
     px, py, pz = points_world[i, 0], points_world[i, 1], points_world[i, 2]
     x = rotation[0, 0] * px + rotation[0, 1] * py + rotation[0, 2] * pz + translation[0]
@@ -69,7 +69,8 @@ def _whiten_residual(
 
 @kernel()
 def squared_errors(rotation, translation, normalized, covariances, points_world, point_covariances):
-    """Squared Mahalanobis length of each match's reprojection error; infinite behind the camera."""
+    """Return the squared Mahalanobis length of each match's reprojection error, infinite for points
+    behind the camera."""
     squares = np.empty(len(normalized))
     for i in range(len(normalized)):
         squares[i] = _whiten_residual(
@@ -90,15 +91,19 @@ def normal_equations(
     cauchy_scale,
     num_unknowns,
 ):
-    """Gauss-Newton's normal equations of the whitened reprojection errors on the plane z = 1.
+    """Return Gauss-Newton's normal equations of the whitened reprojection errors on the plane z =
+    1.
 
-    `covariances` (n, 2, 2) are those of `normalized`; `point_covariances` is (n, 3, 3), or (0, 3,
+    `covariances` (n, 2, 2) are those of `normalized`. `point_covariances` is (n, 3, 3), or (0, 3,
     3) for exact points. The derivative of an error by the left perturbation (translation, rotation)
-    is D [I, -[p]x]; each match weighs 1 / (1 + e' S^-1 e / c^2), Cauchy's weight. The seventh
-    unknown, of `num_unknowns` = 6 or 7, is the logarithm of the focal length: noise is of pixels,
-    so that it is the projection that moves with it; were the observations taken to move, it would
-    come out too long. Returns the information (k, k) and the gradient (k) of k unknowns, the Cauchy
-    cost and the sum of the weighted squared residuals.
+    is D [I, -[p]x]. Each match has Cauchy's weight 1 / (1 + e' S^-1 e / c^2).
+
+    If `num_unknowns` is 7 instead of 6, the seventh unknown is the logarithm of the focal length.
+    It moves the projection and not the observation. The noise is in pixels, so moving the
+    observations would overestimate the focal length.
+
+    Returns the information (k, k) and the gradient (k) of k unknowns, the Cauchy cost, and the sum
+    of the weighted squared residuals.
     """
     information = np.zeros((num_unknowns, num_unknowns))
     gradient = np.zeros(num_unknowns)
@@ -112,7 +117,7 @@ def normal_equations(
             rotation, translation, normalized, covariances, points_world, point_covariances, i
         )
         if squared == np.inf:
-            cost += 1e6  # a step that puts a match behind the camera is not taken
+            cost += 1e6  # so that a step that puts a match behind the camera is rejected
             continue
         weight = 1.0 / (1.0 + squared / cauchy_scale**2)
         cost += 0.5 * cauchy_scale**2 * np.log1p(squared / cauchy_scale**2)
@@ -147,9 +152,9 @@ def score_outer_products(
     num_cells,
     cauchy_scale,
 ):
-    """The information (6, 6) of all matches, and of the gradients by which they pull at the pose,
-    less their mean, the sums of squares g g' of single matches and of those of one cell
-    together."""
+    """Return the information (6, 6) of all matches, and two sums of outer products g g' of the
+    gradients minus their mean. The first sum is over single matches. The second sum is over cells,
+    with the gradients in each cell added first."""
     count = len(normalized)
     active = np.ones(1, np.bool_)
     information, independent, clustered = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
@@ -193,7 +198,7 @@ def refine(
     cauchy_scale,
     max_steps,
 ):
-    """Iteratively reweighted Gauss-Newton under Cauchy's loss; ends where the cost falls no more.
+    """Run iteratively reweighted Gauss-Newton under Cauchy's loss until the cost no longer falls.
     Returns (rotation, translation)."""
     information, gradient, cost, _ = normal_equations(
         rotation,
@@ -240,8 +245,8 @@ def refine(
 
 @kernel()
 def solve_cholesky(matrix, right):
-    """(True, x) with matrix @ x = right by Cholesky's decomposition; (False, _) if not positive
-    definite."""
+    """Return (True, x) with matrix @ x = right by Cholesky's decomposition, or (False, _) if the
+    matrix is not positive definite."""
     n = len(right)
     lower = np.zeros((n, n))
     x = np.zeros(n)
@@ -271,7 +276,7 @@ def solve_cholesky(matrix, right):
 
 @kernel()
 def _exp_so3(omega):
-    """Rodrigues' formula."""
+    """Return the rotation matrix of a rotation vector by Rodrigues' formula."""
     x, y, z = omega[0], omega[1], omega[2]
     squared = x * x + y * y + z * z
     angle = np.sqrt(squared)

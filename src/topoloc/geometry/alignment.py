@@ -1,7 +1,7 @@
-"""Bringing two coordinate frames together; how far two poses, and two trajectories, are apart:
-absolute error, and drift as KITTI has it.
+"""Align coordinate frames, and measure the error between poses and between trajectories: absolute
+error and KITTI's drift.
 
-A trajectory here is a list of ``world_from_cam`` poses; two of them, of the same moments in worlds
+A trajectory is a list of ``world_from_cam`` poses. Two trajectories of the same moments, in worlds
 a and b, give ``a_from_b`` of the worlds.
 """
 
@@ -16,8 +16,8 @@ from jaxtyping import Float
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 
-# A spread below this share of the longest one, or of a micrometre, is rounding: the points are on a
-# line.
+# A spread below this fraction of the longest one, or below a micrometre, is due to rounding: the
+# points lie on one line.
 _MIN_RELATIVE_SPREAD = 1e-6
 _MIN_SPREAD = 1e-6
 _SIGMA_TRANSLATION, _SIGMA_ROTATION = 0.05, 0.02  # m, rad
@@ -27,14 +27,15 @@ _MIN_KITTI_LENGTH = 200.0
 
 
 def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]) -> Rigid3:
-    """a_from_b that minimises the squared distances between points_a and the moved points_b.
+    """Return a_from_b that minimises the squared distances between points_a and the transformed
+    points_b.
 
     Umeyama, *Least-squares estimation of transformation parameters between two point patterns*,
-    1991, with the scale held at 1.
+    1991, with the scale fixed at 1.
 
     Raises:
-        TrajectoryError: fewer than three points, all on a line, or not finite: no single rotation
-            fits best.
+        TrajectoryError: the numbers of points differ, there are fewer than three, all lie on one
+            line, or some are not finite.
     """
     if len(points_a) != len(points_b):
         raise TrajectoryError(
@@ -60,11 +61,11 @@ def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray,
 def align_similarity(
     points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "n 3"]
 ) -> tuple[float, Rigid3]:
-    """The scale s and a_from_b for which points_a and ``a_from_b.apply(s * points_b)`` are nearest
-    (Umeyama, 1991).
+    """Return the scale s and a_from_b that minimise the distances between points_a and
+    ``a_from_b.apply(s * points_b)`` (Umeyama, 1991).
 
     Raises:
-        TrajectoryError: as `align_points`.
+        TrajectoryError: as in `align_points`.
     """
     rotation = align_points(points_a, points_b).rotation
     centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
@@ -76,15 +77,15 @@ def align_similarity(
 def align_scaled_poses(
     world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]
 ) -> tuple[float, Rigid3]:
-    """The scale s and world_a_from_world_b that bring poses of a world without a scale (b) into one
-    of metres (a).
+    """Return the scale s and world_a_from_world_b that transform poses of a world without metric
+    scale (b) into a metric world (a).
 
-    By the positions alone (`align_similarity`); where these lie on one line, orientations say how
-    it is turned (`align_poses`).
+    Only positions are used (`align_similarity`). If they lie on one line, orientations determine
+    the rotation (`align_poses`).
 
     Raises:
-        TrajectoryError: different lengths, values that are not finite, or positions all in one
-            place, which fix no scale.
+        TrajectoryError: the lengths differ, values are not finite, or all positions coincide and
+            fix no scale.
     """
     _check_lengths(world_a_from_cams, world_b_from_cams)
     positions_a, positions_b = _positions(world_a_from_cams), _positions(world_b_from_cams)
@@ -109,26 +110,27 @@ def align_scaled_poses(
 def align_trajectories(
     world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]
 ) -> Rigid3:
-    """world_a_from_world_b by the positions alone, as in the usual absolute trajectory error.
+    """Return world_a_from_world_b from the positions alone, as in the usual absolute trajectory
+    error.
 
     Raises:
-        TrajectoryError: different lengths, or positions that fix no rotation: a straight or
-            standing camera; see `align_poses`.
+        TrajectoryError: the lengths differ, or the positions fix no rotation because the camera
+            stands or moves straight. Use `align_poses` then.
     """
     _check_lengths(world_a_from_cams, world_b_from_cams)
     return align_points(_positions(world_a_from_cams), _positions(world_b_from_cams))
 
 
 def align_poses(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> Rigid3:
-    """world_a_from_world_b by positions and orientations together: for short, straight and standing
-    trajectories, too.
+    """Return world_a_from_world_b from positions and orientations together, also for short,
+    straight and standing trajectories.
 
     The rotation minimises squared position residuals over `_SIGMA_TRANSLATION` plus squared chordal
-    distances of the orientations over `_SIGMA_ROTATION`: one Wahba problem, in closed form. With a
-    long way the positions decide, with a short one the orientations.
+    distances of the orientations over `_SIGMA_ROTATION`. This is a Wahba problem in closed form.
+    Positions dominate on a long path, orientations on a short one.
 
     Raises:
-        TrajectoryError: different lengths, no pose, or values that are not finite.
+        TrajectoryError: the lengths differ, there is no pose, or values are not finite.
     """
     _check_lengths(world_a_from_cams, world_b_from_cams)
     if len(world_a_from_cams) == 0:
@@ -146,20 +148,21 @@ def align_poses(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence
 
 
 def translation_error(a_from_b: Rigid3, estimated_a_from_b: Rigid3) -> float:
-    """Distance of the two translations, metres: of poses world_from_cam, the distance of the
-    camera's positions."""
+    """Return the distance between the two translations, metres. For poses world_from_cam it is the
+    distance between the camera positions."""
     return float(np.linalg.norm(a_from_b.translation - estimated_a_from_b.translation))
 
 
 def rotation_error(a_from_b: Rigid3, estimated_a_from_b: Rigid3) -> float:
-    """Angle between the two rotations, radians in [0, pi]; precise for small angles, where the
-    trace's arccosine is not."""
+    """Return the angle between the two rotations, radians in [0, pi]. It is precise for small
+    angles, unlike the arccosine of the trace."""
     return Rigid3(a_from_b.rotation.T @ estimated_a_from_b.rotation, np.zeros(3)).angle()
 
 
 @dataclass(frozen=True)
 class Drift:
-    """Mean error of relative poses: a share of the way (0.01 is 1 %), and radians a metre."""
+    """Hold the mean error of relative poses: translation as a fraction of the path length (0.01 is
+    1 %), rotation in radians per metre."""
 
     translation: float
     rotation: float
@@ -168,15 +171,15 @@ class Drift:
 def absolute_trajectory_errors(
     true_world_from_cams: Sequence[Rigid3], world_from_cams: Sequence[Rigid3]
 ) -> Float[np.ndarray, " n"]:
-    """Distance (m) of each position from the true one, once the trajectory is aligned with the
-    truth by a rigid transform.
+    """Return the distance (m) of each position from the true one, after a rigid alignment of the
+    trajectories.
 
-    Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems*, IROS 2012; their ATE is
-    the root of the mean square. Where positions alone fix no alignment (a straight way, a standing
-    camera) orientations help.
+    Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems*, IROS 2012. Their ATE is
+    the root mean square of these distances. If positions alone fix no alignment (a straight path, a
+    standing camera), orientations are used too.
 
     Raises:
-        TrajectoryError: different lengths, no pose, or values that are not finite.
+        TrajectoryError: the lengths differ, there is no pose, or values are not finite.
     """
     try:
         true_from_estimated = align_trajectories(true_world_from_cams, world_from_cams)
@@ -191,14 +194,14 @@ def absolute_trajectory_errors(
 def relative_drift(
     true_world_from_cams: Sequence[Rigid3], world_from_cams: Sequence[Rigid3]
 ) -> Drift | None:
-    """Mean error over all pieces of some lengths (of the true way), from every frame on; None where
-    no piece fits.
+    """Return the mean error over all segments of certain lengths of the true path, starting at
+    every frame. Return None if no segment fits.
 
-    Geiger et al., *Are we ready for autonomous driving?*, CVPR 2012: 100 m to 800 m. Ways below 200
-    m are measured over 10 m to 50 m.
+    Geiger et al., *Are we ready for autonomous driving?*, CVPR 2012: 100 m to 800 m. Paths below
+    200 m are measured over 10 m to 50 m.
 
     Raises:
-        TrajectoryError: different lengths.
+        TrajectoryError: the lengths differ.
     """
     if len(true_world_from_cams) != len(world_from_cams):
         raise TrajectoryError(
@@ -224,7 +227,7 @@ def relative_drift(
 
 
 def nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation R of the largest tr(R' C)."""
+    """Return the rotation R that maximises tr(R' C)."""
     u, _, vt = np.linalg.svd(correlation)
     return u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 

@@ -1,106 +1,50 @@
-"""Does a picture fit its calibration? Pose, focal length and principal point together, from pixels
-of known points.
+"""Check a camera's calibration in one image: estimate pose, focal length and principal point
+together from pixels of map points.
 
-The pose that was found with a wrong focal length or principal point has given way as far as it
-could; what is left of the points' errors still leans one way. So from the pose found, Gauss-Newton
-frees three more numbers, all on the plane z = 1: observations there are `scale` times the
-projection, plus `offset`, where the focal length is `scale` times the calibrated one, and the
-principal point `offset` focal lengths beside the calibrated one.
+A pose found with a wrong focal length or principal point absorbs part of the error, but the
+residuals stay systematic. So Gauss-Newton starts from this pose and estimates three more unknowns
+on the plane z = 1. Observations are `scale` times the projection plus `offset`. `scale` is the
+focal length relative to the calibrated one. `offset` is the shift of the principal point in
+calibrated focal lengths.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.calibration_check_kernels import calibration_equations
+from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.geometry.rigid import Rigid3
 
 _NUM_ITERATIONS = 3
-_MAX_POINTS = 256  # evenly among all: their noise is the least of what is unknown
+_MAX_POINTS = 256  # evenly chosen among all: their noise is the smallest error
 _CAUCHY_SCALE = 2.3849
-# standard deviation; without any, a wall seen straight leaves the focal length and the distance
-# open together
+# Standard deviation of the prior. Without it, a frontal view of a wall does not separate the focal
+# length from the distance.
 _PRIOR_SIGMA = 0.3
 _MIN_POINTS = 20
-MISMATCH_FOCAL_FIELDS = ("focal_length_px", "focal_sigma_px", "calibrated_focal_length_px")
-"""The first fields of a `CalibrationMismatch`, which are its JSON's keys as well."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageCalibration:
-    """What a picture says of its camera: the focal length as `scale` times the calibrated one, the
-    principal point's place beside the calibrated one (`offset`, focal lengths; x, y), `covariance`
-    of the logarithm of the scale and of the offset, and the pose that goes with them."""
+    """Hold the calibration estimated from one image.
+
+    Args:
+        scale: focal length relative to the calibrated one.
+        offset: principal point relative to the calibrated one, in focal lengths (x, y).
+        covariance: covariance of the logarithm of the scale and of the offset.
+        cam_from_world: pose estimated together with them.
+    """
 
     scale: float
     offset: Float[np.ndarray, " 2"]
     covariance: Float[np.ndarray, "3 3"]
     cam_from_world: Rigid3
-
-
-@dataclass(frozen=True, eq=False)
-class IntrinsicsDeviation:
-    """What a picture says of its camera beside the calibration, whatever the picture's size.
-
-    `deviation` is the logarithm of the focal length over the calibrated one, and the principal
-    point's way from the calibrated one (calibrated focal lengths; x, y); `covariance` is its noise,
-    of points that are wrong independently. Pictures that show one `place` (a node) share what its
-    points are wrong by.
-    """
-
-    deviation: Float[np.ndarray, " 3"]
-    covariance: Float[np.ndarray, "3 3"]
-    place: int = -1
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationMismatch:
-    """What the picture says of its camera, against the calibration: pixels of the image as it came.
-
-    `shift` is the left perturbation by which the pose differs that the picture's own camera leads
-    to (metres, radians).
-    """
-
-    focal_length_px: float
-    focal_sigma_px: float
-    calibrated_focal_length_px: float
-    principal_point_px: Float[np.ndarray, " 2"]
-    calibrated_principal_point_px: Float[np.ndarray, " 2"]
-    has_focal_mismatch: bool
-    has_principal_point_mismatch: bool
-    shift: Float[np.ndarray, " 6"]
-
-    def __str__(self) -> str:
-        parts = []
-        if self.has_focal_mismatch:
-            measured = f"f = {self.focal_length_px:.0f} +- {max(self.focal_sigma_px, 0.5):.0f} px"
-            parts.append(f"{measured}, the calibration {self.calibrated_focal_length_px:.0f}")
-        if self.has_principal_point_mismatch:
-            (x, y), (cx, cy) = self.principal_point_px, self.calibrated_principal_point_px
-            parts.append(
-                f"the principal point at ({x:.0f}, {y:.0f}), the calibration ({cx:.0f}, {cy:.0f})"
-            )
-        return f"the picture says {'; '.join(parts)}"
-
-    def to_json(self) -> dict[str, Any]:
-        of = {
-            "focal_length": self.has_focal_mismatch,
-            "principal_point": self.has_principal_point_mismatch,
-        }
-        return {
-            **{key: getattr(self, key) for key in MISMATCH_FOCAL_FIELDS},
-            "of": [name for name, is_off in of.items() if is_off],
-            "shift": self.shift.tolist(),
-            "principal_point_px": self.principal_point_px.tolist(),
-            "calibrated_principal_point_px": self.calibrated_principal_point_px.tolist(),
-            "detail": str(self),
-        }
 
 
 def estimate_image_calibration(
@@ -111,8 +55,8 @@ def estimate_image_calibration(
     cam_from_world: Rigid3,
     sigma_px: float,
 ) -> ImageCalibration | None:
-    """From n pixels of points (metres), beginning at a pose found with the calibration; None from
-    too few, or where nothing follows."""
+    """Estimate the calibration from n pixels of points (metres), starting from a pose found with
+    the given calibration. Return None if there are fewer than 20 points or the estimate fails."""
     if len(points_img) < _MIN_POINTS:
         return None
     rows = np.unique(np.linspace(0, len(points_img) - 1, _MAX_POINTS).astype(int))
@@ -129,9 +73,15 @@ def estimate_image_calibration(
             np.ascontiguousarray(pose.rotation),
             np.ascontiguousarray(pose.translation),
         )
-        of_points = (observed, points_world, point_covariances, sigma_px / camera.fx, _CAUCHY_SCALE)
+        point_args = (
+            observed,
+            points_world,
+            point_covariances,
+            sigma_px / camera.fx,
+            _CAUCHY_SCALE,
+        )
         information, gradient, squares = calibration_equations(
-            rotation, translation, free, *of_points
+            rotation, translation, free, *point_args
         )
         information[6:, 6:] += np.eye(3) / _PRIOR_SIGMA**2
         gradient[6:] += free / _PRIOR_SIGMA**2
@@ -150,7 +100,8 @@ def estimate_image_calibration(
 
 
 def corrected_camera(camera: Camera, found: ImageCalibration) -> Camera:
-    """The camera that a picture speaks of; its distortion is left as it is."""
+    """Return the camera with the estimated focal length and principal point. Its distortion is
+    unchanged."""
     focal = np.array([camera.fx, camera.fy])
     (fx, fy), (cx, cy) = (
         found.scale * focal,
@@ -169,10 +120,14 @@ def corrected_camera(camera: Camera, found: ImageCalibration) -> Camera:
 def compute_intrinsics_deviation(
     calibrated: Camera, camera: Camera, found: ImageCalibration, place: int
 ) -> IntrinsicsDeviation:
-    """What was found with `camera`, beside the calibration that the picture came with; both of one
-    picture size."""
-    own = corrected_camera(camera, found)
-    way = np.array([own.cx - calibrated.cx, own.cy - calibrated.cy]) / calibrated.fx
+    """Return the deviation of the estimate, found with `camera`, from the image's original
+    calibration. Both cameras must have one image size."""
+    estimated = corrected_camera(camera, found)
+    principal_point_shift = (
+        np.array([estimated.cx - calibrated.cx, estimated.cy - calibrated.cy]) / calibrated.fx
+    )
     return IntrinsicsDeviation(
-        np.array([math.log(own.fx / calibrated.fx), *way]), found.covariance, place
+        np.array([math.log(estimated.fx / calibrated.fx), *principal_point_shift]),
+        found.covariance,
+        place,
     )

@@ -1,4 +1,4 @@
-"""Compiled inner loop of `calibration_check`: one pass over the points a call."""
+"""Implement the inner loop of `calibration_check`. Each call passes over the points once."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ from topoloc.compiled import kernel
 def calibration_equations(
     rotation, translation, free, observed, points_world, point_covariances, sigma, cauchy_scale
 ):
-    """Gauss-Newton's normal equations for the pose's left perturbation (translation, rotation) and
-    `free`: the logarithm of the scale, and the offset.
+    """Return Gauss-Newton's normal equations for the pose's left perturbation (translation,
+    rotation) and for `free`: the logarithm of the scale, and the offset.
 
-    `observed` (n, 2) lie on the plane z = 1, each of whose numbers has the standard deviation
-    `sigma` there; each point weighs 1 / (1 + s / c^2), Cauchy's weight of its squared Mahalanobis
-    length s. Returns the information (9, 9), the gradient (9) and these squared lengths (n).
+    `observed` (n, 2) are coordinates on the plane z = 1, with standard deviation `sigma`. Each
+    point has Cauchy's weight 1 / (1 + s / c^2) of its squared Mahalanobis length s. Returns the
+    information (9, 9), the gradient (9) and the squared lengths (n).
     """
     information, gradient, squares = np.zeros((9, 9)), np.zeros(9), np.empty(len(observed))
     jacobian, by_world, spread = np.zeros((2, 9)), np.zeros((2, 3)), np.zeros((2, 2))

@@ -1,11 +1,10 @@
-"""What many pictures of one camera say of its calibration together: what one picture cannot tell,
-they can.
-
-Each picture's say is weighed by its information; pictures that disagree with the others by more
-than their noise allows for are heard less (Cauchy weights), and what they scatter by beyond their
-noise is one more variance of each (random effects: DerSimonian and Laird, *Controlled Clinical
-Trials* 7, 1986). Pictures of one place share what its points are wrong by, so that they count as
+"""Check the calibration of a camera with many of its images together, which are more precise than
 one.
+
+Each image is weighted by its information. Images that disagree by more than their noise get smaller
+weights (Cauchy). Their scatter beyond the noise is added to each variance (random effects:
+DerSimonian and Laird, *Controlled Clinical Trials* 7, 1986). Images of one place share the errors
+of its points, so the covariance is scaled to the number of places.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.calibration_check import IntrinsicsDeviation
+from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 
-MIN_IMAGES, MIN_PLACES = 5, 4  # pictures of one place are wrong together, however many they are
-_NUM_SIGMAS, _MIN_RELATIVE_DEVIATION = 3.0, 0.02  # of the focal length, or of the picture's width
+MIN_IMAGES, MIN_PLACES = 5, 4  # images of one place share their errors, however many there are
+_NUM_SIGMAS, _MIN_RELATIVE_DEVIATION = 3.0, 0.02  # of the focal length, or of the image's width
 _NUM_ITERATIONS = 10
 _MAD_TO_SIGMA = 1.4826
 _CAUCHY_SCALE_SQUARED = 2.3849**2
@@ -29,8 +28,8 @@ _CAUCHY_SCALE_SQUARED = 2.3849**2
 
 @dataclass(frozen=True, eq=False)
 class CalibrationConsistency:
-    """Pixels of the pictures as they came; sigmas are of the numbers before them. `num_images`
-    are those that had something to say."""
+    """Hold the intrinsics estimated from many images, in pixels of the original images. Each sigma
+    is the standard deviation of the field before it. `num_images` is the number of images used."""
 
     num_images: int
     focal_length_px: float
@@ -44,7 +43,7 @@ class CalibrationConsistency:
 
     @property
     def is_contradicted(self) -> bool:
-        """Is the calibration contradicted?"""
+        """Return whether the images contradict the calibration."""
         return self.has_focal_mismatch or self.has_principal_point_mismatch
 
     def __str__(self) -> str:
@@ -74,6 +73,7 @@ class CalibrationConsistency:
         return f"the pictures say {'; '.join(parts)} ({self.num_images} pictures)"
 
     def to_json(self) -> dict[str, Any]:
+        """Return the result as JSON, with a text for the user as `detail`."""
         return {
             "num_pictures": self.num_images,
             "focal_length_px": self.focal_length_px,
@@ -90,8 +90,8 @@ class CalibrationConsistency:
 def check_calibration_consistency(
     observations: Sequence[IntrinsicsDeviation], calibrated: Camera
 ) -> CalibrationConsistency | None:
-    """What pictures of one camera say together; None from fewer than five, or of fewer than four
-    places."""
+    """Return the intrinsics estimated from images of one camera. Return None if there are fewer
+    than five images or fewer than four places."""
     if len(observations) < MIN_IMAGES or len({one.place for one in observations}) < MIN_PLACES:
         return None
     deviation, covariance = _robust_mean(observations)
@@ -118,7 +118,7 @@ def check_calibration_consistency(
 def _robust_mean(
     observations: Sequence[IntrinsicsDeviation],
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
-    """Robust mean of the deviations, and its covariance."""
+    """Return the robust mean of the deviations and its covariance."""
     deviations, covariances = (
         np.stack([one.deviation for one in observations]),
         np.stack([one.covariance for one in observations]),

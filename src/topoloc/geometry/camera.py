@@ -1,7 +1,7 @@
-"""Cameras: pinhole with distortion, under COLMAP's model names.
+"""Model cameras: pinhole with distortion, under COLMAP's model names.
 
-Pixels are (x, y) with the centre of the top-left pixel at (0, 0); COLMAP's own origin, half a pixel
-up and left, appears only where its files are read or written.
+Pixels are (x, y) with the centre of the top-left pixel at (0, 0). COLMAP's origin, half a pixel up
+and left, is used only when COLMAP's files are read or written.
 """
 
 from __future__ import annotations
@@ -33,23 +33,28 @@ MODELS: dict[str, tuple[str, ...]] = {
 _MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = (
     1e-3,
     1e4,
-)  # times the longer side of the picture; real lenses have 0.2 to 100
+)  # times the longer side of the image; real lenses have 0.2 to 100
 _TWO_FOCAL_MODELS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
 
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera: COLMAP model name, image size in pixels, parameters in the model's order.
+    """Hold one camera: COLMAP model name, image size in pixels, parameters in the model's order.
 
     Raises:
-        CalibrationError: unknown model, wrong number of parameters, values not finite, focal length
-            not positive or of no lens.
+        CalibrationError: the model is unknown, the number of parameters is wrong, values are not
+            finite, or the focal length is not positive or not realistic.
     """
 
     model: str
     width: int
     height: int
     params: tuple[float, ...]
+
+    @staticmethod
+    def model_names() -> list[str]:
+        """Return the names of all camera models."""
+        return list(MODELS)
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
@@ -80,6 +85,7 @@ class Camera:
 
     @staticmethod
     def pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera:
+        """Return a pinhole camera. Lengths are in pixels."""
         return Camera("PINHOLE", width, height, (float(fx), float(fy), float(cx), float(cy)))
 
     def _param(self, name: str) -> float:
@@ -88,27 +94,33 @@ class Camera:
 
     @property
     def fx(self) -> float:
+        """Return the horizontal focal length, pixels."""
         return self._param("f" if "f" in MODELS[self.model] else "fx")
 
     @property
     def fy(self) -> float:
+        """Return the vertical focal length, pixels."""
         return self._param("f" if "f" in MODELS[self.model] else "fy")
 
     @property
     def cx(self) -> float:
+        """Return the x coordinate of the principal point, pixels."""
         return self._param("cx")
 
     @property
     def cy(self) -> float:
+        """Return the y coordinate of the principal point, pixels."""
         return self._param("cy")
 
     @property
     def is_fisheye(self) -> bool:
+        """Return whether the model is OpenCV's fisheye."""
         return self.model == "OPENCV_FISHEYE"
 
     @property
     def is_distorted(self) -> bool:
-        """Anything but a plain pinhole; a fisheye lens is, whatever its coefficients."""
+        """Return whether the camera is not a plain pinhole. A fisheye camera is always distorted,
+        whatever its coefficients."""
         return self.is_fisheye or any(
             value != 0.0
             for name, value in zip(MODELS[self.model], self.params, strict=True)
@@ -116,11 +128,12 @@ class Camera:
         )
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """K: pixels from the normalised plane."""
+        """Return K, which maps the plane z = 1 to pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def distortion(self) -> Float[np.ndarray, " d"]:
-        """Coefficients in OpenCV's order: (k1, k2, p1, p2, k3 .. k6), or (k1 .. k4) for fisheye."""
+        """Return the coefficients in OpenCV's order: (k1, k2, p1, p2, k3 .. k6), or (k1 .. k4) for
+        fisheye."""
         names = (
             ("k1", "k2", "k3", "k4")
             if self.is_fisheye
@@ -129,10 +142,10 @@ class Camera:
         return np.array([self._param(name) for name in names])
 
     def img_from_cam(self, points_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Pixels of points in the camera frame (metres).
+        """Return the pixels of points in the camera frame (metres).
 
-        Points at or behind the camera, and points beyond the field that the distortion model
-        describes, give NaN.
+        Points at or behind the camera, and points outside the valid field of the distortion model,
+        give NaN.
         """
         in_front = points_cam[:, 2] > 1e-9
         normalized = points_cam[:, :2] / np.where(in_front, points_cam[:, 2], np.nan)[:, None]
@@ -144,8 +157,8 @@ class Camera:
         return normalized * [self.fx, self.fy] + [self.cx, self.cy]
 
     def normalized_from_img(self, points_img: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Undistorted coordinates (x / z, y / z) on the plane z = 1 of pixels; NaN for pixels that
-        no ray reaches."""
+        """Return the undistorted coordinates (x / z, y / z) of pixels on the plane z = 1, NaN for
+        pixels without a ray."""
         distorted = (np.asarray(points_img, dtype=np.float64) - [self.cx, self.cy]) / [
             self.fx,
             self.fy,
@@ -158,8 +171,8 @@ class Camera:
     def normalized_jacobian(
         self, normalized: Float[np.ndarray, "n 2"]
     ) -> Float[np.ndarray, "n 2 2"]:
-        """Derivative of `normalized_from_img` at the pixels whose undistorted coordinates these
-        are."""
+        """Return the derivative of `normalized_from_img` at the pixels with these undistorted
+        coordinates."""
         focal = np.array([self.fx, self.fy])
         if not self.is_distorted:
             return np.broadcast_to(np.diag(1.0 / focal), (len(normalized), 2, 2)).copy()
@@ -175,20 +188,20 @@ class Camera:
         )
 
     def rays_from_img(self, points_img: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-        """Unit direction in the camera frame of each pixel."""
+        """Return the unit direction of each pixel in the camera frame."""
         normalized = self.normalized_from_img(points_img)
         rays = np.concatenate([normalized, np.ones((len(normalized), 1))], axis=1)
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def undistorted(self) -> Camera:
-        """The pinhole camera with the same matrix and size."""
+        """Return the pinhole camera with the same matrix and size."""
         return Camera.pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def rescaled(self, width: int, height: int) -> Camera:
-        """The same camera for its image resized to width x height; pixel centres stay pixel
+        """Return the camera of the image resized to width x height. Pixel centres stay pixel
         centres.
 
-        Models with one focal length become their two-focal siblings where the two scales differ.
+        If the two scales differ, a model with one focal length becomes its counterpart with two.
         """
         scale_x, scale_y = width / self.width, height / self.height
         model = self.model if scale_x == scale_y else _TWO_FOCAL_MODELS.get(self.model, self.model)
@@ -205,16 +218,16 @@ class Camera:
         return Camera(model, width, height, tuple(values.values()))
 
     def to_colmap(self) -> tuple[str, int, int, tuple[float, ...]]:
-        """(model, width, height, params) as COLMAP writes them: there the centre of the top-left
+        """Return (model, width, height, params) in COLMAP's convention: the centre of the top-left
         pixel is (0.5, 0.5)."""
         return self.model, self.width, self.height, self._shift_principal_point(0.5)
 
     @staticmethod
     def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) -> Camera:
-        """The camera of one entry of COLMAP's cameras file; inverse of `to_colmap`.
+        """Return the camera of one entry of COLMAP's cameras file. Inverse of `to_colmap`.
 
         Raises:
-            CalibrationError: a model that is not known here, or parameters that are not usable.
+            CalibrationError: the model is unknown or the parameters are not usable.
         """
         camera = Camera(model, width, height, tuple(float(value) for value in params))
         return replace(camera, params=camera._shift_principal_point(-0.5))
@@ -224,13 +237,13 @@ class Camera:
         return tuple(value + offset_px if name in ("cx", "cy") else value for name, value in named)
 
     def to_json(self) -> dict[str, object]:
-        """As in ``camera.json``: model, width, height and the parameters by name."""
+        """Return the form of ``camera.json``: model, width, height and the parameters by name."""
         size: dict[str, object] = {"model": self.model, "width": self.width, "height": self.height}
         return size | dict(zip(MODELS[self.model], self.params, strict=True))
 
     @staticmethod
     def from_json(data: dict[str, object]) -> Camera:
-        """Read the form of `to_json`; other keys (baseline, depth_factor) are left to the caller.
+        """Read the form of `to_json`. Other keys (baseline, depth_factor) are ignored.
 
         Raises:
             CalibrationError: a key is missing or not a number, or the camera is not usable.

@@ -1,11 +1,9 @@
-"""What the errors of matches have in common that lie near each other in the picture, and how much
-less they say together for it.
+"""Estimate how much correlated errors of neighbouring matches inflate the variance of a pose.
 
-PnP's covariance takes the errors of all matches for independent. Where a chair was moved by a
-centimetre, or a wall's depth is wrong, the errors of all points there pull the pose the same way.
-That shows: summed over a part of the picture, what pulls at the pose is then larger than the sum of
-as many independent pulls. The ratio of the two covariances of the pose that follow is that of the
-clustered "sandwich" to the plain one (Liang and Zeger, *Longitudinal data analysis using
+PnP's covariance assumes independent errors. If a chair was moved or the depth of a wall is wrong,
+the errors of all its points pull the pose in one direction. Then the summed gradient of an image
+cell is larger than that of independent errors. The inflation is the ratio of two covariances of the
+pose: the clustered "sandwich" and the plain one (Liang and Zeger, *Longitudinal data analysis using
 generalized linear models*, 1986).
 """
 
@@ -20,7 +18,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 
 _COLUMNS, _ROWS = 8, 6
-_MIN_CELLS = 6  # with matches in fewer of them nothing is said
+_MIN_CELLS = 6  # with fewer occupied cells no inflation is estimated
 
 
 def compute_variance_inflation(
@@ -31,12 +29,15 @@ def compute_variance_inflation(
     cam_from_world: Rigid3,
     config: AbsolutePoseConfig,
 ) -> float:
-    """How many times larger the pose's variance is than if the errors of its inliers were
-    independent, in the mean of its six directions; at least 1.
+    """Return the ratio of the pose's variance to that under independent errors of the inliers. It
+    is averaged over the six directions and at least 1.
+
+    If the inliers lie in fewer than six image cells, the ratio is 1.
 
     Args:
-        points_img: pixels of the inliers, and their points (metres) with the covariances of these
-            (m^2).
+        points_img: pixels of the inliers.
+        points_world: world points of the inliers (metres).
+        point_covariances: covariances of these points (m^2).
     """
     normalized = camera.normalized_from_img(points_img)
     matches = Matches.from_pixels(
@@ -56,14 +57,14 @@ def compute_variance_inflation(
         np.isfinite(information).all() and np.linalg.matrix_rank(information, hermitian=True) == 6
     ):
         return 1.0
-    of_fit = len(used) / (
+    fit_correction = len(used) / (
         len(used) - 3.0
-    )  # the pose follows from the same pulls, which makes their sums smaller
+    )  # the pose is fitted to the same matches, which makes the sums smaller
     variance_alone, variance_together = (
         np.trace(np.linalg.solve(information, gradients)) for gradients in (independent, clustered)
     )
     return (
-        max(1.0, float(of_fit * variance_together / variance_alone))
+        max(1.0, float(fit_correction * variance_together / variance_alone))
         if variance_alone > 0.0
         else 1.0
     )

@@ -1,9 +1,9 @@
-"""Lens distortion on the plane z = 1: OpenCV's rational model and its fisheye model, each with its
-Jacobian and inverse.
+"""Distort points on the plane z = 1 with OpenCV's rational model and its fisheye model, with
+Jacobians and inverses.
 
 Coefficients are in OpenCV's order: (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) for
-fisheye. Radial polynomials fold back beyond some radius, so that one pixel would belong to two
-rays: all functions here are confined to the part before the first fold and give NaN outside.
+fisheye. Beyond some radius a radial polynomial folds back, and one pixel has two rays. The inverse
+functions accept only radii before the first fold and return NaN outside.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _CONVERGENCE_TOLERANCE = 1e-13
 def distort_rational(
     coefficients: Float[np.ndarray, "8"], normalized: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Distorted coordinates and their derivative (OpenCV's calib3d documentation: six radial, two
-    tangential coefficients)."""
+    """Return distorted coordinates and their derivative (OpenCV's calib3d documentation: six
+    radial, two tangential coefficients)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = normalized[:, 0], normalized[:, 1]
     xy, r2 = x * y, x * x + y * y
@@ -49,8 +49,8 @@ def distort_rational(
 def distort_fisheye(
     coefficients: Float[np.ndarray, "4"], normalized: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Distorted coordinates and their derivative (Kannala and Brandt, *A generic camera model*,
-    2006)."""
+    """Return distorted coordinates and their derivative (Kannala and Brandt, *A generic camera
+    model*, 2006)."""
     r = np.linalg.norm(normalized, axis=1)
     theta_d, theta_d_slope = _fisheye_polynomial(coefficients, np.arctan(r))
     safe = np.maximum(r, 1e-9)
@@ -67,8 +67,8 @@ def distort_fisheye(
 def undistort_rational(
     coefficients: Float[np.ndarray, "8"], distorted: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """The inverse of `distort_rational` by Newton's method, to machine precision; NaN where no ray
-    belongs to the point."""
+    """Invert `distort_rational` by Newton's method, to machine precision. Points without a ray give
+    NaN."""
     normalized = distorted.copy()
     limit = max_radius(tuple(coefficients.tolist()), is_fisheye=False)
     error = np.full(len(distorted), np.inf)
@@ -84,8 +84,8 @@ def undistort_rational(
             step_x = (d * residual[:, 0] - b * residual[:, 1]) / determinant
             step_y = (a * residual[:, 1] - b * residual[:, 0]) / determinant
             normalized = normalized + np.stack([step_x, step_y], axis=1)
-            # A point at the limit is kept there, so that one that has no ray cannot wander to the
-            # far side of the fold.
+            # A point is kept within the limit, so that one without a ray cannot move beyond the
+            # fold.
             radius = np.linalg.norm(normalized, axis=1, keepdims=True)
             normalized = np.where(radius > limit, normalized * (limit / radius), normalized)
         solved = error < 1e-9
@@ -95,8 +95,8 @@ def undistort_rational(
 def undistort_fisheye(
     coefficients: Float[np.ndarray, "4"], distorted: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """The inverse of `distort_fisheye` by Newton's method on the angle; NaN where no ray before 87
-    deg belongs to the point."""
+    """Invert `distort_fisheye` by Newton's method on the angle. Points without a ray within 87 deg
+    of the axis give NaN."""
     theta_d = np.linalg.norm(distorted, axis=1)
     limit = float(np.arctan(max_radius(tuple(coefficients.tolist()), is_fisheye=True)))
     theta = np.minimum(theta_d, limit)
@@ -114,14 +114,14 @@ def undistort_fisheye(
 
 @lru_cache(maxsize=256)
 def max_radius(coefficients: tuple[float, ...], is_fisheye: bool) -> float:
-    """Largest distance from the axis on the plane z = 1 up to which the distorted radius still
-    grows; at most tan(87 deg)."""
+    """Return the largest distance from the axis on the plane z = 1 up to which the distorted radius
+    grows. It is at most tan(87 deg)."""
     r = np.tan(np.linspace(0.0, np.arctan(_MAX_TAN), _NUM_SAMPLES))
     k = np.array(coefficients)
     if is_fisheye:
         grows = _fisheye_polynomial(k, np.arctan(r))[1] > 0.0
     else:
-        # The radial part alone: the tangential one is a small correction without a fold of its own.
+        # Use the radial part alone: the tangential one is a small correction without a fold.
         radial_only = k * [1, 1, 0, 0, 1, 1, 1, 1]
         with np.errstate(all="ignore"):
             distorted, jacobian = distort_rational(

@@ -1,10 +1,10 @@
-"""WGS-84: latitude, longitude and height, earth-centred coordinates, and the plane east-north-up of
-a place.
+"""Convert between WGS-84 latitude, longitude and height, earth-centred coordinates, and a local
+east-north-up frame.
 
-Latitudes and longitudes are degrees, heights metres above the ellipsoid. ECEF: x to latitude 0,
-longitude 0, z to the north pole, metres. Formulas: Torge and Mueller, *Geodesy*, 4.1; the way back
-by Bowring, *Transformation from spatial to geographical coordinates*, 1976, repeated until it
-stands still.
+Latitudes and longitudes are degrees. Heights are metres above the ellipsoid. ECEF is in metres,
+with x to latitude 0, longitude 0 and z to the north pole. Formulas: Torge and Mueller, *Geodesy*,
+4.1. The inverse is that of Bowring, *Transformation from spatial to geographical coordinates*,
+1976, iterated to convergence.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ FLATTENING = 1.0 / 298.257223563
 _SEMI_MINOR = SEMI_MAJOR * (1.0 - FLATTENING)
 _ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 _MAX_HEIGHT = 1e8  # metres
-# Axes of a camera as a body (x forward, y left, z up) in its own (x right, y down, z forward), as
-# the OSCP's reference server has them.
+# Axes of the camera's body (x forward, y left, z up) in the camera frame (x right, y down, z
+# forward), as in the OSCP's reference server.
 CAM_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class GeoPoint:
-    """A place on WGS-84: degrees, and metres above the ellipsoid.
+    """Hold a place on WGS-84: degrees, and metres above the ellipsoid.
 
     Raises:
-        GeoreferenceError: not finite, no latitude or longitude, or far from the earth.
+        GeoreferenceError: a value is not finite, latitude or longitude are out of range, or the
+            height is far from the earth.
     """
 
     lat: float
@@ -52,7 +53,7 @@ class GeoPoint:
             raise GeoreferenceError(f"a height of {self.h:g} m above the ellipsoid")
 
     def ecef(self) -> Float[np.ndarray, "3"]:
-        """Earth-centred, earth-fixed, metres."""
+        """Return the earth-centred, earth-fixed coordinates, metres."""
         lat, lon = math.radians(self.lat), math.radians(self.lon)
         normal = SEMI_MAJOR / math.sqrt(1.0 - _ECCENTRICITY_SQUARED * math.sin(lat) ** 2)
         across = (normal + self.h) * math.cos(lat)
@@ -66,8 +67,8 @@ class GeoPoint:
 
     @staticmethod
     def from_ecef(ecef: Float[np.ndarray, "3"]) -> GeoPoint:
-        """Of a point less than `_MAX_HEIGHT` from the ellipsoid. Raises GeoreferenceError for any
-        other."""
+        """Return the place of a point in ECEF (metres). Raises GeoreferenceError if it is farther
+        than `_MAX_HEIGHT` from the ellipsoid."""
         x, y, z = (float(value) for value in ecef)
         across = math.hypot(x, y)
         beta = math.atan2(SEMI_MAJOR * z, _SEMI_MINOR * across)
@@ -91,7 +92,8 @@ class GeoPoint:
         return GeoPoint(math.degrees(lat), math.degrees(math.atan2(y, x)), height)
 
     def ecef_from_enu(self) -> Rigid3:
-        """The plane east-north-up that touches here, as it lies in earth-centred coordinates."""
+        """Return the transform from the east-north-up frame at this place to earth-centred
+        coordinates."""
         lat, lon = math.radians(self.lat), math.radians(self.lon)
         east = [-math.sin(lon), math.cos(lon), 0.0]
         north = [-math.sin(lat) * math.cos(lon), -math.sin(lat) * math.sin(lon), math.cos(lat)]
@@ -101,24 +103,24 @@ class GeoPoint:
 
 @dataclass(frozen=True, eq=False)
 class GeoPose:
-    """OGC GeoPose 1.0, Basic-Quaternion: where the camera is, and how it is turned against
-    east-north-up at that very place.
+    """Hold an OGC GeoPose 1.0, Basic-Quaternion: the camera's place, and its orientation relative
+    to east-north-up at that place.
 
-    The camera is turned as a body: x forward, y left, z up.
+    The orientation is that of a body: x forward, y left, z up.
     """
 
     position: GeoPoint
     quat_wxyz: Float[np.ndarray, "4"]
 
     def to_json(self) -> dict[str, dict[str, float]]:
-        """The strict form: these members and no others."""
+        """Return the strict form, with exactly the members of the standard."""
         w, x, y, z = self.quat_wxyz.tolist()
         position = {"lat": self.position.lat, "lon": self.position.lon, "h": self.position.h}
         return {"position": position, "quaternion": {"x": x, "y": y, "z": z, "w": w}}
 
     @staticmethod
     def from_json(data: object) -> GeoPose:
-        """The form of `to_json`. Raises GeoreferenceError where it is another."""
+        """Read the form of `to_json`. Raises GeoreferenceError if the data have another form."""
         try:
             position, quaternion = data["position"], data["quaternion"]  # type: ignore[index]
             lat, lon, h = (float(position[name]) for name in ("lat", "lon", "h"))
@@ -127,17 +129,18 @@ class GeoPose:
             raise GeoreferenceError(
                 "no GeoPose: position (lat, lon, h) and quaternion (x, y, z, w) are needed"
             ) from None
-        if not abs(float(np.linalg.norm(quat_wxyz)) - 1.0) < 1e-3:  # NaN is not
+        if not abs(float(np.linalg.norm(quat_wxyz)) - 1.0) < 1e-3:  # also true for NaN
             raise GeoreferenceError("no GeoPose: its quaternion is not of unit length")
         return GeoPose(GeoPoint(lat, lon, h), quat_wxyz)
 
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """Where a map's world lies on earth: `enu_from_world` into the plane east-north-up at `origin`.
+    """Hold the place of a map's world frame on earth: `enu_from_world` transforms to the
+    east-north-up frame at `origin`.
 
-    `source` says what it comes from; `rms_m` is the root mean square of what the fit left over
-    (metres), None where nothing was fitted.
+    `source` names the source of the georeference. `rms_m` is the root mean square residual of the
+    fit (metres), or None if nothing was fitted.
     """
 
     origin: GeoPoint
@@ -146,7 +149,7 @@ class Georeference:
     rms_m: float | None = None
 
     def to_json(self) -> dict[str, object]:
-        """As the map file keeps it."""
+        """Return the form stored in the map file."""
         origin = {"lat": self.origin.lat, "lon": self.origin.lon, "h": self.origin.h}
         matrix = self.enu_from_world.matrix()[:3].tolist()
         return {
@@ -158,7 +161,7 @@ class Georeference:
 
     @staticmethod
     def from_json(data: object) -> Georeference:
-        """The form of `to_json`. Raises GeoreferenceError where it is another."""
+        """Read the form of `to_json`. Raises GeoreferenceError if the data have another form."""
         try:
             origin, rms_m, source = data["origin"], data["rms_m"], data["source"]  # type: ignore[index]
             lat, lon, h = (float(origin[name]) for name in ("lat", "lon", "h"))
@@ -166,7 +169,7 @@ class Georeference:
             enu_from_world = Rigid3.from_matrix(matrix)
             if (
                 np.abs(enu_from_world.matrix()[:3] - matrix[:3]).max() < 1e-9
-            ):  # as it was written, to the last bit
+            ):  # keep the stored values bit by bit
                 enu_from_world = Rigid3(matrix[:3, :3].copy(), matrix[:3, 3].copy())
             rms_m = None if rms_m is None else float(rms_m)
         except (KeyError, TypeError, ValueError, OverflowError, TrajectoryError):
@@ -180,20 +183,20 @@ class Georeference:
         return Georeference(GeoPoint(lat, lon, h), enu_from_world, source, rms_m)
 
     def geopoint(self, point_world: Float[np.ndarray, "3"]) -> GeoPoint:
-        """Latitude, longitude and height of a point of the world (metres). Raises GeoreferenceError
-        where it is far from the earth."""
+        """Return latitude, longitude and height of a point in the world frame (metres). Raises
+        GeoreferenceError if it is far from the earth."""
         ecef_from_world = self.origin.ecef_from_enu() @ self.enu_from_world
         return GeoPoint.from_ecef(ecef_from_world.apply(point_world))
 
     def geopose(self, world_from_cam: Rigid3) -> GeoPose:
-        """Of a camera. East, north and up are those of its own place, which differ from the
-        origin's by 0.01 degrees a kilometre."""
+        """Return the GeoPose of a camera. East, north and up are those of its own place, which
+        differ from the origin's by 0.01 degrees per kilometre."""
         ecef_from_cam = self.origin.ecef_from_enu() @ self.enu_from_world @ world_from_cam
         position = GeoPoint.from_ecef(ecef_from_cam.translation)
         enu_from_body = position.ecef_from_enu().rotation.T @ ecef_from_cam.rotation @ CAM_FROM_BODY
         return GeoPose(position, Rigid3(enu_from_body, np.zeros(3)).quat_wxyz())
 
     def heading_deg(self, direction_world: Float[np.ndarray, "3"]) -> float:
-        """Degrees clockwise from true north, 0 to 360, of a direction."""
+        """Return the heading of a direction in degrees clockwise from true north, 0 to 360."""
         east, north, _ = self.enu_from_world.rotation @ direction_world
         return math.degrees(math.atan2(east, north)) % 360.0

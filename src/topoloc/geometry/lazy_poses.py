@@ -1,4 +1,5 @@
-"""Poses made when they are asked for: a file may hold a million, a recording few of them."""
+"""Create poses only when they are accessed: a file may hold a million poses, and a recording uses
+few of them."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True, eq=False)
 class LazyPoses(Sequence[Rigid3]):
-    """A pose a row, which `to_pose` makes of it."""
+    """Hold one row of numbers per pose. `to_pose` converts a row when it is accessed."""
 
     rows: Float[np.ndarray, "n c"]
     to_pose: Callable[[Float[np.ndarray, " c"]], Rigid3]
@@ -35,13 +36,13 @@ class LazyPoses(Sequence[Rigid3]):
 
 
 def pose_from_quaternion(row: Float[np.ndarray, "7"]) -> Rigid3:
-    """Of a position (metres) and a quaternion (x, y, z, w), which need not be of unit length.
-    Raises TrajectoryError: it has none."""
+    """Return the pose of a row: position (metres) and quaternion (x, y, z, w) of any length above
+    zero. Raises TrajectoryError if the quaternion is zero or a value is not finite."""
     return Rigid3.from_quat_wxyz(row[[6, 3, 4, 5]], row[:3])
 
 
 def _pose_from_matrix(row: Float[np.ndarray, "12"]) -> Rigid3:
-    """Of the upper 3x4 of a matrix, row by row, whose rotation is one."""
+    """Return the pose of the upper 3x4 of a matrix, row by row. Its 3x3 part must be a rotation."""
     matrix = row.reshape(3, 4)
     return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
 
@@ -49,8 +50,12 @@ def _pose_from_matrix(row: Float[np.ndarray, "12"]) -> Rigid3:
 def poses_from_matrices(
     numbers: Float[np.ndarray, "n 12"], tolerance: float
 ) -> tuple[LazyPoses, Bool[np.ndarray, " n"]]:
-    """Poses of matrices' upper rows, made exact (Newton's iteration for the polar factor), and
-    whether they are such but for rounding."""
+    """Return the poses of the upper 3x4 rows of matrices, and whether each 3x3 part is a rotation
+    within the tolerance.
+
+    Rotations are made orthonormal by Newton's iteration for the polar factor. Other 3x3 parts are
+    replaced by the identity.
+    """
     matrices = numbers.reshape(-1, 3, 4).copy()
     given = matrices[:, :, :3]
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,10 +1,12 @@
-"""How trajectories of other programs are written, and how they become ours: world_from_cam, metres,
-camera axes x right, y down, z forward.
+"""Convert poses from the conventions of other programs to topoloc's: world_from_cam, metres, camera
+axes x right, y down, z forward.
 
-Conventions are named as `--poses` takes them, one or several in turn: ``inverse``, ``wxyz,opengl``,
-``mm``, ``scale=0.42``, ``body=0.1,0,0,0,0,0,1`` (body_from_cam: x, y, z, and the quaternion x, y,
-z, w), ``shift=0.2`` (seconds by which the poses' clock is ahead of the pictures'), ``clock=1e6``
-(times of the file, as read, in units of what they should be).
+Conventions are named as in `--poses`, one or several in turn:
+
+``inverse``, ``wxyz,opengl``, ``mm``, ``scale=0.42``
+``body=0.1,0,0,0,0,0,1``: body_from_cam as x, y, z, and the quaternion x, y, z, w.
+``shift=0.2``: seconds by which the clock of the poses is ahead of that of the images.
+``clock=1e6``: factor by which the times of the file, as read, are multiplied.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ def _reorder_quaternion(pose: Rigid3) -> Rigid3:
     w, x, y, z = pose.quat_wxyz()
     return Rigid3.from_quat_wxyz(
         np.array([x, y, z, w]), pose.translation
-    )  # what was taken for x is w, for y is x, and so on
+    )  # the value read as x is w, y is x, z is y and w is z
 
 
 def _mirror_pose(pose: Rigid3) -> Rigid3:
@@ -52,7 +54,7 @@ _PARAMETRIC_CONVENTIONS = (
     "clock=FACTOR",
 )
 UNITS = {"mm": 0.001, "cm": 0.01, "feet": 0.3048}
-"""Metres of each."""
+"""Length of each unit in metres."""
 ROTATIONS: dict[str, PoseConversion] = {
     "wxyz": _reorder_quaternion,
     "transposed": lambda pose: Rigid3(pose.rotation.T.copy(), pose.translation),
@@ -85,23 +87,24 @@ CONVENTION_DESCRIPTIONS = {
 
 @dataclass(frozen=True)
 class PoseConventions:
-    """How the poses of a file become ours: `conventions` undone in turn. The file's times, as read,
-    times `time_scale`, are the pictures' plus `shift_s`."""
+    """Convert the poses and times of a file. `conventions` are undone in turn. A time of the file
+    times `time_scale` is the image time plus `shift_s` (seconds)."""
 
     conventions: tuple[str, ...] = ()
     time_scale: float = 1.0
     shift_s: float = 0.0
 
     def undo_conventions(self, pose: Rigid3) -> Rigid3:
+        """Return the pose in topoloc's convention."""
         return undo_pose_conventions(pose, self.conventions)
 
     @staticmethod
     def of(text: str | None) -> PoseConventions:
-        """``wxyz,body=1,2,3,0,0,0,1,shift=0.2``: a part that begins with a number belongs to the
-        one before.
+        """Parse a text such as ``wxyz,body=1,2,3,0,0,0,1,shift=0.2``. A part that begins with a
+        number belongs to the part before it.
 
         Raises:
-            TrajectoryError: it names no known convention, or numbers are missing.
+            TrajectoryError: a convention is unknown, or numbers are missing.
         """
         parts: list[str] = []
         for part in (text or "").split(","):
@@ -129,23 +132,23 @@ class PoseConventions:
 
 
 def undo_pose_conventions(pose: Rigid3, conventions: Sequence[str]) -> Rigid3:
-    """One pose, with these conventions undone in turn. Raises TrajectoryError: there is no such
-    convention."""
+    """Return one pose with these conventions undone in turn. Raises TrajectoryError if a convention
+    is unknown."""
     for convention in conventions:
         pose = find_conversion(convention)(pose)
     return pose
 
 
 def describe_conventions(conventions: Sequence[str]) -> str:
-    """What poses are that need these, in words."""
+    """Return a readable description of poses with these conventions."""
     return ", ".join(
         CONVENTION_DESCRIPTIONS[convention.partition("=")[0]] for convention in conventions
     )
 
 
 def find_conversion(convention: str) -> PoseConversion:
-    """What undoes a convention, written as `--poses` takes it. Raises TrajectoryError: there is
-    none of that name."""
+    """Return the function that undoes a convention, named as in `--poses`. Raises TrajectoryError
+    if it is unknown."""
     name, _, value = convention.partition("=")
     if name in ("scale", "body"):
         numbers = _parse_numbers(convention, value, 1 if name == "scale" else 7)

@@ -1,6 +1,8 @@
-"""How a camera moved between two of its pictures, by what both show: the turn, and the direction of
-the way, for pictures alone know no metre. PoseLib's five-point method in LO-RANSAC
-(https://github.com/PoseLib/PoseLib)."""
+"""Estimate the motion of a camera between two images from matched pixels: the rotation and the
+direction of the translation, without its length.
+
+The method is PoseLib's five-point method in LO-RANSAC (https://github.com/PoseLib/PoseLib).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ _MIN_PARALLAX = math.radians(1.0)
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """`second_from_first` has a way of length 1; `inliers` are the points that agree."""
+    """Hold a relative pose. `second_from_first` has a translation of length 1. `inliers` are the
+    points that agree with it."""
 
     second_from_first: Rigid3
     inliers: Bool[np.ndarray, " n"]
@@ -32,10 +35,11 @@ def estimate_relative_pose(
     second_img: Float[np.ndarray, "n 2"],
     second: Camera,
 ) -> RelativePose | None:
-    """From pixels of the same points in two pictures; None where none is found, or the camera moved
-    too little to say where to.
+    """Return the relative pose from pixels of the same points in two images. Return None if none is
+    found or the camera moved too little.
 
-    The way must show: half of the points must be displaced by a degree and more, beyond the turn.
+    The translation must be visible: the median displacement of the inliers beyond the rotation must
+    be at least one degree.
     """
     if len(first_img) < 8:
         return None

@@ -1,4 +1,4 @@
-"""A stereo rig: two calibrated cameras, the transform between them, and its rectification to equal
+"""Model a stereo rig: two calibrated cameras, the transform between them, and its rectification to
 pinholes side by side."""
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ _MAX_ANGLE = np.deg2rad(60.0)
 
 @dataclass(frozen=True)
 class StereoRig:
-    """Left and right camera; `right_from_left` in metres.
+    """Hold the left and right camera. `right_from_left` is in metres.
 
     Raises:
-        CalibrationError: the two cameras stand in the same place, or not finite.
+        CalibrationError: the baseline is zero or not finite.
     """
 
     left: Camera
@@ -34,18 +34,18 @@ class StereoRig:
 
     @staticmethod
     def rectified(camera: Camera, baseline: float) -> StereoRig:
-        """Two equal pinhole cameras side by side, the right one `baseline` metres to +x."""
+        """Return two equal pinhole cameras side by side, the right one `baseline` metres to +x."""
         return StereoRig(camera, camera, Rigid3(np.eye(3), np.array([-baseline, 0.0, 0.0])))
 
     @property
     def baseline(self) -> float:
-        """Distance between the two centres, metres."""
+        """Return the distance between the two camera centres, metres."""
         return float(np.linalg.norm(self.right_from_left.translation))
 
     @property
     def is_rectified(self) -> bool:
-        """Undistorted, equal rows, right camera straight to +x (principal points may differ in
-        x)."""
+        """Return whether both cameras are undistorted with equal rows, and the right one lies
+        straight to +x. Principal points may differ in x."""
         if self.left.is_distorted or self.right.is_distorted:
             return False
         translation = self.right_from_left.translation
@@ -64,10 +64,10 @@ class StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """How to make a rectified pair of a raw one: ``cv2.remap(image, left_map, None,
-    cv2.INTER_LINEAR)``, the same for right.
+    """Hold the maps that rectify a raw image pair: ``cv2.remap(image, left_map, None,
+    cv2.INTER_LINEAR)``, and the same for right.
 
-    `rig` is what the remapped images see. `rectified_from_left` is a pure rotation, so a pose of
+    `rig` is the rig of the remapped images. `rectified_from_left` is a pure rotation, so a pose of
     the left camera becomes ``world_from_rectified = world_from_left @
     rectified_from_left.inverse()``. The maps hold raw pixels (x, y).
     """
@@ -82,9 +82,9 @@ def rectify(rig: StereoRig) -> Rectification:
     """Rectify a rig of any two camera models: equal pinhole cameras, equal rows, zero disparity at
     infinity, no black border.
 
-    Each camera turns by half of the angle between the two, then both turn so that the baseline
+    Each camera turns by half of the angle between the two. Then both turn so that the baseline
     becomes the x axis (Bouguet's method, as in OpenCV's stereoRectify). The common pinhole is the
-    widest that both images fill. A rig that is rectified already keeps its cameras.
+    widest that both images fill. An already rectified rig keeps its cameras.
 
     Raises:
         CalibrationError: the right camera is not to the right of the left one, the sizes differ, or
@@ -111,7 +111,7 @@ def rectify(rig: StereoRig) -> Rectification:
 def _rectifying_rotations(
     rig: StereoRig,
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """(rectified_from_left, rectified_from_right)."""
+    """Return (rectified_from_left, rectified_from_right)."""
     half = log_so3(rig.right_from_left.rotation) / 2.0
     mid_from_left, mid_from_right = exp_so3(half), exp_so3(-half)
     right_in_mid = -(mid_from_right @ rig.right_from_left.translation)
@@ -138,7 +138,7 @@ def _common_pinhole(
     rotation_left: Float[np.ndarray, "3 3"],
     rotation_right: Float[np.ndarray, "3 3"],
 ) -> Camera:
-    """The widest pinhole whose every pixel both raw images fill."""
+    """Return the widest pinhole whose pixels all lie in both raw images."""
     lows, highs = zip(
         _inner_rectangle(rig.left, rotation_left),
         _inner_rectangle(rig.right, rotation_right),
@@ -158,11 +158,11 @@ def _common_pinhole(
 def _inner_rectangle(
     camera: Camera, rotation: Float[np.ndarray, "3 3"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """(low, high) corners, on the rectified plane z = 1, of an upright rectangle inside the raw
-    image's outline.
+    """Return the (low, high) corners of an upright rectangle inside the raw image's outline, on the
+    rectified plane z = 1.
 
-    Rays further than 60 degrees off the axis are left out: a pinhole would spend most of its pixels
-    on them.
+    Rays more than 60 degrees off the axis are excluded, because a pinhole would spend most of its
+    pixels on them.
     """
     right, bottom = camera.width - 1.0, camera.height - 1.0
     steps = np.linspace(0.0, 1.0, _NUM_OUTLINE_POINTS)
@@ -190,5 +190,5 @@ def _compute_remap(
     rays = rectified.rays_from_img(np.column_stack([x.ravel(), y.ravel()])) @ rotation
     pixels = np.nan_to_num(
         raw.img_from_cam(rays), nan=-1e4
-    )  # outside of the image: remap paints it black
+    )  # outside of the image, where remap fills black
     return pixels.reshape(rectified.height, rectified.width, 2).astype(np.float32)

@@ -1,8 +1,8 @@
-"""SE(3): rigid transforms between named frames.
+"""Compute with SE(3): rigid transforms between named frames.
 
-Frames are read right to left: ``cam_from_world = cam_from_node @ node_from_world``; equal
-neighbours cancel. Tangent vectors are ``xi = (translation, rotation)`` and perturbations act on the
-left: ``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
+Frames are read right to left: ``cam_from_world = cam_from_node @ node_from_world``. Equal
+neighbours cancel. Tangent vectors are ``xi = (translation, rotation)``, and perturbations act on
+the left: ``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ _TOLERANCE = 1e-2
 
 
 def skew(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The matrix [v]x with ``skew(v) @ w == cross(v, w)``."""
+    """Return the matrix [v]x with ``skew(v) @ w == cross(v, w)``."""
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def exp_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation matrix of a rotation vector (radians), by Rodrigues' formula."""
+    """Return the rotation matrix of a rotation vector (radians), by Rodrigues' formula."""
     angle = float(np.linalg.norm(omega))
     k = skew(omega)
     if angle < _SMALL_ANGLE:
@@ -36,8 +36,8 @@ def exp_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def log_so3(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """Rotation vector (radians, norm in [0, pi]) of a rotation matrix; stable at 0 and at pi by the
-    quaternion."""
+    """Return the rotation vector (radians, norm in [0, pi]) of a rotation matrix. The quaternion
+    makes it stable at 0 and at pi."""
     w, x, y, z = quat_wxyz_from_matrix(rotation)
     v = np.array([x, y, z])
     sin_half = float(np.linalg.norm(v))
@@ -47,7 +47,7 @@ def log_so3(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
 
 
 def quat_wxyz_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (Shepperd's method)."""
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (Shepperd's method)."""
     m = rotation
     four_squares = np.array(
         [
@@ -70,10 +70,10 @@ def quat_wxyz_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarra
 
 
 def matrix_from_quat_wxyz(quat_wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation matrix of a quaternion (w, x, y, z), which need not be of unit length.
+    """Return the rotation matrix of a quaternion (w, x, y, z), which need not have unit length.
 
     Raises:
-        TrajectoryError: the quaternion is not finite or has no length.
+        TrajectoryError: the quaternion is not finite or zero.
     """
     norm = float(np.linalg.norm(quat_wxyz))
     if not np.isfinite(norm) or norm < 1e-6:
@@ -90,21 +90,24 @@ def matrix_from_quat_wxyz(quat_wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Rigid3:
-    """A rigid transform ``a_from_b``: ``point_a = rotation @ point_b + translation`` (metres)."""
+    """Hold a rigid transform ``a_from_b``: ``point_a = rotation @ point_b + translation``
+    (metres)."""
 
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, "3"]
 
     @staticmethod
     def identity() -> Rigid3:
+        """Return the identity."""
         return Rigid3(np.eye(3), np.zeros(3))
 
     @staticmethod
     def from_matrix(matrix: np.ndarray) -> Rigid3:
-        """From a 3x4 or 4x4 matrix, its rotation made exactly orthonormal.
+        """Return the transform of a 3x4 or 4x4 matrix. Its rotation is made orthonormal.
 
         Raises:
-            TrajectoryError: not finite, or not a rotation within `_TOLERANCE`.
+            TrajectoryError: the shape is wrong, values are not finite, or the 3x3 part is not a
+                rotation within `_TOLERANCE`.
         """
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape not in ((3, 4), (4, 4)):
@@ -118,10 +121,10 @@ class Rigid3:
 
     @staticmethod
     def from_quat_wxyz(quat_wxyz: np.ndarray, translation: np.ndarray) -> Rigid3:
-        """From a quaternion (w, x, y, z) and a translation in metres.
+        """Return the transform of a quaternion (w, x, y, z) and a translation in metres.
 
         Raises:
-            TrajectoryError: values that are not finite, or a quaternion of no length.
+            TrajectoryError: values are not finite, or the quaternion is zero.
         """
         t = np.asarray(translation, dtype=np.float64)
         if t.shape != (3,) or not np.all(np.isfinite(t)):
@@ -130,12 +133,12 @@ class Rigid3:
 
     @staticmethod
     def exp(xi: Float[np.ndarray, "6"]) -> Rigid3:
-        """The transform of a tangent vector (translation, rotation)."""
+        """Return the transform of a tangent vector (translation, rotation)."""
         rho, omega = xi[:3], xi[3:]
         return Rigid3(exp_so3(omega), _left_jacobian_so3(omega) @ rho)
 
     def log(self) -> Float[np.ndarray, "6"]:
-        """The tangent vector (translation, rotation) whose `exp` this is."""
+        """Return the tangent vector (translation, rotation) whose `exp` is this transform."""
         omega = log_so3(self.rotation)
         return np.concatenate([np.linalg.solve(_left_jacobian_so3(omega), self.translation), omega])
 
@@ -145,35 +148,38 @@ class Rigid3:
         )
 
     def inverse(self) -> Rigid3:
+        """Return b_from_a."""
         return Rigid3(self.rotation.T.copy(), -(self.rotation.T @ self.translation))
 
     def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Points of frame b, given in frame a."""
+        """Transform points of frame b to frame a."""
         return points @ self.rotation.T + self.translation
 
     def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """Return the homogeneous 4x4 matrix."""
         m = np.eye(4)
         m[:3, :3] = self.rotation
         m[:3, 3] = self.translation
         return m
 
     def quat_wxyz(self) -> Float[np.ndarray, "4"]:
+        """Return the rotation as a unit quaternion (w, x, y, z) with w >= 0."""
         return quat_wxyz_from_matrix(self.rotation)
 
     def adjoint(self) -> Float[np.ndarray, "6 6"]:
-        """Ad with ``self @ exp(xi) == exp(Ad @ xi) @ self``."""
+        """Return Ad with ``self @ exp(xi) == exp(Ad @ xi) @ self``."""
         ad = np.zeros((6, 6))
         ad[:3, :3] = ad[3:, 3:] = self.rotation
         ad[:3, 3:] = skew(self.translation) @ self.rotation
         return ad
 
     def angle(self) -> float:
-        """Rotation angle in radians, in [0, pi]."""
+        """Return the rotation angle in radians, in [0, pi]."""
         return float(np.linalg.norm(log_so3(self.rotation)))
 
     def interpolate(self, other: Rigid3, fraction: float) -> Rigid3:
-        """The pose `fraction` of the way from this one to `other`: position linear, rotation along
-        the geodesic."""
+        """Return the pose between this one (fraction 0) and `other` (fraction 1). The position is
+        linear, the rotation follows the geodesic."""
         omega = log_so3(other.rotation @ self.rotation.T)
         translation = (1.0 - fraction) * self.translation + fraction * other.translation
         return Rigid3(exp_so3(fraction * omega) @ self.rotation, translation)
@@ -182,11 +188,11 @@ class Rigid3:
 def inverse_covariance(
     a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "6 6"]:
-    """Covariance of the left perturbation of ``b_from_a = a_from_b.inverse()``, from that of
-    `a_from_b`.
+    """Return the covariance of the left perturbation of ``b_from_a = a_from_b.inverse()`` from that
+    of `a_from_b`.
 
-    As ``(exp(xi) @ a_from_b).inverse() == exp(-Ad @ xi) @ b_from_a`` with Ad the adjoint of
-    b_from_a. The result's translation part is of the frame b at its origin; see
+    It follows from ``(exp(xi) @ a_from_b).inverse() == exp(-Ad @ xi) @ b_from_a`` with Ad the
+    adjoint of b_from_a. The translation part belongs to frame b at its origin. Use
     `position_covariance` for the camera's own position.
     """
     adjoint = a_from_b.inverse().adjoint()
@@ -196,11 +202,11 @@ def inverse_covariance(
 def position_covariance(
     cam_from_world: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Covariance (m^2, world axes) of the camera's position, from that of the left perturbation of
-    `cam_from_world`.
+    """Return the covariance of the camera's position (m^2, world axes) from that of the left
+    perturbation of `cam_from_world`.
 
-    The position is ``-R' t``; moving R and t by (rho, omega) moves it by ``-R' rho`` alone, to
-    first order.
+    The position is ``-R' t``. To first order, a perturbation (rho, omega) moves it by ``-R' rho``
+    alone.
     """
     return cam_from_world.rotation.T @ covariance[:3, :3] @ cam_from_world.rotation
 
@@ -208,7 +214,7 @@ def position_covariance(
 def _left_jacobian_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     angle = float(np.linalg.norm(omega))
     k = skew(omega)
-    if angle < 1e-5:  # the closed form loses all digits of (angle - sin angle) below this
+    if angle < 1e-5:  # below this the closed form loses all digits of (angle - sin angle)
         return np.eye(3) + 0.5 * k + k @ k / 6.0
     return (
         np.eye(3)

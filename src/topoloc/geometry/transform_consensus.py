@@ -1,9 +1,8 @@
-"""One transform out of many estimates of it, most of which may be wrong: what is seen from here of
-what was seen there.
+"""Estimate one transform from many estimates, most of which may be wrong.
 
-Each estimate is a hypothesis; that which most independent others agree with, within their
-covariances, is refined by all that do (weighted least squares on SE(3)). It is refused where too
-few agree, and where others that say something else are nearly as many.
+Each estimate is a hypothesis. The one with the most independent estimates that agree within their
+covariances is refined with all of these (weighted least squares on SE(3)). It is rejected if too
+few estimates agree, or if nearly as many agree on another transform.
 """
 
 from __future__ import annotations
@@ -24,38 +23,40 @@ _MIN_STEP = 1e-9
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """When estimates agree, and when enough of them do."""
+    """Hold the conditions under which estimates agree and a consensus is accepted."""
 
     max_sigmas: Annotated[float, Above(0)] = 4.8
-    """Estimates that differ by no more than this (all six residuals together, in sigma) agree; one
-    right pair in a thousand does not."""
+    """Estimates agree if they differ by no more than this (all six residuals together, in sigma).
+    One correct pair in a thousand does not."""
     rival_sigmas: Annotated[float, Above(0)] = 8.0
-    """Those that differ from the consensus by more than this say something else."""
+    """Estimates that differ from the consensus by more than this contradict it."""
     min_independent: Annotated[int, AtLeast(1)] = 3
-    """Independent estimates that must agree."""
+    """Minimum number of independent estimates that agree."""
     rival_share: Annotated[float, Between(0, 1)] = 0.5
-    """Nothing is believed where so large a share of their number agrees on something else."""
+    """The consensus is rejected if this fraction of its number of independent estimates, and at
+    least two, agrees on another transform."""
     max_hypotheses: Annotated[int, AtLeast(1)] = 300
-    """Of more estimates than this, so many, drawn with a fixed seed, are tried as hypotheses."""
+    """Maximum number of hypotheses. With more estimates, this many are drawn with a fixed seed."""
 
 
 @dataclass(frozen=True)
 class DriftConfig:
-    """How wrong the way may be along which an estimate is carried."""
+    """Hold the drift of the motion along which an estimate is propagated."""
 
     drift: Annotated[float, AtLeast(0)] = 0.02
-    """Share of the way by which its end may be off (one sigma) ..."""
+    """Standard deviation of the translation, as a fraction of the distance."""
     drift_deg: Annotated[float, AtLeast(0)] = 0.3
-    """... and degrees a metre."""
+    """Standard deviation of the rotation, degrees per metre."""
 
     def covariance(self, motion: Rigid3) -> Float[np.ndarray, "6 6"]:
-        """Of a motion, m and rad."""
+        """Return the covariance of a motion, m and rad."""
         distance = float(np.linalg.norm(motion.translation))
         return diagonal_covariance(self.drift * distance, self.drift_deg * distance)
 
 
 def diagonal_covariance(metres: float, degrees: float) -> Float[np.ndarray, "6 6"]:
-    """Of these standard deviations along and about each axis, m and rad."""
+    """Return the covariance with these standard deviations along and about each axis, in m and
+    rad."""
     return np.diag(np.square([metres] * 3 + [np.deg2rad(degrees)] * 3))
 
 
@@ -66,8 +67,8 @@ def propagate_estimate(
     b_from_d: Rigid3,
     config: DriftConfig,
 ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-    """An estimate of a_from_b, said at other places: c_from_d, and the covariance of its left
-    perturbation. The longer the ways between, the less certain."""
+    """Propagate an estimate of a_from_b along two motions. Return c_from_d and the covariance of
+    its left perturbation, which grows with the length of the motions."""
     to_c, to_d = c_from_a.adjoint(), (c_from_a @ a_from_b).adjoint()
     at_c = to_c @ covariance @ to_c.T + config.covariance(c_from_a)
     return c_from_a @ a_from_b @ b_from_d, at_c + to_d @ config.covariance(b_from_d) @ to_d.T
@@ -75,11 +76,11 @@ def propagate_estimate(
 
 @dataclass(frozen=True, eq=False)
 class TransformConsensus:
-    """What the estimates where `is_inlier` is True say together.
+    """Hold the transform on which the estimates with `is_inlier` agree.
 
-    `covariance` is that of the left perturbation (m, rad); it does not shrink by estimates that
-    share a picture, and grows where those that agree scatter by more than they should.
-    `num_independent` counts them with each picture taken once.
+    `covariance` is that of the left perturbation (m, rad). Estimates that share an image do not
+    reduce it. It grows if the agreeing estimates scatter by more than their covariances.
+    `num_independent` is the number of agreeing estimates with each image used once.
     """
 
     a_from_b: Rigid3
@@ -94,15 +95,16 @@ def find_consensus(
     config: ConsensusConfig,
     image_ids: Int[np.ndarray, "n 2"] | None = None,
 ) -> TransformConsensus | None:
-    """The transform that the estimates support; None where none is supported well enough, or
-    another one nearly as well.
+    """Return the transform that the estimates support. Return None if the support is too small, or
+    if another transform has nearly as much.
 
     Args:
-        covariances: of the left perturbations, ``exp(xi) @ a_from_b``, m and rad, symmetric and
-            positive definite. They must be honest: what is far too certain agrees with nothing,
-            what is uncertain with everything. Leave out what says nothing.
-        pictures: which picture of a and which of b each estimate was made from: estimates that
-            share one are not independent. By default all are.
+        covariances: covariances of the left perturbations, ``exp(xi) @ a_from_b``, m and rad,
+            symmetric and positive definite. They must be realistic: overconfident estimates agree
+            with none, and very uncertain ones agree with all. Leave out estimates without
+            information.
+        image_ids: image of a and image of b of each estimate. Estimates that share an image are not
+            independent. Default: all are independent.
     """
     num = len(a_from_bs)
     if num < config.min_independent:
@@ -135,7 +137,7 @@ def find_consensus(
 def _pairwise_distances(
     a_from_bs: Sequence[Rigid3], covariances: Float[np.ndarray, "n 6 6"], config: ConsensusConfig
 ) -> Float[np.ndarray, "h n"]:
-    """Of each hypothesis, a row: how far all estimates are from it, in sigma of both."""
+    """Return for each hypothesis (row) the distances of all estimates, in sigma of both."""
     num = len(a_from_bs)
     tried = np.arange(num)
     if num > config.max_hypotheses:
@@ -162,8 +164,8 @@ def _distances(
 
 
 def _residuals(hypothesis: Rigid3, a_from_bs: Sequence[Rigid3]) -> Float[np.ndarray, "n 6"]:
-    """Logarithms of ``a_from_b @ hypothesis^-1``, all at once; of turns near pi the axis is not
-    exact, which nothing asks for."""
+    """Return the logarithms of ``a_from_b @ hypothesis^-1``, vectorised. For rotations near pi the
+    axis is not exact, which is sufficient here."""
     inverse = hypothesis.inverse()
     rotations = np.stack([estimate.rotation for estimate in a_from_bs])
     translations = (
@@ -187,8 +189,8 @@ def _residuals(hypothesis: Rigid3, a_from_bs: Sequence[Rigid3]) -> Float[np.ndar
 def _select_best_hypothesis(
     agree: Bool[np.ndarray, "h n"], image_ids: Int[np.ndarray, "n 2"]
 ) -> tuple[int, int]:
-    """The hypothesis that most independent estimates agree with, of equals that with most
-    estimates, and how many the former are."""
+    """Return the hypothesis with the most independent agreeing estimates, and their number. Among
+    equals, the one with the most agreeing estimates wins."""
     counts = agree.sum(axis=1)
     best, support = 0, 0
     for k in np.argsort(-counts, kind="stable").tolist():
@@ -201,8 +203,8 @@ def _select_best_hypothesis(
 
 
 def _count_independent(chosen: Bool[np.ndarray, " n"], image_ids: Int[np.ndarray, "n 2"]) -> int:
-    """How many of the chosen estimates can be had with no picture taken twice: those go first whose
-    pictures have the fewest others."""
+    """Return how many of the chosen estimates can be used with no image used twice. Estimates whose
+    images have the fewest other estimates are taken first."""
     pairs = image_ids[chosen]
     partners = sum(
         (
@@ -228,8 +230,8 @@ def _refine_transform(
     covariances: Float[np.ndarray, "n 6 6"],
     is_inlier: Bool[np.ndarray, " n"],
 ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-    """Weighted least squares over those that agree, from the most certain of them on; its
-    covariance, scaled up to what they scatter by."""
+    """Return the weighted least squares solution over the inliers, starting from the most certain
+    one, and its covariance. The covariance is scaled up to the scatter of the inliers."""
     rows = np.flatnonzero(is_inlier).tolist()
     chosen, informations = [a_from_bs[k] for k in rows], np.linalg.inv(covariances[rows])
     mean = chosen[int(np.argmax(np.linalg.slogdet(informations).logabsdet))]

@@ -1,4 +1,4 @@
-"""A camera nobody has calibrated: its picture's size, and a range that its focal length lies in."""
+"""Describe an uncalibrated camera by the size of its image and a range of focal lengths."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 
-# Of the longer side: fields of view of 103 to 19 degrees along it, from the wide lens of a
-# telephone to its long one.
+# As fractions of the longer side: fields of view of 103 to 19 degrees along it, from the wide lens
+# of a phone to its telephoto lens.
 MIN_FOCAL, MAX_FOCAL = 0.4, 3.0
-# What a focal length written into a picture's file may be wrong by: it is rounded, and focusing and
-# stabilisation change it.
+# Error factor of a focal length in EXIF data: it is rounded, and focusing and stabilisation change
+# it.
 FOCAL_GUESS_TOLERANCE = 1.15
 
 
 @dataclass(frozen=True)
 class UncalibratedCamera:
-    """Pinhole, square pixels, principal point in the middle; the focal length (pixels) between
-    these two.
+    """Hold a pinhole with square pixels, its principal point in the image centre, and a focal
+    length (pixels) between two bounds.
 
     Raises:
-        CalibrationError: no positive size, or no range of positive lengths.
+        CalibrationError: the size is not positive, or the range is not one of positive lengths.
     """
 
     width: int
@@ -44,31 +44,33 @@ class UncalibratedCamera:
 
     @staticmethod
     def unknown(width: int, height: int) -> UncalibratedCamera:
-        """Any usual lens."""
+        """Return a camera with the range of usual lenses."""
         side = max(width, height)
         return UncalibratedCamera(width, height, MIN_FOCAL * side, MAX_FOCAL * side)
 
     @staticmethod
     def from_focal_guess(width: int, height: int, focal: float) -> UncalibratedCamera:
-        """A focal length (pixels) that is about right, such as that of a picture's EXIF data."""
+        """Return a camera with a range around an approximate focal length (pixels), such as that of
+        EXIF data."""
         return UncalibratedCamera(
             width, height, focal / FOCAL_GUESS_TOLERANCE, focal * FOCAL_GUESS_TOLERANCE
         )
 
     def with_focal(self, focal: float) -> Camera:
-        """The pinhole camera of this focal length (pixels)."""
+        """Return the pinhole camera of this focal length (pixels)."""
         return Camera.pinhole(
             self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2
         )
 
     def rescaled(self, width: int, height: int) -> UncalibratedCamera:
-        """The same camera for its image resized to width x height."""
+        """Return the camera of the image resized to width x height."""
         scale = math.sqrt(width * height / (self.width * self.height))
         return UncalibratedCamera(width, height, self.min_focal * scale, self.max_focal * scale)
 
 
 def nominal_camera(camera: Camera | UncalibratedCamera) -> Camera:
-    """The camera, of a rough one that with the focal length in the middle of its range."""
+    """Return the camera itself. For an uncalibrated camera, return the one with the focal length in
+    the (geometric) middle of its range."""
     return (
         camera.with_focal(math.sqrt(camera.min_focal * camera.max_focal))
         if isinstance(camera, UncalibratedCamera)

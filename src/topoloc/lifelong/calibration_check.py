@@ -1,4 +1,4 @@
-"""Is a session's calibration that of its camera? The map's points that its pictures show say so."""
+"""Check the calibration of a session's camera against the points of the map."""
 
 from __future__ import annotations
 
@@ -16,13 +16,20 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.recordings.frame import StereoSequence
 
 _NUM_QUERIES, _MIN_LOCALIZED = 7, 3
-_FOCAL_LENGTH_RANGE = 1.5  # times the focal length that is said
+_FOCAL_LENGTH_RANGE = 1.5  # widens the range around the stated focal length, in both directions
 _MAX_LOG_RATIO = math.log(1.04)
 
 
 def check_calibration(name: str, results: Sequence[Localization | NotLocalized]) -> None:
-    """Hold that what the pictures say together does not contradict the calibration that they came
-    with. Raises CalibrationError."""
+    """Check a session's calibration against the localization results of its images.
+
+    Args:
+        name: the session's name, for the error message.
+        results: the localization results of the session's images.
+
+    Raises:
+        CalibrationError: the results together contradict the calibration.
+    """
     wrong = next(
         (verdict for verdict in check_camera_calibrations(results) if verdict.is_contradicted), None
     )
@@ -35,15 +42,22 @@ def check_calibration(name: str, results: Sequence[Localization | NotLocalized])
 def check_focal_length(
     sequence: StereoSequence, indices: Sequence[int], localizer: Localizer
 ) -> None:
-    """Of a session that the map recognises too little of: hold that it is not recognised where its
-    focal length is left open.
+    """Check if a session is localized better with another focal length than its own.
+
+    The map localizes too few images of such a session. A few of them are localized again with the
+    focal length free between 1/1.5 and 1.5 times the stated one. The check ends without an error if
+    an image has no camera model.
 
     Args:
-        indices: the frames that were asked, of which a few are asked once more.
+        sequence: the session.
+        indices: the frames that were queried. At most seven of them, evenly spread, are localized
+            again.
+        localizer: the localizer of the map.
 
     Raises:
-        CalibrationError: the pictures agree on another focal length.
-        UnreadableImageError, QueryError: from its pictures.
+        CalibrationError: at least three images agree on a focal length that differs by more than 4
+            %.
+        UnreadableImageError, QueryError: an image of the session cannot be read or localized.
     """
     tried, found = sample_evenly(indices, _NUM_QUERIES), list[float]()
     for index in tried:
@@ -65,9 +79,9 @@ def check_focal_length(
     middle = float(np.median(found))
     agreeing = sum(abs(one - middle) < _MAX_LOG_RATIO for one in found)
     if abs(middle) > _MAX_LOG_RATIO and agreeing >= _MIN_LOCALIZED:
-        said = sequence[tried[0]].camera
-        assert said is not None, "it was asked"
-        lengths = f"{said.fx * math.exp(middle):.0f} pixels, not {said.fx:.0f}"
+        stated = sequence[tried[0]].camera
+        assert stated is not None, "checked above"
+        lengths = f"{stated.fx * math.exp(middle):.0f} pixels, not {stated.fx:.0f}"
         raise CalibrationError(
             f"{sequence.name}: its calibration is not that of its camera: the map recognises"
             f" {agreeing} of {len(tried)} pictures where the focal length is about {lengths}; the"

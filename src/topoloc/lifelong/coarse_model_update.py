@@ -1,5 +1,7 @@
-"""Coarse localizers learn the pictures of a new session: k-NN adds vectors, under the vocabulary or
-the network that is there."""
+"""Add the images of a new session to a map's coarse localizers.
+
+k-NN localizers receive new vectors. Their vocabulary or network stays the same.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,7 @@ from topoloc.retrieval.vlad import SurfVlad
 
 @dataclass(frozen=True, eq=False)
 class PlaceFeatures:
-    """What a mapping picture of this size (pixels) shows, and the id of the node that it belongs
-    to."""
+    """Hold the local features of a mapping image, its size (pixels) and the id of its node."""
 
     features: Features
     width: int
@@ -29,8 +30,8 @@ class PlaceFeatures:
 
 @dataclass(frozen=True, eq=False)
 class UpdatedCoarseModels:
-    """A map's coarse localizers with what was added, and the names of those that could not learn
-    it."""
+    """Hold a map's extended coarse localizers and the names of the localizers that were not
+    updated."""
 
     models: dict[str, CoarseModel]
     not_updated: list[str]
@@ -41,12 +42,20 @@ def update_coarse_models(
     views: Mapping[str, Sequence[PlaceFeatures]],
     images: Sequence[PlaceImage],
 ) -> UpdatedCoarseModels:
-    """The map's coarse localizers with new places: those by local features learn `views`, by their
-    kinds, and those that compare a network's vectors the small pictures `images`. One with an
-    output a node (cnn-fc) is to be trained, and without PyTorch no network is asked.
+    """Return the map's coarse localizers with new places added.
+
+    Localizers that use local features are extended with `views`. Localizers that compare network
+    descriptors are extended with `images`. A localizer with one output per node (cnn-fc) cannot be
+    extended, because it would need training. No network localizer is extended if PyTorch is
+    missing.
+
+    Args:
+        topomap: the map.
+        views: the local features of the new places, by feature type.
+        images: the small images of the new places.
 
     Raises:
-        MapError: a coarse localizer of the map, or a picture, is damaged.
+        MapError: a coarse localizer of the map, or an image, is damaged.
     """
     models, not_updated = dict(topomap.coarse_models), []
     for name, model in models.items():
@@ -54,9 +63,9 @@ def update_coarse_models(
         if of_name == SurfVlad.name:
             models[name] = _add_features(model, views.get(of_kind or topomap.kind, []))
         elif images:
-            grown = _add_images(model, images)
-            models[name] = grown or model
-            not_updated += [] if grown else [name]
+            extended = _add_images(model, images)
+            models[name] = extended or model
+            not_updated += [] if extended else [name]
     return UpdatedCoarseModels(models, sorted(not_updated))
 
 
@@ -64,10 +73,10 @@ def _add_features(model: CoarseModel, views: Sequence[PlaceFeatures]) -> CoarseM
     if not views:
         return model
     described = [(view.features, view.width, view.height) for view in views]
-    grown = SurfVlad.from_model(model).extend_with_features(
+    extended = SurfVlad.from_model(model).extend_with_features(
         described, np.array([view.node_id for view in views])
     )
-    return replace(grown.to_model(), name=model.name)
+    return replace(extended.to_model(), name=model.name)
 
 
 def _add_images(model: CoarseModel, images: Sequence[PlaceImage]) -> CoarseModel | None:

@@ -1,11 +1,10 @@
-"""Descriptors in larger steps: half of a landmark's bytes are its descriptor, and most of these say
-nothing that matching needs.
+"""Quantize a map's descriptors in larger steps, to make the map's file smaller.
 
-A file keeps a descriptor's numbers as signed bytes and packs them, so what few different numbers
-occur takes few bits, and a map reads them as any others: their length does not matter. In steps of
-0.64 of a number's root mean square (16 times the file's for 64 numbers) two descriptors' scalar
-product moves by 0.02. Product quantisation to 8 to 32 bytes and signs alone find no more at equal
-bytes (`benchmarks/descriptor_size.py`).
+Descriptors take half of a landmark's bytes. A file stores their numbers as signed bytes and
+compresses them, so fewer different values take fewer bits. A map reads them as usual, because the
+length of a descriptor does not matter. The default step is 0.64 times a number's root mean square
+(16 times the file's step for 64 numbers). With it, the scalar product of two descriptors changes by
+0.02. `benchmarks/descriptor_size.py` compares this with product quantization and with signs alone.
 """
 
 from __future__ import annotations
@@ -19,19 +18,23 @@ from topoloc.lifelong.lazy_sequences import TransformedSequence
 from topoloc.mapping.point_encoding import dequantize_descriptors
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 
-# stored numbers no larger than so many times those of this step are in it, or a larger one, already
+# A node counts as quantized if the median norm of its stored descriptors is at most this many times
+# the norm expected for the step.
 _MAX_NORM_RATIO = 1.5
 
 
 def quantize_map_descriptors(topomap: TopoMetricMap, step: float) -> TopoMetricMap:
-    """The map, each of whose nodes rounds its descriptors when it is asked for; the map itself
-    where all are rounded. The walls beside the nodes stay as they are.
+    """Return the map with quantized descriptors, or the same map if all nodes are quantized
+    already.
+
+    A node is quantized each time it is read. Virtual nodes keep their descriptors.
 
     Args:
-        step: in root mean squares of a descriptor's numbers.
+        topomap: the map.
+        step: the step, in root mean squares of a descriptor's numbers.
 
     Raises:
-        MapError: from reading the nodes.
+        MapError: a node cannot be read.
     """
     if all(
         quantize_node_descriptors(node, step) is node
@@ -49,8 +52,8 @@ def quantize_map_descriptors(topomap: TopoMetricMap, step: float) -> TopoMetricM
 
 
 def quantize_node_descriptors(node: TopoNode, step: float) -> TopoNode:
-    """The node with its descriptors in steps of so many root mean squares; the node itself where
-    they are."""
+    """Return the node with its descriptors quantized, or the same node if they are quantized
+    already. `step` is in root mean squares of a descriptor's numbers."""
     stored = node.stored_descriptors
     if len(node.features) == 0 or (
         stored is not None
@@ -66,7 +69,7 @@ def quantize_node_descriptors(node: TopoNode, step: float) -> TopoNode:
 
 
 def _quantize(descriptors: Float32[np.ndarray, "n d"], step: float) -> Int8[np.ndarray, "n d"]:
-    """Of descriptors of length 1."""
+    """Quantize descriptors of length 1 to signed bytes."""
     return np.clip(np.rint(descriptors * (np.sqrt(descriptors.shape[1]) / step)), -127, 127).astype(
         np.int8
     )

@@ -1,5 +1,4 @@
-"""Long sequences changed without reading them: some entries changed and others behind them, some
-left out, all changed when asked for."""
+"""Provide changed versions of long sequences that read an entry only when it is accessed."""
 
 from __future__ import annotations
 
@@ -10,8 +9,8 @@ T = TypeVar("T")
 
 
 class OverlaySequence(Sequence[T]):
-    """`base` with the entries of `changed` (by their rows) in place of its own, and `added`
-    behind it."""
+    """Show `base` with the entries of `changed` (by row) replaced and the entries of `added`
+    appended."""
 
     def __init__(self, base: Sequence[T], changed: Mapping[int, T], added: Sequence[T]) -> None:
         self._base, self._changed, self._added = base, changed, added
@@ -31,7 +30,7 @@ class OverlaySequence(Sequence[T]):
 
 
 class SelectedSequence(Sequence[T]):
-    """Some rows of `base`."""
+    """Show the given rows of `base`."""
 
     def __init__(self, base: Sequence[T], rows: Sequence[int]) -> None:
         self._base, self._rows = base, rows
@@ -48,7 +47,7 @@ class SelectedSequence(Sequence[T]):
 
 
 class TransformedSequence(Sequence[T]):
-    """Each entry of `base` as `transform` makes it, every time that it is asked for."""
+    """Show the entries of `base`, each transformed by `transform` at every access."""
 
     def __init__(self, base: Sequence[T], transform: Callable[[T], T]) -> None:
         self._base, self._transform = base, transform

@@ -1,10 +1,8 @@
-"""What the rest of a map says of its own nodes: what is stored of a node is asked as a picture
-would be, as if nobody had stood there.
+"""Localize nodes of a map in the rest of the map (leave-one-out).
 
-A node is found by itself, however poor the place is. So it is left out, with those of its session
-beside it where that is wished: of the points, of what names candidates, and of where points are
-sought. What is asked are the node's local features as the file keeps them, those with a 3-D
-position.
+A map always finds a node by the node itself. So the node is hidden from the map, and optionally its
+neighbours of the same session. Hidden nodes take no part in retrieval, matching or guided search.
+The query consists of the node's stored local features, which all have a 3-D position.
 """
 
 from __future__ import annotations
@@ -23,13 +21,13 @@ from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
-"""An answer further off than this (metres, degrees) is that of another place."""
+"""Count a result as wrong if it is further off than this (metres, degrees)."""
 
 
 @dataclass(frozen=True)
 class LeaveOneOutResult:
-    """What the rest of the map says of a node: `num_inliers` is 0 where it does not localize it, or
-    elsewhere (`is_wrong`)."""
+    """Hold the result of localizing a hidden node. `is_wrong` marks a pose at another place.
+    `num_inliers` is 0 if the node is not localized or the pose is wrong."""
 
     is_localized: bool
     is_wrong: bool
@@ -37,7 +35,7 @@ class LeaveOneOutResult:
 
 
 def sample_evenly(rows: Sequence[int], max_count: int) -> list[int]:
-    """At most so many of these, spread over them in their order."""
+    """Return at most `max_count` of `rows`, evenly spaced and in their order."""
     if len(rows) <= max_count:
         return list(rows)
     return [
@@ -49,7 +47,10 @@ def sample_evenly(rows: Sequence[int], max_count: int) -> list[int]:
 def beside(
     topomap: TopoMetricMap, row: int, num_d_thresh: float, poses: NodePoses
 ) -> Int[np.ndarray, " k"]:
-    """The rows of a node and of those of its session within so many D_thresh of it (Eq. 1)."""
+    """Return the rows of a node and of the near nodes of its session.
+
+    A node is near if its distance by Eq. 1 is at most `num_d_thresh` times D_thresh.
+    """
     summary = topomap.summaries[row]
     near = np.flatnonzero(
         node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
@@ -70,8 +71,18 @@ def localize_left_out(
     num_d_thresh: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[int, LeaveOneOutResult]:
-    """What a map says of nodes of `stored`, which is this map or an earlier version of it, by their
-    rows there."""
+    """Localize nodes of `stored` in the localizer's map while the nodes themselves are hidden.
+
+    Args:
+        localizer: the localizer of the map. Its map is `stored` or a version of it.
+        stored: the map that holds the nodes used as queries.
+        rows: the rows of these nodes in `stored`.
+        num_d_thresh: also hide nodes of the same session within this many D_thresh.
+        progress: is called with the number of nodes done and the number of all nodes.
+
+    Returns:
+        The results by row. A node is not localized if all nodes of the map would be hidden.
+    """
     known = {summary.node_id for summary in localizer.topomap.summaries}
     poses = NodePoses.of([summary.world_from_cam for summary in stored.summaries])
     answers = dict[int, LeaveOneOutResult]()

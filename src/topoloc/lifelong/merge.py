@@ -1,9 +1,9 @@
-"""Two maps of overlapping places become one: read from `merge_maps`.
+"""Merge two maps of overlapping places. Start reading at `merge_maps`.
 
-Nothing but the maps is needed: what is stored of a node is asked of the other map as a picture
-would be. The second map's nodes, which keep their order and distances, are held in place by these
-answers like the frames of a session (`session_poses.py`). Nodes that the first map holds well are
-left out, the others join it, with their sessions, what these know of their points, and their walls.
+Only the two maps are needed. The stored features of the second map's nodes are localized in the
+first map. The second map's nodes are then aligned like the frames of a session
+(`session_poses.py`). Nodes that the first map localizes well are skipped. The other nodes are added
+with their sessions, landmark statistics and virtual nodes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 
 @dataclass(frozen=True, eq=False)
 class MergedMap:
-    """The first map with the second one in it, and what that changed: numbers by their names."""
+    """Hold the merged map and the numbers of changes, by name."""
 
     topomap: TopoMetricMap
     changes: dict[str, Any]
@@ -44,14 +44,14 @@ def merge_maps(
     localizer_config: LocalizerConfig | None = None,
     progress: Progress | None = None,
 ) -> MergedMap:
-    """One map of two, in the world of the first.
+    """Merge the second map into the first and return the result in the first map's world.
 
     Raises:
         ConfigError: a setting is out of its bounds.
-        MapError: they are one map, or the second lacks a kind of features of the first.
-        TrajectoryError: they see too little in common, or not at the distances that both say.
-        FeatureKindError, MissingExtraError, WeightsError: the maps' features cannot be compared
-            here.
+        MapError: both are versions of one map, or the second lacks a feature type of the first.
+        TrajectoryError: the maps overlap too little, or their distances disagree.
+        FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
+            this machine.
     """
     config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
     check_bounds(config)
@@ -62,20 +62,20 @@ def merge_maps(
         )
     if first.map_id is not None and first.map_id == second.map_id:
         raise MapError("they are one map in two versions; nothing is merged")
-    held = _align_second_map(first, second, config, localizer_config, progress)
+    aligned = _align_second_map(first, second, config, localizer_config, progress)
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
     added = [
         row
-        for row, answer in held.answers.items()
+        for row, answer in aligned.answers.items()
         if not is_well_localized(answer, d_thresh, config)
     ]
-    poses = {row: pose for row, pose in enumerate(held.world_from_cams) if pose is not None}
+    poses = {row: pose for row, pose in enumerate(aligned.world_from_cams) if pose is not None}
     merged, not_updated = _add_nodes(first, second, added, poses)
     changes = {
         "nodes_of_second": len(second.summaries),
-        "localized": sum(answer is not None for answer in held.answers.values()),
-        "agreeing": len(held.inlier_idx),
+        "localized": sum(answer is not None for answer in aligned.answers.values()),
+        "agreeing": len(aligned.inlier_idx),
         "nodes_added": len(added),
         "not_taught": not_updated,
     }
@@ -93,7 +93,7 @@ def _align_second_map(
     localizer_config: LocalizerConfig | None,
     progress: Progress,
 ) -> SessionPoses:
-    """The second map's nodes, by their rows, in the world of the first."""
+    """Return poses of the second map's nodes, by row, in the world of the first map."""
     rows = range(len(second.summaries))
     answers = localize_nodes(
         Localizer(first, localizer_config),
@@ -115,8 +115,8 @@ def _align_second_map(
 def _add_nodes(
     first: TopoMetricMap, second: TopoMetricMap, added: Sequence[int], poses: Mapping[int, Rigid3]
 ) -> tuple[TopoMetricMap, list[str]]:
-    """The first map with these nodes of the second, and the coarse localizers that could not learn
-    them."""
+    """Return the first map with these nodes of the second, and the names of the coarse localizers
+    that were not updated."""
     base = first.free_ids.session
     sessions = {
         session.session_id: replace(session, session_id=base + k)
@@ -164,7 +164,8 @@ def _place_features(node: TopoNode) -> PlaceFeatures:
 def _transform_node(
     node: TopoNode, node_id: int, world_from_cam: Rigid3, session_ids: Mapping[int, int]
 ) -> TopoNode:
-    """A node of the second map as one of the first."""
+    """Return a node of the second map with the node id, pose and session id it has in the merged
+    map."""
     of = node.summary
     summary = replace(
         of,
@@ -194,7 +195,8 @@ def _select_images(
     poses: Mapping[int, Rigid3],
     session_ids: Mapping[int, int],
 ) -> list[PlaceImage]:
-    """The mapping pictures that became the added nodes: others cannot be looked at again."""
+    """Return the mapping images that belong to the added nodes. Other images of the second map are
+    dropped."""
     wanted = {(second.summaries[row].session_id, second.summaries[row].name): row for row in new_id}
     found = []
     for image in second.place_images:
@@ -217,8 +219,8 @@ def _transfer_edges(
     new_id: Mapping[int, int],
     poses: Mapping[int, Rigid3],
 ) -> set[Edge]:
-    """The second map's edges; a node that was left out is the one of the first map that stands
-    nearest."""
+    """Return the second map's edges. A skipped node is replaced by the nearest node of the first
+    map."""
     lambda_rot = first.config.nodes.lambda_rot
     assert lambda_rot is not None, "a map's own configuration is resolved"
     old = NodePoses.of([summary.world_from_cam for summary in first.summaries])
@@ -240,7 +242,8 @@ def _transfer_virtual_nodes(
     poses: Mapping[int, Rigid3],
     summaries: Sequence[Any],
 ):
-    """The walls along the way of both, where they are described alike."""
+    """Return the virtual nodes of both maps if they have the same feature type, else the first
+    map's."""
     if first.sides is None or second.sides is None or first.sides.kind != second.sides.kind:
         return first.sides
     row_of = {summary.node_id: row for row, summary in enumerate(second.summaries)}

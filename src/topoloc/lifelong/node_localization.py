@@ -1,4 +1,4 @@
-"""What is stored of the nodes of one map, asked of another one as pictures would be."""
+"""Localize nodes of one map in another map, with their stored features as queries."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ def localize_nodes(
     rows: Sequence[int],
     on_localized: Callable[[int], None] = lambda done: None,
 ) -> dict[int, Localization | None]:
-    """What the localizer's map answers to these nodes (rows) of another one, which has all its
-    kinds of features; None where it refuses.
+    """Localize nodes of another map in the localizer's map.
 
     Args:
-        asked: called with the number of nodes that were asked so far.
+        localizer: the localizer of the map.
+        source_map: the map that holds the nodes. It has all feature types of the localizer's map.
+        rows: the rows of the nodes in `source_map`.
+        on_localized: is called with the number of nodes done so far.
+
+    Returns:
+        The localizations by row. None if a node is not localized.
     """
     answers: dict[int, Localization | None] = {}
     for row in rows:

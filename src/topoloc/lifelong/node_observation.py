@@ -1,5 +1,4 @@
-"""What a picture shows of a node that is in the map: its landmarks sought where they must be
-seen."""
+"""Find the landmarks of a node in an image whose pose is known."""
 
 from __future__ import annotations
 
@@ -22,7 +21,16 @@ def observe_node(
     config: MapConfig,
     session_id: int = 0,
 ) -> Observations:
-    """See `observe_points`; `features` are what the picture shows, of the kind of the node's."""
+    """Search an image for a node's landmarks near their projections. See `observe_points`.
+
+    Args:
+        node: the node of the map.
+        features: the image's features, of the node's feature type.
+        camera: the image's camera model.
+        cam_from_node: the pose of the node in the image's camera frame.
+        config: the map's settings.
+        session_id: the id of the image's session.
+    """
     roots = np.zeros((len(node.features), 3, 3))
     roots[:, *np.tril_indices(3)] = node.point_sqrt_covs
     known = (node.features, node.points_cam.astype(np.float64), roots @ roots.transpose(0, 2, 1))

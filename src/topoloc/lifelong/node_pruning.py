@@ -1,11 +1,10 @@
-"""Whole nodes that a map can do without: what they show is shown by nodes that stay.
+"""Remove whole nodes whose content is covered by nodes that stay.
 
-A node stands for the pictures that belong to it, its own first. It is held by the one among the
-nodes that stay whose landmarks are recognised in it most; what many show alike counts once
-(facility location, which is submodular: Krause & Golovin 2014). So the node goes whose loss takes
-least from the places it stands for and holds, one after the other, never one that nothing else
-holds. The node that holds a place then stands for its pictures, too: what goes today is not
-forgotten when the next one is chosen.
+A node covers its own mapping images. Another node supports it by the number of landmarks recognised
+in it. Each node counts only its best supporter among the nodes that stay. This is the facility
+location objective, which is submodular (Krause & Golovin 2014). The greedy algorithm removes the
+node with the least loss, one after the other. It never removes a node without which some node would
+lose its support. The support of nodes already removed counts in later steps.
 """
 
 from __future__ import annotations
@@ -28,9 +27,12 @@ _PER_VECTOR_ARRAYS = ("vectors", "centres", "cell_vectors")
 
 @dataclass(frozen=True, eq=False)
 class NodeSupport:
-    """How firmly nodes hold each other, by their rows: landmarks of node `by[v, k]` that are
-    recognised in node v, `landmarks[v, k]`. The node itself is among them, with all of its own.
-    `num_images` counts what each node stands for."""
+    """Hold how well nodes support each other, by row.
+
+    `landmarks[v, k]` counts the landmarks of node `supporters[v, k]` that are recognised in node v.
+    The node itself is among its supporters, with all its landmarks. `num_images` counts the mapping
+    images of each node.
+    """
 
     supporters: Int[np.ndarray, "nodes k"]
     landmarks: Int[np.ndarray, "nodes k"]
@@ -38,11 +40,12 @@ class NodeSupport:
 
 
 def compute_node_support(topomap: TopoMetricMap, num_compared: int) -> NodeSupport:
-    """Each node compared with so many others, the nearest by Eq. 1. Of several kinds of features
-    the one that recognises most counts.
+    """Compare each node with its `num_compared` nearest nodes by Eq. 1.
+
+    If a map has several feature types, the type that recognises most counts.
 
     Raises:
-        MapError: from reading the nodes.
+        MapError: a node cannot be read.
     """
     config = topomap.config
     lambda_rot = config.nodes.lambda_rot
@@ -73,7 +76,8 @@ def compute_node_support(topomap: TopoMetricMap, num_compared: int) -> NodeSuppo
 
 
 def _count_recognised_landmarks(node: TopoNode, view: TopoNode, topomap: TopoMetricMap) -> int:
-    """Landmarks of a node that are found in what another one shows, where they must be."""
+    """Count the landmarks of `node` that are found in the features of `view` near their
+    projections."""
     if len(node.features) == 0 or len(view.features) == 0:
         return 0
     cam_from_node = view.summary.world_from_cam.inverse() @ node.summary.world_from_cam
@@ -83,9 +87,12 @@ def _count_recognised_landmarks(node: TopoNode, view: TopoNode, topomap: TopoMet
 def iterate_node_removals(
     support: NodeSupport, min_held: int
 ) -> Iterable[tuple[int, Int[np.ndarray, " nodes"]]]:
-    """The rows of nodes in the order in which they go, with the row of the node that holds each
-    place then. It ends where every further one would leave a place with fewer than `min_held`
-    landmarks recognised."""
+    """Yield the rows of nodes in the order of removal, each with the current supporter of every
+    node.
+
+    The iteration ends if any further removal would leave a node with fewer than `min_held`
+    recognised landmarks.
+    """
     num = len(support.supporters)
     is_kept, weights = np.ones(num, bool), np.log1p(support.landmarks)
     while is_kept.sum() > 1:
@@ -109,9 +116,16 @@ def iterate_node_removals(
 def remove_nodes(
     topomap: TopoMetricMap, removed: Sequence[int], supporter: Int[np.ndarray, " nodes"]
 ) -> TopoMetricMap:
-    """The map without these rows, of nodes of which `supporter` (rows) says which holds the place
-    of each: edges and pictures are the holder's then. Of a dropped node's mapping pictures one
-    stays, and one place vector."""
+    """Return the map without the nodes `removed`.
+
+    Edges and images of a removed node pass to its supporter. One mapping image and one global
+    descriptor of each removed node are kept.
+
+    Args:
+        topomap: the map.
+        removed: the rows of the nodes to remove.
+        supporter: the row of the supporting node, for each node.
+    """
     gone = set(removed)
     kept = [row for row in range(len(topomap.summaries)) if row not in gone]
     ids = [summary.node_id for summary in topomap.summaries]
@@ -137,7 +151,8 @@ def remove_nodes(
 
 
 def _reassign_images(images: Sequence[PlaceImage], new_id: Mapping[int, int]) -> list[PlaceImage]:
-    """Of each dropped node the first picture, which is the holder's now, and all others."""
+    """Return the images of the kept nodes and the first image of each removed node, which passes to
+    its supporter."""
     kept, seen = list[PlaceImage](), set[int]()
     for image in images:
         if image.node_id not in new_id:
@@ -149,12 +164,13 @@ def _reassign_images(images: Sequence[PlaceImage], new_id: Mapping[int, int]) ->
 
 
 def _reassign_descriptors(model: CoarseModel, new_id: Mapping[int, int]) -> CoarseModel:
-    """A coarse localizer by vectors: of each dropped node the one nearest to the middle of its own,
-    which leads to the holder now."""
+    """Return a coarse localizer with the global descriptors of removed nodes reduced to one each.
+    The descriptor nearest to the node's mean is kept and passes to the supporter."""
     vectors, of_node = model.arrays.get("vectors"), model.arrays.get("node_ids")
     if vectors is None or of_node is None:
         return (
-            model  # it has an output a node; what it says of nodes that are not there is left out
+            # a model with one output per node: the outputs of missing nodes are ignored later
+            model
         )
     is_kept, ids = np.ones(len(of_node), bool), of_node.copy()
     for node_id, supporter_id in new_id.items():
@@ -171,7 +187,7 @@ def _reassign_descriptors(model: CoarseModel, new_id: Mapping[int, int]) -> Coar
 
 
 def _remove_virtual_nodes(topomap: TopoMetricMap, new_id: Mapping[int, int]) -> VirtualNodes | None:
-    """The walls beside the nodes that stay."""
+    """Return the virtual nodes of the nodes that stay."""
     sides = topomap.sides
     if sides is None or not any(summary.of_node in new_id for summary in sides.summaries):
         return sides
@@ -185,8 +201,11 @@ def _remove_virtual_nodes(topomap: TopoMetricMap, new_id: Mapping[int, int]) -> 
 def select_removed_nodes(
     support: NodeSupport, min_held: int, is_enough: Callable[[list[int]], bool]
 ) -> tuple[list[int], Int[np.ndarray, " nodes"]] | None:
-    """The first so many nodes that go, until it `is_enough` or no further one can go, and what
-    holds each place then; None where none can go."""
+    """Return the nodes to remove and the final supporter of every node.
+
+    Removal ends when `is_enough` returns true or no further node can be removed. Returns None if no
+    node can be removed.
+    """
     removed, last = list[int](), None
     for row, supporter in iterate_node_removals(support, min_held):
         removed.append(row)

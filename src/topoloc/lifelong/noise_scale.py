@@ -1,12 +1,12 @@
-"""How far a session's motion and the map's answers are to be trusted, as they tell of each other.
+"""Estimate the noise scales of a session's motion and of the map's localizations from each other.
 
-Sigmas that are assumed are wrong by different factors in each recording: SLAM of a rendered lap
-drifts by a thousandth of its way, that of a hand-held camera whose calibration is nominal by some
-hundredths, and what a map says of its answers' errors holds for its worst parts. How much the
-answers scatter from one to the next, and how much further they are off after a longer way, tells
-both apart (variance components; Harville, JASA 72, 1977). The motion is predicted from answer to
-answer and corrected by each (Kalman filter); the factors under which the answers are the least
-surprise win. A few answers may be wrong: each counts as one of Student's t distribution.
+Assumed sigmas are wrong by a different factor in each recording. SLAM of a rendered loop drifts by
+about a thousandth of the distance. A hand-held camera with a nominal calibration drifts by some
+hundredths. The localizations' sigmas describe the worst parts of a map. The scatter between
+consecutive localizations and its growth with distance separate the two (variance components,
+Harville, JASA 72, 1977). A Kalman filter predicts the motion from localization to localization and
+corrects it by each. The factors with the highest likelihood are selected. Student's t distribution
+limits the effect of wrong localizations.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
 
-_DEGREES_OF_FREEDOM = 4.0  # of Student's t: the fewer, the less does one wrong answer tell
+_DEGREES_OF_FREEDOM = 4.0  # of Student's t distribution: fewer give an outlier less weight
 _NUM_DIMENSIONS = 6
 
 
 @dataclass(frozen=True)
 class NoiseScale:
-    """By how many times the sigmas of the motion, and of the answers, are as large as they were
-    assumed to be."""
+    """Hold the factors by which the sigmas of the motion and of the localizations differ from the
+    assumed ones."""
 
     motion: float = 1.0
     answers: float = 1.0
@@ -35,11 +35,11 @@ class NoiseScale:
 
 @dataclass(frozen=True, eq=False)
 class LocalizedStep:
-    """A picture that the map answered, and the motion to it from the one that was answered before.
+    """Hold a localized image and the motion to it from the previous localized image.
 
-    `cam_from_before` and `motion_covariance` (6, 6) say nothing in the first one. Covariances are
-    those of left perturbations (translation, rotation; metres and radians) of `cam_from_before` and
-    of the answer, `cam_from_world`.
+    The first step's `cam_from_before` and `motion_covariance` (6, 6) have no meaning. Covariances
+    belong to left perturbations (translation, rotation, in metres and radians) of `cam_from_before`
+    and of the localization `cam_from_world`.
     """
 
     cam_from_before: Rigid3
@@ -51,8 +51,8 @@ class LocalizedStep:
 def estimate_noise_scale(
     steps: Sequence[LocalizedStep], motion_scales: Sequence[float], answer_scales: Sequence[float]
 ) -> NoiseScale:
-    """The pair of these factors under which the answers are the least surprise; 1 and 1 where fewer
-    than two pictures were answered."""
+    """Return the pair of factors with the highest likelihood, or 1 and 1 if there are fewer than
+    two steps."""
     if len(steps) < 2:
         return NoiseScale()
     adjoints = [step.cam_from_before.adjoint() for step in steps]
@@ -65,8 +65,8 @@ def estimate_noise_scale(
 def _negative_log_likelihood(
     steps: Sequence[LocalizedStep], adjoints: Sequence[Float[np.ndarray, "6 6"]], scale: NoiseScale
 ) -> float:
-    """-2 times the logarithm of how likely the answers are after the first one, but for a
-    constant."""
+    """Compute -2 times the log-likelihood of the localizations after the first, without
+    constants."""
     pose, covariance = steps[0].cam_from_world, scale.answers**2 * steps[0].covariance
     cost = 0.0
     for step, adjoint in zip(steps[1:], adjoints[1:], strict=True):
@@ -79,7 +79,7 @@ def _negative_log_likelihood(
         cost += float(np.linalg.slogdet(both)[1]) + (
             _DEGREES_OF_FREEDOM + _NUM_DIMENSIONS
         ) * np.log1p(square / _DEGREES_OF_FREEDOM)
-        # an answer that strays corrects less
+        # an outlier corrects the pose less
         inflation = max(
             (_DEGREES_OF_FREEDOM + square) / (_DEGREES_OF_FREEDOM + _NUM_DIMENSIONS), 1.0
         )

@@ -1,11 +1,12 @@
-"""A map made smaller: read from `prune_map`. What is gone goes first, then, where it is wanted,
-descriptors' last digits (`descriptor_quantization.py`), then what adds least.
+"""Make a map smaller. Start reading at `prune_map`.
 
-A landmark is gone where pictures that found their other landmarks again never found this one. For a
-budget, nodes that others hold are left out while else every node would keep few landmarks
-(`node_pruning.py`). Every node that stays then keeps so many as fit: those with the best chance to
-be seen again, spread over the picture, for a landmark beside others tells less (submodular
-coverage: a cell of the picture counts as the root of the chances in it; Krause & Golovin 2014,
+Vanished landmarks are removed first. A landmark has vanished if many images that show its
+neighbours again never show it. Descriptors are then quantized if configured
+(`descriptor_quantization.py`). With a size budget, nodes supported by others are removed if every
+node would otherwise keep few landmarks (`node_pruning.py`). Each remaining node then keeps as many
+landmarks as fit. Landmarks with a high observation probability are preferred. They are spread over
+the image, because a landmark beside others adds less. The objective is a submodular coverage: a
+cell of the image counts as the square root of the sum of its probabilities (Krause & Golovin 2014,
 greedy choice).
 """
 
@@ -33,50 +34,52 @@ from topoloc.mapping.map_writing import write_map
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.recordings.atomic import temporary_file
 
-_PAGE_SLACK_BYTES = 4096  # what an entry in the history may take
+_PAGE_SLACK_BYTES = 4096  # reserved for an entry in the map's history
 _POINT_COLUMNS = ("points_img", "shapes", "descriptors", "points_cam", "sqrt_covs")
 
 
 @dataclass(frozen=True)
 class PruneConfig:
-    """What is taken for gone, and what is never dropped."""
+    """Configure which landmarks count as vanished and which limits apply to pruning."""
 
     min_expected: Annotated[int, Between(1, 1000)] = 4
-    """Pictures of later sessions that should have shown a landmark, before it can be taken for
-    gone."""
+    """Minimum number of images of later sessions that should have shown a landmark, before it can
+    count as vanished."""
     min_seen_share: Annotated[float, Between(0, 1)] = 0.3
-    """Only sessions count that saw at least this share of a node's landmarks again: in another
-    light none are seen."""
+    """Sessions count only if they saw at least this share of a node's landmarks again. A session in
+    other light may see none of them."""
     max_chance: Annotated[float, Between(1e-9, 1)] = 0.02
-    """A landmark is gone only where one that is there stayed unseen in so many pictures with this
-    chance at most, by the shares that the sessions saw of its node."""
+    """A landmark counts as vanished if an existing landmark would stay unseen in all these images
+    with at most this probability. The probability follows from the shares that the sessions saw of
+    the node."""
     cells: Annotated[int, Between(1, 100)] = 8
-    """The picture's columns of cells, over which the landmarks that are kept are spread."""
+    """Number of cell columns in the image. The kept landmarks are spread over the cells."""
     min_points: Annotated[int, Between(10, 100_000)] = 100
-    """Landmarks that a node keeps at least; a budget that asks for fewer is refused."""
+    """Minimum number of landmarks per node. A budget that requires fewer is an error."""
     few_points: Annotated[int, Between(10, 100_000)] = 200
-    """Where a budget leaves a node fewer landmarks than so many, nodes that others hold go first
-    ..."""
+    """Whole nodes are removed if the budget leaves fewer landmarks per node than this."""
     min_held: Annotated[int, Between(1, 100_000)] = 60
-    """... none of whose place another one recognises fewer landmarks than so many."""
+    """A node is removed only if every place keeps a node with at least this many recognised
+    landmarks."""
     num_compared: Annotated[int, Between(1, 1000)] = 12
-    """Nodes near a node that may hold it."""
+    """Number of near nodes that each node is compared with."""
     descriptors: Literal["fine", "coarse"] = "fine"
-    """Coarse: rounded to steps of ..."""
+    """`coarse` quantizes the descriptors in steps of `descriptor_step`. `fine` keeps them."""
     descriptor_step: Annotated[float, Between(0.04, 1.5)] = 0.64
-    """... so many root mean squares of a descriptor's numbers, before any landmark goes that may be
-    there."""
+    """Step of coarse descriptors, in root mean squares of a descriptor's numbers. They are
+    quantized before any landmark is removed for the budget."""
     max_gone_share: Annotated[float, AtLeast(0)] = 0.7
-    """Of a node's landmarks at most this share is taken for gone."""
+    """If more than this share of a node's landmarks would count as vanished, none of them does."""
     earlier_asked: Annotated[int, Between(0, 10_000)] = 24
-    """Nodes, at most, that the map is asked before and after, for its history to tell what the edit
-    cost; 0: none."""
+    """Maximum number of nodes localized before and after the edit, to record the change of recall
+    in the map's history. 0 skips this."""
 
 
 @dataclass(frozen=True)
 class _FileSize:
-    """Bytes of a map's file: all of it, of a landmark of each kind, and what else goes with a node
-    on the average: its template, its walls, its pictures but for one."""
+    """Hold the sizes of a map's file in bytes: the whole file, one landmark of each feature type,
+    and the average of a node's other data. The other data are its template, its virtual nodes and
+    all its images but one."""
 
     size: int
     bytes_per_point: dict[str, float]
@@ -84,6 +87,7 @@ class _FileSize:
 
     @staticmethod
     def of(path: Path, kinds: Sequence[str]) -> _FileSize:
+        """Measure a map's file with these feature types."""
         lengths = " + ".join(f"total(length({name}))" for name in _POINT_COLUMNS)
         counted = "SELECT count(*), total(length(jpeg)) FROM"
         with closing(
@@ -98,17 +102,19 @@ class _FileSize:
                 ).fetchone()[0]
                 bytes_per_point[kind] = (num_bytes + of_sums) / max(num, 1)
             num, of_templates = database.execute(f"{counted} node_templates").fetchone()
-            num_pictures, of_pictures = database.execute(f"{counted} place_images").fetchone()
-            of_walls = database.execute(f"SELECT {lengths} FROM side_node_points").fetchone()[0]
-        of_pictures *= max(1.0 - num / max(num_pictures, 1), 0.0)
+            num_images, of_images = database.execute(f"{counted} place_images").fetchone()
+            of_virtual_nodes = database.execute(
+                f"SELECT {lengths} FROM side_node_points"
+            ).fetchone()[0]
+        of_images *= max(1.0 - num / max(num_images, 1), 0.0)
         return _FileSize(
             path.stat().st_size,
             bytes_per_point,
-            (of_templates + of_walls + of_pictures) / max(num, 1),
+            (of_templates + of_virtual_nodes + of_images) / max(num, 1),
         )
 
     def bytes_without_points(self, topomap: TopoMetricMap) -> float:
-        """Bytes of the map, whose file this is, without its landmarks."""
+        """Return the bytes of this file without the landmarks of its map."""
         return self.size - sum(
             of_one * sum(len(node.features) for node in topomap.nodes_of(kind))
             for kind, of_one in self.bytes_per_point.items()
@@ -116,7 +122,7 @@ class _FileSize:
 
 
 def _measure_file_size(topomap: TopoMetricMap, path: Path) -> _FileSize:
-    """Of the map's file, which is to be at `path`. Raises MapError."""
+    """Write the map to a temporary file beside `path` and measure it. Raises MapError."""
     try:
         with temporary_file(path) as tried:
             write_map(topomap, tried)
@@ -127,7 +133,7 @@ def _measure_file_size(topomap: TopoMetricMap, path: Path) -> _FileSize:
 
 @dataclass(frozen=True, eq=False)
 class PrunedMap:
-    """The smaller map, and what changed: numbers by their names."""
+    """Hold the pruned map and the numbers of changes, by name."""
 
     topomap: TopoMetricMap
     changes: dict[str, Any]
@@ -139,15 +145,17 @@ def prune_map(
     max_bytes: int | None = None,
     config: PruneConfig | None = None,
 ) -> PrunedMap:
-    """The map without landmarks that are gone, and, with a budget, with so many a node that its
-    file fits.
+    """Return the map without vanished landmarks and, if there is a budget, small enough for it.
 
     Args:
-        path: the map's file, whose bytes the budget is reckoned from.
+        topomap: the map.
+        path: the map's file. Its size is the basis of the budget.
+        max_bytes: the budget in bytes. None removes vanished landmarks only.
+        config: the settings. Defaults to `PruneConfig()`.
 
     Raises:
         ConfigError: a setting is out of its bounds.
-        MapError: the budget is too small for what is no landmark, and `min_points` a node.
+        MapError: the budget is too small for the map with `min_points` landmarks per node.
     """
     config = config or PruneConfig()
     check_bounds(config)
@@ -165,7 +173,8 @@ def prune_map(
 
 
 def _merge_session_counts(topomap: TopoMetricMap, config: PruneConfig) -> TopoMetricMap:
-    """Sessions that only counted made two, where there are more; else the map itself."""
+    """Merge the observation counts of sessions that only counted. Return the same map if nothing
+    changes."""
 
     def merge_counts(node: TopoNode) -> TopoNode:
         return replace(
@@ -190,8 +199,8 @@ def _merge_session_counts(topomap: TopoMetricMap, config: PruneConfig) -> TopoMe
 def _drop_nodes(
     topomap: TopoMetricMap, file: _FileSize, max_bytes: int, config: PruneConfig
 ) -> TopoMetricMap:
-    """Without the nodes that go before any keeps fewer than `few_points`; the map itself where none
-    needs to."""
+    """Remove nodes until each remaining node can keep `few_points` landmarks, or no further node
+    can be removed. Return the same map if none needs to be removed."""
     remaining = {
         kind: np.array([(~_find_vanished(node, config)).sum() for node in topomap.nodes_of(kind)])
         for kind in topomap.kinds
@@ -221,8 +230,16 @@ def _prune_landmarks(
     max_bytes: int | None,
     config: PruneConfig,
 ) -> PrunedMap:
-    """The map without what is gone, and within its budget; `before` is what it was made of, `file`
-    the size that it has."""
+    """Remove vanished landmarks and reduce the others to the budget.
+
+    Args:
+        before: the original map.
+        topomap: the map after the earlier steps.
+        path: the map's file.
+        file: the file sizes of `topomap`.
+        max_bytes: the budget in bytes, or None.
+        config: the settings.
+    """
     vanished = {
         kind: [_find_vanished(node, config) for node in topomap.nodes_of(kind)]
         for kind in topomap.kinds
@@ -262,13 +279,13 @@ def _prune_landmarks(
             )
         budget -= (
             round(1.1 * (written - max_bytes)) + _PAGE_SLACK_BYTES
-        )  # how well bytes pack is known only now
+        )  # the compressed size is known only after writing
 
 
 def _drop_landmarks(
     topomap: TopoMetricMap, vanished: Mapping[str, list[np.ndarray]], most: int, config: PruneConfig
 ) -> PrunedMap:
-    """Without the landmarks that are `vanished` (booleans, a node), and with `most` of the others a
+    """Remove the `vanished` landmarks (a mask per node) and keep at most `most` of the others per
     node."""
     pruned, num_gone, num_dropped = {}, 0, 0
     for kind in topomap.kinds:
@@ -295,8 +312,8 @@ def _drop_landmarks(
 
 
 def select_landmarks(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
-    """The node with these of its landmarks (rows in increasing order) and what sessions know of
-    them."""
+    """Return the node with the landmarks `kept` (rows in increasing order) and their session
+    statistics."""
     new_row = np.full(len(node.features), -1)
     new_row[kept] = np.arange(len(kept))
     session_statistics = []
@@ -322,9 +339,12 @@ def select_landmarks(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
 
 
 def _find_vanished(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"]:
-    """The landmarks that later sessions never saw though they saw the rest, and so often that a
-    landmark that is there hardly stays unseen: a session that finds a third of what is in view
-    misses four pictures in a row by chance, one of five times."""
+    """Return the mask of landmarks that later sessions never saw although they saw the rest of the
+    node.
+
+    The number of missed images must be large enough: a session that finds a third of the landmarks
+    misses an existing one in four images with a probability of one in five.
+    """
     num = len(node.features)
     expected, seen, log_missed = np.zeros(num, np.int64), np.zeros(num, np.int64), np.zeros(num)
     for session_statistics in node.session_statistics:
@@ -345,7 +365,7 @@ def _find_vanished(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"
 
 
 def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
-    """Each landmark's chance to be seen by a picture that should show it, by all that sessions saw
+    """Return each landmark's probability of being seen if it should be visible, over all sessions
     (Laplace's rule)."""
     expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
     for session_statistics in node.session_statistics:
@@ -357,8 +377,8 @@ def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
 def _select_landmarks(
     node: TopoNode, rows: Int[np.ndarray, " m"], most: int, config: PruneConfig
 ) -> Int[np.ndarray, " k"]:
-    """Which of these rows a node keeps: chance by chance the one that adds most to what its cell
-    holds already."""
+    """Select the rows that a node keeps. Greedy choice: each next landmark adds most to the
+    coverage of its cell."""
     size = node.camera.width / config.cells
     cell = (node.features.points_img[rows] / size).astype(np.int64)
     key = cell[:, 1] * (config.cells + 1) + cell[:, 0]
@@ -369,7 +389,7 @@ def _select_landmarks(
         total = np.cumsum(chances[best_first])
         gains[best_first] = np.sqrt(total) - np.sqrt(
             total - chances[best_first]
-        )  # falls from one to the next: greedy is sorting
+        )  # gains decrease within a cell, so sorting is the greedy choice
     return np.sort(np.argsort(-gains, kind="stable")[:most])
 
 
@@ -380,8 +400,8 @@ def _max_points_per_node(
     max_bytes: int,
     config: PruneConfig,
 ) -> int:
-    """Landmarks a node of each kind so that a file fits whose bytes without landmarks are
-    `fixed_bytes`."""
+    """Return the largest number of landmarks per node and feature type that fits the budget.
+    `fixed_bytes` is the size of the file without landmarks."""
 
     def file_size_with(most: int) -> float:
         return fixed_bytes + sum(

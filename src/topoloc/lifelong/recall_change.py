@@ -1,9 +1,9 @@
-"""What an edit costs the sessions that a map has: some of its nodes are asked before and after,
-each as if nobody had stood there.
+"""Measure how an edit changes the recall of a map's earlier sessions.
 
-The small pictures that the map keeps for its coarse localizers are no use for that: of 160 pixels a
-side, most are not localized by the very map that holds them. What is stored of nodes is as sharp as
-the camera was.
+Some nodes are localized before and after the edit, each with the node itself hidden. The small
+images stored for the coarse localizers cannot serve as queries. At 160 pixels per side, even their
+own map does not localize most of them. The stored features of nodes have the camera's full
+resolution.
 """
 
 from __future__ import annotations
@@ -19,9 +19,20 @@ def measure_recall_change(
     max_asked: int,
     localizer_config: LocalizerConfig | None = None,
 ) -> dict[str, int]:
-    """How many of the earlier nodes each of two versions of a map localizes, by the names that the
-    history has for it; empty where none is to be asked. Raises as `Localizer`, and MapError from
-    reading."""
+    """Count how many nodes of `before` each of the two map versions localizes.
+
+    Args:
+        before: the map before the edit.
+        after: the map after the edit.
+        max_asked: the maximum number of nodes, evenly spaced.
+        localizer_config: the localizer's settings.
+
+    Returns:
+        The counts by the names used in the map's history. Empty if `max_asked` is 0.
+
+    Raises:
+        MapError: a map cannot be read. Further errors as of `Localizer`.
+    """
     rows = sample_evenly(range(len(before.summaries)), max_asked)
     if not rows:
         return {}
@@ -35,7 +46,7 @@ def measure_recall_change(
 
 
 def describe_recall_change(changes) -> str | None:
-    """The same in words; None where it was not measured."""
+    """Describe the counts in one sentence. Return None if they were not measured."""
     if not changes.get("earlier_asked"):
         return None
     asked, before, after = (

@@ -1,9 +1,9 @@
-"""The metres of a motion that a single camera made in a unit of its own: by what a map answers to
-some of its pictures.
+"""Estimate the metric scale of monocular motion from localizations of some of its images.
 
-The unit drifts along the way. Its logarithm is taken for a random walk, which the distances between
-answers hold: least squares over knots along the way, which say how well it is known, too. Which
-answers may be right is first found by one similarity that explains most of them.
+The scale drifts along the trajectory. Its logarithm is modelled as a random walk. Least squares
+over knots along the trajectory fit it to the distances between localizations and give its
+uncertainty. The inlier localizations are selected first: the largest set that one similarity
+transform explains.
 """
 
 from __future__ import annotations
@@ -22,27 +22,29 @@ from topoloc.localization.result import Localization
 
 @dataclass(frozen=True)
 class ScaleConfig:
-    """How the unit of a motion is found, and where it is not known."""
+    """Configure the scale estimation and its limits."""
 
     drift: Annotated[float, Above(0)] = 0.01
-    """Sigma of the unit's logarithm after a metre; it grows with the root of the way."""
+    """Sigma of the logarithm of the scale after one metre. It grows with the square root of the
+    distance."""
     max_sigma: Annotated[float, Above(0)] = 0.1
-    """Where the unit is less certain than by this share of itself, frames have no pose."""
+    """Frames have no pose if the relative sigma of the scale is larger than this."""
     max_error: Annotated[float, Above(0)] = 0.05
-    """An answer may be off by this share of the way from another one, for one similarity to explain
-    both."""
+    """Tolerance of one similarity transform, as a share of the distance travelled between two
+    localizations."""
     widened: Annotated[float, Above(0)] = 3.0
-    """The map's answers are trusted as if their sigmas were so many times as large."""
+    """Factor applied to the sigmas of the localizations."""
     max_pairs: Annotated[int, Between(2, 1000)] = 40
-    """Of so many answers, evenly along the way, all pairs are tried for a similarity."""
+    """Number of localizations, evenly spaced, of which all pairs are tried as a similarity
+    transform."""
     max_knots: Annotated[int, Between(2, 10_000)] = 200
-    """Places along the way at which the unit is estimated."""
+    """Maximum number of knots along the trajectory at which the scale is estimated."""
 
 
 @dataclass(frozen=True, eq=False)
 class _LocalizedFrames:
-    """Where the map puts some frames, and where the motion does: positions, rotations, ways gone up
-    to there, sigmas of the map's."""
+    """Hold the poses of localized frames, in the map and in the motion, with the distances
+    travelled and the localizations' position sigmas (metres)."""
 
     rows: Int[np.ndarray, " k"]
     odom: Float[np.ndarray, "k 3"]
@@ -53,6 +55,7 @@ class _LocalizedFrames:
     sigmas: Float[np.ndarray, " k"]
 
     def select(self, rows: Int[np.ndarray, " m"]) -> _LocalizedFrames:
+        """Return these rows of all columns."""
         return _LocalizedFrames(*(column[rows] for column in vars(self).values()))
 
 
@@ -63,8 +66,18 @@ def find_largest_consensus(
     slack_deg: float,
     config: ScaleConfig,
 ) -> list[int]:
-    """The frames of the most answers that one similarity of the motion explains but for its drift;
-    fewer than three are none."""
+    """Return the frames of the largest set of localizations that one similarity transform of the
+    motion explains.
+
+    The tolerance grows with the distance travelled. Sets of fewer than three give an empty list.
+
+    Args:
+        odom: the motion, as poses by frame.
+        localized: the localizations by frame.
+        slack_m: the constant tolerance in metres.
+        slack_deg: the constant tolerance in degrees.
+        config: the settings.
+    """
     answers = _collect_localized_frames(odom, localized)
     num = len(answers.rows)
     tried = (
@@ -87,8 +100,8 @@ def find_largest_consensus(
 def _find_inliers(
     answers: _LocalizedFrames, i: int, j: int, slack_m: float, slack_deg: float, config: ScaleConfig
 ) -> Bool[np.ndarray, " k"]:
-    """By the similarity that turns the motion as answer i says, and makes it as long as i and j
-    do."""
+    """Return the inliers of the similarity with the rotation of localization i and the scale of the
+    distance from i to j."""
     apart, own_apart = (
         float(np.linalg.norm(places[i] - places[j])) for places in (answers.world, answers.odom)
     )
@@ -109,8 +122,12 @@ def _find_inliers(
 def scale_to_metres(
     odom: Mapping[int, Rigid3], localized: Mapping[int, Localization], config: ScaleConfig
 ) -> dict[int, Rigid3]:
-    """The motion with its steps in metres, as answers that agree say; only where these tell its
-    unit. Its world stays the first frame's."""
+    """Return the motion with its steps in metres, according to localizations that agree with each
+    other.
+
+    The world of the motion stays at its first frame. Frames whose scale has a sigma above
+    `max_sigma` are left out.
+    """
     answers = _collect_localized_frames(odom, localized)
     positions = np.array([pose.translation for pose in odom.values()])
     path_lengths = compute_path_lengths(positions)
@@ -133,7 +150,7 @@ def _estimate_scale_profile(
     pairs: Int[np.ndarray, "p 2"],
     config: ScaleConfig,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The logarithm of the unit at each frame, and its sigma."""
+    """Return the logarithm of the scale at each frame and its sigma."""
     a, b = answers.select(pairs[:, 0]), answers.select(pairs[:, 1])
     apart, own_apart = (
         np.linalg.norm(a.world - b.world, axis=1),
@@ -168,8 +185,8 @@ def _estimate_scale_profile(
 
 
 def _select_pairs(answers: _LocalizedFrames, config: ScaleConfig) -> Int[np.ndarray, "p 2"]:
-    """Answers with the ones 1, 2, 4, ... after them that lie apart for more than what they may be
-    off."""
+    """Pair each localization with the 1st, 2nd, 4th, ... after it. Keep pairs whose distance is
+    clearly larger than its uncertainty."""
     num, pairs = len(answers.rows), []
     for offset in (2**power for power in range(16) if 2**power < num):
         first = np.arange(num - offset)
@@ -202,14 +219,14 @@ def _collect_localized_frames(
 
 
 def compute_path_lengths(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """How far it is along a motion to each of its positions."""
+    """Return the distance travelled up to each position, in the unit of the positions."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
 
 
 def _interpolation_weights(
     at: Float[np.ndarray, " m"], knots: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "m k"]:
-    """What each knot counts for a value in between, linearly."""
+    """Return each knot's weight in the linear interpolation at each value."""
     right = np.clip(np.searchsorted(knots, at), 1, max(len(knots) - 1, 1))
     share = np.clip((at - knots[right - 1]) / (knots[right] - knots[right - 1]), 0.0, 1.0)
     weights = np.zeros((len(at), len(knots)))

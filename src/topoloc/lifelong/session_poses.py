@@ -1,10 +1,9 @@
-"""Where a new session was taken, in the world of a map: the pictures that the map localizes hold
-the session's own motion in place.
+"""Estimate the poses of a new session in the world of a map.
 
-The session's motion is that of its poses (given, or SLAM's) in any world of their own; of a single
-camera without poses, see `single_camera_poses.py`. One rigid transform must explain most of what
-the map answers, but for a drift; the motion and the answers are then brought to agree as a pose
-graph, in which the map stands still, each trusted as far as the session itself shows
+Localizations of some images anchor the session's own motion. The motion comes from its poses
+(given, or from SLAM) in any world. `single_camera_poses.py` handles a single camera without poses.
+One rigid transform, up to drift, must explain most localizations. A pose graph with a fixed map
+then combines the motion and the localizations. Their weights follow from the session itself
 (`noise_scale.py`).
 """
 
@@ -36,79 +35,82 @@ from topoloc.slam.monocular_config import MonocularOdometryConfig
 from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimize_pose_graph
 
 Progress = Callable[[str, int, int], None]
-"""Called with a stage's name, steps done and steps in all."""
+"""Called with a stage's name, the number of steps done and the number of all steps."""
 
 
 @dataclass(frozen=True)
 class SessionPosesConfig:
-    """How a session is held in place, and when it is refused."""
+    """Configure how a session is aligned and when it is refused."""
 
     max_scale: Annotated[float, Above(0)] = 0.03
-    """A metre of the motion may be off by this share of a metre of the map, beside three sigmas of
-    what the answers say of it, and beside the share that one sigma of an answer is of the way
-    between the furthest."""
+    """Maximum relative difference between the motion's scale and the map's. Three sigmas of the
+    measured scale are added, and the ratio of one localization sigma to the longest distance."""
     max_drift: Annotated[float, Between(0, 1)] = 0.03
-    """Of two answers of the map that agree, the motion between them may be off by this share of the
-    way ..."""
+    """Tolerance of the position between two agreeing localizations, as a share of the distance
+    travelled between them. `slack` is added."""
     max_turn_drift_deg: Annotated[float, AtLeast(0)] = 0.3
-    """... and by so many degrees a metre of the way, ..."""
+    """Tolerance of the rotation between two agreeing localizations, in degrees per metre travelled.
+    `slack_deg` is added."""
     slack: Annotated[float, Above(0)] = 0.3
-    """... and by so many D_thresh in any case, ..."""
+    """Constant part of the position tolerance, in D_thresh."""
     slack_deg: Annotated[float, Above(0)] = 2.0
-    """... and by so many degrees."""
+    """Constant part of the rotation tolerance, in degrees."""
     min_agreeing: Annotated[int, Between(2, 1000)] = 5
-    """Pictures that the map must localize in agreement with the motion; with fewer the session is
-    refused."""
+    """Minimum number of localized images that agree with the motion. The session is refused if
+    there are fewer."""
     min_share: Annotated[float, Between(0, 1)] = 0.5
-    """Share of the localized pictures that must agree; with fewer the session is refused."""
+    """Minimum share of the localized images that agree. The session is refused if the share is
+    smaller."""
     drift: Annotated[float, Above(0)] = 0.01
-    """Sigma of the motion from picture to picture, as a share of its way, beside a millimetre."""
+    """Sigma of the motion between images, as a share of the distance. A millimetre is added."""
     turn_drift: Annotated[float, Above(0)] = 0.002
-    """Sigma of its rotation, radians a metre of the way and a radian of the turn, beside half a
-    milliradian."""
+    """Sigma of the rotation between images, in radians per metre and per radian of rotation. Half a
+    milliradian is added."""
     widened: Annotated[float, Above(0)] = 3.0
-    """The map's answers are trusted as if their sigmas were so many times as large: neighbours
-    share errors of the map."""
+    """Factor applied to the sigmas of the localizations, because neighbours share errors of the
+    map."""
     motion_factors: Annotated[tuple[float, ...], Above(0)] = (0.5, 1.0, 3.0, 10.0)
-    """Of stereo, RGB-D and given poses it is measured by how many times the motion's sigmas are as
-    large: which of these ..."""
+    """Candidate factors for the sigmas of the motion (stereo, RGB-D and given poses). The most
+    likely pair of a motion factor and an answer factor is selected."""
     answer_factors: Annotated[tuple[float, ...], Above(0)] = (1.0 / 3.0, 1.0)
-    """... and, beside `widened`, which of these for the answers' sigmas agrees best with what the
-    answers say of the motion."""
+    """Candidate factors for the sigmas of the localizations, applied in addition to `widened`."""
     rival_share: Annotated[float, Between(0, 1)] = 0.3
-    """Of a single camera, answers that agree about one way are believed if fewer than this share of
-    them agree about another one."""
+    """Of a single camera, the agreeing localizations are rejected if a rival set with at least this
+    share of their number agrees on another trajectory."""
     contradiction: Annotated[float, Above(0)] = 0.1
-    """Where the map and a single camera's motion say places that are further apart than so many
-    D_thresh, beside three of the map's sigmas (widened), a frame has no pose."""
+    """Of a single camera, a frame has no pose if map and motion differ by more than this many
+    D_thresh. Three sigmas of the localization, multiplied by `widened`, are added."""
     max_sigma: Annotated[float, Above(0)] = 0.1
-    """A frame that no motion holds has the pose that the map answers where that is known to within
-    so many D_thresh (a sigma of its position)."""
+    """A frame without odometry takes the map's pose if its position sigma is at most this many
+    D_thresh."""
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     adjustment: BundleConfig = field(
         default_factory=lambda: BundleConfig(max_steps=30, min_decrease=1e-5, cauchy_scale=0.5)
     )
-    """Of a single camera's walk as a whole."""
+    """Settings of the bundle adjustment of a single camera's whole trajectory."""
     points_widened: Annotated[float, Above(0)] = 8.0
-    """In it, points that were followed are trusted as if their sigmas were so many times as large:
-    one that slides does so in all of its key frames."""
+    """Factor applied to the sigmas of tracked points in that adjustment. A sliding point does so in
+    all of its key frames."""
     bend: CorrectionConfig = field(default_factory=CorrectionConfig)
-    """How a single camera's walk is drawn to the map's answers."""
+    """Settings of the correction of a single camera's trajectory towards the localizations."""
     odometry: MonocularOdometryConfig = field(default_factory=MonocularOdometryConfig)
     scale: ScaleConfig = field(default_factory=ScaleConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class SessionPoses:
-    """world_from_cam of each frame, up to the last with a pose, in the map's world, None where it
-    is not known; what the map answered to the frames that it was asked of, and which of these
-    answers hold the session in place."""
+    """Hold the poses of a session in the world of the map.
+
+    `world_from_cams` holds the poses of the frames up to the last one with a pose, None if unknown.
+    `answers` holds the localizations of the queried frames, None if a frame is not localized.
+    `inlier_idx` lists the frames whose localizations anchor the session.
+    """
 
     world_from_cams: list[Rigid3 | None]
     answers: Mapping[int, Localization | None]
     inlier_idx: list[int]
     propagated_idx: Sequence[int] = ()
-    """Of a single camera, the frames that odometry gave their pose, and not the map."""
+    """Of a single camera, the frames whose pose comes from odometry and not from the map."""
 
 
 def estimate_poses_by_motion(
@@ -118,13 +120,15 @@ def estimate_poses_by_motion(
     config: SessionPosesConfig,
     progress: Progress,
 ) -> SessionPoses:
-    """Of a session that has poses of its own, in any world, or in several, one a stretch. Frames
-    about as far apart as nodes are asked.
+    """Estimate the poses of a session that has its own poses.
+
+    Its poses are in any metric world, or in several, one per stretch. Frames are queried about as
+    far apart as nodes.
 
     Raises:
-        TrajectoryError: the map recognises too little of it, or not as its poses say.
-        CalibrationError: the pictures contradict their calibration.
-        UnreadableImageError, QueryError: from its pictures.
+        TrajectoryError: the map recognises too little of it, or contradicts its poses.
+        CalibrationError: the images contradict their calibration.
+        UnreadableImageError, QueryError: an image cannot be read or localized.
     """
     d_thresh = map_config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
@@ -165,7 +169,7 @@ def _known_poses(poses: Sequence[Rigid3 | None]) -> dict[int, Rigid3]:
 
 
 def _select_node_frames(odom: Mapping[int, Rigid3], map_config: MapConfig) -> list[int]:
-    """Frames of a motion about as far apart as nodes of the map."""
+    """Return frames of a motion that are about as far apart as nodes of the map."""
     indices = list(odom)
     return [indices[k] for k in select_node_frames(list(odom.values()), map_config.nodes)]
 
@@ -177,24 +181,23 @@ def _align_stretches(
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> SessionPoses:
-    """Each stretch held by what the map answers to its own pictures; stretches that the map does
-    not hold have no poses. Raises TrajectoryError, that of the first stretch, where it holds
-    none."""
-    held, refused = list[SessionPoses](), list[TrajectoryError]()
+    """Align each stretch by the localizations of its own images. Stretches that cannot be aligned
+    have no poses. Raises the TrajectoryError of the first stretch if none can be aligned."""
+    aligned, refused = list[SessionPoses](), list[TrajectoryError]()
     for odom, of_motion in zip(motions, answers, strict=True):
         try:
-            held.append(align_motion_to_map(name, odom, of_motion, d_thresh, config))
+            aligned.append(align_motion_to_map(name, odom, of_motion, d_thresh, config))
         except TrajectoryError as error:
             refused.append(error)
-    if not held:
+    if not aligned:
         raise refused[0]
-    world_from_cams: list[Rigid3 | None] = [None] * max(len(one.world_from_cams) for one in held)
-    for one in held:
+    world_from_cams: list[Rigid3 | None] = [None] * max(len(one.world_from_cams) for one in aligned)
+    for one in aligned:
         for index, pose in _known_poses(one.world_from_cams).items():
             world_from_cams[index] = pose
     every = {index: answer for of_motion in answers for index, answer in of_motion.items()}
     return SessionPoses(
-        world_from_cams, every, sorted(index for one in held for index in one.inlier_idx)
+        world_from_cams, every, sorted(index for one in aligned for index in one.inlier_idx)
     )
 
 
@@ -206,14 +209,18 @@ def align_motion_to_map(
     config: SessionPosesConfig,
     noise_scale: NoiseScale | None = None,
 ) -> SessionPoses:
-    """A motion of its own world held in place by what a map answers to some of its pictures, all by
-    their numbers.
+    """Align a motion in its own world with the map, by localizations of some of its frames.
 
     Args:
-        trust: how far to trust the two; without, it is measured.
+        name: the session's name, for error messages.
+        odom: the poses of the motion, by frame.
+        answers: the localizations of the queried frames, None if not localized.
+        d_thresh: D_thresh of the map, in metres.
+        config: the settings.
+        noise_scale: the noise scales of motion and localizations. Estimated if None.
 
     Raises:
-        TrajectoryError: the map recognises too little of it, or not as the motion says.
+        TrajectoryError: the map recognises too little of it, or contradicts the motion.
     """
     localized = {index: result for index, result in answers.items() if result is not None}
     inlier_idx = _find_consensus(name, odom, localized, len(answers), d_thresh, config)
@@ -231,19 +238,20 @@ def _find_consensus(
     name: str,
     odom: Mapping[int, Rigid3],
     localized: Mapping[int, Localization],
-    num_asked: int,
+    num_queried: int,
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> list[int]:
-    """The largest set of answers that one transform of the motion explains."""
+    """Return the largest set of localized frames that one transform of the motion explains. Raises
+    TrajectoryError."""
     indices = list(localized)
-    if num_asked < config.min_agreeing:
+    if num_queried < config.min_agreeing:
         raise TrajectoryError(
-            f"{name}: {_too_few_message(num_asked, config)}; the map stays as it is"
+            f"{name}: {_too_few_message(num_queried, config)}; the map stays as it is"
         )
     if len(indices) < config.min_agreeing:
         raise TrajectoryError(
-            f"{name}: the map recognises {len(indices)} of {num_asked} pictures asked: another"
+            f"{name}: the map recognises {len(indices)} of {num_queried} pictures asked: another"
             " place, or changed; the map stays as it is"
         )
     _check_scale(name, odom, localized, config)
@@ -268,7 +276,8 @@ def _find_inliers(
     slack_m: float,
     config: SessionPosesConfig,
 ) -> Bool[np.ndarray, " n"]:
-    """Which answers agree with the transform of the motion that answer `k` says."""
+    """Return the mask of localizations that agree with the transform defined by localization
+    `k`."""
     world_from_odom = localized[k].world_from_cam @ odom[k].inverse()
     agrees = []
     for index, answer in localized.items():
@@ -283,8 +292,8 @@ def _find_inliers(
     return np.array(agrees)
 
 
-def _too_few_message(num_asked: int, config: SessionPosesConfig) -> str:
-    found = f"{num_asked} of its pictures are" if num_asked > 1 else "one of its pictures is"
+def _too_few_message(num_queried: int, config: SessionPosesConfig) -> str:
+    found = f"{num_queried} of its pictures are" if num_queried > 1 else "one of its pictures is"
     return (
         f"{found} as far apart as nodes of the map, too few to join: it takes {config.min_agreeing}"
     )
@@ -296,8 +305,8 @@ def _check_scale(
     localized: Mapping[int, Localization],
     config: SessionPosesConfig,
 ) -> None:
-    """Hold that a metre of the motion is one of the map, by the distances between what was
-    localized."""
+    """Check by distances between localized frames that the motion is in metres of the map. Raises
+    TrajectoryError."""
     a = np.array([odom[k].translation for k in localized])
     b = np.array([answer.world_from_cam.translation for answer in localized.values()])
     rows, columns = np.triu_indices(len(a), 1)
@@ -311,8 +320,8 @@ def _check_scale(
     ratios = lengths[far] / odom_lengths[far]
     scale = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(ratios - scale)))
-    # the answers are wrong together, too, which their spread does not show; of what hardly moves
-    # that is all there is
+    # Localizations share errors, which their spread does not show. For a short motion this is the
+    # largest part.
     sigma_m = float(np.median([answer.position_sigma_m for answer in localized.values()]))
     uncertainty = 3.0 * spread / np.sqrt(len(a)) + sigma_m / lengths.max()
     if abs(scale - 1.0) > config.max_scale + uncertainty:
@@ -322,7 +331,7 @@ def _check_scale(
 
 
 def _path_lengths(odom: Mapping[int, Rigid3]) -> dict[int, float]:
-    """Metres gone up to each frame."""
+    """Return the metres travelled up to each frame."""
     positions = np.array([pose.translation for pose in odom.values()])
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return dict(zip(odom, np.concatenate([[0.0], np.cumsum(steps)]).tolist(), strict=True))
@@ -334,8 +343,8 @@ def _optimize_motion(
     noise_scale: NoiseScale,
     config: SessionPosesConfig,
 ) -> list[Rigid3 | None]:
-    """The motion held in place by the anchors: a pose graph whose first node is the map's world,
-    which does not move."""
+    """Optimize the motion with its anchors as a pose graph. The first node is the world of the map
+    and is fixed."""
     indices = list(odom)
     first = min(anchors)
     world_from_odom = anchors[first].world_from_cam @ odom[first].inverse()
@@ -363,8 +372,8 @@ def _optimize_motion(
 def _estimate_noise(
     odom: Mapping[int, Rigid3], anchors: Mapping[int, Localization], config: SessionPosesConfig
 ) -> NoiseScale:
-    """Of the motion from anchor to anchor and of the anchors, not widened: what neighbours share
-    does not scatter."""
+    """Estimate the noise scales of the motion between anchors and of the anchors. The anchors'
+    sigmas are not widened, because shared errors do not scatter."""
     seen, moved, spread = list[LocalizedStep](), Rigid3.identity(), np.zeros((6, 6))
     before = None
     for index, pose in odom.items():
@@ -384,7 +393,7 @@ def _estimate_noise(
 def _relative_motion(
     odom_from_a: Rigid3, odom_from_b: Rigid3, config: SessionPosesConfig
 ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-    """b_from_a, and the covariance of its left perturbation."""
+    """Return b_from_a and the covariance of its left perturbation."""
     b_from_a = odom_from_b.inverse() @ odom_from_a
     path_length = float(np.linalg.norm(b_from_a.translation))
     sigma_m, sigma_rad = (

@@ -1,8 +1,8 @@
-"""Two maps of overlapping pieces of one recording: the same pictures became part of both, and say
-how these lie to each other.
+"""Estimate the transform between two maps from images that are part of both.
 
-No two pictures that a camera takes are the same to the last bit, for their noise differs. So maps
-that were taught by the same ones saw the same place, whatever else looks like it.
+Maps of overlapping parts of one recording share mapping images. Because of noise, two images of a
+camera are never identical. So maps with identical images show the same place, even if other places
+look similar.
 """
 
 from __future__ import annotations
@@ -23,17 +23,20 @@ from topoloc.geometry.transform_consensus import (
 from topoloc.mapping.topomap import TopoMetricMap
 
 _MAX_IMAGES = 200
-_SIGMA_M, _SIGMA_DEG = 0.01, 0.1  # of the way from one map to the other as one picture has it
+_SIGMA_M, _SIGMA_DEG = 0.01, 0.1  # of the transform between the maps as one image gives it
 
 
 def estimate_by_shared_images(
     first: TopoMetricMap, second: TopoMetricMap, along: DriftConfig, config: ConsensusConfig
 ) -> tuple[Rigid3, np.ndarray, int] | None:
-    """first_from_second (metres), the covariance of its left perturbation (m, rad), and how many
-    pictures of both maps agree on it; None where they have too few in common, or these say
-    different things."""
+    """Estimate first_from_second (metres) from the images that both maps contain.
+
+    Returns:
+        first_from_second, the covariance of its left perturbation (m, rad), and the number of
+        images that agree. None if the maps share too few images or the images do not agree.
+    """
     here, there = _image_poses(first), _image_poses(second)
-    shared = sorted(here.keys() & there.keys(), key=lambda picture: (picture[0], picture[1]))
+    shared = sorted(here.keys() & there.keys(), key=lambda image_key: (image_key[0], image_key[1]))
     chosen = (
         np.unique(
             np.linspace(0, len(shared) - 1, min(len(shared), _MAX_IMAGES)).round().astype(int)
@@ -45,7 +48,7 @@ def estimate_by_shared_images(
     if len(poses) < config.min_independent:
         return None
     one, other = poses[len(poses) // 2]
-    said = [
+    estimates = [
         propagate_estimate(
             one.inverse() @ a,
             Rigid3.identity(),
@@ -56,7 +59,9 @@ def estimate_by_shared_images(
         for a, b in poses
     ]
     consensus = find_consensus(
-        [pose for pose, _ in said], np.stack([covariance for _, covariance in said]), config
+        [pose for pose, _ in estimates],
+        np.stack([covariance for _, covariance in estimates]),
+        config,
     )
     return None if consensus is None else _to_worlds(consensus, one, other)
 
@@ -74,8 +79,8 @@ def _to_worlds(
 
 
 def _image_poses(topomap: TopoMetricMap) -> dict[tuple[str, bytes], Rigid3]:
-    """world_from_cam of each mapping picture, by its name and bytes; without those that are there
-    several times, as of a covered lens."""
-    pictures = [(image.name, image.jpeg, image.world_from_cam) for image in topomap.place_images]
-    times = Counter(jpeg for _, jpeg, _ in pictures)
-    return {(name, jpeg): pose for name, jpeg, pose in pictures if times[jpeg] == 1}
+    """Return world_from_cam of each mapping image by its name and bytes. Images that occur several
+    times are left out, such as images of a covered camera."""
+    images = [(image.name, image.jpeg, image.world_from_cam) for image in topomap.place_images]
+    times = Counter(jpeg for _, jpeg, _ in images)
+    return {(name, jpeg): pose for name, jpeg, pose in images if times[jpeg] == 1}

@@ -1,10 +1,11 @@
-"""Where a session of a single camera was taken: what the map answers to its pictures as a stream
-holds the camera's own odometry.
+"""Estimate the poses of a session of a single camera without poses.
 
-The map gives a stretch of odometry (`slam/single_camera.py`) its metres and its place; the odometry
-carries the poses into what the map does not know, and answers that contradict it count for nothing.
-A stretch that too few answers hold has no odometry: of its frames those have a pose whose answers
-agree with one another under it. Where there is no odometry at all, the map is believed as a stream.
+The images are localized as a stream, and visual odometry runs on the same images
+(`slam/monocular_odometry.py`). The localizations give each odometry stretch its scale and its
+place. Odometry carries the poses into areas that the map does not cover. Localizations that
+contradict the odometry are ignored. If too few localizations support a stretch, its odometry is not
+used. Frames of such a stretch have a pose only if their localizations agree with each other. The
+stream's poses are used for frames without any odometry.
 """
 
 from __future__ import annotations
@@ -45,12 +46,14 @@ def estimate_poses_by_map(
     config: SessionPosesConfig,
     progress: Progress,
 ) -> SessionPoses:
-    """Of a session without poses. Frames so far apart as nodes are the answers.
+    """Estimate the poses of a session without poses by localizing each of its images.
+
+    The result's `answers` hold frames about as far apart as nodes.
 
     Raises:
         TrajectoryError: the map recognises too little of it.
-        CalibrationError: it has none, or the pictures contradict it.
-        UnreadableImageError, QueryError: from its pictures.
+        CalibrationError: a frame has no calibration, or the images contradict it.
+        UnreadableImageError, QueryError: an image cannot be read or localized.
     """
     by_map, localized, results = (
         dict[int, Rigid3](),
@@ -94,23 +97,23 @@ def estimate_poses_by_map(
     ]
     for stretch in odometry.submaps:
         odom = stretch.submap_from_cams()
-        held, inlier_idx = align_stretch_to_map(sequence.name, odom, localized, d_thresh, config)
-        if held is not None:
+        aligned, inlier_idx = align_stretch_to_map(sequence.name, odom, localized, d_thresh, config)
+        if aligned is not None:
             anchors = {index: localized[index] for index in inlier_idx}
             adjusted = adjust_trajectory(
-                stretch, held, anchors, config.points_widened, config.adjustment
+                stretch, aligned, anchors, config.points_widened, config.adjustment
             )
             corrected = correct_trajectory(adjusted, anchors, d_thresh, config.bend)
-            held, inlier_idx = _reject_contradicted(
+            aligned, inlier_idx = _reject_contradicted(
                 corrected, localized, inlier_idx, d_thresh, config
             )
         for index in odom:
             answer = localized[index] if index in inlier_idx else localized.pop(index, None)
-            if held is None:
+            if aligned is None:
                 poses[index] = by_map[index] if index in inlier_idx and index in clear else None
             else:
                 poses[index] = _pose_if_consistent(
-                    held[index] if index < len(held) else None, answer, d_thresh, config
+                    aligned[index] if index < len(aligned) else None, answer, d_thresh, config
                 )
     known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
     if not known:
@@ -128,7 +131,8 @@ def estimate_poses_by_map(
 
 
 def _failure_reason(localized: Mapping[int, Localization]) -> str:
-    """Why no frame has a pose, of the answers that agree with the motion."""
+    """Return the reason why no frame has a pose. `localized` holds the localizations that agree
+    with the motion."""
     if not localized:
         return "what the map answers to its pictures does not agree with their motion"
     known_to = float(np.median([answer.position_sigma_m for answer in localized.values()]))
@@ -145,17 +149,19 @@ def align_stretch_to_map(
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
-    """A stretch of odometry in the map's world, world_from_cam by frame, None where too few answers
-    hold it; and the frames of the answers that agree with it. Frames of which the map and the
-    motion say different things, and either may be right, have no pose."""
+    """Align a stretch of odometry with the map.
+
+    Returns:
+        world_from_cam by frame, and the frames of the localizations that agree with it. The poses
+        are None if too few localizations support the stretch. A single pose is None if map and
+        motion contradict each other there.
+    """
     within_stretch = {index: answer for index, answer in localized.items() if index in odom}
     inlier_idx = find_largest_consensus(
         odom, within_stretch, config.slack * d_thresh, config.slack_deg, config.scale
     )
-    held = None
-    for _ in range(
-        _NUM_REFITS
-    ):  # what agrees but for the drift of the unit agrees once that is known
+    aligned = None
+    for _ in range(_NUM_REFITS):  # each refit uses the inliers found with the previous scale
         metric = (
             scale_to_metres(
                 odom, {index: within_stretch[index] for index in inlier_idx}, config.scale
@@ -167,15 +173,17 @@ def align_stretch_to_map(
         if len(within) < config.min_agreeing:
             return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config)
         try:
-            held = align_motion_to_map(
+            aligned = align_motion_to_map(
                 name, metric, within, d_thresh, config, NoiseScale()
-            )  # the unit's drift is no random walk
+            )  # fixed noise scales: the drift of the scale is not a random walk
         except TrajectoryError:
             return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config)
-        inlier_idx = held.inlier_idx
-    if held is None or not _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config):
+        inlier_idx = aligned.inlier_idx
+    if aligned is None or not _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config):
         return None, []
-    return _reject_contradicted(held.world_from_cams, within_stretch, inlier_idx, d_thresh, config)
+    return _reject_contradicted(
+        aligned.world_from_cams, within_stretch, inlier_idx, d_thresh, config
+    )
 
 
 def _reject_ambiguous(
@@ -185,9 +193,8 @@ def _reject_ambiguous(
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> list[int]:
-    """The agreeing answers, or none of them where others agree with one another about another way:
-    a place that looks like itself from the other end is answered wrongly for as long as it is in
-    view."""
+    """Return the agreeing localizations, or none if a large rival set agrees on another trajectory.
+    A place that looks like another one is localized wrongly for as long as it is in view."""
     rest = {index: answer for index, answer in within_stretch.items() if index not in inlier_idx}
     rivals = find_largest_consensus(
         odom, rest, config.slack * d_thresh, config.slack_deg, config.scale
@@ -206,9 +213,8 @@ def _reject_contradicted(
     d_thresh: float,
     config: SessionPosesConfig,
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
-    """The poses and the agreeing answers without those of which the map and the motion say
-    different things, and either may be right; no poses where too few answers are left to hold
-    them."""
+    """Remove poses and localizations of frames for which map and motion contradict each other.
+    Return None for the poses if too few localizations are left."""
     within_stretch = {
         index: answer
         for index, answer in localized.items()
@@ -228,8 +234,8 @@ def _reject_contradicted(
 def _pose_if_consistent(
     pose: Rigid3 | None, answer: Localization | None, d_thresh: float, config: SessionPosesConfig
 ) -> Rigid3 | None:
-    """The pose, unless the map says another one: a node there would contradict those that say
-    so."""
+    """Return the pose, or None if the localization differs from it. A node there would contradict
+    the map's nodes."""
     if pose is None or answer is None:
         return pose
     apart = answer.world_from_cam.inverse() @ pose
@@ -249,9 +255,13 @@ def _contradicts(
 
 
 def _find_contradicted_frames(answered: list[int], apart: Set[int]) -> set[int]:
-    """The frames of several answers in a row that contradict the motion, or of a single one with
-    none before it, or none after it, that holds the motion; and a few around them, but for those
-    beyond an answer that does. Between two that hold it the motion is right."""
+    """Return the frames around contradictions between the map and the motion.
+
+    A contradiction is a run of several contradicting localizations, or a single one at either end
+    of the stretch. A few frames around it are included, up to the next consistent localization. A
+    single contradiction between two consistent localizations is ignored, because the motion is
+    right there.
+    """
     frames = set[int]()
     runs = [
         (is_apart, list(run)) for is_apart, run in groupby(answered, lambda index: index in apart)

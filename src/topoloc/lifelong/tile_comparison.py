@@ -1,13 +1,13 @@
-"""Do two maps overlap, and how do they lie to each other? Read from `compare_tiles`.
+"""Determine if two maps overlap, and the transform between them. Start reading at `compare_tiles`.
 
-Maps of overlapping pieces of one recording have pictures in common, which say it at once
-(`shared_images.py`). Of all others, nodes of either are asked of the other as pictures would be,
-those that look most alike first. Each answer says how the maps lie to each other; what enough of
-them agree on, from pictures of which none counts twice, is taken for true
-(`transform_consensus.py`) if it stands a test: of the nodes that then stand about where one of the
-other map stands, nearly all must be recognised there, and nearly all that they match before a pose
-is known must agree with it. Two corridors of one plan agree by the centimetre on what they share;
-but what one of them has and the other has not is matched with something else.
+Maps of overlapping parts of one recording share images, which give the transform at once
+(`shared_images.py`). Otherwise nodes of each map are localized in the other one, the most similar
+ones first. Each localization gives an estimate of the transform. A consensus needs enough agreeing
+estimates from independent images (`transform_consensus.py`). It must then pass a test on nodes that
+would stand near a node of the other map. Nearly all of them must be localized at their expected
+pose. Nearly all of their matches before guided search must agree with that pose. The test separates
+corridors of the same plan: their shared parts agree to centimetres, but the parts that differ match
+something else.
 """
 
 from __future__ import annotations
@@ -41,81 +41,84 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 @dataclass(frozen=True)
 class TileJoinConfig:
-    """Which tiles are compared, and what joins them."""
+    """Configure which tiles are compared and which comparisons lead to a join."""
 
     num_neighbours: Annotated[int, Between(1, 1000)] = 6
-    """Other tiles, those that look most alike, that a tile is compared with."""
+    """Number of most similar other tiles that each tile is compared with."""
     max_pairs: Annotated[int, Between(0, 1_000_000)] = 10_000
-    """Pairs of tiles that are compared at most, the most alike first."""
+    """Maximum number of pairs of tiles to compare. The most similar pairs come first."""
     min_likeness: Annotated[float, Between(-1, 1)] = 0.35
-    """Tiles whose most similar places (the median of the best few) are less like each other than
-    this are not compared."""
+    """Minimum similarity of two tiles: the median over their few most similar places. Less similar
+    tiles are not compared."""
     num_probed: Annotated[int, Between(1, 1000)] = 8
-    """Nodes of either tile that are asked of the other first; where it recognises none, no further
-    ones are asked."""
+    """Number of nodes of each tile that are localized in the other one first. The comparison ends
+    if none is localized."""
     num_asked: Annotated[int, Between(1, 10_000)] = 32
-    """Nodes of either tile that are asked of the other at most."""
+    """Maximum number of nodes of each tile that are localized in the other one in each step."""
     consensus: ConsensusConfig = field(
         default_factory=lambda: ConsensusConfig(min_independent=3, rival_share=0.34)
     )
     along: DriftConfig = field(default_factory=lambda: DriftConfig(0.01, 0.1))
-    """How wrong the way between two nodes of a tile may be."""
+    """Drift of the poses between two nodes of a tile."""
     widened: Annotated[float, Above(0)] = 3.0
-    """Answers are trusted as if their sigmas were so many times as large: neighbours share errors
-    of the map."""
+    """Factor applied to the sigmas of the localizations, because neighbours share errors of the
+    map."""
     sigma: Annotated[float, Above(0)] = 0.01
-    """Metres by which an answer may be wrong (one sigma), besides, ..."""
+    """Additional position sigma of a localization, in metres."""
     sigma_deg: Annotated[float, Above(0)] = 0.2
-    """... and degrees."""
+    """Additional rotation sigma of a localization, in degrees."""
     near: Annotated[float, Above(0)] = 3.0
-    """A node that stands so many D_thresh (distance of Eq. 1) from one of the other tile, or
-    nearer, must be recognised."""
+    """A node must be localized if it is within this many D_thresh (distance of Eq. 1) of a node of
+    the other tile."""
     min_near: Annotated[int, AtLeast(1)] = 12
-    """Such nodes there must be, of both tiles together; ..."""
+    """Minimum number of such nodes, of both tiles together."""
     min_recognised: Annotated[float, Between(0, 1)] = 0.9
-    """... this share of them must be recognised where the join has them, ..."""
+    """Minimum share of these nodes that are localized at their expected pose."""
     min_agreeing: Annotated[float, Between(0, 1)] = 0.75
-    """... and of three in four of them this share of the matches that no pose guided must agree
-    with the pose: another place of the same plan matches as many, but what differs is matched with
-    something else."""
+    """Minimum share of unguided matches that agree with the pose, in three quarters of these nodes.
+    Another place of the same plan may match as often, but its different parts match something
+    else."""
 
 
 @dataclass(frozen=True, eq=False)
 class OpenTile:
-    """A tile whose map is open, and the place vectors of its nodes."""
+    """Hold a tile with its open map and the global descriptors of its nodes."""
 
     localizer: Localizer
     vectors: GlobalDescriptors
 
     @property
     def topomap(self) -> TopoMetricMap:
+        """Return the tile's map."""
         return self.localizer.topomap
 
     @cached_property
     def poses(self) -> NodePoses:
+        """Return the poses of the tile's nodes."""
         return NodePoses.of([summary.world_from_cam for summary in self.topomap.summaries])
 
     @property
     def apart(self) -> tuple[float, float]:
-        """D_thresh and lambda of Eq. 1."""
+        """Return D_thresh (metres) and lambda (metres per radian) of Eq. 1."""
         nodes = self.topomap.config.nodes
         assert nodes.d_thresh is not None, "a map's own configuration is resolved"
         assert nodes.lambda_rot is not None, "a map's own configuration is resolved"
         return nodes.d_thresh, nodes.lambda_rot
 
     def world_from_node(self, row: int) -> Rigid3:
+        """Return the pose of the node of a row."""
         return self.topomap.summaries[row].world_from_cam
 
 
 @dataclass(frozen=True, eq=False)
 class TileTransform:
-    """How two maps lie to each other; the covariance is that of the left perturbation of
-    `first_from_second` (m, rad).
+    """Hold the transform between two maps and the evidence for it.
 
-    `num_agreeing` pictures say so: the same ones of both maps (`is_from_shared_images`), or nodes
-    of either that are recognised in the other. Of these, `num_near` must be recognised and
-    `num_recognised` are; in three in four of them at least the share `agreeing` of the matches
-    agrees with the pose.
+    The covariance belongs to the left perturbation of `first_from_second` (m, rad). `num_agreeing`
+    images support the transform. They are images of both maps (`is_from_shared_images`), or nodes
+    of one map localized in the other. `num_near` nodes should be localized, and `num_recognised` of
+    them are. In three quarters of these nodes, at least the share `agreeing` of the matches agrees
+    with the pose.
     """
 
     first_from_second: Rigid3
@@ -129,15 +132,15 @@ class TileTransform:
 
 @dataclass(frozen=True)
 class NotJoined:
-    """Why two tiles are not joined, in a few words."""
+    """Hold the reason why two tiles are not joined."""
 
     reason: str
 
 
 @dataclass(frozen=True, eq=False)
 class _Answer:
-    """Node `queried` of one map as the other one places it, which recognises its node `by` in
-    it."""
+    """Hold the localization of node `queried` of one map in the other map, whose nearest match is
+    node `matched_row`."""
 
     queried: int
     matched_row: int
@@ -147,12 +150,13 @@ class _Answer:
 def compare_tiles(
     first: OpenTile, second: OpenTile, config: TileJoinConfig
 ) -> TileTransform | NotJoined:
-    """How the second map lies to the first, if they overlap and that is beyond doubt.
+    """Return the transform from the second map to the first, if they overlap and the evidence is
+    sufficient.
 
     Raises:
         MapError: a map cannot be read.
-        FeatureKindError, MissingExtraError, WeightsError: the maps' features cannot be compared
-            here.
+        FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
+            this machine.
     """
     shared = estimate_by_shared_images(
         first.topomap, second.topomap, config.along, config.consensus
@@ -169,17 +173,18 @@ def compare_tiles(
 
 
 class _Comparison:
-    """Two tiles, and what each has answered so far to the other's nodes, by their rows; None where
-    it does not know the place."""
+    """Hold two tiles and the localizations so far of each tile's nodes in the other, by row. None
+    if a node is not localized."""
 
     def __init__(self, first: OpenTile, second: OpenTile, config: TileJoinConfig) -> None:
         self._tiles, self._config = (first, second), config
         self._answers: tuple[dict[int, Localization | None], ...] = (
             {},
             {},
-        )  # of the first to the second's nodes, of the second
+        )  # nodes of the second tile in the first, and nodes of the first in the second
 
     def verdict(self) -> TileTransform | NotJoined:
+        """Compare the tiles and return the transform, or the reason for no join."""
         config = self._config
         orders = self._rank_nodes_by_similarity()
         self._localize_nodes([order[: config.num_probed] for order in orders])
@@ -228,16 +233,16 @@ class _Comparison:
         return found
 
     def _rank_nodes_by_similarity(self) -> list[list[int]]:
-        """The nodes of the second tile, and of the first, by how alike the other's most similar
-        place looks."""
+        """Return the rows of the second tile's nodes, and of the first's, by similarity to the
+        other tile's most similar node."""
         first, second = (tile.vectors for tile in self._tiles)
         kind = [kind for kind in first if kind in second][-1]
         alike = first[kind] @ second[kind].T
         return [np.argsort(-alike.max(axis=side), kind="stable").tolist() for side in (0, 1)]
 
     def _localize_nodes(self, rows: Sequence[Sequence[int]]) -> None:
-        """Nodes of the second tile of the first, and nodes of the first of the second, where these
-        were not asked before."""
+        """Localize nodes of the second tile in the first, and nodes of the first in the second, if
+        not done before."""
         for queried, of, known, wanted in zip(
             self._tiles, self._tiles[::-1], self._answers, rows, strict=True
         ):
@@ -249,8 +254,8 @@ class _Comparison:
                 )
 
     def _localized_nodes(self) -> list[list[_Answer]]:
-        """The answers that have a pose, of the first tile and of the second; an empty list where
-        neither has any."""
+        """Return the successful localizations in the first tile and in the second. Return an empty
+        list if there is none."""
         found = [
             [
                 _Answer(row, queried.topomap.row_of(result.node_id), result)
@@ -262,7 +267,7 @@ class _Comparison:
         return found if any(found) else []
 
     def _find_consensus(self) -> tuple[TransformConsensus, tuple[int, int]] | NotJoined:
-        """How two nodes, one of either tile, lie to each other, and which these are."""
+        """Return the transform between two nodes, one of each tile, and the rows of these nodes."""
         by_first, by_second = self._localized_nodes()
         answers = [*by_first, *by_second]
         pairs = [(one.matched_row, one.queried) for one in by_first] + [
@@ -288,7 +293,8 @@ class _Comparison:
     def _estimate_transform(
         self, one: _Answer, ends: tuple[int, int], is_from_second: bool
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-        """How the nodes `ends` lie to each other as an answer has it: first_from_second."""
+        """Return the transform between the nodes `ends` according to one localization:
+        first_from_second."""
         config, (first, second) = self._config, self._tiles
         matched_row = second if is_from_second else first
         node_from_world = matched_row.world_from_node(one.matched_row).inverse()
@@ -310,8 +316,8 @@ class _Comparison:
         return propagate_estimate(to_first, by_from_asked, covariance, from_second, config.along)
 
     def _find_nearby_nodes(self, first_from_second: Rigid3) -> list[list[int]]:
-        """Nodes of the second tile, and of the first, that the join has near one of the other, at
-        most `num_asked` each, evenly."""
+        """Return nodes of the second tile, and of the first, that the transform puts near a node of
+        the other. At most `num_asked` of each tile are chosen, evenly spaced."""
         rows = []
         for queried, of, pose in zip(
             self._tiles,
@@ -336,8 +342,8 @@ class _Comparison:
     def _verify(
         self, first_from_second: Rigid3, near: Sequence[Sequence[int]]
     ) -> tuple[int, int, float]:
-        """How many nodes must be recognised, how many are, and what share of the matches agrees
-        with their pose in three in four of all."""
+        """Return the number of tested nodes, the number localized at their expected pose, and the
+        lower quartile of the share of agreeing matches."""
         num_at_pose, shares = 0, list[float]()
         poses = (first_from_second, first_from_second.inverse())
         for queried, of, known, rows, pose in zip(
@@ -364,6 +370,6 @@ def _is_at_pose(result: Localization | None, world_from_cam: Rigid3, d_thresh: f
 
 
 def _unguided_inlier_ratio(result: Localization | None) -> float:
-    """Of the matches that no pose guided, those that agree with the pose."""
+    """Return the share of unguided matches that agree with the pose."""
     evidence = None if result is None else result.evidence
     return 0.0 if evidence is None else evidence.num_inliers / max(evidence.num_matches, 1)

@@ -1,4 +1,5 @@
-"""A tile's map is edited as any map file is, and put back where nobody was faster."""
+"""Edit the map of an atlas tile as a map file, and store the result if no other writer was
+faster."""
 
 from __future__ import annotations
 
@@ -20,18 +21,22 @@ T = TypeVar("T")
 
 
 def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Tile, T]:
-    """The tile with its map edited, in the same world and with the same joins, and what the edit
-    says.
+    """Edit the map of a tile. The tile keeps its world and its joins.
 
     Args:
-        edit: edits the map file at a path, a copy, as `map/edit.py` does; the undo file beside it
-            is kept with the tile. It is called again where another writer replaced the tile
-            meanwhile.
+        where: the atlas.
+        tile_id: the tile.
+        edit: a function that edits the map file at a path, as `mapping/edit.py` does. It receives a
+            copy. The undo file beside the copy is stored with the tile. It is called again if
+            another writer replaced the tile in the meantime.
+
+    Returns:
+        The tile after the edit, and the return value of `edit`.
 
     Raises:
-        AtlasError: there is no such atlas or tile, it cannot be read or written, or others replaced
-            it again and again.
-        TopolocError: as of `edit`; the atlas is as it was.
+        AtlasError: there is no such atlas or tile, it cannot be read or written, or other writers
+            replaced the tile in each of five tries.
+        TopolocError: raised by `edit`. The atlas stays unchanged.
     """
     for _ in range(_MAX_TRIES):
         atlas = Atlas.open(where)
@@ -54,7 +59,7 @@ def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Tile
 
 
 def _edit_with_tile_name(edit: Callable[[Path], T], path: Path, name: str) -> T:
-    """What the edit says; its failures name the tile and not the copy."""
+    """Call `edit` and return its result. Its errors name the tile instead of the copy."""
     try:
         return edit(path)
     except TopolocError as error:

@@ -1,8 +1,8 @@
-"""The tiles of an atlas that overlap are joined: read from `join_tiles`.
+"""Join the overlapping tiles of an atlas. Start reading at `join_tiles`.
 
-Only tiles whose places look alike are compared, by the atlas's index over the places of all; each
-pair as `tile_comparison.py` says. What is found is committed at once, so that whoever is called
-again goes on. The manifest adjusts all joins together (`atlas/joint_worlds.py`).
+Only tiles with similar places are compared, according to the atlas's index of global descriptors.
+`tile_comparison.py` compares each pair. Each join is committed at once, so an interrupted run can
+continue. The manifest adjusts all joins together (`atlas/joint_worlds.py`).
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ OnCompared = Callable[["PairResult"], None]
 
 @dataclass(frozen=True)
 class NotCompared(NotJoined):
-    """Why nothing is known of two tiles: whoever compared them ended in the middle."""
+    """Hold the reason why a comparison of two tiles did not finish."""
 
 
 @dataclass(frozen=True)
 class PairResult:
-    """Two tiles, and what was found of them."""
+    """Hold the ids of two tiles and the result of comparing them."""
 
     first: str
     second: str
@@ -53,7 +53,7 @@ class PairResult:
 
 @dataclass(frozen=True, eq=False)
 class TileJoiningResult:
-    """The atlas as it is afterwards, and what was tried."""
+    """Hold the manifest of the atlas after joining, and the results of all pairs."""
 
     manifest: Manifest
     pair_results: list[PairResult]
@@ -66,17 +66,20 @@ def join_tiles(
     on_compared: OnCompared | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
 ) -> TileJoiningResult:
-    """Tiles that overlap joined, those of them that no join connects directly yet.
+    """Join overlapping tiles that have no direct join yet.
 
     Args:
-        tile_ids: only pairs with one of these; none: all.
-        tell: is told of each pair that was compared.
-        pairs: just these are compared, by the ids of the tiles; None: those that look alike.
+        where: the atlas.
+        tile_ids: compare only pairs with one of these tiles. Empty means all tiles.
+        config: the settings. Defaults to `TileJoinConfig()`.
+        on_compared: is called with the result of each pair.
+        pairs: compare exactly these pairs of tile ids. None means pairs of similar tiles.
 
     Raises:
         ConfigError: a setting is out of its bounds.
-        AtlasError: no atlas is there, it has no such tile, or it cannot be written.
-        FeatureKindError, MissingExtraError, WeightsError: maps' features cannot be compared here.
+        AtlasError: there is no such atlas or tile, or the atlas cannot be written.
+        FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
+            this machine.
     """
     config, atlas = config or TileJoinConfig(), Atlas.open(where)
     maps, pair_results = MapCache([], Localizer, _MAX_BYTES), list[PairResult]()
@@ -96,16 +99,16 @@ def select_tile_pairs(
     config: TileJoinConfig | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
 ) -> list[tuple[str, str]]:
-    """The ids of the tiles that `join_tiles` compares, in its order. Raises ConfigError, AtlasError
-    as that does."""
+    """Return the ids of the tiles that `join_tiles` compares, in its order. Raises ConfigError and
+    AtlasError as `join_tiles`."""
     found = _select_pairs(Atlas.open(where), tile_ids, config or TileJoinConfig(), pairs)
     return [(first.tile_id, second.tile_id) for first, second in found]
 
 
 @dataclass(frozen=True)
 class PairJob:
-    """Two tiles of the atlas at `where`, which are compared, and joined if they overlap, by whoever
-    runs it: a job of a cluster."""
+    """Compare two tiles of the atlas at `where` and join them if they overlap, as a job of a
+    cluster."""
 
     where: str
     first: str
@@ -114,10 +117,12 @@ class PairJob:
 
     @property
     def name(self) -> str:
+        """Return the name of the job."""
         return f"join {self.first} {self.second}"
 
     def run(self, progress: Progress) -> PairResult:
-        """Raises as `join_tiles`; AtlasError also where a tile is gone."""
+        """Compare and join the tiles. Raises as `join_tiles`, and AtlasError if a tile does not
+        exist any more."""
         maps = MapCache([], Localizer, _MAX_BYTES)
         try:
             atlas = Atlas.open(self.where)
@@ -128,6 +133,7 @@ class PairJob:
             maps.close()
 
     def failure_outcome(self, reason: str) -> PairResult:
+        """Return the result of a job that did not finish."""
         return PairResult(self.first, self.second, NotCompared(reason))
 
 
@@ -149,7 +155,7 @@ def _select_pairs(
 def _join_pair(
     atlas: Atlas, maps: MapCache, pair: tuple[Tile, Tile], config: TileJoinConfig
 ) -> PairResult:
-    """What is found of a pair; it stands in the manifest then."""
+    """Compare a pair of tiles and return the result. A join is added to the manifest."""
     first, second = pair
     try:
         found = _compare_pair(atlas, maps, first, second, config)
@@ -181,7 +187,7 @@ def _compare_pair(
 
 
 def _find_unjoined_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list[tuple[Tile, Tile]]:
-    """Those of the pairs, in the order of their ids, that are not joined yet."""
+    """Return the given pairs that are not joined yet, each in the order of its ids."""
     ordered = [(min(pair), max(pair)) for pair in pairs]
     known = {join.pair for join in atlas.manifest.joins}
     return [
@@ -194,8 +200,11 @@ def _find_unjoined_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list
 def find_candidate_pairs(
     atlas: Atlas, wanted: Collection[str], config: TileJoinConfig
 ) -> list[tuple[Tile, Tile]]:
-    """Pairs of tiles in the order of their ids that may overlap, the most alike first: of worlds of
-    their own, not joined yet, not known to lie far apart; their most similar places look alike."""
+    """Return pairs of tiles that may overlap, the most similar first, each in the order of its ids.
+
+    The tiles of a pair are in different worlds, have no join yet and are not known to be far apart.
+    Their most similar places have at least `min_likeness`.
+    """
     manifest, index = atlas.manifest, atlas.index
     scores = dict[tuple[str, str], float]()
     known = {join.pair for join in manifest.joins}
@@ -218,7 +227,7 @@ def find_candidate_pairs(
 def _find_similar_tiles(
     atlas: Atlas, tile: Tile, candidate_ids: Sequence[str], config: TileJoinConfig
 ) -> Iterator[tuple[str, float]]:
-    """The tiles that look most like a tile, with how much: the median of the most similar
+    """Yield the most similar tiles with their similarity: the median over the most similar
     places."""
     places, found = atlas.places_of(tile), dict[str, list[float]]()
     kind = next((kind for kind in tile.kinds if kind in places), next(iter(places)))
@@ -240,7 +249,7 @@ def _find_similar_tiles(
 
 
 def _may_overlap(tile: Tile, other: Tile) -> bool:
-    """Are these of two worlds that are not known to lie far from each other?"""
+    """Return whether two tiles are in different worlds and not known to be far apart."""
     if tile.world == other.world:
         return False
     world_from_other = tile.from_world_of(other)

@@ -1,5 +1,4 @@
-"""Which tile of an atlas is a recording of? A sample of its pictures is asked of the atlas; what
-most answers name takes it, clearly or not at all."""
+"""Find the tile of an atlas that a recording belongs to, by localizing a sample of its images."""
 
 from __future__ import annotations
 
@@ -21,14 +20,14 @@ from topoloc.recordings.frame import StereoSequence
 
 @dataclass(frozen=True)
 class TileSelectionConfig:
-    """When a recording is of a tile."""
+    """Configure when a recording is assigned to a tile."""
 
     num_asked: Annotated[int, Between(1, 10_000)] = 12
-    """Pictures of the recording, evenly chosen, that are asked of the atlas."""
+    """Number of images of the recording, evenly spaced, that are localized in the atlas."""
     min_answers: Annotated[int, Between(1, 10_000)] = 3
-    """So many of them at least must be localized in the tile, ..."""
+    """Minimum number of images localized in the tile."""
     min_share: Annotated[float, Between(0.5, 1)] = 0.67
-    """... and this share of those that are localized in it, or in tiles of one world with it."""
+    """Minimum share of the localized images that are in the tile or in tiles of the same world."""
 
 
 def find_tile_of_recording(
@@ -37,13 +36,12 @@ def find_tile_of_recording(
     config: TileSelectionConfig,
     progress: Progress,
 ) -> Tile:
-    """The tile that a recording's pictures are of: of several of one world the one in which most of
-    them are localized.
+    """Return the tile in which most sampled images of a recording are localized.
 
     Raises:
         ConfigError: a setting is out of its bounds.
-        TrajectoryError: too few of them are localized, or in tiles of several worlds.
-        UnreadableImageError, QueryError, AtlasError: as of `AtlasLocalizer.localize`.
+        TrajectoryError: too few images are localized, or they are in tiles of several worlds.
+        UnreadableImageError, QueryError, AtlasError: raised by `AtlasLocalizer.localize`.
     """
     check_bounds(config)
     rows = np.unique(
@@ -68,8 +66,18 @@ def select_tile(
     tiles: Mapping[str, Tile],
     config: TileSelectionConfig,
 ) -> Tile:
-    """The tile that these answers of so many pictures of the recording `name` speak for. Raises
-    TrajectoryError."""
+    """Return the tile with the most localizations.
+
+    Args:
+        name: the recording's name, for error messages.
+        num_asked: the number of sampled images.
+        answers: the localizations of the sampled images.
+        tiles: the tiles by id.
+        config: the settings.
+
+    Raises:
+        TrajectoryError: no tile has enough localizations, or they are in tiles of several worlds.
+    """
     counts = Counter(
         answer.provenance.tile for answer in answers if answer.provenance.tile is not None
     )
@@ -92,7 +100,7 @@ def select_tile(
 
 
 def _format_counts(counts: Counter[str]) -> str:
-    """How many pictures each tile knows, the most first."""
+    """Format the number of localized images per tile, the largest first."""
     return (
         ", ".join(f"{tile_id} knows {number}" for tile_id, number in counts.most_common(4))
         or "none knows any"

@@ -1,9 +1,8 @@
-"""A single camera's walk adjusted as a whole: all that its key frames see, and what the map
-answers, brought to agree.
+"""Adjust the whole trajectory of a single camera to its tracked points and the map's localizations.
 
-Odometry adjusts the last key frames alone, and a pose graph afterwards knows the steps alone:
-neither uses that all answers together say how long the whole walk is. Here each landmark and each
-key frame moves, and the map's answers hold them by their covariances.
+Odometry adjusts only the latest key frames, and a pose graph uses only the steps. Neither uses the
+scale information that all localizations contain together. This adjustment moves all landmarks and
+key frames. The localizations constrain them with their covariances.
 """
 
 from __future__ import annotations
@@ -25,29 +24,32 @@ _NUM_NEIGHBOURS = 3
 
 def adjust_trajectory(
     stretch: MonocularSubmap,
-    held: Sequence[Rigid3 | None],
+    world_from_cams: Sequence[Rigid3 | None],
     anchors: Mapping[int, Localization],
     points_widened: float,
     config: BundleConfig,
 ) -> list[Rigid3 | None]:
-    """world_from_cam of the frames, better than `held`, which has them in the map's world and
-    metres; None stays None.
+    """Return the adjusted world_from_cam of each frame. None stays None.
 
-    The stretch's own key frames and landmarks move along: they are in the map's world afterwards.
+    The stretch's key frames and landmarks change, too. Afterwards they are in the map's world, in
+    metres.
 
     Args:
-        anchors: the map's answers that are believed, by frame.
-        points_widened: how many times as large the sigmas of followed points are as odometry took
-            them for.
+        stretch: the odometry of the trajectory.
+        world_from_cams: the initial poses of the frames, in the map's world and metres.
+        anchors: the trusted localizations, by frame.
+        points_widened: the factor by which the sigmas of tracked points are larger than in
+            odometry.
+        config: the settings of the bundle adjustment.
     """
-    keyframes = _transform_to_map(stretch, held)
+    keyframes = _transform_to_map(stretch, world_from_cams)
     moved = set(map(id, keyframes))
     frames = {
         f.frame_idx: f
         for f in stretch.frames
-        if id(f.keyframe) in moved and _has_pose(held, f.frame_idx)
+        if id(f.keyframe) in moved and _has_pose(world_from_cams, f.frame_idx)
     }
-    relative = {index: _relative_pose(frame, held) for index, frame in frames.items()}
+    relative = {index: _relative_pose(frame, world_from_cams) for index, frame in frames.items()}
     for keyframe in keyframes:
         keyframe.observations.weights /= points_widened
     map_anchors = [
@@ -56,7 +58,7 @@ def adjust_trajectory(
         if index in anchors
     ]
     adjust_bundle(keyframes, [], stretch.landmarks, config, map_anchors)
-    adjusted = list(held)
+    adjusted = list(world_from_cams)
     for index, frame in frames.items():
         adjusted[index] = (
             relative[index] @ frame.keyframe.cam_from_world
@@ -64,13 +66,13 @@ def adjust_trajectory(
     return adjusted
 
 
-def _has_pose(held: Sequence[Rigid3 | None], index: int) -> bool:
-    return index < len(held) and held[index] is not None
+def _has_pose(world_from_cams: Sequence[Rigid3 | None], index: int) -> bool:
+    return index < len(world_from_cams) and world_from_cams[index] is not None
 
 
-def _relative_pose(frame: FramePose, held: Sequence[Rigid3 | None]) -> Rigid3:
-    """cam_from_keyframe of a frame, in metres."""
-    pose = held[frame.frame_idx]
+def _relative_pose(frame: FramePose, world_from_cams: Sequence[Rigid3 | None]) -> Rigid3:
+    """Return cam_from_keyframe of a frame, in metres."""
+    pose = world_from_cams[frame.frame_idx]
     assert pose is not None
     return frame.view_from_cam @ pose.inverse() @ frame.keyframe.cam_from_world.inverse()
 
@@ -78,7 +80,7 @@ def _relative_pose(frame: FramePose, held: Sequence[Rigid3 | None]) -> Rigid3:
 def _keyframe_anchor(
     cam_from_keyframe: Rigid3, frame: FramePose, answer: Localization
 ) -> PosePrior:
-    """What an answer to a frame says of its key frame."""
+    """Return the pose prior on a frame's key frame that follows from the frame's localization."""
     keyframe_from_cam = cam_from_keyframe.inverse() @ frame.view_from_cam
     information = np.linalg.inv(inverse_covariance(answer.world_from_cam, answer.covariance))
     turned = keyframe_from_cam.inverse().adjoint()
@@ -89,18 +91,22 @@ def _keyframe_anchor(
     )
 
 
-def _transform_to_map(stretch: MonocularSubmap, held: Sequence[Rigid3 | None]) -> list[KeyFrame]:
-    """Bring the key frames whose pose is known, and the landmarks that they see, into the map's
-    world and metres; these key frames."""
+def _transform_to_map(
+    stretch: MonocularSubmap, world_from_cams: Sequence[Rigid3 | None]
+) -> list[KeyFrame]:
+    """Move the key frames with a known pose, and their landmarks, into the map's world and metres.
+    Return these key frames."""
     views = {f.frame_idx: f.view_from_cam for f in stretch.frames}
     keyframes = [
-        k for k in stretch.keyframes if _has_pose(held, k.frame_idx) and k.frame_idx in views
+        k
+        for k in stretch.keyframes
+        if _has_pose(world_from_cams, k.frame_idx) and k.frame_idx in views
     ]
     before = [k.cam_from_world for k in keyframes]
     after = [
         views[k.frame_idx] @ pose.inverse()
         for k in keyframes
-        if (pose := held[k.frame_idx]) is not None
+        if (pose := world_from_cams[k.frame_idx]) is not None
     ]
     moved = np.zeros(stretch.landmarks.num, np.bool_)
     for keyframe, old, new, metres in zip(
@@ -117,8 +123,8 @@ def _transform_to_map(stretch: MonocularSubmap, held: Sequence[Rigid3 | None]) -
 
 
 def _metres_per_unit(before: Sequence[Rigid3], after: Sequence[Rigid3]) -> Float[np.ndarray, " k"]:
-    """What a unit of the motion is in metres at each key frame, by the way to the ones around
-    it."""
+    """Return the scale of the motion at each key frame, in metres per unit, by the path length
+    between its neighbours."""
     path_lengths = [
         compute_path_lengths(
             np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3)

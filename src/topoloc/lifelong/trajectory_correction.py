@@ -1,13 +1,11 @@
-"""A walk drawn to what the map answers: where the map knows the place, the poses of new nodes must
-be those that it would answer itself.
+"""Correct a trajectory towards the map's localizations.
 
-However a single camera's key frames and the map's answers are adjusted together, thousands of
-followed points hold a walk that is bent (by a calibration that is not quite the camera's own, or by
-points that slide) against a hundred answers. What is left between walk and answers is alike for a
-while along the way, and what the answers have in common with the rest of the map is no error: nodes
-side by side that disagree are worse than ones that are wrong together. So the walk takes over what
-the answers around each of them say, the stray ones among them left out. Beyond the first and the
-last answer it keeps its own shape.
+A bundle adjustment balances a hundred localizations against thousands of tracked points. So a bent
+trajectory stays bent, for example after a slightly wrong calibration or with sliding points. The
+remaining difference changes slowly along the trajectory. New nodes must agree with the map's nodes
+beside them, even if both share an error. So the trajectory takes over the smoothed difference of
+the localizations around each position. Outliers are down-weighted. The correction decays before the
+first localization and after the last.
 """
 
 from __future__ import annotations
@@ -30,21 +28,21 @@ _NUM_ITERATIONS, _MAX_SIGMAS = 4, 3.0
 
 @dataclass(frozen=True)
 class CorrectionConfig:
-    """How a walk is drawn to the map's answers."""
+    """Configure the correction of a trajectory towards the localizations."""
 
     reach: Annotated[float, Above(0)] = 1.0
-    """What a walk is bent by is alike over so many D_thresh of the way."""
+    """Length scale over which the correction is smoothed, in D_thresh."""
     stray: Annotated[float, Above(0)] = 0.1
-    """The walk is taken for so many D_thresh off (a sigma); an answer that strays so far from what
-    those around it say counts for half."""
+    """Prior sigma of the correction, in D_thresh. A localization this far from the local mean has
+    half the weight."""
     stray_deg: Annotated[float, Above(0)] = 0.5
-    """The same of its rotation."""
+    """The same for the rotation, in degrees."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Corrections:
-    """By how far (metres, world) and by which rotation vector (radians, world) the walk is off at
-    some metres of its way."""
+    """Hold shifts (metres, world) and rotation vectors (radians, world) at path lengths
+    (metres)."""
 
     path_lengths: Float[np.ndarray, " k"]
     shifts: Float[np.ndarray, "k 3"]
@@ -53,7 +51,7 @@ class _Corrections:
     def at(
         self, path_length: float, reach_m: float
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """In between, linearly; beyond the ends it fades."""
+        """Interpolate the correction linearly. It decays beyond both ends."""
         beyond = (
             max(self.path_lengths[0] - path_length, path_length - self.path_lengths[-1], 0.0)
             / reach_m
@@ -72,11 +70,13 @@ def correct_trajectory(
     d_thresh: float,
     config: CorrectionConfig,
 ) -> list[Rigid3 | None]:
-    """The poses drawn to the answers; None stays None.
+    """Return the corrected poses. None stays None.
 
     Args:
-        answers: what the map says of some frames, and is believed, by frame.
-        d_thresh: of the map (metres).
+        world_from_cams: the poses by frame.
+        answers: the trusted localizations, by frame.
+        d_thresh: D_thresh of the map, in metres.
+        config: the settings.
     """
     poses = {index: pose for index, pose in enumerate(world_from_cams) if pose is not None}
     answered = [
@@ -117,8 +117,8 @@ def _apply_correction(
 
 
 def _is_correctable(pose: Rigid3, answer: Localization) -> bool:
-    """Is the walk no further off than the answer may be? Else one of the two is wrong, and no bend
-    says which."""
+    """Return whether the pose is within three sigmas of the localization. Otherwise one of the two
+    is wrong, and a correction cannot decide which."""
     shift, rotation_vector = _pose_error(pose, answer)
     is_near = np.linalg.norm(shift) <= _MAX_SIGMAS * answer.position_sigma_m
     return bool(
@@ -142,7 +142,7 @@ def _estimate_corrections(
     d_thresh: float,
     config: CorrectionConfig,
 ) -> _Corrections:
-    """What the answers around each say of the walk there."""
+    """Estimate the correction at each localization from the localizations around it."""
     errors = [_pose_error(pose, answer) for pose, answer in zip(poses, answers, strict=True)]
     sigmas_m = np.array([answer.position_sigma_m for answer in answers])
     sigmas = np.radians([answer.rotation_sigma_deg for answer in answers])
@@ -170,8 +170,8 @@ def _robust_mean(
     sigmas: Float[np.ndarray, " k"],
     stray: float,
 ) -> Float[np.ndarray, "k 3"]:
-    """The mean of the rows near each, and of no bend at all with `stray` for its sigma; Cauchy's
-    weights for those that stray from it."""
+    """Return the local mean around each row, with zero correction of sigma `stray` as the prior and
+    Cauchy weights for outliers."""
     weights = near / np.maximum(sigmas, 1e-9) ** 2
     common, robust = rows, weights
     for _ in range(_NUM_ITERATIONS):

@@ -1,10 +1,10 @@
-"""A new session joins a map: read from `update_map`.
+"""Add a new session to a map. Start reading at `update_map`.
 
-The session is first put where it was taken (`session_poses.py`). Where the map localizes its
-pictures well, nothing is added but what they saw of the landmarks that are there already: these
-counts tell later what is gone. Where it does not (new places, another light, a changed room), the
-session's own pictures become nodes, as if a map were built of them, and the pictures around teach
-the coarse localizers the way to these nodes. Nothing of what the map had is changed or dropped.
+The session's poses in the map are estimated first (`session_poses.py`). If the map localizes an
+image well, only its observations of existing landmarks are counted. These counts later show which
+landmarks have vanished. Otherwise (new places, other light, a changed room) the session's images
+become nodes, as in a new map. The images around them are added to the coarse localizers. Existing
+content of the map is neither changed nor removed.
 """
 
 from __future__ import annotations
@@ -60,24 +60,23 @@ _NUM_IMAGES_COMPARED = 3
 
 @dataclass(frozen=True)
 class UpdateConfig:
-    """When a session's pictures need nodes of their own."""
+    """Configure when a session's images become nodes."""
 
     poses: SessionPosesConfig = field(default_factory=SessionPosesConfig)
     min_inliers: Annotated[int, Between(1, 10_000)] = 60
-    """A picture that the map localizes with at least so many inliers ..."""
+    """Minimum number of inliers of a well localized image. Such an image becomes no node."""
     max_sigma: Annotated[float, Above(0)] = 0.3
-    """... and to within so many D_thresh (a sigma of its position, without what the map's points
-    are wrong by together, which nodes that the map itself holds in place would share) needs no
-    node."""
+    """Maximum position sigma of a well localized image, in D_thresh. Correlated errors of the map's
+    points are left out, because a node aligned by the map would share them."""
     earlier_asked: Annotated[int, Between(0, 10_000)] = 24
-    """Nodes of earlier sessions, at most, that the map is asked before and after, for its history
-    to tell what the edit cost; 0: none."""
+    """Maximum number of earlier nodes localized before and after the edit, to record the change of
+    recall in the map's history. 0 skips this."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapUpdate:
-    """The map with the session in it, the session with its poses in the map's world, and what
-    changed: numbers and texts by their names."""
+    """Hold the updated map, the session with its poses in the map's world, and the changes by
+    name."""
 
     topomap: TopoMetricMap
     sequence: StereoSequence
@@ -86,8 +85,11 @@ class MapUpdate:
 
 @dataclass(frozen=True, eq=False)
 class _SessionContent:
-    """What the session brings: its nodes by kind of features and their side nodes, its pictures
-    with the nodes that they belong to, what it saw of nodes that were there, and its light."""
+    """Hold the new content of a session.
+
+    This is: its nodes by feature type, its virtual nodes, its images with their nodes, its
+    observations of existing nodes, and its illumination.
+    """
 
     nodes: dict[str, list[TopoNode]]
     sides: list[TopoNode]
@@ -105,38 +107,45 @@ def update_map(
     localizer_config: LocalizerConfig | None = None,
     progress: Progress | None = None,
 ) -> MapUpdate:
-    """The map with one more session in it.
+    """Return the map with one more session.
 
     Args:
-        sequence: with poses in any metric world, or, where `poses_from` is `map`, pictures of a
-            stream.
-        poses_from: where its poses come from, for the map to remember; `map`: the map is asked for
-            every picture.
+        topomap: the map.
+        sequence: the session, with poses in any metric world. If `poses_from` is `map`, its images
+            form a stream and need no poses.
+        poses_from: the source of the poses, which the map records. `map` localizes every image in
+            the map.
+        config: the settings. Defaults to `UpdateConfig()`.
+        localizer_config: the localizer's settings.
+        progress: is called with a stage's name, steps done and all steps.
 
     Raises:
         ConfigError: a setting is out of its bounds.
-        SessionKnownError: it is in the map already.
-        TrajectoryError: the map recognises too little of it, or not as its poses say.
-        FeatureKindError, MissingExtraError, WeightsError: the map's features cannot be found here.
-        RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
+        DuplicateSessionError: the session is in the map already.
+        TrajectoryError: the map recognises too little of it, or contradicts its poses.
+        FeatureTypeError, MissingExtraError, WeightsError: the map's features cannot be extracted on
+            this machine.
+        RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
     """
     config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
     check_bounds(config)
     check_session_is_new(topomap, sequence)
     localizer = Localizer(topomap, localizer_config)
     if poses_from == "map":
-        held = estimate_poses_by_map(
+        session_poses = estimate_poses_by_map(
             sequence, Tracker(localizer), topomap.config, config.poses, progress
         )
     else:
-        held = estimate_poses_by_motion(sequence, localizer, topomap.config, config.poses, progress)
+        session_poses = estimate_poses_by_motion(
+            sequence, localizer, topomap.config, config.poses, progress
+        )
     session_id = topomap.free_ids.session
-    without = [None] * (len(sequence) - len(held.world_from_cams))
+    without = [None] * (len(sequence) - len(session_poses.world_from_cams))
     posed_sequence = SequenceView(
-        sequence, list(range(len(sequence))), [*held.world_from_cams, *without]
+        sequence, list(range(len(sequence))), [*session_poses.world_from_cams, *without]
     )
     frames = select_posed_frames(posed_sequence, session_id)
-    content = _create_session_content(topomap, frames, held, config, progress)
+    content = _create_session_content(topomap, frames, session_poses, config, progress)
     session = _create_session(session_id, sequence, frames, content, poses_from)
     updated = update_coarse_models(topomap, content.views, content.images)
     changed = replace(_add_session(topomap, session, frames, content), coarse_models=updated.models)
@@ -148,7 +157,7 @@ def update_map(
     }
     changes |= (
         {"poses_from": poses_from}
-        | _count_changes(held, content, topomap.kind)
+        | _count_changes(session_poses, content, topomap.kind)
         | {"not_taught": updated.not_updated}
     )
     changed = with_map_statistics(changed, progress)
@@ -159,12 +168,14 @@ def update_map(
     )
 
 
-def _count_changes(held: SessionPoses, content: _SessionContent, kind: str) -> dict[str, Any]:
+def _count_changes(
+    session_poses: SessionPoses, content: _SessionContent, kind: str
+) -> dict[str, Any]:
     return {
-        "frames_by_odometry": len(held.propagated_idx),
-        "asked": len(held.answers),
-        "localized": sum(answer is not None for answer in held.answers.values()),
-        "agreeing": len(held.inlier_idx),
+        "frames_by_odometry": len(session_poses.propagated_idx),
+        "asked": len(session_poses.answers),
+        "localized": sum(answer is not None for answer in session_poses.answers.values()),
+        "agreeing": len(session_poses.inlier_idx),
         "nodes_added": len(content.nodes[kind]),
         "side_nodes_added": len(content.sides),
         "points_added": sum(len(node.features) for node in content.nodes[kind]),
@@ -173,8 +184,11 @@ def _count_changes(held: SessionPoses, content: _SessionContent, kind: str) -> d
 
 
 def check_session_is_new(topomap: TopoMetricMap, sequence: StereoSequence) -> None:
-    """A session that is in the map already is not doubled. Names and clocks may be those of another
-    day: pictures, or paths, decide. Raises SessionKnownError."""
+    """Check that a session is not in the map already.
+
+    Names and times may also be those of another day. So the check compares images or file paths,
+    too. Raises DuplicateSessionError.
+    """
     if len(sequence) == 0:
         return
     times, path = (min(sequence.t_ns), max(sequence.t_ns)), find_source_path(sequence)
@@ -195,9 +209,12 @@ def check_session_is_new(topomap: TopoMetricMap, sequence: StereoSequence) -> No
 def _has_same_images(
     topomap: TopoMetricMap, session_id: int, sequence: StereoSequence, is_same_path: bool
 ) -> bool:
-    """Whether pictures of one name are one picture, by what the map keeps of them. Of the same
-    folder (`is_same_path`) other pictures of the same time are the same session, too: every second
-    frame, and then those between."""
+    """Return whether images of the same name are identical, according to the small images in the
+    map.
+
+    Of the same folder (`is_same_path`), other images of the same time span count as the same
+    session, too. This covers selections such as every second frame, then the frames between.
+    """
     rows = {name: index for index, name in enumerate(sequence.names)}
     kept = [image for image in topomap.place_images if image.session_id == session_id]
     common = [image for image in kept if image.name in rows]
@@ -220,7 +237,7 @@ def _has_same_images(
 def _create_session_content(
     topomap: TopoMetricMap,
     frames: Sequence[MappingFrame],
-    held: SessionPoses,
+    session_poses: SessionPoses,
     config: UpdateConfig,
     progress: Progress,
 ) -> _SessionContent:
@@ -232,7 +249,7 @@ def _create_session_content(
     by_index = {frame.index: frame for frame in frames}
     wanted = [
         by_index[k]
-        for k, answer in held.answers.items()
+        for k, answer in session_poses.answers.items()
         if k in by_index and not is_well_localized(answer, d_thresh, config)
     ]
     with_virtual_views = find_new_virtual_views(topomap, [frame.world_from_cam for frame in wanted])
@@ -244,7 +261,7 @@ def _create_session_content(
         if len(draft.points[topomap.kind].features) >= map_config.min_node_points:
             drafts.append(draft)
         progress("new nodes", done + 1, len(wanted))
-    covered = {by_index[k] for k in held.answers if k in by_index} - {
+    covered = {by_index[k] for k in session_poses.answers if k in by_index} - {
         draft.frame for draft in drafts
     }
     content = _SessionContent(
@@ -291,7 +308,7 @@ def _create_session_content(
 
 
 def is_well_localized(answer: Localization | None, d_thresh: float, config: UpdateConfig) -> bool:
-    """Whether the map needs no node where this answer was given."""
+    """Return whether the map localizes an image well enough that it needs no node."""
     if answer is None or answer.num_inliers < config.min_inliers:
         return False
     of_inverse = answer.noise_share * inverse_covariance(answer.world_from_cam, answer.covariance)
@@ -318,7 +335,7 @@ def _observe_map_nodes(
     nearest: Int[np.ndarray, " n"],
     content: _SessionContent,
 ) -> None:
-    """What a picture shows of the nodes that are there."""
+    """Add an image's observations of existing nodes to `content`."""
     config = topomap.config
     for row in nearest[: config.landmarks.nodes_per_image].tolist():
         cam_from_node = image.world_from_cam.inverse() @ topomap.summaries[row].world_from_cam
@@ -399,8 +416,8 @@ def _add_session(
 def _merge_nodes(
     topomap: TopoMetricMap, kind: str, content: _SessionContent
 ) -> OverlaySequence[TopoNode]:
-    """The nodes of a kind: those that were there, with what the session saw of their points, and
-    the new ones."""
+    """Return the existing nodes of a feature type with the session's statistics, followed by the
+    new nodes."""
     before, changed = topomap.nodes_of(kind), {}
     for (of_kind, row), observations in content.observations.items():
         if of_kind == kind:
@@ -419,7 +436,7 @@ def _merge_nodes(
 def _find_traversed_edges(
     topomap: TopoMetricMap, summaries: Sequence[Any], frames: Sequence[MappingFrame]
 ) -> set[Edge]:
-    """An edge wherever the session went from one node to another."""
+    """Return an edge for each transition of the session between two nodes."""
     lambda_rot = topomap.config.nodes.lambda_rot
     assert lambda_rot is not None
     poses = NodePoses.of([summary.world_from_cam for summary in summaries])

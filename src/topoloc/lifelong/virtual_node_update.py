@@ -1,5 +1,7 @@
-"""Side nodes of what joins a map: the walls along a way that it did not know, for those who come
-the other way (`map/side_nodes.py`)."""
+"""Add virtual nodes for the new content of a map (`mapping/virtual_nodes.py`).
+
+They show the walls along new parts of the trajectory, for queries in the reverse direction.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_
 
 
 def find_new_virtual_views(topomap: TopoMetricMap, world_from_cams: Sequence[Rigid3]) -> set[int]:
-    """Which of the pictures that are to be nodes show walls that no side node shows. None where the
-    map's are described otherwise than pictures are now."""
+    """Return which of the poses need virtual views that no virtual node of the map provides. Return
+    an empty set if the map's virtual nodes have another feature type than new images."""
     config = topomap.config
     if topomap.sides is not None and topomap.sides.kind != config.virtual_view_type:
         return set()
@@ -23,8 +25,8 @@ def find_new_virtual_views(topomap: TopoMetricMap, world_from_cams: Sequence[Rig
 
 
 def add_virtual_nodes(topomap: TopoMetricMap, new_nodes: Sequence[TopoNode]) -> VirtualNodes | None:
-    """The map's side nodes and more of the same kind, which know their nodes. What ranks them by
-    looks is learned anew of all."""
+    """Return the map's virtual nodes with new ones of the same feature type. The retrieval model is
+    learned anew from all of them."""
     if not new_nodes:
         return topomap.sides
     before, kind = (

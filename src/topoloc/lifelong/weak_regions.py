@@ -1,8 +1,9 @@
-"""Which parts of a map are weakly held, by the map alone: read from `find_weak_regions`.
+"""Find the weak regions of a map from the map alone. Start reading at `find_weak_regions`.
 
-Four things make a node weak: the rest of the map does not hold it (`leave_one_out.py`); it has few
-landmarks; nobody looked the other way within its reach; no other session saw it again, nor stood
-beside it. Weak nodes that are near each other are a part, which is what one walks to.
+A node is weak for one of four reasons. The rest of the map does not localize it
+(`leave_one_out.py`). It has few landmarks. No node near it looks in the opposite direction. No
+other session saw it again or has a node beside it. Weak nodes near each other form a region, which
+a new recording can visit.
 """
 
 from __future__ import annotations
@@ -23,42 +24,43 @@ from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 
 Reason = Literal["not_held", "few_landmarks", "one_direction", "single_session"]
 REASONS: tuple[Reason, ...] = get_args(Reason)
-"""The worst first."""
-_BATCH_SIZE = 512  # nodes that are compared with all others in one step
+"""The reasons, the most severe first."""
+_BATCH_SIZE = 512  # nodes compared with all others in one step
 
 
 @dataclass(frozen=True)
 class WeakRegionsConfig:
-    """What is weak."""
+    """Configure when nodes are weak."""
 
     max_asked: Annotated[int, AtLeast(0)] = 200
-    """Nodes that are asked of the rest of the map, at most, spread over all; 0 asks none."""
+    """Maximum number of nodes, evenly spaced, that are localized in the rest of the map. 0 skips
+    this."""
     beside: Annotated[float, AtLeast(0)] = 0.0
-    """With a node those of its session are left out that are within so many D_thresh of it (Eq. 1).
-    Nodes of one session are more than one apart, so that by default a node alone is left out, and
-    asked from further away than any picture of the walk is."""
+    """Nodes of the same session within this many D_thresh (Eq. 1) are hidden together with a node.
+    Nodes of one session are more than one D_thresh apart, so 0 hides only the node itself. Its
+    nearest remaining node is then further away than for any query on the trajectory."""
     min_inliers: Annotated[int, Between(1, 10_000)] = 60
-    """The rest holds a node that it localizes with so many inliers: a session's picture like that
-    needs no node of its own."""
+    """The rest of the map must localize a node with at least this many inliers. An update adds no
+    node for such an image."""
     min_landmarks: Annotated[int, Between(1, 100_000)] = 100
-    """A node with fewer has few."""
+    """A node with fewer landmarks than this is weak."""
     reach: Annotated[float, Above(0)] = 4.0
-    """A node looks the other way where it stands within so many D_thresh ..."""
+    """Maximum distance of a node with the opposite view, in D_thresh."""
     min_turn_deg: Annotated[float, Between(1, 180)] = 120.0
-    """... and is turned by at least so much."""
+    """Minimum angle between opposite views, in degrees."""
     min_seen_share: Annotated[float, Between(0, 1)] = 0.2
-    """Another session saw a node again where it saw this share of its landmarks, or has a node of
-    its own ..."""
+    """A node is weak if other sessions saw less than this share of its landmarks and none has a
+    node beside it."""
     stood_by: Annotated[float, AtLeast(0)] = 1.5
-    """... within so many D_thresh (Eq. 1)."""
+    """Maximum distance of another session's node beside a node, in D_thresh (Eq. 1)."""
     apart: Annotated[float, Above(0)] = 3.0
-    """Weak nodes within so many D_thresh of each other are one part."""
+    """Weak nodes within this many D_thresh of each other form one region."""
 
 
 @dataclass(frozen=True)
 class NodeQuality:
-    """How a node is held. `answer` is None where it was not asked; `seen_share` is the share of its
-    landmarks that other sessions saw."""
+    """Hold the quality of a node. `answer` is None if the node was not localized in the rest of the
+    map. `seen_share` is the share of its landmarks that other sessions saw."""
 
     node_id: int
     name: str
@@ -70,6 +72,7 @@ class NodeQuality:
     reasons: tuple[Reason, ...]
 
     def to_json(self) -> dict[str, Any]:
+        """Return the node's quality as JSON."""
         queried_nodes = (
             None
             if self.answer is None
@@ -89,38 +92,42 @@ class NodeQuality:
 
 @dataclass(frozen=True, eq=False)
 class WeakRegion:
-    """Nodes near each other that are weak for one reason, in the order of their ids."""
+    """Hold nodes near each other that are weak for the same reason, in the order of their ids."""
 
     reason: Reason
     nodes: list[NodeQuality]
 
     @property
     def centre(self) -> Float[np.ndarray, "3"]:
-        """Metres, world: of the node nearest to the middle, for a way may bend."""
+        """Return the position (metres, world) of the node nearest to the mean position. The mean
+        itself may be off a bent trajectory."""
         positions = np.array([node.world_from_cam.translation for node in self.nodes])
         return positions[int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmin())]
 
     def to_json(self) -> dict[str, Any]:
+        """Return the region as JSON."""
         ids = [node.node_id for node in self.nodes]
         return {"reason": self.reason, "centre": self.centre.round(3).tolist(), "node_ids": ids}
 
 
 @dataclass(frozen=True, eq=False)
 class WeakRegions:
-    """How every node is held, in the map's order, and the weak parts: the worst reason first, of
-    each the largest part first."""
+    """Hold the quality of every node, in the map's order, and the weak regions.
+
+    Regions are sorted by reason, the most severe first, then by size, the largest first.
+    """
 
     nodes: list[NodeQuality]
     parts: list[WeakRegion]
     session_names: dict[int, str]
 
     def count(self, reason: Reason) -> int:
-        """Nodes that are weak for this reason."""
+        """Return the number of nodes that are weak for this reason."""
         return sum(reason in node.reasons for node in self.nodes)
 
     @property
     def weakest(self) -> list[NodeQuality]:
-        """The nodes that were asked, the one that the rest of the map holds least first."""
+        """Return the queried nodes, the fewest inliers first."""
         return sorted(
             self.queried_nodes,
             key=lambda node: node.answer.num_inliers if node.answer is not None else 0,
@@ -128,10 +135,11 @@ class WeakRegions:
 
     @property
     def queried_nodes(self) -> list[NodeQuality]:
-        """The nodes that were asked of the rest of the map."""
+        """Return the nodes that were localized in the rest of the map, with or without success."""
         return [node for node in self.nodes if node.answer is not None]
 
     def to_json(self) -> dict[str, Any]:
+        """Return all counts, regions and nodes as JSON."""
         return {
             "num_nodes": len(self.nodes),
             "num_sessions": len(self.session_names),
@@ -146,7 +154,7 @@ class WeakRegions:
         }
 
     def suggest_next_recording(self) -> str:
-        """Where to walk next, in one or two sentences."""
+        """Suggest in one or two sentences the places of the next recording."""
         sentences = list[str]()
         of_reason = {
             reason: [part for part in self.parts if part.reason == reason] for reason in REASONS
@@ -202,11 +210,11 @@ def find_weak_regions(
     config: WeakRegionsConfig | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> WeakRegions:
-    """How each node of a map is held by the rest of it.
+    """Assess each node of a map by the rest of the map.
 
     Raises:
         ConfigError: a setting is out of its bounds.
-        MapError: from reading the map.
+        MapError: the map cannot be read.
     """
     config = config or WeakRegionsConfig()
     check_bounds(config)
@@ -270,7 +278,7 @@ def _assess_node(
 
 
 def _seen_share(node: TopoNode) -> float:
-    """The share of a node's landmarks that sessions other than its own saw."""
+    """Return the share of a node's landmarks that other sessions saw."""
     seen = np.zeros(len(node.features), bool)
     for session_statistics in node.session_statistics:
         if session_statistics.session_id != node.summary.session_id:
@@ -281,7 +289,7 @@ def _seen_share(node: TopoNode) -> float:
 def _has_other_session(
     topomap: TopoMetricMap, row: int, poses: NodePoses, num_d_thresh: float
 ) -> bool:
-    """Does a node of another session stand beside this one?"""
+    """Return whether a node of another session is within `num_d_thresh` times D_thresh."""
     summary = topomap.summaries[row]
     near = np.flatnonzero(
         node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
@@ -293,7 +301,7 @@ def _has_other_session(
 def _has_opposite_view(
     poses: NodePoses, reach_m: float, min_turn_deg: float
 ) -> Bool[np.ndarray, " nodes"]:
-    """Of each node, whether another one within reach looks the other way."""
+    """Return for each node whether another one within reach looks in the opposite direction."""
     axes, found = poses.rotations[:, :, 2], np.zeros(len(poses.centres), bool)
     for start in range(0, len(axes), _BATCH_SIZE):
         some = slice(start, start + _BATCH_SIZE)
@@ -314,7 +322,7 @@ def _group_regions(nodes: Sequence[NodeQuality], apart_m: float) -> list[WeakReg
 
 
 def _cluster_nodes(nodes: Sequence[NodeQuality], apart_m: float) -> list[list[NodeQuality]]:
-    """Nodes that stand within `apart_m` (metres) of each other, or of others between them."""
+    """Cluster nodes that are connected by steps of at most `apart_m` (metres)."""
     positions = np.array([node.world_from_cam.translation for node in nodes]).reshape(-1, 3)
     left, groups = np.ones(len(nodes), bool), list[list[NodeQuality]]()
     while left.any():

@@ -1,14 +1,14 @@
-"""What is believed of a query image: hypotheses with their odds, beside "nowhere in the map"; and
-the answer that follows.
+"""Maintain the belief of a query image: pose hypotheses with odds, beside "not in the map".
 
-Every hypothesis excludes the others, and its odds against nothing at all say little of which of
-them is right: a place that repeats itself has most of its things twice. What tells two of them
-apart is the part of the picture where they differ, in which the wrong one finds nothing (the even
-share found), and that the wrong one, which has only some of the picture to stand on, is less
-precise (the doubt). So between two hypotheses the weights of `RivalWeights` count, in logarithms;
-where one of them comes from walls, whose evidence is of another kind, their odds do. With odds o of
-the best hypothesis against "nowhere" and odds of e^d against each other one, by which it leads
-that, it is right with the probability 1 / (1 + 1/o + sum of e^-d).
+The hypotheses exclude each other. The odds of one against "not in the map" do not separate two of
+them, because a repetitive place contains most things twice. Two properties do. The wrong hypothesis
+finds nothing in the part of the image where the places differ (the spatially uniform inlier ratio).
+It is also less precise, because only a part of the image supports it (the normalized uncertainty).
+`RivalWeights` weighs these in logarithms. If one of the two comes from virtual views, the
+difference of their log-odds is used instead, because their evidence is of another kind.
+
+Let o be the odds of the best hypothesis against "not in the map". Let d be its log-odds margin over
+another hypothesis. Its probability is 1 / (1 + 1/o + sum of e^-d).
 """
 
 from __future__ import annotations
@@ -31,17 +31,16 @@ from topoloc.localization.fitted_weights import RivalWeights
 from topoloc.localization.pose_fit import PoseFit
 
 MIN_LOG_ODDS_MARGIN = 2.0
-"""By how much the best hypothesis must lead the next one, in logarithms of odds, to be an
-answer."""
+"""Minimum log-odds margin of the best hypothesis over each other one to be reported."""
 _CHI_SQUARE_6_AT_95 = 12.592
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A pose with the evidence for it.
+    """Hold a pose with its evidence.
 
-    `covariance` is that of the left perturbation of cam_from_world, `noise_share` of it differs
-    from picture to picture; `log_odds` are those of "here" against "nowhere".
+    `covariance` is that of the left perturbation of cam_from_world. Its share `noise_share` is
+    independent from image to image. `log_odds` compares this pose with "not in the map".
     """
 
     source: str
@@ -53,33 +52,37 @@ class Hypothesis:
 
     @property
     def world_from_cam(self) -> Rigid3:
+        """Return the pose."""
         return self.fit.world_from_cam
 
     @cached_property
     def variance(self) -> float:
-        """No direction has more."""
+        """Return an upper bound of the variance in any direction."""
         return float(np.trace(self.covariance))
 
     @property
     def probability(self) -> float:
-        """That of "here" against "nowhere" alone."""
+        """Return the probability of this pose if "not in the map" is the only alternative."""
         return compute_precision_probability(self.evidence) / (1.0 + math.exp(-self.log_odds))
 
     @property
     def is_from_virtual_views(self) -> bool:
+        """Return whether the pose was found by virtual views."""
         return self.evidence.is_from_virtual_views
 
 
 def log_odds_margin(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
-    """By how much `a` is likelier than `b`, in logarithms of odds."""
+    """Return the log-odds margin of `a` over `b`."""
     return float(_log_odds_margins((a, b), weights)[0, 1])
 
 
 def _log_odds_margins(
     hypotheses: tuple[Hypothesis, ...], weights: RivalWeights
 ) -> Float[np.ndarray, "n n"]:
-    """By how much each is likelier than each: by their strengths, or their odds where one of the
-    two comes from walls."""
+    """Compute the log-odds margin of each hypothesis (row) over each (column).
+
+    It is the difference of scores, or of log-odds if one of the two comes from virtual views.
+    """
     scores = np.array(
         [compute_rival_score(one.evidence, one.log_odds, weights) for one in hypotheses]
     )
@@ -90,12 +93,11 @@ def _log_odds_margins(
 
 
 def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
-    """Do two poses say the same? They do where they are as near as two right ones can be, or stand
-    on the same points of the map.
+    """Return whether two fits describe the same pose.
 
-    A pose that is not precise yet may be far from the one that it will become, but sees the same
-    things in the same features; two places that look alike explain the same features by different
-    points.
+    They do if both could be right within the tolerance, or if they share map points for the same
+    features. An imprecise pose may be far from its refined version but matches the same features to
+    the same points. Two similar places match the same features to different points.
     """
     distance = np.linalg.norm(a.world_from_cam.translation - b.world_from_cam.translation)
     if distance < 2.0 * config.max_translation and _relative_pose(a, b).angle() < math.radians(
@@ -127,22 +129,23 @@ def _inlier_point_idx(fit: PoseFit) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """The hypotheses so far, of each pose the one with the most for it.
+    """Hold the hypotheses so far, the strongest one of each pose.
 
-    `all_hypotheses` are all that came, for "the same pose" does not carry over: of a row of three
-    the middle one may say the same as both ends, which differ. So which are left out is decided
-    anew with each, from the strongest down, and the order in which they came counts nothing.
+    `all_hypotheses` holds every hypothesis added, because "the same pose" is not transitive. The
+    middle one of three may equal both ends, which differ from each other. The selection is
+    therefore repeated for each new hypothesis, from the strongest down. The result does not depend
+    on their order.
     """
 
     hypotheses: tuple[Hypothesis, ...] = ()
     all_hypotheses: tuple[Hypothesis, ...] = ()
     _same_pose_as: tuple[frozenset[int], ...] = ()
-    """Of each of these, which of those before it say the same, by their place among them."""
+    """Entry k holds the indices before k of the hypotheses with the same pose as hypothesis k."""
 
     def with_hypothesis(
         self, hypothesis: Hypothesis, config: EvidenceConfig, weights: RivalWeights
     ) -> Belief:
-        """With one more hypothesis."""
+        """Return the belief with one more hypothesis."""
         same_as_new = frozenset(
             k
             for k, other in enumerate(self.all_hypotheses)
@@ -159,11 +162,15 @@ class Belief:
         return Belief(tuple(all_hypotheses[k] for k in kept), all_hypotheses, same_pose)
 
     def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
-        """The hypotheses, the one that leads all others first."""
+        """Return the hypotheses, sorted by their least margin over the others.
+
+        Those with a probability of at least 0.5 come first.
+        """
         return _rank_hypotheses(self.hypotheses, weights)
 
     def best(self, weights: RivalWeights) -> Hypothesis | None:
-        """The likeliest hypothesis, believed or not."""
+        """Return the likeliest hypothesis, even if its probability is low. None if there is
+        none."""
         return self.ranked(weights)[0] if self.hypotheses else None
 
 
@@ -183,7 +190,7 @@ def _rank_hypotheses(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) 
 
 
 def _agree_on_pose(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
-    """As `is_same_pose`; also where their covariances leave open that both are right."""
+    """Return whether `is_same_pose` holds, or the covariances allow both to be the same pose."""
     if is_same_pose(a.fit, b.fit, config):
         return True
     limit = _CHI_SQUARE_6_AT_95 * (a.variance + b.variance)
@@ -191,7 +198,7 @@ def _agree_on_pose(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool
         b.world_from_cam.translation - a.world_from_cam.translation
     )
     if apart @ apart > limit or (turn := _relative_pose(a.fit, b.fit)).angle() ** 2 > limit:
-        return False  # the vector below is longer than either
+        return False  # the log of the rotation and translation is longer than either
     vector = turn.log()
     return (
         float(vector @ np.linalg.solve(a.covariance + b.covariance, vector)) < _CHI_SQUARE_6_AT_95
@@ -199,5 +206,5 @@ def _agree_on_pose(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool
 
 
 def _relative_pose(a: PoseFit, b: PoseFit) -> Rigid3:
-    """From the camera of one to that of the other."""
+    """Return cam_a_from_cam_b."""
     return a.world_from_cam.inverse() @ b.world_from_cam

@@ -1,5 +1,7 @@
-"""Values out of JSON that may come from anywhere: of the type that is expected and within bounds,
-or a ResultError that names the key."""
+"""Read values from untrusted JSON.
+
+Each function checks the type and bounds and raises ResultError with the key otherwise.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ MAX_ITEMS = 10_000
 
 
 def parse_object(line: str | bytes | Mapping[str, Any]) -> Mapping[str, Any]:
-    """A JSON line as what it says, or as what was read of it already."""
+    """Parse a JSON line into an object. An object that is already parsed is returned as is."""
     data: Any = line
     if isinstance(line, str | bytes):
         try:
@@ -33,14 +35,14 @@ def parse_object(line: str | bytes | Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def mapping(value: Any, key: str) -> Mapping[str, Any]:
-    """An object under a key."""
+    """Return a value that must be a JSON object."""
     if not isinstance(value, Mapping):
         raise ResultError(f"no result: {key!r} is no object")
     return value
 
 
 def require(data: Mapping[str, Any], key: str) -> Any:
-    """What stands under a key that must be there."""
+    """Return the value of a required key."""
     if key not in data:
         raise ResultError(f"no result: {key!r} is missing")
     return data[key]
@@ -49,7 +51,7 @@ def require(data: Mapping[str, Any], key: str) -> Any:
 def number(
     value: Any, key: str, min_value: float = -math.inf, max_value: float = math.inf
 ) -> float:
-    """A finite number within bounds."""
+    """Return a value that must be a finite number within bounds."""
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float)
@@ -61,7 +63,7 @@ def number(
 
 
 def integer(value: Any, key: str, min_value: int = 0, max_value: int = 2**63 - 1) -> int:
-    """An integer within bounds."""
+    """Return a value that must be an integer within bounds."""
     if isinstance(value, bool) or not isinstance(value, int) or not min_value <= value <= max_value:
         raise ResultError(
             f"no result: {key!r} is no integer{_range_text(float(min_value), float(max_value))}"
@@ -70,20 +72,22 @@ def integer(value: Any, key: str, min_value: int = 0, max_value: int = 2**63 - 1
 
 
 def text(value: Any, key: str) -> str:
+    """Return a value that must be a text."""
     if not isinstance(value, str):
         raise ResultError(f"no result: {key!r} is no text")
     return value
 
 
 def items(value: Any, key: str) -> list[Any]:
-    """A list of a length that results have."""
+    """Return a value that must be a list of at most `MAX_ITEMS` entries."""
     if not isinstance(value, list | tuple) or len(value) > MAX_ITEMS:
         raise ResultError(f"no result: {key!r} is no list of at most {MAX_ITEMS}")
     return list(value)
 
 
-def rigid(value: Any, key: str) -> Rigid3:
-    """``{"translation": [x, y, z], "quat_wxyz": [w, x, y, z]}``."""
+def pose_from_json(value: Any, key: str) -> Rigid3:
+    """Parse a pose ``{"translation": [x, y, z], "quat_wxyz": [w, x, y, z]}``, translation in
+    metres. `key` is its name in errors. Raises ResultError."""
     data = value if isinstance(value, Mapping) else {}
     quat_wxyz = [
         number(one, f"{key}.quat_wxyz") for one in items(data.get("quat_wxyz"), f"{key}.quat_wxyz")
@@ -103,7 +107,7 @@ def rigid(value: Any, key: str) -> Rigid3:
 
 
 def pose_to_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
-    """A pose as all our JSON has it, metres; what `rigid` reads."""
+    """Return a pose in the common JSON format (metres), as `pose_from_json` reads it."""
     return {
         "translation": world_from_cam.translation.tolist(),
         "quat_wxyz": world_from_cam.quat_wxyz().tolist(),
@@ -111,7 +115,7 @@ def pose_to_json(world_from_cam: Rigid3) -> dict[str, list[float]]:
 
 
 def covariance(value: Any, key: str) -> Float[np.ndarray, "6 6"]:
-    """6x6, symmetric, no variance negative."""
+    """Return a symmetric 6x6 matrix without negative variances."""
     rows = [[number(one, key) for one in items(row, key)] for row in items(value, key)]
     if len(rows) != 6 or any(len(row) != 6 for row in rows):
         raise ResultError(f"no result: {key!r} is no 6x6 matrix")

@@ -1,5 +1,4 @@
-"""How a query is answered: the settings of all steps. What is fitted to data is no setting
-(`fitted_weights.py`)."""
+"""Settings of all localization steps. Values fitted to data are in `fitted_weights.py`."""
 
 from __future__ import annotations
 
@@ -17,66 +16,70 @@ from topoloc.localization.map_facts.correlated_errors import CorrelatedErrorsCon
 
 @dataclass(frozen=True)
 class SimilarPlacesConfig:
-    """When another part of the map that looks like the image is asked on its own."""
+    """Configure the separate search in similar places (perceptual aliasing)."""
 
     num_ranked: Annotated[int, Between(1, 100_000)] = 48
-    """Nodes that the coarse localizer ranks, the candidates among them; look-alikes come from
-    these."""
+    """Number of nodes that the coarse localizer ranks, including the candidates. Similar places are
+    selected from them."""
     min_score_share: Annotated[tuple[float, float], Between(0, 1)] = (0.85, 0.4)
-    """A look-alike's score is at least this share of the best one's: where the pose is clear, and
-    where it is not."""
+    """Minimum score of a similar place, as a share of the best score: if the pose is clear, and if
+    it is not."""
     reach: Annotated[float, AtLeast(0)] = 5.0
-    """Nodes within so many D_thresh of a pose (Eq. 1) belong to it; look-alikes are farther
-    away."""
+    """Nodes within this many D_thresh of a pose (Eq. 1) belong to its place. Similar places are
+    farther away."""
     max_groups: Annotated[int | None, Between(0, 1000)] = None
-    """Parts of the map that are asked on their own, at most; 0 asks none. Unset: what suits the
-    kind of features."""
+    """Maximum number of similar places that are searched. 0 disables this step. Unset: the default
+    of the feature type."""
     min_inlier_share: Annotated[float, Between(0, 1)] = 0.25
-    """A part whose points agree with the image's strongest features in fewer than this share of
-    what agrees with the believed pose is left at that."""
+    """Minimum inliers of a similar place, as a share of the best pose's inliers. A place with
+    fewer, from the image's strongest features, is not refined."""
 
 
 @dataclass(frozen=True)
 class NodeViewpointsConfig:
-    """Where an image that is not clear is compared with what nodes saw."""
+    """Configure node viewpoints as pose priors, used if no pose is clear."""
 
     num_nodes: Annotated[int | None, Between(0, 10_000)] = None
-    """Nodes of the best coarse rank that are compared, one by one; 0 compares none. Unset: 24, none
-    for features without size and angle, which tell little so."""
+    """Number of best-ranked nodes that are compared one by one. 0 disables this step. Unset: 24, or
+    0 for features without size and angle, for which the comparison is weak."""
     shift_px: Annotated[float, Above(0)] = 12.0
-    """Matches whose displacements differ by less than this agree, in an image whose longer side is
-    640 pixels; grows with that."""
+    """Maximum difference between the displacements of consistent matches, in pixels of an image
+    whose longer side is 640. Scales with the image size."""
     min_alike: Annotated[int, AtLeast(0)] = 8
-    """A node is followed up where so many matches agree ..."""
+    """A node is accepted if at least this many matches are consistent, plus `chance_share` of its
+    matches."""
     chance_share: Annotated[float, Between(0, 1)] = 0.09
-    """... and this share of all its matches more."""
+    """Share of a node's matches that is added to `min_alike`."""
     max_fits: Annotated[int, Between(1, 1000)] = 6
-    """Nodes whose matches are asked for a pose, those that agree most."""
+    """Number of accepted nodes, those with the most consistent matches, for which a pose is
+    fitted."""
     max_poses: Annotated[int, Between(1, 1000)] = 4
-    """Of the poses found, those with the most inliers are looked into."""
+    """Number of fitted poses, those with the most inliers, that become proposals."""
     max_iterations: Annotated[int, Between(1, 1_000_000)] = 500
-    """Of RANSAC, for each of them."""
+    """RANSAC iterations for each fit."""
     matching: GuidedConfig = field(default_factory=lambda: GuidedConfig(radius_px=64.0))
-    """How widely points are sought around where the node saw them."""
+    """Guided matching around the pixels where the node saw its points."""
 
 
 @dataclass(frozen=True)
 class VirtualViewSearchConfig:
-    """How the walls along the way are asked."""
+    """Configure the search in virtual views."""
 
     num_places: Annotated[int, Between(0, 10_000)] = 8
-    """Places along the way that are compared with both views; 0 asks none."""
+    """Number of places along the trajectory that are compared with both side views. 0 disables this
+    step."""
     apart: Annotated[float, Above(0)] = 2.0
-    """They are so many D_thresh apart."""
+    """Minimum distance between these places, in D_thresh."""
     min_agreeing: Annotated[int, AtLeast(3)] = 8
-    """Matches of both views with the walls of a place that must agree on one pose, for it to be
-    recognised."""
+    """Minimum number of matches, over both views, that must agree on one pose to recognise a
+    place."""
     num_hypotheses: Annotated[int, Between(1, 1000)] = 6
-    """First poses that are looked into."""
+    """Maximum number of pose proposals that are refined."""
     num_nodes: Annotated[int, Between(1, 1000)] = 4
-    """Side nodes whose points are sought in each view around a pose."""
+    """Number of virtual views around a pose whose points are searched in each side view."""
     min_distance: Annotated[float, AtLeast(0)] = 5.0
-    """Poses within so many D_thresh (Eq. 1) of a node would have been found by that node."""
+    """Poses within this many D_thresh (Eq. 1) of a node are skipped, because that node would have
+    found them."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     guided: GuidedConfig = field(default_factory=GuidedConfig)
     rounds: Annotated[tuple[tuple[float, float], ...], AtLeast(0)] = (
@@ -86,27 +89,28 @@ class VirtualViewSearchConfig:
         (25.0, 3.0),
         (25.0, 3.0),
     )
-    """Matches and pose in turn: search radius and largest error, pixels. Radius 0 are the unguided
-    matches: guided ones draw a pose that is not yet right towards itself."""
+    """Search radius and maximum reprojection error of each round, pixels. Each round matches and
+    fits in turn. Radius 0 uses the unguided matches, because guided ones bias an inaccurate
+    pose."""
     min_found: Annotated[int, AtLeast(4)] = 20
-    """Map points found where the pose says they must be, at least."""
+    """Minimum number of map points found at their predicted pixels."""
     clear_log_odds: Annotated[float, Between(-100, 100)] = 2.5
-    """Where there is more for a pose of the nodes, the walls are not asked."""
+    """Virtual views are skipped if a pose of the nodes has higher log-odds."""
 
 
 @dataclass(frozen=True)
 class LocalizerConfig:
-    """How a query is answered. The features are those that the map was built with."""
+    """Configure the localizer. The features are those that the map was built with."""
 
     kinds: tuple[str, ...] | None = None
-    """Which of the map's kinds of features are asked, in turn, each where the one before leaves the
-    pose unclear (None: all whose networks are there)."""
+    """Feature types of the map to use, in order. Each next one is used if the pose is still unclear
+    (None: all whose networks are installed)."""
     coarse: str | None = None
-    """Which of the map's coarse localizers is asked (None: the map's default)."""
+    """Name of the map's coarse localizer (None: the map's default)."""
     max_ms: Annotated[float | None, AtLeast(0)] = None
-    """After so many milliseconds no further hypothesis is sought (None: all are)."""
+    """Time limit in milliseconds, after which no further hypothesis is tested (None: no limit)."""
     num_candidates: Annotated[int, Between(1, 10_000)] = 4
-    """Nodes whose points are pooled; 1 is the paper's single node."""
+    """Number of nodes whose points are pooled. 1 is the paper's single node."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     guided: GuidedConfig = field(default_factory=GuidedConfig)
     pose: AbsolutePoseConfig = field(
@@ -115,32 +119,31 @@ class LocalizerConfig:
         )
     )
     num_first_features: Annotated[int, AtLeast(1)] = 320
-    """The image's strongest features are matched first; the rest only where these give fewer
-    inliers than the next number."""
+    """Number of the image's strongest features that are matched first. The rest is matched only if
+    these give fewer than `num_clear_inliers` inliers."""
     num_clear_inliers: Annotated[int, AtLeast(0)] = 40
-    """With fewer inliers of the first pose, its surroundings are looked at twice."""
+    """If the first pose has fewer inliers, its surroundings are searched twice."""
     num_chance_inliers: Annotated[int, AtLeast(0)] = 7
-    """Fewer agree on a pose anywhere: where the first matches have no more, and no viewpoint stands
-    out, look-alikes are not asked."""
+    """Number of inliers that can agree by chance. If the first matches give no more, and no
+    viewpoint stands out, similar places are not searched."""
     min_matches: Annotated[int, AtLeast(4)] = 8
-    """With fewer first matches no pose is sought."""
+    """Minimum number of first matches for which a pose is estimated."""
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     look_alikes: SimilarPlacesConfig = field(default_factory=SimilarPlacesConfig)
     viewpoints: NodeViewpointsConfig = field(default_factory=NodeViewpointsConfig)
     max_repetitions: Annotated[int, Between(0, 1000)] = 64
-    """Where a place repeats itself, so many other poses are looked into at most."""
+    """Maximum number of other poses that are tested in a repetitive place."""
     walls: VirtualViewSearchConfig = field(default_factory=VirtualViewSearchConfig)
     correlated_errors: CorrelatedErrorsConfig = field(default_factory=CorrelatedErrorsConfig)
     max_finer: Annotated[float, AtLeast(1)] = 1.15
-    """An image of more than so many times the pixels a radian (focal length in pixels) of the map's
-    finest camera is reduced to that camera's first: at larger sizes its key points find none alike
-    in the map."""
+    """An image is reduced to the focal length (pixels) of the map's finest camera if its own is
+    larger by this factor. At larger sizes its key points match none of the map."""
     max_side_px: Annotated[int, Between(64, 100_000)] = 1600
-    """Larger images are reduced to this width or height first: nothing is gained from more, but
-    time and memory."""
+    """Larger images are reduced to this width or height first. A larger size costs time and memory
+    without a gain."""
 
     def for_feature_type(self, kind: FeatureType) -> LocalizerConfig:
-        """With the thresholds of this kind of features where none are set."""
+        """Return the settings with unset thresholds filled in for this feature type."""
         walls, viewpoints, look_alikes = self.walls, self.viewpoints, self.look_alikes
         has_shape = kind.has_scale and kind.has_angle
         num_nodes = (

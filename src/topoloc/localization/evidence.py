@@ -1,21 +1,22 @@
-"""Is this pose right? The evidence for it, weighed as odds.
+"""Weigh the evidence for a pose as odds.
 
-A count of inliers alone is no test: RANSAC finds a dozen of them in any picture, and poses of
-repeated patterns collect many more. What a wrong pose cannot have is agreement beyond what it was
-fitted to: most map points that must be in view are then not found where they must be, least of all
-in every part of the picture, or no more of them than a third of the picture away, where chance
-alone finds some. So these two ratios count, beside the number and the share of matches that no pose
-guided and that agree with it all the same, and how much of the picture the points found cover. What
-a pose from the right place may lack is precision: its own covariance, beside what is tolerated,
-says so.
+An inlier count alone is not a test. RANSAC finds a dozen inliers in any image, and poses in
+repeated patterns collect many more. A wrong pose does not agree with data that it was not fitted
+to. Most visible map points are then missing at their predicted pixels in some part of the image. Or
+no more of them are found than a third of the image away, where only chance matches are found.
 
-The weights are those of a logistic regression on poses tried, right and wrong ones; each kind of
-features has its own (`fitted_weights.py`). That of the doubt is set by hand: wrong places in a
-corridor of many doors come with precise poses, and a free weight would follow them to zero. Walls
-that are seen from the other side (`walls/`) repeat themselves more than a room does, and less of
-them is recognised at a slant: the same evidence has weights of its own there, and it also counts
-how many of the key points found look more like the map's point here than like any elsewhere, and
-whether both walls agree: one alone may be a twin's.
+So the regression uses these two ratios and the number and ratio of inliers among the unguided
+matches. It also uses the share of the image that the found points cover. A pose at the right place
+may still be imprecise. The last feature is therefore the covariance relative to the tolerance.
+
+The weights come from a logistic regression on right and wrong poses. Each feature type has its own
+(`fitted_weights.py`). The weight of the normalized uncertainty is set by hand: wrong places in a
+corridor of many doors have precise poses, and a free weight would go to zero.
+
+Virtual views (`walls/`) have weights of their own. Walls repeat more than rooms do, and fewer of
+their points are recognised at a slant. Two more features count there. The first is the number of
+found key points that match here better than anywhere else in the map. The second is the agreement
+of both side views, because one wall alone may match a similar place.
 """
 
 from __future__ import annotations
@@ -31,21 +32,27 @@ from topoloc.bounds import Above, AtLeast, Between
 from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, RivalWeights
 
 COLUMNS, ROWS = 8, 6
-"""The cells of a picture whose number with an inlier in it measures the inliers' spread."""
+"""Grid of cells over the image. The inlier spread is the share of cells with an inlier."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for a pose.
+    """Hold the evidence for a pose.
 
-    `num_matches` and `num_inliers` are those of the first, unguided match; `num_found` of the
-    `num_visible` map points that must be in view were found where they must be seen;
-    `num_by_chance` of them would be were the pose wrong. `spread` is the share of the picture's
-    cells that hold one of them, `even_share` the share found of what must be in view, every part of
-    the view asked on its own (`compute_uniform_inlier_ratio`), `doubt` the pose's standard
-    deviation in its worst direction over what is tolerated: 1 where the two are equal. Of walls
-    only, `num_distinct` of the points found look more like the map's point here than like any
-    elsewhere, and `num_lesser_side` are those of the wall, of the two, of which fewer were found.
+    Attributes:
+        num_matches: number of unguided matches.
+        num_inliers: number of unguided matches that agree with the pose.
+        num_found: number of visible map points found at their predicted pixels.
+        num_visible: number of map points in view.
+        num_by_chance: number of points that would be found if the pose were wrong.
+        spread: share of the image's cells with a found point.
+        doubt: normalized uncertainty, the standard deviation in the worst direction over the
+            tolerance. It is 1 if the two are equal.
+        even_share: spatially uniform inlier ratio, the found share of the visible points, averaged
+            over all parts of the view (`compute_uniform_inlier_ratio`).
+        num_distinct: number of found points that match here better than anywhere else in the map.
+            Virtual views only.
+        num_lesser_side: number of found points of the side view that has fewer. Virtual views only.
     """
 
     num_matches: int
@@ -61,34 +68,34 @@ class Evidence:
 
     @property
     def is_from_virtual_views(self) -> bool:
-        """Is the pose one that the walls along the way let expect, not the map's nodes?"""
+        """Return whether the pose was found by virtual views, not by the map's nodes."""
         return self.num_distinct is not None
 
 
 @dataclass(frozen=True)
 class EvidenceConfig:
-    """What a right pose is, and what is asked of an answer."""
+    """Configure the tolerance of a right pose and the conditions for reporting one."""
 
     max_translation: Annotated[float, Above(0)] = 0.25
-    """A right pose is no further off than this (metres), nor than `depth_share` of the distance of
-    what is seen, if that is less."""
+    """Maximum position error of a right pose, metres. `depth_share` of the distance of the seen
+    points replaces it if that is less."""
     depth_share: Annotated[float, Above(0)] = 0.05
-    """See `max_translation`."""
+    """Maximum position error as a share of the median distance of the seen points."""
     max_rotation_deg: Annotated[float, Between(0.001, 180)] = 2.0
-    """A right pose is turned by no more than this."""
+    """Maximum rotation error of a right pose, degrees."""
     agreement_px: Annotated[float, Above(0)] = 4.0
-    """Unguided matches within this of the final pose agree with it, in an image whose longer side
-    is 640 pixels; grows with that."""
+    """Maximum distance of an unguided match from the final pose's projection, in pixels of an image
+    whose longer side is 640. Scales with the image size."""
     min_inliers: Annotated[int, AtLeast(4)] = 5
-    """With fewer, a first pose is not even tried out."""
+    """Minimum number of inliers of a pose proposal. Proposals with fewer are not tested."""
     min_found: Annotated[int, AtLeast(4)] = 12
-    """Map points found where the pose says they must be, at least."""
+    """Minimum number of map points found at their predicted pixels."""
     min_probability: Annotated[float, Between(0, 1)] = 0.5
-    """Poses less probable than this are not reported."""
+    """Minimum probability of a reported pose."""
 
 
 def compute_translation_tolerance(median_depth: float, config: EvidenceConfig) -> float:
-    """How far (metres) a right pose may be off where the points seen are `median_depth` (metres)
+    """Return the maximum position error (metres) of a right pose for points `median_depth` (metres)
     away."""
     return min(config.max_translation, config.depth_share * median_depth)
 
@@ -96,8 +103,10 @@ def compute_translation_tolerance(median_depth: float, config: EvidenceConfig) -
 def compute_normalized_uncertainty(
     covariance: Float[np.ndarray, "6 6"], median_depth: float, config: EvidenceConfig
 ) -> float:
-    """`Evidence.doubt`, of the covariance of the left perturbation of cam_from_world (metres,
-    radians)."""
+    """Compute `Evidence.doubt` from a covariance.
+
+    The covariance is that of the left perturbation of cam_from_world (metres, radians).
+    """
     metres = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) / compute_translation_tolerance(
         median_depth, config
     )
@@ -109,7 +118,7 @@ def compute_normalized_uncertainty(
 
 
 def compute_inlier_spread(points_img: Float[np.ndarray, "n 2"], width: int, height: int) -> float:
-    """`Evidence.spread` of the inliers' pixels."""
+    """Compute `Evidence.spread` from the inliers' pixels."""
     return len(np.unique(_cells(points_img, width, height))) / (COLUMNS * ROWS)
 
 
@@ -119,11 +128,11 @@ def compute_uniform_inlier_ratio(
     width: int,
     height: int,
 ) -> float:
-    """`Evidence.even_share`, of the pixels of points found and of all that must be in view: the
-    share found in the cell of each visible point, as a geometric mean.
+    """Compute `Evidence.even_share` from the pixels of found and of visible points.
 
-    A place that repeats itself explains most of a picture from its twin; where the two differ
-    nothing is found, which a mean would hide.
+    It is the geometric mean, over the visible points, of the share found in their cells. A similar
+    place explains most of the image. Nothing is found where the two places differ, which an
+    arithmetic mean would hide.
     """
     if len(visible_img) == 0:
         return 0.0
@@ -143,8 +152,10 @@ def _cells(points_img: Float[np.ndarray, "n 2"], width: int, height: int) -> Int
 
 
 def compute_score_features(evidence: Evidence) -> tuple[float, ...]:
-    """What the regression weighs: logarithms; the added constants keep small counts from weighing
-    too much."""
+    """Return the inputs of the regression, as logarithms.
+
+    The added constants reduce the influence of small counts.
+    """
     e = evidence
     return (
         math.log(e.even_share + 0.002),
@@ -157,38 +168,36 @@ def compute_score_features(evidence: Evidence) -> tuple[float, ...]:
 
 
 def compute_log_odds(evidence: Evidence, weights: FittedWeights) -> float:
-    """Logarithm of the odds that the pose is right."""
+    """Compute the log-odds that the pose is right."""
     if evidence.is_from_virtual_views:
         features, walls = compute_virtual_view_features(evidence), weights.walls
         return (
-            sum(weight * x for weight, x in zip(walls.parallel_map, features, strict=True))
+            sum(weight * x for weight, x in zip(walls.as_vector, features, strict=True))
             + walls.bias
         )
     return compute_node_log_odds(evidence, weights.evidence)
 
 
 def compute_node_log_odds(evidence: Evidence, weights: EvidenceWeights) -> float:
-    """The same of a pose that the map's nodes let expect, not its walls."""
+    """Compute the log-odds of a pose found by the map's nodes."""
     return (
         sum(
             weight * x
-            for weight, x in zip(
-                weights.parallel_map, compute_score_features(evidence), strict=True
-            )
+            for weight, x in zip(weights.as_vector, compute_score_features(evidence), strict=True)
         )
         + weights.bias
     )
 
 
 def compute_rival_score(evidence: Evidence, log_odds: float, rivals: RivalWeights) -> float:
-    """By how much more of this a pose that the nodes let expect leads another one, in logarithms of
-    odds."""
+    """Compute the score of a pose found by nodes. The difference of two scores is a log-odds
+    margin."""
     even, doubt = math.log(evidence.even_share + 0.002), math.log(max(evidence.doubt, 0.01))
     return rivals.odds * log_odds + rivals.even_share * even + rivals.doubt * doubt
 
 
 def compute_virtual_view_features(evidence: Evidence) -> tuple[float, ...]:
-    """As `compute_score_features`, of a pose that the walls let expect."""
+    """Return the inputs of the regression for a pose found by virtual views."""
     e = evidence
     assert e.num_distinct is not None
     return (
@@ -205,21 +214,23 @@ def compute_virtual_view_features(evidence: Evidence) -> tuple[float, ...]:
 
 
 def compute_precision_probability(evidence: Evidence) -> float:
-    """The probability that a pose from the right place is as precise as is asked; 1 where the odds
-    count that already.
+    """Return the probability that a pose at the right place is within the tolerance.
 
-    A wall alone may leave a pose imprecise though the place is beyond doubt.
+    It is 1 for a pose of the nodes, whose log-odds include the precision already. A single wall may
+    leave a pose imprecise although the place is certain.
     """
     return probability_within_tolerance(evidence.doubt) if evidence.is_from_virtual_views else 1.0
 
 
 def probability_within_tolerance(doubt: float) -> float:
-    """The probability that an error of so many times what is tolerated (one standard deviation) is
-    tolerable."""
+    """Return the probability that a normal error is within the tolerance.
+
+    `doubt` is the standard deviation divided by the tolerance.
+    """
     return math.erf(1.0 / (math.sqrt(2.0) * doubt))
 
 
 def is_only_imprecise(evidence: Evidence, weights: FittedWeights, config: EvidenceConfig) -> bool:
-    """Would the same evidence do if the pose it gives were more precise?"""
+    """Return whether the pose would be accepted if it were more precise."""
     log_odds = compute_log_odds(replace(evidence, doubt=min(evidence.doubt, 0.3)), weights)
     return 1.0 / (1.0 + math.exp(-log_odds)) >= config.min_probability

@@ -1,5 +1,4 @@
-"""A map as it is asked by one of its kinds of features: with the settings, the fitted weights and
-the shared errors of that kind."""
+"""Combine a map with the settings, fitted weights and correlated errors of one feature type."""
 
 from __future__ import annotations
 
@@ -17,9 +16,12 @@ from topoloc.retrieval.coarse import CoarseLocalizer
 
 @dataclass(frozen=True, eq=False)
 class FeatureTypeContext:
-    """`config` has the kind's own thresholds where none are set; `correlated_errors` is rho of the
-    map: the share of a match's variance that its points have in common (see
-    `correlated_errors.py`)."""
+    """Hold a map opened for one feature type.
+
+    `config` has the type's own thresholds filled in. `correlated_errors` is the correlated error
+    share (rho) of the map: the share of a match's variance that its points have in common
+    (`correlated_errors.py`).
+    """
 
     map: OpenMap
     config: LocalizerConfig
@@ -33,8 +35,10 @@ class FeatureTypeContext:
         coarse: CoarseLocalizer | None = None,
         weights: FittedWeights | None = None,
     ) -> FeatureTypeContext:
-        """Of a map's first kind; `weights` instead of those that ship for it. Raises as
-        `OpenMap`."""
+        """Open a map for its first feature type.
+
+        `weights` replaces the shipped weights. Raises the errors of `OpenMap`.
+        """
         opened = OpenMap(topomap, coarse or config.coarse)
         c, weights = config.for_feature_type(opened.kind), weights or _select_weights(opened)
         rho = find_correlated_error_share(
@@ -44,7 +48,7 @@ class FeatureTypeContext:
 
 
 def _select_weights(opened: OpenMap) -> FittedWeights:
-    """Those that ship; of the walls those of the kind that describes them."""
+    """Return the shipped weights. Those of virtual views belong to their own feature type."""
     weights, sides = load_fitted_weights(opened.kind.name), opened.topomap.sides
     if sides is None or not sides.is_used_with(opened.kind.name):
         return weights
@@ -54,12 +58,14 @@ def _select_weights(opened: OpenMap) -> FittedWeights:
 def select_feature_types(
     topomap: TopoMetricMap, requested: tuple[str, ...] | None
 ) -> tuple[list[str], dict[str, str]]:
-    """The kinds of features by which a map is asked, in turn: those that are wanted, else all whose
-    networks are here. And those of the map that are left out, each with what it lacks.
+    """Select the feature types to use, in order: the requested ones, or all available ones.
+
+    Returns:
+        The available types, and the unavailable types of the map with the reason for each.
 
     Raises:
-        MissingExtraError, WeightsError: what a kind that is wanted needs is not here, or what each
-            kind of the map needs.
+        MissingExtraError, WeightsError: a requested type is not available, or no type of the map
+            is.
     """
     available, unavailable_types, first = list[str](), dict[str, str](), None
     for kind in requested or topomap.kinds:

@@ -1,10 +1,9 @@
-"""What was fitted to data: how much each piece of evidence counts, and what the errors of a map's
-points have in common.
+"""Hold the values fitted to data: the weights of the evidence and the correlated errors of a map.
 
-These numbers carry every probability and covariance, and belong to one kind of features each:
-`weights/KIND.json` holds them with the corpus and the command that they come from, and the
-calibration error on places that they were not fitted to. They are no settings. A kind without a
-file answers with those of a kind like it, and says that its probability is not calibrated.
+All probabilities and covariances depend on these values. Each feature type has its own file
+`weights/KIND.json`. It also holds the corpus, the command, and the calibration error on places
+outside the fit. They are not settings. A feature type without a file uses the weights of a similar
+type, and its results are marked as not calibrated.
 """
 
 from __future__ import annotations
@@ -21,18 +20,17 @@ from topoloc.features.feature_types import FEATURE_TYPES, LEARNED_TYPES
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FALLBACK_TYPE, LEARNED_FALLBACK_TYPE = "surf", LEARNED_TYPES[0].name
-"""The kinds whose weights others take that have none: where no network is asked, and where one
-is."""
+"""Feature types whose weights are the fallback: for types without a network, and with one."""
 
 _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
 class EvidenceWeights:
-    """Of the evidence for one pose (`evidence.py`), in logarithms of odds.
+    """Hold the weights of the evidence for one pose (`evidence.py`), in log-odds.
 
-    A pose with more than `clear_log_odds` for it is clear: only parts of the map that look nearly
-    the same are asked then.
+    A pose with more than `clear_log_odds` is clear. Only very similar places of the map are then
+    searched.
     """
 
     even_share: float
@@ -45,8 +43,8 @@ class EvidenceWeights:
     clear_log_odds: float
 
     @property
-    def parallel_map(self) -> tuple[float, ...]:
-        """In the order of `compute_score_features`; without the bias."""
+    def as_vector(self) -> tuple[float, ...]:
+        """Return the weights in the order of `compute_score_features`, without the bias."""
         return (
             self.even_share,
             self.chance,
@@ -59,11 +57,11 @@ class EvidenceWeights:
 
 @dataclass(frozen=True)
 class RivalWeights:
-    """How much the odds, the even share found and the doubt count between two poses of one picture
-    (`belief.py`), in logarithms.
+    """Hold the weights that compare two poses of one image (`belief.py`).
 
-    unclear_lead: by how much, in logarithms of odds, a pose that is not clear must lead each one
-    elsewhere.
+    They weigh the log-odds, the spatially uniform inlier ratio and the normalized uncertainty, in
+    logarithms. `unclear_lead` is the minimum log-odds margin of a pose that is not clear over each
+    pose elsewhere.
     """
 
     odds: float
@@ -74,11 +72,11 @@ class RivalWeights:
 
 @dataclass(frozen=True)
 class VirtualViewWeights:
-    """Of the evidence for a pose that the walls let expect (`walls/`), in logarithms of odds.
+    """Hold the weights of the evidence for a pose from virtual views (`walls/`), in log-odds.
 
-    sigma_px: standard deviation of a key point found at such a slant. few_points: from n points the
-    covariance is this over n times as large as independent errors would have it: where few are
-    found, guided matching has drawn most of them to the pose itself.
+    `sigma_px` is the standard deviation (pixels) of a key point found at a slant. `few_points` over
+    n is the covariance factor for n points, relative to independent errors. If few points are
+    found, guided matching has biased most of them towards the pose.
     """
 
     found: float
@@ -95,19 +93,18 @@ class VirtualViewWeights:
     few_points: float
 
     @property
-    def parallel_map(self) -> tuple[float, ...]:
-        """In the order of `compute_virtual_view_features`; without the bias."""
+    def as_vector(self) -> tuple[float, ...]:
+        """Return the weights in the order of `compute_virtual_view_features`, without the bias."""
         shares = (self.found, self.chance, self.inliers, self.inlier_share, self.spread)
         return (*shares, self.distinct, self.lesser_side, self.even_share, self.doubt)
 
 
 @dataclass(frozen=True)
 class CorrelatedErrorWeights:
-    """What rho (`correlated_errors.py`) is taken to be, from what comparing neighbouring nodes
-    gives.
+    """Hold the conversion from a comparison of neighbouring nodes to rho (`correlated_errors.py`).
 
-    factor: what neighbours share cannot be seen by comparing them. unknown: where too few nodes can
-    be compared.
+    `factor` corrects for errors that neighbours share, which a comparison cannot show. `least` is
+    the minimum of rho. `unknown` is rho if too few nodes can be compared.
     """
 
     factor: float
@@ -117,11 +114,11 @@ class CorrelatedErrorWeights:
 
 @dataclass(frozen=True)
 class FittedWeights:
-    """The weights of one kind of features, and where they come from.
+    """Hold the weights of one feature type and their source.
 
-    calibration_error: mean difference, over ten bins, of the probability said and the share that
-    was right, on places that the weights were not fitted to; None where they were never fitted to
-    this kind.
+    `calibration_error` is the mean difference, over ten bins, of the reported probability and the
+    share of right poses. It is measured on places outside the fit. None: the weights were not
+    fitted to this feature type.
     """
 
     kind: str
@@ -136,10 +133,11 @@ class FittedWeights:
 
     @property
     def is_calibrated(self) -> bool:
+        """Return whether the weights were fitted to this feature type."""
         return self.calibration_error is not None
 
     def to_json(self) -> dict[str, Any]:
-        """What `parse_fitted_weights` reads."""
+        """Return a JSON object that `parse_fitted_weights` reads."""
         whole = asdict(self)
         return {name: whole.pop(name) for name in _SOURCE} | {"weights": whole}
 
@@ -155,11 +153,12 @@ _SOURCE = ("kind", "corpus", "date", "command", "calibration_error")
 
 @cache
 def load_fitted_weights(kind: str) -> FittedWeights:
-    """The weights that ship for this kind of features; those of a kind like it, not calibrated,
-    where there are none.
+    """Return the shipped weights of a feature type.
+
+    If there are none, return those of a similar type, marked as not calibrated.
 
     Raises:
-        FeatureKindError: the file is damaged, or of another kind.
+        FeatureTypeError: the file is damaged, or of another feature type.
     """
     path = WEIGHTS_FOLDER / f"{kind}.json"
     if not path.exists():
@@ -176,10 +175,10 @@ def load_fitted_weights(kind: str) -> FittedWeights:
 
 
 def read_weights(path: Path) -> FittedWeights:
-    """The weights in a file.
+    """Read the weights from a file.
 
     Raises:
-        FeatureKindError: it cannot be read, or is not what `FittedWeights.to_json` gives.
+        FeatureTypeError: the file cannot be read, or has not the format of `FittedWeights.to_json`.
     """
     try:
         return parse_fitted_weights(json.loads(path.read_text(encoding="utf-8")))
@@ -188,8 +187,11 @@ def read_weights(path: Path) -> FittedWeights:
 
 
 def parse_fitted_weights(read: Any) -> FittedWeights:
-    """The opposite of `FittedWeights.to_json`; ValueError where a key is missing, unknown or of the
-    wrong type."""
+    """Parse the object that `FittedWeights.to_json` returns.
+
+    Raises:
+        ValueError: a key is missing, unknown or of the wrong type.
+    """
     _check_keys(read, {*_SOURCE, "weights"}, "the file")
     _check_keys(read["weights"], set(_GROUPS), "weights")
     for name in _SOURCE[:-1]:

@@ -1,8 +1,8 @@
-"""Guided matching: once a pose is roughly known, map points are sought where they must be seen.
+"""Match map points near their predicted pixels, given an approximate pose.
 
-Matches that the ratio test had to give up among thousands of descriptors are safe within a few
-pixels, and the nodes can be chosen by where the camera stands instead of by looks: the nearest
-ones, whose points were measured from nearly the same place.
+The ratio test must reject many true matches among thousands of descriptors. Within a few pixels
+these matches are safe. The nodes can be selected by the camera position instead of appearance. The
+nearest nodes measured their points from nearly the same place.
 """
 
 from __future__ import annotations
@@ -29,33 +29,34 @@ from topoloc.localization.local_map import LocalMap
 
 @dataclass(frozen=True)
 class GuidedConfig:
-    """Settings of guided matching. A threshold that is None is that of the kind of features
-    (`features/kinds.py`)."""
+    """Configure guided matching. Unset thresholds come from the feature type
+    (`features/feature_types.py`)."""
 
     num_nodes: Annotated[int, Between(0, 1000)] = 3
-    """Nodes nearest to the first pose (Eq. 1) whose points are sought; 0 keeps the first pose as it
-    is."""
+    """Number of nodes nearest to the pose proposal (Eq. 1) whose points are searched. 0 keeps the
+    proposal as it is."""
     radius_px: Annotated[float, Between(0, 1000)] = 10.0
-    """How far from its projection a map point is sought, in an image whose longer side is 640
-    pixels; grows with that."""
+    """Search radius around the projection of a map point, in pixels of an image whose longer side
+    is 640. Scales with the image size."""
     max_scale: Annotated[float | None, AtLeast(1)] = None
-    """Largest ratio of a key point's size to the one expected, or the other way round. Unset: what
-    suits the kind of features."""
+    """Maximum ratio between the measured and the predicted key point size, in either direction.
+    Unset: the default of the feature type."""
     max_turn: Annotated[float | None, AtLeast(0)] = None
-    """Largest difference of a key point's orientation from the one expected, radians. Unset: what
-    suits the kind of features."""
+    """Maximum difference between the measured and the predicted orientation, radians. Unset: the
+    default of the feature type."""
     min_similarity: Annotated[float | None, Between(-1, 1)] = None
-    """Least scalar product of the two descriptors. Unset: what suits the kind of features."""
+    """Minimum scalar product of the two descriptors. Unset: the default of the feature type."""
     min_margin: Annotated[float | None, Between(0, 2)] = None
-    """By how much the best key point must lead the next one within the radius."""
+    """Minimum difference in similarity between the best and the second key point within the radius.
+    Unset: the default of the feature type."""
 
     def resolved(
         self, kind: FeatureType, thresholds: GuidedThresholds | None = None
     ) -> GuidedConfig:
-        """With the kind's thresholds (`thresholds`, or those for key points nearby) where none is
-        set.
+        """Return the settings with unset thresholds filled in for a feature type.
 
-        Sizes and angles that do not follow the picture are never looked at.
+        `thresholds` replaces those of the type for nearby key points. Sizes and angles are not
+        compared if the feature type does not measure them.
         """
         unset = {
             name: value
@@ -74,8 +75,10 @@ def match_guided(
     camera: Camera,
     config: GuidedConfig,
 ) -> Matches:
-    """Matches of key points with map points that `cam_from_world` lets expect nearby: one map point
-    a key point, the most similar."""
+    """Match key points with map points near the pixels that `cam_from_world` predicts.
+
+    Each key point gets at most one map point, the most similar.
+    """
     return match_predicted(
         features, local_map, predict_key_points(local_map, cam_from_world, camera), camera, config
     )
@@ -88,7 +91,7 @@ def match_predicted(
     camera: Camera,
     config: GuidedConfig,
 ) -> Matches:
-    """As `match_guided`, where each map point is expected as `predict_key_points` says."""
+    """Match as `match_guided` does, with the output of `predict_key_points` given."""
     found, similarities = _match_predictions(features, local_map, predicted, camera, config)
     train_idx = np.flatnonzero(found >= 0)
     train_idx = train_idx[np.argsort(-similarities[train_idx], kind="stable")]
@@ -105,8 +108,10 @@ def count_chance_matches(
     camera: Camera,
     config: GuidedConfig,
 ) -> int:
-    """How many matches `match_guided` would find were the pose wrong: all map points are sought a
-    third of the picture away."""
+    """Count the matches that `match_guided` would find with a wrong pose.
+
+    All map points are searched a third of the image away from their predictions.
+    """
     predicted = predict_key_points(local_map, cam_from_world, camera)
     size = np.array([camera.width, camera.height], np.float32)
     predicted[:, :2] = np.mod(predicted[:, :2] + size / 3.0, size)
@@ -121,8 +126,7 @@ def _match_predictions(
     camera: Camera,
     config: GuidedConfig,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """The most similar key point near where each map point is expected, -1 for none; and how
-    similar it is."""
+    """Return the most similar key point near each prediction (-1 for none) and its similarity."""
     thresholds = (config.max_scale, config.max_turn, config.min_similarity, config.min_margin)
     numbers = [threshold for threshold in thresholds if threshold is not None]
     assert len(numbers) == 4, "resolve the configuration first"
@@ -148,7 +152,7 @@ def _match_predictions(
 def select_visible_points(
     local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
 ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 2"]]:
-    """The map points that lie in the camera's view, by their rows, and where they must be seen."""
+    """Return the rows of the map points in the camera's view, and their pixels."""
     _, pixels = _project_points(local_map, cam_from_world, camera)
     rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
     return rows, pixels[rows]
@@ -157,7 +161,7 @@ def select_visible_points(
 def _project_points(
     local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
-    """The map points in the camera (metres), and their pixels, NaN where they are out of view."""
+    """Return the map points in the camera frame (metres) and their pixels, NaN if out of view."""
     if not camera.is_distorted:
         rotation, translation = (
             np.ascontiguousarray(cam_from_world.rotation),
@@ -181,10 +185,9 @@ def _project_points(
 def predict_key_points(
     local_map: LocalMap, cam_from_world: Rigid3, camera: Camera
 ) -> Float32[np.ndarray, "n 5"]:
-    """Pixel, size and orientation (cosine, sine) at which each map point must be seen; NaN where it
-    is out of view.
+    """Predict the pixel, size and orientation (cosine, sine) of each map point, NaN if out of view.
 
-    The surface is taken to face the node's camera; `max_scale` and `max_turn` leave room for its
+    The surface is assumed to face the node's camera. `max_scale` and `max_turn` allow for its
     slant.
     """
     points_cam, pixels = _project_points(local_map, cam_from_world, camera)
@@ -201,9 +204,11 @@ def count_consistent_displacements(
     camera: Camera,
     within_px: float,
 ) -> int:
-    """How many of these matches are displaced alike from where they were expected: the most that
-    lie within `within_px` of the displacement of one of them, in an image whose longer side is 640
-    pixels; grows with that."""
+    """Count the matches with consistent displacements from their predictions.
+
+    The count is the largest number of matches within `within_px` of the displacement of one match.
+    `within_px` refers to an image whose longer side is 640 pixels, and scales with the image size.
+    """
     if len(matches) == 0:
         return 0
     shifts = features.points_img[matches.query_idx] - predicted[matches.train_idx, :2]

@@ -1,5 +1,4 @@
-"""Numba kernels of guided matching: where must a map point be seen? And which key point lies there,
-and looks like it?"""
+"""Numba kernels of guided matching: predict the pixels of map points and match key points there."""
 
 from __future__ import annotations
 
@@ -22,16 +21,15 @@ def match_projections(
     min_similarity,
     min_margin,
 ):
-    """For every map point the key point within `radius` pixels of where it must be seen that is
-    most similar.
+    """Find the most similar key point within `radius` pixels of each predicted map point.
 
-    Rows of `predicted` and `key_points` are (x, y, size, cosine and sine of the angle), float32;
-    NaN where a map point is out of view. Key points whose size differs by more than the factor
-    `max_scale`, or whose angle by more than that of `min_cosine`, are others.
+    Rows of `predicted` and `key_points` are (x, y, size, cosine and sine of the angle), float32. A
+    prediction is NaN if the point is out of view. A key point is rejected if its size differs by
+    more than the factor `max_scale`, or the cosine of the angle difference is below `min_cosine`.
 
-    Returns the key point's row for each map point, -1 for none, and the similarity (scalar
-    product). Of several key points within the radius the best must lead by `min_margin`, unless
-    they lie within two pixels of each other: one blob found at two scales.
+    Return the row of the key point for each map point (-1 for none) and the similarity (scalar
+    product). The best key point must exceed the others within the radius by `min_margin`. Others
+    within two pixels (L1) of it are exempt, because they are one blob at two scales.
     """
     num_columns, num_rows = int(width / radius) + 1, int(height / radius) + 1
     num_cells = num_columns * num_rows
@@ -44,7 +42,7 @@ def match_projections(
         starts[cells[k] + 1] += 1
     starts = np.cumsum(starts)
     order, free = np.empty(len(key_points), np.int64), starts.copy()
-    for k in range(len(key_points)):  # those of a cell in their own order
+    for k in range(len(key_points)):  # keeps the order within a cell
         order[free[cells[k]]] = k
         free[cells[k]] += 1
     found = np.full(len(predicted), -1, np.int32)
@@ -98,8 +96,11 @@ def match_projections(
 
 @kernel(error_model="numpy")
 def project_undistorted(points_world, rotation, translation, focal, centre, width, height):
-    """Points in the camera (n, 3), metres, and their pixels (n, 2), NaN where they are out of view,
-    of a camera without distortion."""
+    """Project points into a camera without distortion.
+
+    Return the points in the camera frame (n, 3), metres, and their pixels (n, 2), NaN if out of
+    view.
+    """
     points_cam, pixels = np.empty((len(points_world), 3)), np.empty((len(points_world), 2))
     for n in range(len(points_world)):
         p = points_world[n]
@@ -119,11 +120,10 @@ def project_undistorted(points_world, rotation, translation, focal, centre, widt
 
 @kernel(error_model="numpy")
 def predict_from_pixels(points_cam, pixels, sizes, directions, rotation, focal):
-    """Rows (x, y, size, cosine and sine of the angle), float32, at which points must be seen whose
-    pixels are known; NaN where these are.
+    """Predict rows (x, y, size, cosine and sine of the angle), float32, for points at known pixels.
 
-    `sizes` (metres) and `directions` (unit vectors, world) are those of what the points'
-    descriptors describe, `focal` is in pixels.
+    Rows with NaN pixels are NaN. `sizes` (metres) and `directions` (unit vectors, world) describe
+    the patch of each descriptor. `focal` is in pixels.
     """
     predicted = np.full((len(pixels), 5), np.nan, np.float32)
     for n in range(len(pixels)):

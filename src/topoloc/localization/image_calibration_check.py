@@ -1,12 +1,12 @@
-"""A calibration that the picture contradicts: named, and paid for by the answer's covariance and
-probability.
+"""Check the camera calibration against one image, and penalize the result if they contradict.
 
-A wrong focal length or principal point gives a pose that is wrong, and as sure as any. What is left
-of the points' errors shows it (`geometry/calibration_check.py`); where it does, the points are
-sought once more around the pose and the camera that it leads to, until nothing changes, so that the
-camera named is the picture's own and not half way there. It must explain the picture better than
-the calibration does: where the map itself is off, as at a bend that was seen from one lane alone,
-another camera fits no worse, and no better.
+A wrong focal length or principal point gives a wrong pose with a small covariance. The residuals of
+the points show the error (`geometry/calibration_check.py`). If they do, the points are matched
+again around the corrected pose and camera until the estimate converges. The reported camera is then
+the image's own, not one halfway.
+
+The corrected camera must explain the image better than the calibration does. If the map itself is
+inaccurate, as in a bend that was seen from one lane only, another camera fits no better.
 """
 
 from __future__ import annotations
@@ -18,9 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.calibration_check import (
-    CalibrationMismatch,
     ImageCalibration,
-    IntrinsicsDeviation,
     compute_intrinsics_deviation,
     corrected_camera,
     estimate_image_calibration,
@@ -29,6 +27,7 @@ from topoloc.geometry.calibration_consistency import (
     CalibrationConsistency,
     check_calibration_consistency,
 )
+from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.guided import match_guided
@@ -40,24 +39,26 @@ from topoloc.localization.search import Search
 _SUSPECT_LIMITS, _REPORTED_LIMITS = (
     (3.0, 0.01),
     (5.0, 0.035),
-)  # sigmas, and share of the focal length or of the picture's width
+)  # sigmas, and share of the focal length or image width
 _ROUNDS, _CONVERGED_CHANGE = 4, 0.003
 _INLIER_RADII_PX, _LEAST_GAIN = (
     (1.0, 2.0),
     3.0,
-)  # of a picture of 640 pixels; standard deviations by which points so near become more, in all
+)  # px for a 640-px image; total gain in sigmas
 
 
 def check_camera_calibrations(
     results: Iterable[Localization | NotLocalized],
 ) -> list[CalibrationConsistency]:
-    """What the pictures of each camera say of it together; nothing of cameras that too few pictures
-    say anything of."""
+    """Combine the calibration estimates of all images of each camera.
+
+    Cameras with too few estimates are left out.
+    """
     by_camera: dict[Camera, dict[IntrinsicsDeviation, None]] = {}
     for result in results:
         if result.seen_camera is not None and result.provenance.camera is not None:
             by_camera.setdefault(result.provenance.camera, {})[result.seen_camera] = (
-                None  # a picture that comes twice says it once
+                None  # counts a repeated image once
             )
     verdicts = (
         check_calibration_consistency(list(seen), camera) for camera, seen in by_camera.items()
@@ -68,8 +69,12 @@ def check_camera_calibrations(
 def check_image_calibration(
     search: Search, fit: PoseFit
 ) -> tuple[IntrinsicsDeviation | None, CalibrationMismatch | None]:
-    """What the points of an answer say of its camera (None: nothing, or there was no calibration),
-    and what of that is said against the calibration (None where they agree)."""
+    """Estimate the camera from the inliers of a fit and compare it with the calibration.
+
+    Returns:
+        The deviation from the calibration, None if it cannot be estimated or there is no
+        calibration. And the mismatch, None if the two agree.
+    """
     if isinstance(fit.input_camera, UncalibratedCamera) or fit.pose is None:
         return None, None
     found = _estimate_image_calibration(search, fit)
@@ -108,12 +113,14 @@ def check_image_calibration(
 def _refine_image_calibration(
     search: Search, fit: PoseFit, found: ImageCalibration
 ) -> tuple[PoseFit, ImageCalibration]:
-    """The points sought again around what is found, until nothing changes; not at all where the
-    settings seek none around poses."""
+    """Match the points again around the estimated camera until the estimate converges.
+
+    It does nothing if `guided.num_nodes` is 0.
+    """
     for _ in range(_ROUNDS if search.config.guided.num_nodes else 0):
         around = _rematch(search, fit, found)
         again = _estimate_image_calibration(search, around)
-        if again is None:  # it leads nowhere: what was seen at first has to do
+        if again is None:  # no estimate: keep the previous one
             break
         fit, found = around, again
         if max(abs(math.log(found.scale)), float(np.abs(found.offset).max())) < _CONVERGED_CHANGE:
@@ -122,8 +129,10 @@ def _refine_image_calibration(
 
 
 def _gain(before: PoseFit, after: PoseFit) -> float:
-    """By how many more points lie where they must be seen, in standard deviations of their numbers,
-    summed over how near that is."""
+    """Return the gain in points near their projections, in standard deviations of the counts.
+
+    It is summed over two radii.
+    """
     counts = [
         (_count_within_radius(before, px), _count_within_radius(after, px))
         for px in _INLIER_RADII_PX
@@ -132,8 +141,8 @@ def _gain(before: PoseFit, after: PoseFit) -> float:
 
 
 def _count_within_radius(fit: PoseFit, px: float) -> int:
-    """How many of the fit's points are seen within so many pixels, in a picture whose longer side
-    is 640, of where they must be."""
+    """Count the points within a radius of their projections, in pixels of a 640-pixel-wide
+    image."""
     assert fit.pose is not None
     seen = fit.inlier_observations(1.0)
     offsets = (
@@ -162,7 +171,7 @@ def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibratio
 
 
 def _rematch(search: Search, fit: PoseFit, found: ImageCalibration) -> PoseFit:
-    """The points sought again around the pose and the camera that the picture led to."""
+    """Match the points again around the estimated pose and camera."""
     camera, cam_from_world, config = (
         corrected_camera(fit.camera, found),
         found.cam_from_world,
@@ -178,8 +187,11 @@ def _rematch(search: Search, fit: PoseFit, found: ImageCalibration) -> PoseFit:
 def _is_calibration_off(
     fit: PoseFit, found: ImageCalibration, calibrated: Camera, num_sigmas: float, share: float
 ) -> tuple[bool, bool]:
-    """Are the focal length and the principal point off by more than so many sigmas, and that share
-    (of itself, of the width)?"""
+    """Return whether the focal length and the principal point are off.
+
+    Both `num_sigmas` and `share` must be exceeded. `share` refers to the focal length and the image
+    width.
+    """
     camera = corrected_camera(fit.camera, found)
     sigmas = np.sqrt(np.diag(found.covariance))
     stretch = abs(math.log(camera.fx / calibrated.fx))
@@ -191,5 +203,5 @@ def _is_calibration_off(
 
 
 def _principal_point(camera: Camera, scale: float) -> Float[np.ndarray, " 2"]:
-    """The principal point in a picture that is `scale` times as wide."""
+    """Return the principal point in an image that is `scale` times as wide."""
     return (np.array([camera.cx, camera.cy]) + 0.5) * scale - 0.5

@@ -1,5 +1,4 @@
-"""The part of the map that a query is matched with: the points of its candidate nodes, thrown
-together, in the world frame."""
+"""Hold the part of the map that a query is matched with: pooled node points in the world frame."""
 
 from __future__ import annotations
 
@@ -13,11 +12,12 @@ from topoloc.mapping.topomap import TopoNode
 
 @dataclass(frozen=True, eq=False)
 class LocalMap:
-    """Row k: a map point with its descriptor, world position (metres), covariance (m^2), radius of
-    doubt (metres), and node.
+    """Hold map points. Row k: descriptor, world position (metres), covariance (m^2), radius and
+    node.
 
-    `sizes` is the diameter (metres) of what the descriptor describes, `directions` the unit vector
-    of its orientation: from these follows how large and how turned a camera elsewhere must see it.
+    `radii` (metres) bounds the position error of a point. `sizes` is the diameter (metres) of the
+    described patch, and `directions` the unit vector (world) of its orientation. The size and angle
+    of its key point in another camera follow from these.
     """
 
     descriptors: Float32[np.ndarray, "n d"]
@@ -30,14 +30,13 @@ class LocalMap:
 
     @staticmethod
     def of_node(node: TopoNode) -> LocalMap:
-        """A node's points, moved into the world."""
+        """Return a node's points in the world frame."""
         world_from_cam = node.summary.world_from_cam
         lower = np.zeros((len(node.points_cam), 3, 3))
         lower[:, *np.tril_indices(3)] = node.point_sqrt_covs
         root = world_from_cam.rotation @ lower
         covariances = root @ root.transpose(0, 2, 1)
-        # three standard deviations of the worst direction, and a centimetre for what no covariance
-        # knows
+        # three sigmas over all directions, plus 1 cm for errors outside the covariance
         radii = 0.01 + 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         points_world = world_from_cam.apply(node.points_cam.astype(np.float64))
         node_ids = np.full(len(radii), node.summary.node_id)
@@ -54,7 +53,7 @@ class LocalMap:
 
     @staticmethod
     def concatenate(parts: list[LocalMap]) -> LocalMap:
-        """The points of several nodes."""
+        """Return the points of several nodes."""
         return LocalMap(
             *(
                 np.concatenate([getattr(part, field.name) for part in parts])

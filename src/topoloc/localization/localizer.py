@@ -1,14 +1,16 @@
-"""Localizing a single image in the topo-metric map: section III-B of the paper, read from the top.
+"""Localize a single image in the topo-metric map (section III-B of the paper).
 
-The coarse localizer names the nodes that the image may belong to; the image is patch-normalised and
-its features are matched with those of the nodes; PnP on the matches gives the camera's global pose.
-Unlike the paper's blind first choice, this is one loop of hypotheses (`query_session.py`): first
-poses are proposed (`propose.py`), the cheapest and likeliest first; each is refined in the same
-way, its evidence counted (`refine.py`), and it joins what is believed (`belief.py`), until that is
-settled. A pose is reported only where the evidence for it is strong and nothing else in the map
-explains the image as well. One candidate, no guided step, no look-alikes, viewpoints and walls
-(`num_candidates=1`, `guided.num_nodes=0`, `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`,
-`walls.num_places=0`) give the paper's own behaviour.
+The coarse localizer ranks candidate nodes. The image is patch-normalised and its features are
+matched with those of the nodes. PnP on the matches gives the camera's global pose.
+
+The paper keeps the first pose without a check. This localizer runs one loop over pose hypotheses
+(`query_session.py`) instead. Pose proposals are generated cheapest and likeliest first
+(`propose.py`). Each one is refined and its evidence counted in the same way (`refine.py`). It then
+enters the belief over hypotheses (`belief.py`), until the result is settled. A pose is reported
+only if its evidence is strong and no other place in the map explains the image as well.
+
+These settings give the paper's own behaviour: `num_candidates=1`, `guided.num_nodes=0`,
+`look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_places=0`.
 """
 
 from __future__ import annotations
@@ -42,24 +44,24 @@ R = TypeVar("R", bound=Localization | NotLocalized)
 
 
 class Localizer:
-    """Holds an open map, its coarse localizer and the nodes used lately.
+    """Hold an open map, its coarse localizer and a cache of recently used nodes.
 
-    `unavailable_types` names the map's kinds of features that are not asked because their network,
-    or ONNX Runtime, is not here, each with what it lacks.
+    `unavailable_types` maps each feature type of the map that cannot be used to the reason. A type
+    cannot be used if its network or ONNX Runtime is not installed.
 
     Args:
-        coarse: names the candidate nodes instead of one of the map's own coarse localizers: any
-            object with `CoarseLocalizer.rank` (`topoloc/retrieval/coarse.py`), such as retrieval of
-            another kind or a prior from elsewhere. `config.coarse` is then left aside.
-        weights: what the evidence counts, instead of what ships for the map's kind of features.
+        coarse: ranks the candidate nodes instead of one of the map's own coarse localizers. Any
+            object with `CoarseLocalizer.rank` (`topoloc/retrieval/coarse.py`) works, such as
+            another retrieval method or an external prior. `config.coarse` is then ignored.
+        weights: fitted weights to use instead of those shipped for the map's first feature type.
 
     Raises:
         ConfigError: a setting is out of bounds.
-        FeatureKindError: the map's features are of a kind that there is not.
+        FeatureTypeError: the map's feature type is unknown.
         EmptyMapError: the map has no node.
         MapError: the map has no such coarse localizer.
-        MissingExtraError, WeightsError: a network of features is not here, and the map has no
-            others, or `config.kinds` names them.
+        MissingExtraError, WeightsError: a feature network is not installed, and the map has no
+            other feature type or `config.kinds` names this one.
     """
 
     def __init__(
@@ -97,22 +99,23 @@ class Localizer:
         trace: Trace | None = None,
         t_ns: int | None = None,
     ) -> Localization | NotLocalized:
-        """Where was this image (grey or RGB, uint8) taken, by a camera of this calibration?
+        """Estimate the pose of an image (grey or RGB, uint8).
 
-        Of a camera that is only roughly known, or not at all (None), the focal length is found with
-        the pose; that takes a few times as long, and it is taken for a pinhole.
+        If the camera is only approximately known, or unknown (None), the focal length is estimated
+        with the pose. This takes a few times as long and assumes a pinhole camera.
 
         Args:
-            prior: about where the camera is (world_from_cam): the nodes nearest to it replace the
-                coarse search. The pose needs the same evidence as any other, of matches that the
+            camera: camera model of the image, exact or approximate. None: unknown.
+            prior: approximate pose (world_from_cam). The nodes nearest to it replace coarse
+                retrieval. The pose needs the same evidence as any other, from matches that the
                 prior did not guide.
-            max_ms: after so many milliseconds no further hypothesis is sought, instead of
-                `config.max_ms`.
-            trace: collects all that is tried.
-            t_ns: when it was taken, nanoseconds, for the result to say.
+            max_ms: time limit in milliseconds, instead of `config.max_ms`. No further hypothesis is
+                tested after it.
+            trace: collects all tried proposals.
+            t_ns: capture time in nanoseconds, stored in the result.
 
         Raises:
-            QueryError: the image is no picture of 8 bits, or the camera is of another image size.
+            QueryError: the image is not an 8-bit image, or its size differs from the camera's.
         """
         result = self.localize_with_inliers(
             image, camera or unknown_camera(image), prior, max_ms, trace
@@ -127,8 +130,10 @@ class Localizer:
         max_ms: float | None = None,
         trace: Trace | None = None,
     ) -> ResultWithInliers:
-        """As `localize`; also each pose that the result names (its own, or its alternatives) with
-        the points that it stands on."""
+        """Localize as `localize` does, and also return the inliers of each reported pose.
+
+        The reported poses are the result's own pose, or its alternatives.
+        """
         return self.localize_query(QueryImage(image, camera), prior, max_ms, trace)
 
     def localize_query(
@@ -138,8 +143,10 @@ class Localizer:
         max_ms: float | None = None,
         trace: Trace | None = None,
     ) -> ResultWithInliers:
-        """As `localize_with_inliers`, of a picture whose features other maps may have asked for
-        before."""
+        """Localize as `localize_with_inliers` does, with a query image that caches its features.
+
+        Several maps can share these features.
+        """
         return self.query_session(query_image, prior, max_ms, trace).localize_exhaustive()
 
     def query_session(
@@ -149,7 +156,8 @@ class Localizer:
         max_ms: float | None = None,
         trace: Trace | None = None,
     ) -> QuerySession:
-        """The same question, to be put at a glance first."""
+        """Return a session for this query, which can run a coarse pass before the exhaustive
+        one."""
         searches, camera = (
             self._searches(self._query(query_image, max_ms), trace),
             query_image.camera,
@@ -163,11 +171,13 @@ class Localizer:
         return QuerySession(searches, prior, with_provenance)
 
     def without(self, node_ids: Iterable[int]) -> Localizer:
-        """The same map as if nobody had stood at these nodes: a picture that was taken there is
-        then asked of the rest of the map.
+        """Return a localizer for the same map without these nodes.
 
-        At least one node is left; the walls along the way are not asked. Raises KeyError where the
-        map has no node of such an id.
+        An image recorded at one of them is then localized in the rest of the map. At least one node
+        must remain. Virtual views are not used.
+
+        Raises:
+            KeyError: the map has no node with such an id.
         """
         rows, other = [self.topomap.row_of(node_id) for node_id in node_ids], copy.copy(self)
         other._kinds = [replace(kind, map=kind.map.without(rows)) for kind in self._kinds]
@@ -177,8 +187,8 @@ class Localizer:
     def with_provenance(
         self, result: R, camera: Camera | UncalibratedCamera | None = None, t_ns: int | None = None
     ) -> R:
-        """The result with the map that it is of, where on earth that is, the picture's camera, and
-        its time (nanoseconds)."""
+        """Return the result with the map's identity, its geopose, the camera and the time
+        (nanoseconds)."""
         if isinstance(camera, UncalibratedCamera):
             focal = result.focal_length_px if isinstance(result, Localization) else None
             camera = None if focal is None else camera.with_focal(focal)
@@ -200,7 +210,7 @@ class Localizer:
         )
 
     def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
-        """One by each kind of features, which know those before them."""
+        """Return one search for each feature type. Each search links to the previous one."""
         searches = list[Search]()
         for kind in self._kinds:
             of_kind = replace(query, feature_config=kind.map.feature_config)
@@ -214,8 +224,10 @@ class Localizer:
 
     @property
     def correlated_errors(self) -> float:
-        """rho of the map by its first kind of features: the share of a match's variance that its
-        points have in common."""
+        """Return the correlated error share (rho) of the map for its first feature type.
+
+        It is the share of a match's variance that the map's points have in common.
+        """
         return self._kinds[0].correlated_errors
 
     def _query(self, query_image: QueryImage, max_ms: float | None) -> Query:

@@ -1,5 +1,7 @@
-"""A map opened for queries: where its nodes stand, what names them, and their points in the world.
-Nodes go by their rows."""
+"""Open a map for queries: node poses, coarse localizer, and points in the world frame.
+
+Nodes are identified by their rows.
+"""
 
 from __future__ import annotations
 
@@ -32,20 +34,20 @@ from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
 
 _NO_MOVES = np.zeros((0, 4, 4))
-_MIN_SHIFT_REACH = 2.5  # metres: how far shifts are looked for, at least
+_MIN_SHIFT_REACH = 2.5  # metres: minimum search range of repetition shifts
 _NUM_SIMILAR_NODES, _MAX_SIMILAR_GROUPS, _GROUP_RADIUS = (
     64,
     6,
     5.0,
-)  # nodes that look alike; parts of the map that they make up; a part, in D_thresh (Eq. 1)
+)  # nodes alike; groups of them; group radius in D_thresh (Eq. 1)
 
 
 class OpenMap:
-    """What a localizer keeps of a map between queries.
+    """Hold the data of a map that a localizer keeps between queries.
 
     Args:
-        coarse: the map's coarse localizer of this name, or any object with `CoarseLocalizer.rank`;
-            None for the map's default.
+        coarse: name of one of the map's coarse localizers, or any object with
+            `CoarseLocalizer.rank`. None: the map's default.
 
     Raises:
         EmptyMapError: the map has no node.
@@ -77,8 +79,10 @@ class OpenMap:
         self._masked_rows = list[int]()
 
     def without(self, rows: Iterable[int]) -> OpenMap:
-        """The same map as if nobody had stood at these nodes, whose rows stay theirs; what was read
-        is shared. Its walls are not asked."""
+        """Return the same map without these nodes. The other rows keep their numbers.
+
+        Loaded nodes are shared. Virtual views are not used.
+        """
         other = copy.copy(self)
         other._masked_rows = sorted(set(rows))
         other.coarse = _MaskedCoarseLocalizer(self.coarse, frozenset(other._masked_rows))
@@ -87,7 +91,7 @@ class OpenMap:
 
     @cached_property
     def walls(self) -> VirtualViewIndex | None:
-        """The map's side nodes; None where it has none, or by features of another kind."""
+        """Return the map's virtual views, None if it has none for this feature type."""
         sides = self.topomap.sides
         return (
             VirtualViewIndex(self.topomap, sides)
@@ -96,25 +100,27 @@ class OpenMap:
         )
 
     def with_node_ids(self, candidates: list[NodeScore]) -> list[NodeScore]:
-        """Candidates as they are reported: until then a candidate's `node_id` is the row of its
+        """Return candidates with node ids. Internally, `node_id` of a candidate is the row of its
         node."""
         return [
             NodeScore(self.node_ids[candidate.node_id], candidate.score) for candidate in candidates
         ]
 
     def cam_from_world(self, row: int) -> Rigid3:
-        """Of a node's camera."""
+        """Return cam_from_world of a node."""
         return self.topomap.summaries[row].world_from_cam.inverse()
 
     def local_map(self, rows: Sequence[int] | Int[np.ndarray, " n"]) -> LocalMap:
-        """The points of these nodes together."""
+        """Return the points of these nodes, pooled."""
         return LocalMap.concatenate([self._local_map(int(row)) for row in rows])
 
     def predict_at_node(self, row: int, camera: Camera) -> Float32[np.ndarray, "n 5"]:
-        """What `predict_key_points` says of a node's points for a camera that stands where the
-        node does."""
+        """Return `predict_key_points` of a node's points for a camera at the node's pose.
+
+        The predictions are cached for one camera.
+        """
         kept = self._predicted_at_nodes
-        if kept is None or kept[0] != camera:  # queries mostly come from one camera
+        if kept is None or kept[0] != camera:  # most queries share one camera
             read = CachedNodes(
                 lambda row: predict_key_points(
                     self._local_map(row), self.cam_from_world(row), camera
@@ -124,14 +130,18 @@ class OpenMap:
         return kept[1](row)
 
     def repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
-        """The shifts (metres, world) by which what a node shows repeats itself, see
-        `repetition.py`: of its moves those without a turn."""
+        """Return the repetition shifts (metres, world) of a node: its moves without rotation.
+
+        See `repetition.py`.
+        """
         moves = self.moves(row)
         return moves[(moves[:, :3, :3] == np.eye(3)).all(axis=(1, 2)), :3, 3]
 
     def moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
-        """The moves (world) by which what a node shows is found elsewhere in the map; as the map
-        tells them, or found now."""
+        """Return the transforms (world) that move a node's content onto copies of it in the map.
+
+        They are read from the map if it stores them, and computed otherwise.
+        """
         known = self._stored_moves
         return self._moves(row) if known is None else known.get(self.node_ids[row], _NO_MOVES)
 
@@ -146,8 +156,10 @@ class OpenMap:
         return np.array([move.matrix() for move in found]).reshape(-1, 4, 4)
 
     def _similar_distant_nodes(self, node: TopoNode) -> Iterator[list[int]]:
-        """The rows of nodes that look like this one and are far from it, those near each other
-        together, the most alike first."""
+        """Generate groups of rows of distant nodes that look like this one, most similar first.
+
+        Each group holds up to three nodes near each other.
+        """
         if self._appearance_ranker is None:
             return
         blank = np.zeros((node.camera.height, node.camera.width), np.uint8)
@@ -169,7 +181,7 @@ class OpenMap:
 
     @cached_property
     def _appearance_ranker(self) -> CoarseLocalizer | None:
-        """What ranks nodes by features alone, where the map has it."""
+        """Return the coarse localizer that needs features only, None if the map has none."""
         return (
             open_map_coarse_localizer(self.topomap, SurfVlad.name)
             if SurfVlad.name in self.topomap.coarse_models
@@ -191,21 +203,20 @@ class OpenMap:
         return find_repetition_shifts(node, self.local_map(near[spread]))
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
-        """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is
-        up."""
+        """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll."""
         distances = roll_invariant_distances(world_from_cam, self.node_poses, self.lambda_rot)
         distances[self._masked_rows] = np.inf
         return distances
 
     def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> Int[np.ndarray, " n"]:
-        """The rows of the nodes nearest to a camera, the nearest first."""
+        """Return the rows of the nodes nearest to a camera, nearest first."""
         return np.argsort(self.distances(world_from_cam), kind="stable")[
             : min(num_nodes, len(self.node_ids) - len(self._masked_rows))
         ]
 
 
 class _MaskedCoarseLocalizer:
-    """A coarse localizer that does not name some nodes, by their rows."""
+    """Rank nodes with another coarse localizer and leave out some rows."""
 
     def __init__(self, coarse: CoarseLocalizer, masked_rows: frozenset[int]) -> None:
         self._coarse, self._masked_rows = coarse, masked_rows
@@ -219,8 +230,7 @@ class _MaskedCoarseLocalizer:
 
 
 def _stored_moves(topomap: TopoMetricMap) -> Mapping[int, Float[np.ndarray, "k 4 4"]] | None:
-    """The moves that the map tells by the ids of its nodes, where they were found of the nodes that
-    it has."""
+    """Return the map's stored moves by node id, None if they belong to other nodes."""
     known = topomap.repetitions
     return (
         dict(known.moves)
@@ -230,8 +240,10 @@ def _stored_moves(topomap: TopoMetricMap) -> Mapping[int, Float[np.ndarray, "k 4
 
 
 def _max_focal_length(topomap: TopoMetricMap) -> float:
-    """Focal length (pixels) of the finest camera that mapped; each recording is taken to have one
-    camera."""
+    """Return the focal length (pixels) of the finest mapping camera.
+
+    Each recording is assumed to have one camera.
+    """
     first_rows = {
         topomap.summaries[row].session_id: row for row in reversed(range(len(topomap.summaries)))
     }
@@ -239,14 +251,16 @@ def _max_focal_length(topomap: TopoMetricMap) -> float:
 
 
 QUARTER_TURN = Rigid3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-"""A quarter turn about the optical axis."""
+"""Rotation by 90 degrees about the optical axis."""
 
 
 def roll_invariant_distances(
     world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float
 ) -> Float[np.ndarray, " nodes"]:
-    """D_total of Eq. 1 (metres) between a camera and each node, whichever side of the camera is up:
-    the least of four quarter turns."""
+    """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll.
+
+    It is the minimum over four rolls, 90 degrees apart.
+    """
     distances = node_distances(world_from_cam, nodes, lambda_rot)
     for _ in range(3):
         world_from_cam = world_from_cam @ QUARTER_TURN

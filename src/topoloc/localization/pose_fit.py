@@ -1,5 +1,4 @@
-"""Matches of a query image's features with points of the map, and the pose that most of them agree
-on."""
+"""Match a query image's features with map points and fit a pose to the matches."""
 
 from __future__ import annotations
 
@@ -20,8 +19,7 @@ from topoloc.localization.local_map import LocalMap
 
 @dataclass(frozen=True, eq=False)
 class PointObservations:
-    """Row k: the pixel at which a map point was found, its world position (metres) and the
-    covariance of that (m^2)."""
+    """Hold matched map points. Row k: pixel, world position (metres) and its covariance (m^2)."""
 
     points_img: Float32[np.ndarray, "n 2"]
     points_world: Float[np.ndarray, "n 3"]
@@ -31,12 +29,13 @@ class PointObservations:
         return len(self.points_img)
 
     def select(self, rows: np.ndarray) -> PointObservations:
+        """Return the given rows."""
         return PointObservations(
             self.points_img[rows], self.points_world[rows], self.covariances[rows]
         )
 
     def to_image_scale(self, scale: float) -> PointObservations:
-        """The same in a picture that is `scale` times as wide."""
+        """Return the same points in an image that is `scale` times as wide."""
         points_img = (
             (self.points_img + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)
         ).astype(np.float32)
@@ -48,8 +47,11 @@ _MIN_MATCHES = 4
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """`input_camera` is what is known of the camera, `camera` the same, or, of a rough one, what
-    comes of it with the focal length found."""
+    """Hold matches and the pose fitted to them.
+
+    `input_camera` is the given camera. `camera` is the same, or has the estimated focal length if
+    the given camera is approximate. `pose` is None if no pose was found.
+    """
 
     features: Features
     input_camera: Camera | UncalibratedCamera
@@ -60,11 +62,12 @@ class PoseFit:
 
     @property
     def num_inliers(self) -> int:
+        """Return the number of inliers, 0 without a pose."""
         return int(self.pose.inliers.sum()) if self.pose else 0
 
     @property
     def node_id(self) -> int:
-        """The node that most inliers come from; -1 without any."""
+        """Return the node with the most inliers, -1 if there are no inliers."""
         if self.num_inliers == 0 or self.pose is None:
             return -1
         node_ids, counts = np.unique(
@@ -74,27 +77,30 @@ class PoseFit:
 
     @cached_property
     def world_from_cam(self) -> Rigid3:
-        """Of a fit with a pose."""
+        """Return the pose. The fit must have one."""
         assert self.pose is not None
         return self.pose.cam_from_world.inverse()
 
     @cached_property
     def _bounding_box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-        """The corners (metres, world) of what the inliers' points fill."""
+        """Return the lower and upper corner (metres, world) of the box around the inliers'
+        points."""
         assert self.pose is not None
         columns = self.matches.train_idx[self.pose.inliers]
         points, radii = self.local_map.points_world[columns], self.local_map.radii[columns][:, None]
         return (points - radii).min(axis=0), (points + radii).max(axis=0)
 
     def may_share_points(self, other: PoseFit) -> bool:
-        """Might inliers of both be the same points of the map? Where even the boxes that they fill
-        are apart they are not."""
+        """Return whether inliers of both may be the same map points. If the boxes are disjoint,
+        they are not."""
         (low, high), (other_low, other_high) = self._bounding_box, other._bounding_box
         return bool(np.all(low <= other_high) and np.all(other_low <= high))
 
     def inlier_observations(self, scale: float) -> PointObservations:
-        """The inliers of a fit with a pose, in a picture that is `scale` times as wide as that of
-        the features."""
+        """Return the inliers, in an image `scale` times as wide as that of the features.
+
+        The fit must have a pose.
+        """
         assert self.pose is not None
         query_idx, train_idx = (
             self.matches.query_idx[self.pose.inliers],
@@ -117,8 +123,10 @@ def fit_pose(
     config: AbsolutePoseConfig,
     start: tuple[Rigid3, Camera] | None = None,
 ) -> PoseFit:
-    """Robust PnP on the matches, or the refinement of `start` (cam_from_world and the camera); with
-    the focal length, of a rough camera."""
+    """Fit a pose by robust PnP, or refine `start` (cam_from_world, camera).
+
+    The focal length is estimated too if the camera is approximate.
+    """
     camera = start[1] if start else nominal_camera(input_camera)
     if len(matches) < _MIN_MATCHES:
         return PoseFit(features, input_camera, camera, local_map, matches, None)

@@ -1,24 +1,22 @@
-"""First poses for a query image, the cheapest and likeliest first. Who proposes judges nothing:
-that is `evidence.py`'s and `belief.py`'s.
+"""Generate pose proposals for a query image, cheapest and likeliest first.
 
-- **prior**: the nodes nearest to where the camera is expected to be.
-- **retrieval**: the nodes that the coarse localizer names, their points thrown together.
-- **look-alikes**: the pool of the best candidates hides a second place: where its nodes are in the
-  pool, points that are in both fail the ratio test; where they are not, nobody asks. So nodes that
-  look as much like the image as the best one does, but stand far from what was found, are asked on
-  their own.
-- **viewpoints**: in the dark most true matches fail the ratio test, among thousands of descriptors
-  something is always as similar. A camera near a node sees the same things about where the node saw
-  them, about as large and as upright, and among the few key points that fit so the most similar one
-  is right far more often. So each node that ranks high lends its pose as if it were the camera's.
-  Wrong nodes give matches that are displaced anyhow, the right one matches that are displaced
-  alike: only nodes whose displacements agree are followed up.
+`evidence.py` and `belief.py` judge them. The sources are:
 
-- **repetition**: where a place repeats itself (`repetition.py`), a hypothesis is one of many: the
-  poses shifted so are proposed, too.
-- **walls**: what is seen of the walls along the way, from the other side (`walls/`).
+- **prior**: the nodes nearest to the expected pose.
+- **retrieval**: the pooled points of the nodes that the coarse localizer ranks first.
+- **look-alikes**: similar places. A second place is hidden by the pool of the best candidates. If
+  its nodes are in the pool, points of both places fail the ratio test. If they are not, they are
+  not searched. So nodes with similar scores, far from the current best pose, are searched on their
+  own.
+- **viewpoints**: node viewpoints as pose priors. In darkness most true matches fail the ratio test,
+  because some other descriptor is always as similar. A camera near a node sees the same points at
+  about the same pixels, sizes and angles as the node. Among the few key points that fit, the most
+  similar one is much more often right. Wrong nodes give matches with random displacements, the
+  right node consistent ones. Only nodes with consistent displacements are refined.
+- **repetition**: the shifted poses of each hypothesis in a repetitive place (`repetition.py`).
+- **walls**: virtual views of the walls, seen from the reverse direction (`walls/`).
 
-Each proposer looks at what is believed so far and proposes nothing where that is settled.
+Each source reads the current belief and proposes nothing if it is settled.
 """
 
 from __future__ import annotations
@@ -46,13 +44,16 @@ from topoloc.mapping.nodes import node_distances
 from topoloc.retrieval.coarse import NodeScore
 
 _MAX_SAME_POSE_ANGLE = 0.25  # radians
-_MAX_OTHER_POSES = 3  # poses of other features that are asked
-_MIN_FOUND_RATIO = 0.2  # of what is found at a pose, that must be found at one that is as likely
+_MAX_OTHER_POSES = 3  # maximum number of poses from the preceding feature type
+_MIN_FOUND_RATIO = 0.2  # minimum points found at a repeated pose, relative to the original
 
 
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
-    """All first poses worth a look, each made when it is asked for; only the first of them where
-    another kind of features is asked next."""
+    """Generate the pose proposals lazily.
+
+    With a prior there is one proposal. If another feature type follows and the pose is not clear,
+    only retrieval is used.
+    """
     if prior is not None:
         rows = [candidate.node_id for candidate in _nearest_nodes(search, prior)]
         yield _propose_from_nodes(search, "prior", rows, float(search.config.num_chance_inliers))
@@ -69,7 +70,7 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
 
 
 def propose_more(search: Search) -> Iterator[Proposal]:
-    """What is left to look at once retrieval has had its say, which was the first tried."""
+    """Generate the proposals that follow retrieval."""
     viewpoints = [] if search.is_clear else list(_propose_node_viewpoints(search))
     yield from viewpoints
     assert search.retrieved is not None
@@ -84,8 +85,10 @@ def propose_more(search: Search) -> Iterator[Proposal]:
 
 
 def propose_quick(search: Search, least: float) -> Proposal | None:
-    """What retrieval by the strongest features alone leads to; None where fewer than `least` of
-    them agree."""
+    """Return the proposal of retrieval with the strongest features only.
+
+    None if fewer than `least` of them agree.
+    """
     quick_proposal = _match_and_fit(
         search,
         "retrieval",
@@ -97,8 +100,7 @@ def propose_quick(search: Search, least: float) -> Proposal | None:
 
 
 def _rank_nodes(search: Search) -> list[int]:
-    """The rows of the nodes that the coarse localizer names, of which the best are asked
-    together."""
+    """Rank the nodes with the coarse localizer and return the rows of the candidates."""
     features = search.query.features
     with search.query.clock.stage("coarse"):
         num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
@@ -107,7 +109,8 @@ def _rank_nodes(search: Search) -> list[int]:
 
 
 def _nearest_nodes(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
-    """As many nodes as the coarse step would name; nearer ones (Eq. 1) score higher."""
+    """Return `num_candidates` nodes nearest to a pose. The score is the negative distance (Eq.
+    1)."""
     distances = search.map.distances(world_from_cam)
     rows = search.map.nearest(world_from_cam, search.config.num_candidates)
     search.ranked = [NodeScore(int(row), -float(distances[row])) for row in rows]
@@ -115,8 +118,11 @@ def _nearest_nodes(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
 
 
 def _propose_from_nodes(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
-    """These nodes' points together. The strongest features are nearly always enough, or agree in
-    fewer than `least`; else all are tried."""
+    """Propose a pose from the pooled points of these nodes.
+
+    The strongest features are matched first. All are matched if at least `least` of these agree but
+    the pose is not clear.
+    """
     config, matcher = search.config, _create_matcher(search, rows)
     proposal = _match_and_fit(search, source, matcher, least, config.num_first_features)
     is_open = least <= proposal.fit.num_inliers < config.num_clear_inliers
@@ -126,7 +132,7 @@ def _propose_from_nodes(search: Search, source: Source, rows: list[int], least: 
 
 
 def _create_matcher(search: Search, rows: list[int]) -> tuple[LocalMap, Matcher]:
-    """The points of these nodes, and what matches the query's features with them."""
+    """Return the points of these nodes and a matcher of the query's features with them."""
     points = search.map.local_map(rows)
     return points, Matcher(
         search.query.features.descriptors,
@@ -143,8 +149,10 @@ def _match_and_fit(
     least: float,
     max_features: int | None = None,
 ) -> Proposal:
-    """Matches with the points of nodes, and robust PnP, where as many as `least` may agree on a
-    pose."""
+    """Match the points of nodes and fit a pose by robust PnP.
+
+    The pose is None if there are fewer than `least` or `min_matches` matches.
+    """
     query, (local_map, matcher) = search.query, points_and_matcher
     with query.clock.stage("matching"):
         matches = matcher.match_first(max_features)
@@ -163,8 +171,10 @@ def _match_and_fit(
 
 
 def _propose_similar_places(search: Search) -> Iterator[Proposal]:
-    """Parts of the map far from what is believed that look like the image about as much as the best
-    node does."""
+    """Propose poses in similar places, far from the best pose.
+
+    They are groups of nodes with nearly the best coarse score.
+    """
     config, best, nodes = search.config.look_alikes, search.best, search.map.node_poses
     if not search.ranked or not config.max_groups:
         return
@@ -190,8 +200,10 @@ def _propose_similar_places(search: Search) -> Iterator[Proposal]:
 
 
 def min_rival_inliers(search: Search) -> float:
-    """With how many of the strongest features another place must agree: more than by chance, not
-    far fewer than what is believed."""
+    """Return the minimum number of inliers of another place, among the strongest features.
+
+    It is more than chance and a share of the inliers of the best pose.
+    """
     best, config, least = search.best, search.config, float(search.config.num_chance_inliers)
     if best is None or best.fit.pose is None or best.probability < config.evidence.min_probability:
         return least
@@ -203,8 +215,11 @@ def min_rival_inliers(search: Search) -> float:
 
 
 def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
-    """What would be seen from where a node stands, for the nodes whose displacements agree, the
-    most agreeing first."""
+    """Propose poses from node viewpoints, most consistent first.
+
+    Each node predicts its own points at its own pose. Nodes with consistent displacements are
+    fitted.
+    """
     config, query = search.config.viewpoints, search.query
     found = []
     with query.clock.stage("matching"):
@@ -224,8 +239,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
                 found.append((num_alike, local_map, matches))
     found.sort(key=lambda one: -one[0])
     quick = replace(search.config.pose, max_iterations=config.max_iterations)
-    # where a place repeats itself, many nodes see the same, and the right one is no better than the
-    # others
+    # in a repetitive place many nodes see the same, and the right one is no better than the others
     more = 3 if found and len(search.map.repeats(search.ranked[0].node_id)) else 1
     with query.clock.stage("pnp"):
         fits = [
@@ -244,7 +258,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
 
 
 def _propose_from_other_features(search: Search) -> Iterator[Proposal]:
-    """The poses that other features left open, where these features did not settle it."""
+    """Propose the poses of the preceding feature type if this one is not clear."""
     config, previous = search.config, search.previous
     if previous is None or search.is_clear or config.guided.num_nodes == 0:
         return
@@ -260,8 +274,7 @@ def _propose_from_other_features(search: Search) -> Iterator[Proposal]:
 
 
 def _propose_repetitions(search: Search) -> Iterator[Proposal]:
-    """The poses that a repetition of the place allows as well as those that are believed, and
-    theirs in turn."""
+    """Propose the repeated poses of the probable hypotheses, and the repetitions of new ones."""
     config, tried, num_asked = search.config, list[Rigid3](), 0
     waiting = [one for one in search.belief.hypotheses if not one.is_from_virtual_views]
     while waiting and config.guided.num_nodes > 0:
@@ -289,7 +302,7 @@ def _propose_repetitions(search: Search) -> Iterator[Proposal]:
 
 
 def _is_near_any(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
-    """Is a pose one of these, not a repetition of it?"""
+    """Return whether a pose equals one of the others, instead of being a repetition of it."""
     distances = np.linalg.norm(
         np.array([other.translation for other in others]) - world_from_cam.translation, axis=1
     )
@@ -302,8 +315,10 @@ def _is_near_any(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
 def _fit_moved_pose(
     search: Search, world_from_cam: Rigid3, hypothesis: Hypothesis
 ) -> PoseFit | None:
-    """What is found around a pose that is known to a few centimetres; None where it is far less
-    than at the one that it repeats."""
+    """Fit a pose around a repeated pose, which is accurate to a few centimetres.
+
+    None if far fewer points are found than at the original pose.
+    """
     return _fit_around_pose(
         search,
         world_from_cam,
@@ -315,7 +330,7 @@ def _fit_moved_pose(
 def _fit_around_pose(
     search: Search, world_from_cam: Rigid3, camera: Camera, least: float
 ) -> PoseFit | None:
-    """What is found around a pose; None where fewer than so many agree."""
+    """Fit a pose to guided matches around a pose. None if fewer than `least` agree."""
     query, config, start = search.query, search.config, (world_from_cam.inverse(), camera)
     with query.clock.stage("matching"):
         local_map = search.map.local_map(

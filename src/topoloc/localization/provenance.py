@@ -1,4 +1,4 @@
-"""What a result comes from: map, features, time and camera."""
+"""Describe the source of a result: map, features, time and camera."""
 
 from __future__ import annotations
 
@@ -14,12 +14,19 @@ from topoloc.localization import checked_json as checked
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a result comes from: the map by its id, in which version (the number of its last edit),
-    by which kind of `features`; when the picture was taken (nanoseconds), and with which camera.
-    What is not known is None, or empty. `tile` is what the map is called in the atlas that was
-    asked, `atlas_from_cam` the camera's pose in the atlas's world; None where no atlas was asked,
-    or that is not known. `joint_world` is the name of the world that the tile shares with those
-    joined with it, `joint_from_cam` the pose in that one."""
+    """Hold the source of a result. Unknown values are None or empty.
+
+    Attributes:
+        map_id: id of the map.
+        map_version: number of the map's last edit.
+        features: feature type that found the pose.
+        t_ns: capture time of the image, nanoseconds.
+        camera: camera model of the image.
+        tile: name of the map in the queried atlas. None if no atlas was queried.
+        atlas_from_cam: camera pose in the atlas's world, None if unknown.
+        joint_world: name of the world that the tile shares with joined tiles.
+        joint_from_cam: camera pose in the joint world.
+    """
 
     map_id: str = ""
     map_version: int = 0
@@ -32,6 +39,7 @@ class Provenance:
     joint_from_cam: Rigid3 | None = None
 
     def to_json(self) -> dict[str, Any]:
+        """Return the provenance as keys of a result's JSON."""
         camera = None if self.camera is None else self.camera.to_json()
         of_atlas: dict[str, Any] = {} if self.tile is None else {"tile": self.tile}
         if self.atlas_from_cam is not None:
@@ -50,7 +58,11 @@ class Provenance:
 
     @staticmethod
     def from_json(data: Mapping[str, Any]) -> Provenance:
-        """Of a result's JSON; results of before there was any have none. Raises ResultError."""
+        """Parse the provenance in a result's JSON. Missing keys give the defaults.
+
+        Raises:
+            ResultError: a value is invalid.
+        """
         t_ns, camera, tile, pose = (
             data.get(key) for key in ("t_ns", "camera", "tile", "atlas_from_cam")
         )
@@ -65,9 +77,11 @@ class Provenance:
                 None if t_ns is None else checked.integer(t_ns, "t_ns", -(2**63)),
                 None if camera is None else Camera.from_json(camera),
                 None if tile is None else checked.text(tile, "tile"),
-                None if pose is None else checked.rigid(pose, "atlas_from_cam"),
+                None if pose is None else checked.pose_from_json(pose, "atlas_from_cam"),
                 None if joint is None else checked.text(joint, "joint_world"),
-                None if joint_pose is None else checked.rigid(joint_pose, "joint_from_cam"),
+                None
+                if joint_pose is None
+                else checked.pose_from_json(joint_pose, "joint_from_cam"),
             )
         except CalibrationError as error:
             raise ResultError(f"no result: {error}") from None

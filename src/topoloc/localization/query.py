@@ -1,10 +1,9 @@
-"""A query image made ready: of the size at which the map can be asked, with its features when they
-are first wanted.
+"""Prepare a query image: reduce it to the map's resolution and extract its features lazily.
 
-Key points have sizes in pixels, and those of a picture with far more pixels a radian than the map's
-pictures had are mostly smaller than any that the map holds: they crowd out the ones that it does. A
-long lens and a picture of many megapixels are alike in that. Such a picture is reduced until its
-pixels see as much as the map's did; a coarser one stays as it is.
+Key points have sizes in pixels. If an image has far more pixels per radian than the map's images,
+most of its key points are smaller than any in the map. They displace the key points that would
+match. A long focal length and a high pixel count have the same effect. Such an image is reduced to
+the map's pixels per radian. A coarser image keeps its size.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from topoloc.retrieval.coarse import Image
 
 
 class StageClock:
-    """Adds up the time spent in named stages; `total` is the time since it was made."""
+    """Accumulate the time spent in named stages. `total` is the time since construction."""
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
@@ -38,6 +37,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
+        """Add the duration of the context to a named stage."""
         start = time.perf_counter()
         try:
             yield
@@ -47,24 +47,30 @@ class StageClock:
             )
 
     def times_ms(self) -> dict[str, float]:
+        """Return the milliseconds of each stage, and `total`."""
         return self._times_ms | {"total": (time.perf_counter() - self._start) * 1e3}
 
 
 class SharedFeatures:
-    """The features of one picture by its size and their settings, extracted once, whichever of
-    several maps asks for them first."""
+    """Cache the features of one image by image size and settings.
+
+    Several maps share the cache, so each set of features is extracted once.
+    """
 
     def __init__(self) -> None:
         self._kept: dict[tuple[int, int, FeatureConfig, Hashable], Features] = {}
 
     def of(self, query: Query) -> Features:
-        """Of the picture as it was reduced for a query."""
+        """Return the features of the image as reduced for this query."""
         return self.get_or_extract(query, None, query.extract_features)
 
     def get_or_extract(
         self, query: Query, view: Hashable, extract: Callable[[], Features]
     ) -> Features:
-        """Those of a view of that picture, such as the one to its side."""
+        """Return the cached features of a view of the image, or extract them.
+
+        A view is, for example, one that was rotated to the side.
+        """
         key = (query.image.shape[1], query.image.shape[0], query.feature_config, view)
         if key not in self._kept:
             self._kept[key] = extract()
@@ -72,16 +78,22 @@ class SharedFeatures:
 
 
 class StoredFeatures(SharedFeatures):
-    """Those of a picture of which nothing else is left, by their kinds, such as a node of another
-    map; pixels of `width` columns."""
+    """Hold features of an image whose pixels are not available, such as a node of another map.
+
+    `known` holds them by feature type. Their pixel coordinates belong to an image of `width`
+    columns.
+    """
 
     def __init__(self, known: Mapping[str, Features], width: int) -> None:
         super().__init__()
         self._known, self._width = known, width
 
     def of(self, query: Query) -> Features:
-        """As they would be in the picture as it was reduced. Raises KeyError where they are of
-        other kinds."""
+        """Return the features, scaled to the image as reduced for this query.
+
+        Raises:
+            KeyError: there are no features of the query's type.
+        """
         known, scale = (
             self._known[query.feature_config.kind],
             np.float32(query.image.shape[1] / self._width),
@@ -95,8 +107,11 @@ class StoredFeatures(SharedFeatures):
 
 @dataclass(frozen=True, eq=False)
 class QueryImage:
-    """A picture with what is known of its camera, to be asked of one map or of several. Raises as
-    `check_image_size`."""
+    """Hold an image and its camera model, to be localized in one map or several.
+
+    Raises:
+        QueryError: see `check_image_size`.
+    """
 
     image: Image
     camera: Camera | UncalibratedCamera
@@ -107,9 +122,11 @@ class QueryImage:
 
     @staticmethod
     def of_features(known: Mapping[str, Features], camera: Camera) -> QueryImage:
-        """One of which nothing but local features is left, by their kinds. What looks at the
-        picture itself (other scales and turns of it, walls, what a network says beside its key
-        points) finds nothing in it."""
+        """Return a query image made of local features only, by feature type.
+
+        Its pixels are zero. Steps that read pixels find nothing in it: other scales and rotations,
+        virtual views, and dense or global descriptors of a network.
+        """
         return QueryImage(
             np.zeros((camera.height, camera.width), np.uint8),
             camera,
@@ -119,11 +136,10 @@ class QueryImage:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An image with what is known of its camera (`input_camera`), reduced; the image as it came is
-    `scale` times as wide.
+    """Hold a reduced image and its camera model (`input_camera`).
 
-    `deadline` is the time (of `time.perf_counter`) after which no further hypothesis is sought;
-    infinite where there is none.
+    The original image is `scale` times as wide. `deadline` is the `time.perf_counter` value
+    (seconds) after which no further hypothesis is tested. It is infinite by default.
     """
 
     image: Image
@@ -136,20 +152,21 @@ class Query:
 
     @property
     def camera(self) -> Camera:
-        """The calibration; of a camera that is only roughly known, the likeliest."""
+        """Return the calibrated camera, or the nominal one if the camera is only approximate."""
         return nominal_camera(self.input_camera)
 
     @cached_property
     def grey(self) -> UInt8[np.ndarray, "h w"]:
+        """Return the reduced image in grey."""
         return to_grey(self.image)
 
     @cached_property
     def features(self) -> Features:
-        """The local features."""
+        """Return the local features."""
         return self.shared.of(self)
 
     def extract_features(self) -> Features:
-        """Patch normalisation, then the local features."""
+        """Normalise patches, then extract the local features."""
         with self.clock.stage("patch_normalization"):
             normalized = normalize_image(self.grey, self.feature_config)
         with self.clock.stage("features"):
@@ -157,12 +174,16 @@ class Query:
 
     @property
     def is_past_deadline(self) -> bool:
+        """Return whether the deadline has passed."""
         return time.perf_counter() > self.deadline
 
 
 def check_image_size(image: Image, camera: Camera | UncalibratedCamera) -> None:
-    """Raises QueryError where the image is no picture of 8 bits, or the camera is of another image
-    size."""
+    """Check that the image is an 8-bit image of the camera's size.
+
+    Raises:
+        QueryError: it is not.
+    """
     if problem := find_image_problem(image):
         raise QueryError(problem)
     height, width = image.shape[:2]
@@ -173,8 +194,11 @@ def check_image_size(image: Image, camera: Camera | UncalibratedCamera) -> None:
 
 
 def unknown_camera(image: Image) -> UncalibratedCamera:
-    """The camera of a picture of which nothing is known. Raises QueryError where the image is no
-    picture of 8 bits."""
+    """Return the approximate camera for an image without any calibration.
+
+    Raises:
+        QueryError: the image is not an 8-bit image.
+    """
     if problem := find_image_problem(image):
         raise QueryError(problem)
     return UncalibratedCamera.unknown(image.shape[1], image.shape[0])
@@ -187,12 +211,15 @@ def reduce_image(
     max_finer: float,
     max_side_px: int,
 ) -> tuple[np.ndarray, Camera | UncalibratedCamera]:
-    """The image with its camera, smaller where it has over `max_finer` times the map's pixels a
-    radian, or a longer side.
+    """Return the image and its camera, reduced if the image is too fine or too large.
 
     Args:
-        map_focal: focal length (pixels) of the map's finest camera: its pixels a radian. A rough
-            camera counts as finer only as far as its whole range is.
+        map_focal_length: focal length (pixels) of the map's finest camera, which equals its pixels
+            per radian.
+        max_finer: the image is reduced to `map_focal_length` if its own focal length exceeds
+            `max_finer` times this. For an approximate camera the smallest possible focal length
+            counts.
+        max_side_px: largest width or height of the returned image.
     """
     height, width = image.shape[:2]
     focal = camera.min_focal if isinstance(camera, UncalibratedCamera) else camera.fx

@@ -1,4 +1,4 @@
-"""What is known of a query picture's camera: what `--camera` says, its recording, or its file."""
+"""Select the camera model of a query image: from `--camera`, the recording or the image file."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.calibration import parse_calibration
+from topoloc.recordings.calibration import parse_calibration, parse_intrinsics
 from topoloc.recordings.frame import StereoFrame
 
 CameraOfSize = Callable[[int, int], Camera | UncalibratedCamera]
-"""The camera of a picture of this width and height."""
+"""A function from image width and height to a camera model."""
 
 
 def select_frame_camera(
     frame: StereoFrame, of_size: CameraOfSize | None
 ) -> Camera | UncalibratedCamera:
-    """What `--camera` says, else the recording; else what the picture's file says of its focal
-    length, or nothing."""
+    """Return the camera of an image.
+
+    The order is: `--camera`, the recording's calibration, the focal length in the EXIF data,
+    unknown.
+    """
     height, width = frame.image.shape[:2]
     if of_size is not None:
         return of_size(width, height)
@@ -32,13 +35,23 @@ def select_frame_camera(
     )
 
 
-def parse_camera_option(text: str, topomap: TopoMetricMap | None) -> CameraOfSize:
-    """What `--camera` says; `map` only where one map is asked. Raises CalibrationError."""
+def parse_camera_option(
+    text: str, topomap: TopoMetricMap | None, allow_files: bool = True
+) -> CameraOfSize:
+    """Parse the value of `--camera`. `map` is allowed only if a single map is queried.
+
+    Args:
+        allow_files: read the calibration from a file of that name; if not, the text must be
+            ``map``, ``unknown`` or ``fx,fy,cx,cy`` (pixels).
+
+    Raises:
+        CalibrationError: the value is invalid.
+    """
     if text == "map" and topomap is not None:
         return _rescaled_camera(topomap.nodes[0].camera)
     if text == "unknown":
         return UncalibratedCamera.unknown
-    calibration = parse_calibration(text)
+    calibration = parse_calibration(text) if allow_files else parse_intrinsics(text)
     return lambda width, height: calibration(width, height).camera
 
 
@@ -46,7 +59,7 @@ def _rescaled_camera(camera: Camera) -> CameraOfSize:
     def of_size(width: int, height: int) -> Camera:
         if abs(width * camera.height - height * camera.width) > max(
             camera.width, camera.height
-        ):  # more than a pixel's rounding
+        ):  # more than one pixel of rounding
             raise QueryError(
                 f"the image is {width}x{height}, the map's camera {camera.width}x{camera.height}:"
                 " not of one shape"

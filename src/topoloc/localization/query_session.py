@@ -1,5 +1,7 @@
-"""One picture put to one map, at a glance or by all means; by all means after a glance goes on from
-there."""
+"""Localize one image in one map, coarse only or exhaustively.
+
+The exhaustive search continues from the coarse one.
+"""
 
 from __future__ import annotations
 
@@ -25,52 +27,61 @@ from topoloc.localization.result_decision import (
 )
 from topoloc.localization.search import Proposal, Search
 
-# log odds of a pose that only the features asked first found: twins of the true place come to 1.2
+# minimum log-odds of a pose found only by the first feature type; similar places reach 1.2
 _MIN_CONFIRMED_LOG_ODDS = 1.4
 
 
 @dataclass(eq=False)
 class QuerySession:
-    """`searches` are one by each kind of the map's features, in turn; `prior` is about where the
-    camera is (world_from_cam); `with_provenance` adds what else the map says of an answer."""
+    """Hold the state of one query in one map.
+
+    `searches` holds one search for each feature type, in order. `prior` is the approximate pose
+    (world_from_cam). `with_provenance` adds the map's identity to a result.
+    """
 
     searches: list[Search]
     prior: Rigid3 | None
     with_provenance: Callable[[ResultWithInliers], ResultWithInliers]
 
     def compute_best_case_evidence(self, least: float) -> Evidence | None:
-        """The most that a glance could say for a pose, by the strongest features of the first kind;
-        None where fewer than `least` of these agree, or nothing speaks for it. Far cheaper than a
-        glance where the picture is of another place."""
+        """Return the best evidence that a coarse search could give, from the strongest features.
+
+        It uses the first feature type. It returns None if fewer than `least` features agree or too
+        few points are found. For an out-of-map image this is much cheaper than a coarse search.
+        """
         quick_search = replace(self.searches[0])
         proposal = propose_quick(quick_search, least)
         return compute_best_case_evidence(quick_search, proposal) if proposal is not None else None
 
     def localize_coarse_only(self) -> ResultWithInliers:
-        """What retrieval by the first kind of features says alone: the cheapest question that a
-        clear picture answers."""
+        """Return the result of retrieval with the first feature type only.
+
+        It is the cheapest search that localizes a clear image.
+        """
         first = self.searches[0]
         _evaluate_proposals(first, islice(self._first_proposals, 1))
         return self.with_provenance(decide_result(first))
 
     def localize_exhaustive(self) -> ResultWithInliers:
-        """What is believed once all is tried that may settle it."""
+        """Return the result after all proposals that can settle it."""
         return self.with_provenance(self._localize_all())
 
     @property
     def times_ms(self) -> dict[str, float]:
-        """Milliseconds of each stage so far."""
+        """Return the milliseconds of each stage so far."""
         return self.searches[0].query.clock.times_ms()
 
     @property
     def features(self) -> str:
-        """The kind that is asked at a glance."""
+        """Return the feature type of the coarse search."""
         return self.searches[0].map.kind.name
 
     @property
     def min_rival_inliers(self) -> float:
-        """How many of the picture's strongest features of the first kind must agree on a pose
-        elsewhere for it to be a rival of what is believed."""
+        """Return the minimum number of inliers for a pose elsewhere to rival the best pose.
+
+        They are counted among the strongest features of the first type.
+        """
         return min_rival_inliers(self.searches[0])
 
     @cached_property
@@ -102,9 +113,11 @@ class QuerySession:
         return outcome
 
     def _confirm_with_other_features(self) -> ResultWithInliers:
-        """What the first kind of features believes; the last one is heard on it. The pose is that
-        of the one for which more speaks: in other light the first one's points are found by chance,
-        and hold the pose where it is."""
+        """Confirm the hypotheses of the first feature type with the last one.
+
+        The reported pose is the one with the higher log-odds. In changed light, points of the first
+        type may be found by chance and hold the pose in place.
+        """
         first, last = self.searches[0], self.searches[-1]
         evidence, weights = first.config.evidence, first.weights.rivals
         confirmed, by_last = Belief(), dict[int, Hypothesis]()
@@ -132,13 +145,15 @@ class QuerySession:
 
 
 def _is_calibration_contradicted(result: Localization | NotLocalized) -> bool:
-    """Was the pose refused because the picture contradicts its calibration? What other features say
-    of the place, less precisely, is as wrong: the calibration is the same."""
+    """Return whether the pose was refused because the image contradicts its calibration.
+
+    Other feature types are skipped then, because they have the same wrong calibration.
+    """
     return isinstance(result, NotLocalized) and result.seen_camera is not None
 
 
 def _evaluate_proposals(search: Search, proposals: Iterable[Proposal]) -> None:
-    """All that is proposed, until time is up."""
+    """Evaluate the proposals until the time limit."""
     for proposal in proposals:
         hypothesis = evaluate_proposal(search, proposal)
         if hypothesis is not None:

@@ -1,9 +1,9 @@
-"""From a first pose to a hypothesis: its points sought once more where they must be seen, the pose
-estimated again, the evidence counted.
+"""Refine a pose proposal into a hypothesis.
 
-The nodes nearest to the first pose are asked, whose points were measured from nearly the same
-place; matches that the ratio test had to give up among thousands of descriptors are safe within a
-few pixels.
+The map points are matched again near their predicted pixels, the pose is estimated again, and the
+evidence is counted. The nodes nearest to the proposal supply the points, because they were measured
+from nearly the same place. Within a few pixels, matches are safe that the ratio test must reject
+among thousands of descriptors.
 """
 
 from __future__ import annotations
@@ -40,17 +40,18 @@ from topoloc.localization.walls.propose_virtual_views import (
 _MAX_CROSS_CHECK_LOG_ODDS, _HALF_WEIGHT_MATCHES = (
     3.0,
     30.0,
-)  # odds, in logarithms, that one kind adds to another's; matches with which it is heard by half
-_MAX_COMPARED_POINTS = 512  # of the points in view that are compared with dense descriptors
-_MIN_SHARED_POINT_RATIO = (
-    0.75  # of the points of a believed pose, within reach of the guided step around another one
-)
-_HOPELESS_LOG_ODDS = -3.0  # odds, in logarithms, that nothing can mend
+)  # maximum log-odds from a second feature type; number of matches with half weight
+_MAX_COMPARED_POINTS = 512  # visible points that are compared with dense descriptors
+_MIN_SHARED_POINT_RATIO = 0.75  # of a known pose's points, within the guided search radius
+_HOPELESS_LOG_ODDS = -3.0  # unguided matches cannot raise lower log-odds enough
 
 
 def evaluate_proposal(search: Search, proposal: Proposal) -> Hypothesis | None:
-    """The proposal followed up; None where too little was found for any evidence, or nothing new
-    can be."""
+    """Refine a proposal and score it.
+
+    Returns:
+        The hypothesis. None if too few points were found, or the pose was found already.
+    """
     final, hypothesis = (
         (None, None) if is_already_found(search, proposal) else _refine_and_score(search, proposal)
     )
@@ -77,8 +78,10 @@ def _refine_and_score(
 
 
 def is_already_found(search: Search, proposal: Proposal) -> bool:
-    """Does the first pose show the points of a believed one in nearly the same pixels? Then the
-    same would be found around it."""
+    """Return whether the proposal would lead to a pose that was found already.
+
+    It does if it projects most inliers of a probable hypothesis to nearly the same pixels.
+    """
     fit, config = proposal.fit, search.config
     if (
         fit.pose is None
@@ -107,13 +110,12 @@ def is_already_found(search: Search, proposal: Proposal) -> bool:
 
 
 def refine(search: Search, proposal: Proposal) -> PoseFit:
-    """The pose that follows from what is found around the first one; the first one where nothing is
-    to be found."""
+    """Return the pose refitted to guided matches, or the proposal if it has too few inliers."""
     config, first = search.config, proposal.fit
     final = _refit_around(search, first)
     if (
         first.num_inliers < config.num_clear_inliers
-    ):  # it may have been too poor for everything to be found from it at once
+    ):  # a poor first pose may need a second round to find all points
         final = max(final, _refit_around(search, final), key=lambda fit: fit.num_inliers)
     return final
 
@@ -144,11 +146,11 @@ def _refit_around(search: Search, fit: PoseFit) -> PoseFit:
 
 
 def score_pose(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | None:
-    """The hypothesis with its evidence; None where too little was found for any.
+    """Score the refined pose and return it as a hypothesis. None if too few points were found.
 
-    Evidence are matches that no pose guided. The first ones will do where they make the pose clear;
-    where they do not, the nodes around the final pose are asked, which are often nearer than those
-    that the coarse search named.
+    The evidence comes from unguided matches. The proposal's own matches are enough if they make the
+    pose clear. Otherwise the nodes around the final pose are matched. They are often nearer than
+    those of the coarse search.
     """
     config, first = search.config.evidence, proposal.fit
     if (
@@ -169,8 +171,10 @@ def score_pose(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis
 
 
 def compute_best_case_evidence(search: Search, proposal: Proposal) -> Evidence | None:
-    """The evidence for the proposal followed up if all that no pose guided agreed with it; None
-    where too little is found for any."""
+    """Return the evidence of the refined proposal if all unguided matches agreed with it.
+
+    None if too few points were found.
+    """
     final = refine(search, proposal)
     if final.pose is None or final.num_inliers < search.config.evidence.min_found:
         return None
@@ -189,8 +193,12 @@ def compute_best_case_evidence(search: Search, proposal: Proposal) -> Evidence |
 def cross_check_hypothesis(
     search: Search, hypothesis: Hypothesis
 ) -> tuple[float, Hypothesis | None]:
-    """What these features say on a pose of others, in logarithms of odds: little where few of them
-    match anything, as in the dark. And the pose that they make of it, None where it is none."""
+    """Score a pose of other features with the features of this search.
+
+    Returns:
+        The log-odds to add: few matches, as in darkness, give a small value. And the hypothesis
+        with these features, None if there is none.
+    """
     final = _refit_around(search, hypothesis.fit)
     if final.num_inliers < search.config.evidence.min_found:
         return 0.0, None
@@ -202,7 +210,7 @@ def cross_check_hypothesis(
     )
     log_odds = (
         -_MAX_CROSS_CHECK_LOG_ODDS if scored is None else scored.log_odds
-    )  # None: it is hopeless
+    )  # None: below the hopeless limit
     return float(
         np.clip(log_odds, -_MAX_CROSS_CHECK_LOG_ODDS, _MAX_CROSS_CHECK_LOG_ODDS)
     ) * num_matches / (num_matches + _HALF_WEIGHT_MATCHES), scored
@@ -211,7 +219,7 @@ def cross_check_hypothesis(
 def _compute_evidence(
     search: Search, proposal: Proposal, final: PoseFit, covariance: Float[np.ndarray, "6 6"]
 ) -> Evidence | None:
-    """None where it is hopeless."""
+    """Compute the evidence for a refined pose, None if it cannot become probable."""
     counted, repeats = _count_found_points(search, final, covariance), proposal.repeats
     if repeats is not None:
         unguided = (repeats.num_matches, repeats.num_inliers)
@@ -234,7 +242,7 @@ def _compute_evidence(
         may_be_hopeless = log_odds < 2.0 * _HOPELESS_LOG_ODDS
     if (
         compute_log_odds(_assume_all_agree(counted, final), search.weights) < _HOPELESS_LOG_ODDS
-    ):  # whatever the unguided matches say
+    ):  # for any unguided matches
         return None
     matcher = _create_unguided_matcher(search, final)
     if may_be_hopeless:
@@ -246,7 +254,7 @@ def _compute_evidence(
         )
         if (
             compute_log_odds(of_strongest, search.weights) < 2.0 * _HOPELESS_LOG_ODDS
-        ):  # whatever those of the other features say
+        ):  # for any matches of the other features
             return None
     return _with_unguided(search, counted, _fit_without_pose(final, matcher.match_first()), final)
 
@@ -254,8 +262,10 @@ def _compute_evidence(
 def _count_found_points(
     search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"]
 ) -> Evidence:
-    """What is found where it must be seen. `covariance` is that of the left perturbation of
-    cam_from_world."""
+    """Count the points found at their predicted pixels.
+
+    `covariance` is that of the left perturbation of cam_from_world.
+    """
     pose, camera = final.pose, final.camera
     assert pose is not None
     depths = pose.cam_from_world.apply(
@@ -283,8 +293,11 @@ def _compute_uniform_inlier_ratio(
     visible_img: Float[np.ndarray, "v 2"],
     found_img: Float[np.ndarray, "f 2"],
 ) -> float:
-    """`Evidence.even_share`: of the points that key points were found for, or that dense
-    descriptors agree with where there are such."""
+    """Compute `Evidence.even_share`.
+
+    If the feature type has dense descriptors, a point counts as found if they agree. Otherwise it
+    counts if it has a key point match.
+    """
     camera, dense = final.camera, final.features.dense
     if dense is not None and len(visible) > 0:
         sampled = np.unique(np.linspace(0, len(visible) - 1, _MAX_COMPARED_POINTS).astype(int))
@@ -307,17 +320,16 @@ def _count_chance_matches(search: Search, final: PoseFit) -> int:
 
 
 def _assume_all_agree(counted: Evidence, final: PoseFit) -> Evidence:
-    """As if all unguided matches agreed with the pose."""
+    """Return the evidence with all unguided matches assumed to agree with the pose."""
     return replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
 
 
 def _with_unguided(
     search: Search, evidence: Evidence, unguided: PoseFit, final: PoseFit
 ) -> Evidence:
-    """The evidence with these matches as those that no pose guided."""
+    """Return the evidence with the counts of these unguided matches."""
     assert final.pose is not None
-    # points that share errors differ by them from node to node, so that even true matches agree
-    # with a pose less well
+    # points with correlated errors differ from node to node, so true matches agree less well
     agreement_px = search.config.evidence.agreement_px * math.sqrt(
         1.0 + search.correlated_error_share
     )
@@ -332,11 +344,11 @@ def _with_unguided(
 
 
 def _create_unguided_matcher(search: Search, final: PoseFit) -> Matcher:
-    """Of features with the points around the final pose, without any pose's say."""
+    """Return a matcher of the features with the points around the final pose, not guided by it."""
     points = final.local_map
     positions = fold_repetitions(
         points.points_world, _repetition_shifts(search, final)
-    )  # copies of a point are no rivals of it
+    )  # copies of a point are not its rivals
     return Matcher(
         final.features.descriptors,
         points.descriptors,
@@ -346,7 +358,7 @@ def _create_unguided_matcher(search: Search, final: PoseFit) -> Matcher:
 
 
 def _fit_without_pose(final: PoseFit, matches: Matches) -> PoseFit:
-    """Matches that owe nothing to the final pose, as a fit without one."""
+    """Return a fit of unguided matches without a pose."""
     return replace(final, matches=matches, pose=None)
 
 
@@ -357,8 +369,7 @@ def _count_agreeing_matches(
     agreement_px: float,
     shifts: Float[np.ndarray, "k 3"],
 ) -> int:
-    """How many of these matches agree with a pose that is not theirs, by their point or a copy of
-    it."""
+    """Count the matches that agree with a pose, by their point or one of its copies."""
     is_near = np.zeros(len(unguided.matches), bool)
     for points_world in shifted_copies(
         unguided.local_map.points_world[unguided.matches.train_idx], shifts
@@ -375,5 +386,5 @@ def _count_agreeing_matches(
 
 
 def _repetition_shifts(search: Search, final: PoseFit) -> Float[np.ndarray, "k 3"]:
-    """The shifts by which what the pose's node shows repeats itself."""
+    """Return the repetition shifts (metres, world) of the pose's node."""
     return search.map.repeats(search.map.topomap.row_of(final.node_id))

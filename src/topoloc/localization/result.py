@@ -1,5 +1,5 @@
-"""What a query gets: a pose with its uncertainty, or an honest "not here". Never a fallback
-pose."""
+"""Results of a query: a pose with its uncertainty, or a reason for none. No fallback pose
+exists."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import GeoreferenceError, ResultError
-from topoloc.geometry.calibration_check import (
+from topoloc.geometry.calibration_mismatch import (
     MISMATCH_FOCAL_FIELDS,
     CalibrationMismatch,
     IntrinsicsDeviation,
@@ -31,26 +31,31 @@ Reason = Literal[
 
 @dataclass(frozen=True, eq=False)
 class Localization:
-    """The image was taken at `world_from_cam`.
+    """Hold the pose `world_from_cam` of an image and its uncertainty.
 
-    `covariance` (6, 6) is that of the left perturbation xi of world_from_cam, ``true_world_from_cam
-    = exp(xi) @ world_from_cam``: order (translation, rotation), metres and radians, axes of the
-    world. It counts the noise of the image, the uncertainty of each map point, what the map's
-    points are wrong by together (`correlated_errors.py`), and what they are in parts of the
-    picture, such as where things were moved (`geometry/clustered_errors.py`). Its translation part
-    is that of the world's origin, as it is moved by xi; `camera_covariance` is that of the camera
-    itself. `noise_share` of it differs from picture to picture; the rest is the map's, and a
-    picture taken close by shares it.
-
-    `probability` is that of the pose being within 0.25 m and 2 degrees, or within 5 % of the
-    distance of what is seen where that is less than 0.25 m; weighed from `evidence`, with weights
-    that were fitted to this kind of features: `calibrated` is False where none are, and those of
-    another kind stand in. `node_id` is the node that most inliers come from; `times_ms` the
-    milliseconds of each stage; `focal_length_px` the focal length found with the pose, None where
-    the camera was calibrated. `calibration_doubt` is what the picture says against its calibration;
-    covariance and probability have paid for it. `seen_camera` is what the picture says of its
-    camera in any case, for many of them to be heard together (`calibration_consistency.py`).
-    `geopose` is the camera's place on earth, of maps that know theirs (`topoloc georeference`).
+    Attributes:
+        covariance: covariance (6, 6) of the left perturbation xi of world_from_cam,
+            ``true_world_from_cam = exp(xi) @ world_from_cam``. Order (translation, rotation),
+            metres and radians, world axes. It includes the image noise, the uncertainty of each map
+            point and the correlated errors of the map (`correlated_errors.py`). It also includes
+            errors shared within parts of the image, such as moved objects
+            (`geometry/clustered_errors.py`). The translation part refers to the world's origin.
+            `camera_covariance` refers to the camera.
+        probability: probability that the pose is within 0.25 m and 2 degrees. 5 % of the distance
+            of the seen points replaces 0.25 m if that is less. It is computed from `evidence` with
+            fitted weights.
+        calibrated: False if no weights were fitted to this feature type and those of another are
+            used.
+        node_id: node with the most inliers.
+        times_ms: milliseconds of each stage.
+        focal_length_px: focal length estimated with the pose, None if the camera was calibrated.
+        noise_share: share of the covariance that is independent from image to image. The rest comes
+            from the map and is common to images taken nearby.
+        calibration_doubt: mismatch of the image and its calibration. The covariance and probability
+            include it.
+        seen_camera: calibration estimate of this image, None if there is none.
+            `calibration_consistency.py` combines those of many images.
+        geopose: the camera's pose on earth, if the map is georeferenced (`topoloc georeference`).
     """
 
     world_from_cam: Rigid3
@@ -72,34 +77,36 @@ class Localization:
 
     @property
     def localized(self) -> Literal[True]:
+        """Return True."""
         return True
 
     @property
     def is_from_virtual_views(self) -> bool:
-        """Was the place recognised by the walls along the way, of which the nodes around show
-        another side?"""
+        """Return whether the place was recognised by virtual views, because nearby nodes show
+        another side."""
         return self.evidence is not None and self.evidence.is_from_virtual_views
 
     @property
     def position_sigma_m(self) -> float:
-        """Root mean square of the distance from the true position that `camera_covariance` lets
-        expect, metres."""
+        """Return the root mean square position error (metres) by `camera_covariance`."""
         return float(np.sqrt(np.trace(self.camera_covariance[:3, :3])))
 
     @property
     def rotation_sigma_deg(self) -> float:
-        """The same of the angle to the true orientation, degrees."""
+        """Return the root mean square rotation error (degrees) by `camera_covariance`."""
         return float(np.rad2deg(np.sqrt(np.trace(self.camera_covariance[3:, 3:]))))
 
     @property
     def camera_covariance(self) -> Float[np.ndarray, "6 6"]:
-        """`covariance` in the camera's own axes, about its own centre: of xi in
-        ``true_world_from_cam = world_from_cam @ exp(xi)``."""
+        """Return `covariance` in the camera frame.
+
+        It is that of xi in ``true_world_from_cam = world_from_cam @ exp(xi)``.
+        """
         adjoint = self.world_from_cam.inverse().adjoint()
         return adjoint @ self.covariance @ adjoint.T
 
     def to_json(self, query: str) -> dict[str, Any]:
-        """One line of the result file, see docs/cli.md."""
+        """Return one line of the result file, see docs/cli.md."""
         return {
             "query": query,
             "localized": True,
@@ -124,10 +131,12 @@ class Localization:
 
     @staticmethod
     def from_json(line: str | bytes | Mapping[str, Any]) -> Localization:
-        """What `to_json` wrote, as text or read already; its query and `seen_camera` are not kept.
+        """Parse the output of `to_json`, as text or as an object.
+
+        The query name and `seen_camera` are not restored.
 
         Raises:
-            ResultError: it is no result, or one of an image that was not localized.
+            ResultError: it is not a result, or the result of an image that was not localized.
         """
         data = checked.parse_object(line)
         if checked.require(data, "localized") is not True:
@@ -139,7 +148,7 @@ class Localization:
             data.get(key) for key in ("focal_length_px", "evidence", "calibration_doubt")
         )
         return Localization(
-            checked.rigid(checked.require(data, "world_from_cam"), "world_from_cam"),
+            checked.pose_from_json(checked.require(data, "world_from_cam"), "world_from_cam"),
             checked.covariance(checked.require(data, "covariance"), "covariance"),
             checked.number(checked.require(data, "probability"), "probability", 0.0, 1.0),
             checked.integer(checked.require(data, "node"), "node"),
@@ -158,9 +167,11 @@ class Localization:
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """A pose that may be the image's, and how probable that is; the rest of all is the probability
-    of none of them. `geopose` as of a `Localization`; `tile` names the tile of an atlas in whose
-    world the pose is."""
+    """Hold one possible pose of an ambiguous image and its probability.
+
+    The probabilities of all alternatives sum to less than 1. The rest is the probability of none of
+    them. `geopose` is as in `Localization`. `tile` is the atlas tile in whose world the pose is.
+    """
 
     world_from_cam: Rigid3
     probability: float
@@ -169,6 +180,7 @@ class Alternative:
     tile: str | None = None
 
     def to_json(self) -> dict[str, Any]:
+        """Return the alternative as a JSON object."""
         pose = {
             "world_from_cam": pose_to_json(self.world_from_cam),
             "probability": self.probability,
@@ -179,11 +191,15 @@ class Alternative:
 
     @staticmethod
     def from_json(data: Any) -> Alternative:
-        """Raises ResultError."""
+        """Parse the output of `to_json`.
+
+        Raises:
+            ResultError: it is not an alternative.
+        """
         if not isinstance(data, Mapping):
             raise ResultError("no result: an alternative is an object")
         return Alternative(
-            checked.rigid(checked.require(data, "world_from_cam"), "world_from_cam"),
+            checked.pose_from_json(checked.require(data, "world_from_cam"), "world_from_cam"),
             checked.number(checked.require(data, "probability"), "probability", 0.0, 1.0),
             checked.integer(checked.require(data, "node"), "node"),
             _parse_geopose(data),
@@ -193,9 +209,9 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False)
 class NotLocalized:
-    """No pose can be vouched for; `reason` says why.
+    """Report that no pose is certain enough, with the `reason`.
 
-    `alternatives` are the poses that an `ambiguous` image may have, the likeliest first.
+    `alternatives` holds the possible poses of an `ambiguous` image, likeliest first.
     """
 
     reason: Reason
@@ -210,10 +226,11 @@ class NotLocalized:
 
     @property
     def localized(self) -> Literal[False]:
+        """Return False."""
         return False
 
     def to_json(self, query: str) -> dict[str, Any]:
-        """One line of the result file, see docs/cli.md."""
+        """Return one line of the result file, see docs/cli.md."""
         alternatives = [one.to_json() for one in self.alternatives]
         refusal = {
             "query": query,
@@ -226,10 +243,10 @@ class NotLocalized:
 
     @staticmethod
     def from_json(line: str | bytes | Mapping[str, Any]) -> NotLocalized:
-        """What `to_json` wrote, as text or read already; its query is not kept.
+        """Parse the output of `to_json`, as text or as an object. The query name is not restored.
 
         Raises:
-            ResultError: it is no result, or one of an image that was localized.
+            ResultError: it is not a result, or the result of an image that was localized.
         """
         data = checked.parse_object(line)
         if checked.require(data, "localized") is not False:
@@ -256,7 +273,11 @@ R = TypeVar("R", bound=Localization | NotLocalized)
 
 
 def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | NotLocalized:
-    """Either of the two. Raises ResultError where it is no result."""
+    """Parse a result of either class.
+
+    Raises:
+        ResultError: it is not a result.
+    """
     data = checked.parse_object(line)
     return (
         Localization.from_json(data)
@@ -266,7 +287,7 @@ def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | No
 
 
 def with_time(result: R, t_ns: int) -> R:
-    """The result, with the time of its picture, nanoseconds."""
+    """Return the result with the capture time of its image, nanoseconds."""
     return replace(result, provenance=replace(result.provenance, t_ns=t_ns))
 
 

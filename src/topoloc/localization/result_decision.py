@@ -1,4 +1,4 @@
-"""What is answered, of what is believed: a pose, "it is one of these", or why there is none."""
+"""Decide the result of a query from its belief: a pose, alternatives, or a reason for none."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from topoloc.localization.result import Alternative, Localization, NotLocalized,
 from topoloc.localization.search import Search
 
 _MIN_DISTANT_ANGLE_DEG = 10.0
-_MIN_ALTERNATIVE_RATIO = 0.01  # ones that are less probable beside the best one are not named
+_MIN_ALTERNATIVE_RATIO = 0.01  # relative to the best probability; less probable ones are dropped
 
 
 LocalizationWithInliers = tuple[Localization, PointObservations]
-"""A pose, and the points that it stands on, in pixels of the image as it came."""
+"""A pose and its inliers, in pixels of the original image."""
 ResultWithInliers = tuple[Localization | NotLocalized, list[LocalizationWithInliers]]
-"""A result, and each pose that it names: its own, or its alternatives, in their order."""
+"""A result with each reported pose and its inliers: its own pose, or its alternatives in order."""
 
 
 def decide_result(search: Search) -> ResultWithInliers:
-    """What follows from what is believed."""
+    """Return the result that follows from the current belief."""
     ranked = search.belief.ranked(search.weights.rivals)
     min_probability = search.config.evidence.min_probability
     if not ranked or ranked[0].probability < min_probability:
@@ -57,8 +57,12 @@ def decide_result(search: Search) -> ResultWithInliers:
 
 
 def decide_final_result(search: Search) -> ResultWithInliers:
-    """`decide_result`, where no other features are asked any more: held against its calibration,
-    which the picture may contradict. That costs it precision, which may be all that it has."""
+    """Return `decide_result` after a check against the camera calibration.
+
+    It runs when no other feature type follows. If the image contradicts its calibration, the
+    covariance grows by the induced shift. The probability falls accordingly, and the pose may be
+    refused.
+    """
     result, named = decide_result(search)
     if isinstance(result, NotLocalized):
         return result, named
@@ -88,7 +92,7 @@ def decide_final_result(search: Search) -> ResultWithInliers:
 def _uncertainty_with_covariance(
     search: Search, best: Hypothesis, covariance: Float[np.ndarray, "6 6"]
 ) -> float:
-    """`Evidence.doubt` of the hypothesis, were its covariance this one."""
+    """Compute `Evidence.doubt` of the hypothesis for another covariance."""
     assert best.fit.pose is not None
     seen = best.fit.inlier_observations(1.0)
     depth = float(np.median(best.fit.pose.cam_from_world.apply(seen.points_world)[:, 2]))
@@ -96,9 +100,12 @@ def _uncertainty_with_covariance(
 
 
 def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
-    """By how much the best hypothesis leads. One that is not clear must lead those elsewhere by its
-    odds, too: where a wrong place of the map has nearly as much for it, a place that is not in the
-    map may as well."""
+    """Return the log-odds margin of the best hypothesis over another one.
+
+    If the best one is not clear and the other is elsewhere, the difference of log-odds also limits
+    it. If a wrong place of the map has nearly as much evidence, a place outside the map may as
+    well.
+    """
     by_all = log_odds_margin(best, other, search.weights.rivals)
     return (
         min(by_all, best.log_odds - other.log_odds)
@@ -116,8 +123,10 @@ def _min_log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) ->
 
 
 def _is_unclear_and_distant(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
-    """Is the best hypothesis not clear, and the other one elsewhere? Evidence of walls is held
-    against all other walls already."""
+    """Return whether the best hypothesis is not clear and the other is at another place.
+
+    It is False for virtual views, whose evidence is already compared with all other virtual views.
+    """
     if best.is_from_virtual_views:
         return False
     apart, config = best.world_from_cam.inverse() @ other.world_from_cam, search.config.evidence
@@ -152,9 +161,11 @@ def _build_localization(
 
 
 def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
-    """With a covariance that also counts what the inliers are wrong by together in parts of the
-    picture. What they have in common all over it and what they have there add up: n rho +
-    coherence^2, times that of independent errors. Walls have an inflation of their own."""
+    """Inflate the covariance by errors that inliers share within parts of the image.
+
+    The errors common to the whole image and those common to parts add up. The factor is n rho +
+    coherence^2, relative to independent errors. Virtual views have an inflation of their own.
+    """
     if best.is_from_virtual_views or best.fit.pose is None:
         return best
     seen = best.fit.inlier_observations(1.0)
@@ -172,7 +183,7 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
 def _ambiguous_result(
     search: Search, ranked: list[Hypothesis], log_odds_margins: list[float], others: float
 ) -> ResultWithInliers:
-    """It is one of these; how probable each is, beside "nowhere"."""
+    """Return an ambiguous result with the probability of each alternative."""
     best = ranked[0]
     shares = [1.0 / (1.0 + others), *(math.exp(-one) / (1.0 + others) for one in log_odds_margins)]
     probable = [
@@ -258,7 +269,7 @@ def _build_not_localized(
 
 
 def _provenance(search: Search) -> Provenance:
-    """By which features the answer was come by; the localizer knows the rest."""
+    """Return the feature type of the result. The localizer fills in the rest."""
     return Provenance(features=search.map.kind.name)
 
 

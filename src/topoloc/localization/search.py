@@ -1,5 +1,4 @@
-"""What the search for one query image shares: the image, the map, the settings, what is believed so
-far; and what it is fed with."""
+"""Hold the state of the search for one query image: image, map, settings, proposals and belief."""
 
 from __future__ import annotations
 
@@ -18,11 +17,12 @@ from topoloc.retrieval.coarse import NodeScore
 
 @dataclass(frozen=True, eq=False)
 class TriedProposal:
-    """A first pose and what became of it.
+    """Record a pose proposal and its outcome.
 
-    `refined` is the pose found around the first one (None: the first was not followed up, as where
-    that pose was found already), `hypothesis` that with its evidence (None: too little was found
-    for any), `milliseconds` the time since the query began, `features` the kind that was asked.
+    `first` is the proposal, and `refined` the pose found around it. It is None if the proposal was
+    not refined, for example because that pose was found already. `hypothesis` is the refined pose
+    with its evidence, None if too few points were found. `milliseconds` is the time since the query
+    began. `features` is the feature type.
     """
 
     source: str
@@ -32,10 +32,19 @@ class TriedProposal:
     milliseconds: float
     features: str
 
+    @property
+    def fit(self) -> PoseFit:
+        """The last fit of it: that of the hypothesis, else the refined one if it has a pose."""
+        if self.hypothesis is not None:
+            return self.hypothesis.fit
+        if self.refined is not None and self.refined.pose is not None:
+            return self.refined
+        return self.first
+
 
 @dataclass(eq=False)
 class Trace:
-    """All first poses that were tried, in order."""
+    """Collect all tried pose proposals, in order."""
 
     tried: list[TriedProposal] = field(default_factory=list)
 
@@ -47,11 +56,11 @@ Source = Literal[
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A first pose (`fit.pose`, None where the matches agree on none), and where it comes from.
+    """Hold a pose proposal and its source.
 
-    `is_guided`: were the matches sought where a pose expects them? Then they are no evidence for
-    it. `repeats`: the evidence for the pose that this one repeats; matches that no pose guided
-    speak for both.
+    `fit.pose` is None if the matches agree on no pose. `is_guided` is True if a pose guided the
+    matches, which are then no evidence for it. `repeats` is the evidence for the pose that this
+    proposal repeats elsewhere. The unguided matches support both.
     """
 
     source: Source
@@ -62,8 +71,11 @@ class Proposal:
 
 @dataclass(eq=False)
 class Search:
-    """`rho` are the map's correlated errors, `ranked` is what the coarse localizer names, the best
-    first, by rows."""
+    """Hold the state of a search with one feature type.
+
+    `correlated_error_share` is rho of the map. `ranked` holds the nodes by row, as ranked by the
+    coarse localizer, best first.
+    """
 
     query: Query
     map: OpenMap
@@ -72,46 +84,48 @@ class Search:
     correlated_error_share: float
     trace: Trace | None = None
     previous: Search | None = None
-    """The search by the kind of features that was asked before, and left it open."""
+    """The search with the preceding feature type, which left the pose unclear."""
     is_last: bool = True
-    """No other kind is asked where this one leaves it open."""
+    """True if no other feature type follows."""
     belief: Belief = field(default_factory=Belief)
     ranked: list[NodeScore] = field(default_factory=list)
     retrieved: PoseFit | None = None
-    """What retrieval led to."""
+    """The fit to the retrieved candidates."""
     first: PoseFit | None = None
-    """What was tried first: where nothing is believed, it says why."""
+    """The first fit tried. It gives the reason if there is no hypothesis."""
     is_repetitive: bool = False
-    """What is believed is one of many poses from which the place looks alike."""
+    """True if the best pose is one of many from which a repetitive place looks the same."""
     is_stopped: bool = False
-    """Time was up before everything was tried."""
+    """True if the time limit was reached before all proposals were tried."""
 
     @property
     def candidates(self) -> list[NodeScore]:
-        """The nodes that were asked together, by their rows."""
+        """Return the nodes whose points are pooled, by row."""
         return self.ranked[: self.config.num_candidates]
 
     @property
     def named(self) -> list[NodeScore]:
-        """The same by their ids, as they are reported."""
+        """Return the candidates by node id, as they are reported."""
         return self.map.with_node_ids(self.candidates)
 
     @property
     def best(self) -> Hypothesis | None:
-        """The likeliest hypothesis so far, believed or not."""
+        """Return the likeliest hypothesis so far, even if its probability is low."""
         return self.belief.best(self.weights.rivals)
 
     @property
     def is_clear(self) -> bool:
-        """Is there so much for one hypothesis that only parts of the map that look nearly the same
-        are asked still?"""
+        """Return whether the best hypothesis is clear. Only very similar places are then
+        searched."""
         best = self.best
         return best is not None and best.log_odds > self.weights.evidence.clear_log_odds
 
     @property
     def is_settled(self) -> bool:
-        """Is it clear, and every other hypothesis as far behind as nowhere is? A twin of the place
-        that this kind of features believes may be told from it by another one."""
+        """Return whether the best hypothesis is clear and leads each other one by the same margin.
+
+        If it does not, another feature type may separate the place from a similar one.
+        """
         if not self.is_clear:
             return False
         best, *others = self.belief.ranked(self.weights.rivals)

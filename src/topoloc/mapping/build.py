@@ -1,7 +1,7 @@
-"""Constructing the topo-metric map: section III-A of the paper, read from the top.
+"""Build the topo-metric map (section III-A of the paper). Start reading at `build_map`.
 
 The trajectory is discretised into nodes (Eq. 1). Each node keeps its template image, its global
-pose, and its features with their 3-D positions. All mapping images, labelled with their node, teach
+pose, and its features with their 3-D positions. All mapping images, labelled with their node, train
 the coarse localizer.
 """
 
@@ -57,7 +57,7 @@ from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_
 
 BuildConfig = MapConfig
 Progress = Callable[[str, int, int], None]
-"""Called with a stage's name, steps done and steps in all."""
+"""Called with a stage's name, the number of steps done and the number of all steps."""
 
 
 def build_map(
@@ -70,14 +70,17 @@ def build_map(
     world.
 
     Args:
-        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the
-            map to remember; else what is known of that.
+        sequences: the recordings.
+        config: the settings. Defaults to `BuildConfig()`.
+        progress: is called with a stage's name, steps done and all steps.
+        poses_from: the source of each recording's poses (`truth`, `slam`, a file), which the map
+            records. None detects it.
 
     Raises:
         ConfigError: a value of `config` is out of its bounds.
         TrajectoryError: no frame of a recording has a pose.
-        EmptyMapError: no picture gave a usable node.
-        RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
+        EmptyMapError: no image gave a usable node.
+        RecordingError, CalibrationError, UnreadableImageError: a recording cannot be read.
     """
     config = config or BuildConfig()
     check_bounds(config)
@@ -124,8 +127,8 @@ def _make_session(
     poses_from: str,
     cameras: dict[int, Camera],
 ) -> Session:
-    """What the map remembers of a recording; `lights` are those of the frames, `cameras` those of
-    the sessions."""
+    """Return the map's record of a recording. `lights` holds the illumination of each frame,
+    `cameras` the camera of each session."""
     of_session = [k for k, frame in enumerate(frames) if frame.session_id == session_id]
     t_ns = [frames[k].t_ns for k in of_session]
     light = average_illumination([lights[k] for k in of_session])
@@ -145,7 +148,7 @@ def _make_session(
 def _resolve_node_config(
     frames: list[MappingFrame], locator: PointLocator, config: BuildConfig
 ) -> NodeConfig:
-    """D_thresh from the scene, where the user named none."""
+    """Set D_thresh from the depth of the scene, if the user set none."""
     if config.nodes.d_thresh is not None:
         return config.nodes.resolved(0.0)
     samples, first = (
@@ -176,8 +179,8 @@ def _draft_nodes(
     config: BuildConfig,
     progress: Progress,
 ) -> NodeDrafts:
-    """The trajectory discretised by Eq. 1; a picture with too few points (dark, blurred, blank)
-    becomes no node."""
+    """Discretise the trajectory by Eq. 1. Images with too few points (dark, blurred, blank) become
+    no nodes."""
     chosen = [
         frames[i]
         for i in select_node_frames([frame.world_from_cam for frame in frames], node_config)
@@ -213,9 +216,11 @@ def _process_mapping_images(
     config: BuildConfig,
     progress: Progress,
 ) -> tuple[list[PlaceImage], list[Illumination], list[CoarseModel]]:
-    """Label every mapping image with its nearest node, let it observe the points of the nodes
-    around, and teach the coarse localizer of each kind of features with it; its light is measured
-    on the way."""
+    """Process every mapping image after the nodes are drafted.
+
+    Each image is labelled with its nearest node and observes the points of near nodes. Its
+    illumination is measured. Finally the coarse localizers of all feature types are fitted.
+    """
     assert node_config.lambda_rot is not None
     words = {kind: _learn_vocabulary(drafts, kind, config) for kind in config.kinds}
     nodes = NearestNodeSearch(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
@@ -267,8 +272,8 @@ def _process_mapping_images(
 
 @dataclass(frozen=True, eq=False)
 class _ImageObservations:
-    """What a mapping image gives: its nearest node's row, what it sees of the nodes around, by
-    their rows, and its VLADs by kind."""
+    """Hold the results of a mapping image: the row of its nearest node, its observations of near
+    nodes by row, and its VLADs by feature type."""
 
     image: MappingImage
     nearest: int
@@ -284,8 +289,8 @@ def _observe_image(
     words: dict[str, Float32[np.ndarray, "k d"]],
     config: BuildConfig,
 ) -> _ImageObservations:
-    """`read` is None for a frame that is a node: what it shows is known already. Changes nothing,
-    so that several may run at a time."""
+    """Process one mapping image. `read` is None for a frame that is a node, whose features are
+    known already. Changes no shared state, so several calls may run in parallel."""
     image = (
         drafts.image(frame)
         if read is None
@@ -328,7 +333,7 @@ def _learn_vocabulary(
 def _finish_nodes(
     drafts: NodeDrafts, config: BuildConfig
 ) -> tuple[dict[str, Sequence[TopoNode]], Sequence[TopoNode]]:
-    """The nodes by their kinds of features, and all side nodes; each draft is looked at once."""
+    """Return the nodes by feature type and all virtual nodes. Each draft is read once."""
     of_kind, sides = {kind: DiskList[TopoNode]() for kind in config.kinds}, DiskList[TopoNode]()
 
     def finish_nodes(node_id: int) -> tuple[list[TopoNode], list[TopoNode]]:
@@ -346,7 +351,7 @@ def _finish_nodes(
 
 
 def _connect_nodes(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:
-    """An edge wherever a recording went from one node to another."""
+    """Return an edge for each transition of a recording between two nodes."""
     steps = pairwise(zip(frames, node_ids, strict=True))
     edges = {
         (source, target)

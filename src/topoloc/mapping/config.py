@@ -1,5 +1,4 @@
-"""The configuration of a map: what it is built with, and what it says of itself afterwards; typed
-and versioned."""
+"""Define the settings of a map, which are stored in it. They are typed and versioned."""
 
 from __future__ import annotations
 
@@ -24,37 +23,36 @@ from topoloc.points.motion_triangulation import MotionTriangulationConfig
 from topoloc.retrieval.vlad import VladConfig
 
 CONFIG_VERSION = 1
-"""Of the JSON in the map file; one more whenever a key comes to mean something else."""
+"""Version of the JSON in the map file. It increases if the meaning of a key changes."""
 
 
 @dataclass(frozen=True)
 class MapConfig:
-    """All that decides what a map looks like; stored in the map."""
+    """Configure how a map is built. The settings are stored in the map."""
 
     nodes: NodeConfig = field(default_factory=NodeConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     other_kinds: tuple[str, ...] | None = None
-    """Further kinds of features that the same nodes are described with: a query asks them where the
-    first one leaves its pose unclear. Unset: beside SURF the learned ones whose network is here, if
-    any is."""
+    """Further feature types of the same nodes. A query uses them if the first type leaves its pose
+    uncertain. None: beside SURF, the default learned type if its network is installed."""
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
     motion: MotionTriangulationConfig = field(default_factory=MotionTriangulationConfig)
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
     sides: VirtualNodesConfig = field(default_factory=VirtualNodesConfig)
     max_node_points: Annotated[int, Between(1, 100_000)] = 800
-    """Features that a node keeps, the strongest ones."""
+    """Maximum number of features per node. The strongest are kept."""
     min_node_points: Annotated[int, Between(1, 100_000)] = 20
-    """A picture with fewer located features becomes no node."""
+    """An image with fewer located features becomes no node."""
     template_side_px: Annotated[int, Between(16, 4096)] = 240
-    """Shorter side of the template picture that a node keeps, at most."""
+    """Maximum length of the shorter side of a node's template image, in pixels."""
     place_side_px: Annotated[int, Between(16, 4096)] = 160
-    """Shorter side of the other mapping images, at most: what the coarse localizers of section
-    III-B are trained with."""
+    """Maximum length of the shorter side of the mapping images kept for the coarse localizers
+    (section III-B), in pixels."""
 
     @property
     def kinds(self) -> list[str]:
-        """All kinds of features, the first one first."""
+        """Return all feature types, the first type first."""
         if self.other_kinds is not None or self.features.kind != SURF.name:
             return [self.features.kind, *(self.other_kinds or ())]
         try:
@@ -64,16 +62,16 @@ class MapConfig:
 
     @property
     def virtual_view_type(self) -> str:
-        """The kind of features that side nodes are described with: that of a kind that a network
-        gives, where the map has one."""
+        """Return the feature type of virtual nodes. It follows from the first learned type, or from
+        the first type if none is learned."""
         kinds = [find_feature_type(kind) for kind in self.kinds]
         return next(
             (kind for kind in kinds if kind.network is not None), kinds[0]
         ).virtual_view_type
 
     def feature_config_for(self, kind: str) -> FeatureConfig:
-        """The settings of the features of this kind: those of `features`, but for the picture's
-        normalization, which suits the kind."""
+        """Return the feature settings of a type. Other types than the first use their own default
+        normalization."""
         return (
             self.features
             if kind == self.features.kind
@@ -81,7 +79,7 @@ class MapConfig:
         )
 
     def vlad_config_for(self, kind: str) -> VladConfig:
-        """The settings of surf-vlad by features of this kind."""
+        """Return the settings of surf-vlad for a feature type."""
         weight = self.vlad.position_weight
         return replace(
             self.vlad,
@@ -90,28 +88,29 @@ class MapConfig:
 
     @property
     def d_thresh(self) -> float:
-        """D_thresh of Eq. 1, metres; of a map that is built it is known."""
+        """Return D_thresh of Eq. 1 in metres. It must be resolved, as in any built map."""
         assert self.nodes.d_thresh is not None, "the configuration of a map that is not built yet"
         return self.nodes.d_thresh
 
     @property
     def lambda_rot(self) -> float:
-        """lambda of Eq. 1, metres a radian."""
+        """Return lambda of Eq. 1 in metres per radian."""
         assert self.nodes.lambda_rot is not None, "the configuration of a map that is not built yet"
         return self.nodes.lambda_rot
 
     def to_json(self) -> dict[str, Any]:
+        """Return the settings and their version as JSON."""
         return {"version": CONFIG_VERSION, **asdict(self)}
 
 
 def config_to_text(config: MapConfig) -> str:
-    """The JSON that the map file keeps."""
+    """Return the JSON text stored in the map file."""
     return json.dumps(config.to_json(), sort_keys=True)
 
 
 def config_from_text(text: str, version: int | None) -> MapConfig:
-    """The inverse of `config_to_text`; files of schema 1 named no version. Raises ConfigError,
-    which names the key."""
+    """Parse the text of `config_to_text`. Files of schema 1 contain no version. Raises ConfigError
+    with the key."""
     data = parse_json(text)
     if version is not None and isinstance(data, dict) and data.pop("version", None) != version:
         raise ConfigError(f"config: of another version than {version}, which is known")

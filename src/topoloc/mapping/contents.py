@@ -1,5 +1,5 @@
-"""What a map holds, as `map_reading.py` finds it in a file and `map_writing.py` writes it. Data
-only; `topomap.py` makes a map of it."""
+"""Define the contents of a map as data. `map_reading.py` reads them, `map_writing.py` writes them,
+and `topomap.py` makes a map of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from topoloc.retrieval.coarse import CoarseModel
 
 @dataclass(frozen=True)
 class NextIds:
-    """The ids that new entries of a map get: more than any that was ever used in it."""
+    """Hold the ids of the next new entries. They are larger than any id ever used in the map."""
 
     session: int = 0
     node: int = 0
@@ -37,18 +37,23 @@ class NextIds:
 _MAP_ID = b"map id"
 
 
-@no_type_check  # at run time: it would read from the file to look at entries' types
+@no_type_check  # a type check at run time would read entries from the file
 @dataclass(frozen=True, eq=False)
 class MapContents:
-    """All of a map. `summaries[i]` describes `nodes[i]`; their ids are in increasing order.
-    `config` is the effective configuration it was built with, `length_m` the metres of trajectory
-    that were mapped. `default_coarse` names the coarse localizer that answers where the user names
-    none. `shared_errors` and `repetitions` are None where nobody has measured them, `sides` where
-    no mapping picture is wide enough to show the walls along the way. `edits` begins with the
-    build. `map_id` stays what it is whatever becomes of the map; None until it is saved, and in
-    older files. `georeference` says where on earth the map's world lies, where that is known.
-    `other_kinds` are the same nodes with points of further kinds of features, by the kind's name,
-    and `other_shared_errors` what `shared_errors` are of these.
+    """Hold all contents of a map.
+
+    - `summaries[i]` describes `nodes[i]`. Their ids increase.
+    - `config` is the resolved configuration of the build.
+    - `length_m` is the mapped trajectory length in metres.
+    - `default_coarse` names the default coarse localizer.
+    - `shared_errors` and `repetitions` are None if not measured.
+    - `sides` holds the virtual nodes. None if no mapping image is wide enough to show the walls
+      beside the trajectory.
+    - `edits` begins with the build.
+    - `map_id` stays the same through all edits. None until the map is saved, and in older files.
+    - `georeference` is the pose of the map's world on earth, if known.
+    - `other_kinds` holds the same nodes with points of further feature types, by name.
+    - `other_shared_errors` holds the shared errors of these types.
     """
 
     summaries: Sequence[NodeSummary]
@@ -72,17 +77,17 @@ class MapContents:
 
     @property
     def kind(self) -> str:
-        """The kind of features that the nodes' points are described with, and queries must be."""
+        """Return the first feature type of the map, which its nodes and queries use."""
         return self.config.features.kind
 
     @property
     def version(self) -> int:
-        """The number of its last edit: 1 as it was built, 0 where it has no history."""
+        """Return the number of the last edit: 1 after the build, 0 without a history."""
         return max((edit.edit_id for edit in self.edits), default=0)
 
     @property
     def free_ids(self) -> NextIds:
-        """Ids that nothing in the map has or had; place images get theirs when they are written."""
+        """Return ids that were never used in the map. Place images receive theirs at writing."""
         return replace(
             self.next_ids,
             session=max(
@@ -92,20 +97,23 @@ class MapContents:
             edit=max([self.next_ids.edit, *(edit.edit_id + 1 for edit in self.edits)]),
         )
 
-    def nodes_of(
-        self, kind: str
-    ):  # no return type: at run time an entry would be read to look at it
-        """The nodes with their points of one of the map's kinds of features. Raises KeyError where
-        it holds no such features."""
+    @property
+    def id(self) -> str:
+        """The map's id, 16 hexadecimal digits, see `get_map_id`."""
+        return get_map_id(self)
+
+    def nodes_of(self, kind: str):  # no return type: a type check at run time would read an entry
+        """Return the nodes with their points of one feature type. Raises KeyError if the map has no
+        such type."""
         return self.nodes if kind == self.kind else self.other_kinds[kind]
 
     @property
     def kinds(self) -> list[str]:
-        """All kinds of features that the map holds, that of the nodes first."""
+        """Return all feature types of the map, that of the nodes first."""
         return [self.kind, *sorted(self.other_kinds)]
 
 
 def get_map_id(contents: MapContents) -> str:
-    """The map's id, 16 hexadecimal digits; of one that was not saved yet, or by an older version,
-    what its nodes make of it."""
+    """Return the map's id, 16 hexadecimal digits. It is computed from the nodes if the map has none
+    yet."""
     return contents.map_id or compute_nodes_digest(contents.summaries, _MAP_ID)

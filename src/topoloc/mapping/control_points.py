@@ -1,5 +1,5 @@
-"""Places that are known on earth, from text files: of pictures by their names or times (GNSS), and
-of points of the world."""
+"""Read known places on earth from text files: GNSS fixes of images (by name or time) and control
+points."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from topoloc.mapping.contents import MapContents
 from topoloc.recordings.text_files import parse_times, read_rows
 
 _MAX_GAP_NS = 2_000_000_000
-"""Between two fixes further apart in time nobody knows where the camera was."""
+"""Positions are not interpolated between fixes further apart in time."""
 
 
 @dataclass(frozen=True, eq=False)
 class ControlPoints:
-    """Point k of the world (metres) is at `places[k]`; `names` are for people."""
+    """Hold points of the world (metres), their places on earth and their names for display."""
 
     points_world: Float[np.ndarray, "n 3"]
     places: Sequence[GeoPoint]
@@ -30,12 +30,12 @@ class ControlPoints:
 
 
 def read_control_points(path: Path) -> ControlPoints:
-    """Lines of ``x, y, z, lat, lon, h``: metres of the map's world, degrees, metres above the
-    ellipsoid. A line of titles may come first.
+    """Read lines of ``x, y, z, lat, lon, h``: metres of the map's world, degrees, metres above the
+    ellipsoid. A header line is optional.
 
     Raises:
-        GeoreferenceError: missing, empty, columns missing, no numbers, no place on earth; with the
-            line.
+        GeoreferenceError: the file is missing or empty, columns or numbers are missing, or a place
+            is not on earth. Names the line.
     """
     rows = _read_table(path, 6, 0, "x, y, z, lat, lon, h")
     numbers = [_parse_numbers(path, line, columns[:6]) for line, columns in rows]
@@ -49,15 +49,15 @@ def read_control_points(path: Path) -> ControlPoints:
 
 
 def read_gnss(path: Path, topomap: MapContents) -> ControlPoints:
-    """Lines of ``name, lat, lon, h`` or ``time, lat, lon, h``: where mapping pictures of that name,
-    or the camera at that time, were.
+    """Read lines of ``name, lat, lon, h`` or ``time, lat, lon, h``: the places of mapping images by
+    name, or of the camera by time.
 
-    Times are seconds, or nanoseconds by their size, of the recordings' clock; between two fixes a
-    place is interpolated.
+    Times are in the recordings' clock, in seconds, or in nanoseconds if they are large. Places
+    between two fixes are interpolated.
 
     Raises:
-        GeoreferenceError: missing, empty, columns missing, no numbers, no place on earth, or
-            nothing of it is of the map; with the line.
+        GeoreferenceError: the file is missing or empty, columns or numbers are missing, a place is
+            not on earth, or no line matches the map. Names the line.
     """
     rows = _read_table(path, 4, 1, "time or name, lat, lon, h")
     places = [
@@ -88,7 +88,7 @@ def read_gnss(path: Path, topomap: MapContents) -> ControlPoints:
 def _interpolate_at_times(
     path: Path, topomap: MapContents, t_ns: Sequence[int], places: Sequence[GeoPoint]
 ) -> ControlPoints:
-    """The nodes' places at their times."""
+    """Interpolate the places of the nodes at their times."""
     origin = places[0].ecef_from_enu()
     points_enu = np.array([origin.inverse().apply(place.ecef()) for place in places])
     found: list[tuple[np.ndarray, GeoPoint, str]] = []
@@ -122,8 +122,8 @@ def _interpolate_at_times(
 
 
 def _find_positions_by_name(topomap: MapContents) -> dict[str, Float[np.ndarray, "3"]]:
-    """Of mapping pictures by their names, whole or the file's alone, with their recording's before
-    where they are of several."""
+    """Return the positions of mapping images by full name, file name, and name with the recording.
+    Ambiguous names are left out."""
     positions, twice = dict[str, np.ndarray](), set[str]()
     for image in (*topomap.place_images, *topomap.summaries):
         for name in {image.name, Path(image.name).name, f"{image.recording}/{image.name}"}:
@@ -137,7 +137,7 @@ def _find_positions_by_name(topomap: MapContents) -> dict[str, Float[np.ndarray,
 def _read_table(
     path: Path, num_columns: int, first_numeric_column: int, wanted: str
 ) -> list[tuple[int, list[str]]]:
-    """Line numbers and columns, without a line of titles at the top."""
+    """Return line numbers and columns, without a header line."""
     if path.exists() and not path.is_file():
         raise GeoreferenceError(f"{path}: no file")
     rows = read_rows(path, GeoreferenceError)

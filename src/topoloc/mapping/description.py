@@ -1,4 +1,4 @@
-"""What a map holds, in numbers and words: for people, for evaluations, for programs."""
+"""Describe the contents of a map in numbers and words."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 
 def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
-    """The facts of a map that evaluations and `info` print: counts, bytes, extent, configuration.
+    """Return the facts of a map for evaluations and `info`: counts, bytes, extent, configuration.
 
     Raises:
         EmptyMapError: the map has no node.

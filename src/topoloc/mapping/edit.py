@@ -1,8 +1,7 @@
-"""Edits of a map file: each is one transaction with a name and a date, and the last ones can be
-taken back, to the byte.
+"""Edit a map file in named and dated transactions, and undo the last edits to byte-identical files.
 
-The file is replaced whole: whoever reads it keeps what he opened, and a process that is killed
-leaves the map before its edit or the one after it.
+An edit replaces the whole file. Readers keep the file they opened. A killed process leaves the map
+before or after its edit.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ from topoloc.recordings.atomic import atomic_write
 
 try:
     import fcntl
-except ImportError:  # Windows: of two edits at once the last one wins whole
+except ImportError:  # Windows: if two edits run at once, the last one wins
     fcntl = None
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 WaitCallback = Callable[[], None]
-"""Called where another process edits the map, before this one waits for it."""
+"""Called before waiting for another process that edits the map."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapEdit:
-    """A map file that nobody else edits while this is open; `topomap` is the map as it is."""
+    """Hold a locked map file during an edit. `topomap` is the current map."""
 
     path: Path
     topomap: TopoMetricMap
@@ -51,13 +50,15 @@ class MapEdit:
     def commit(
         self, changed: TopoMetricMap, name: str, changes: Mapping[str, Any] | None = None
     ) -> Edit:
-        """Replace the file by the changed map, at once or not at all, with an entry in its history.
+        """Replace the file by the changed map atomically, with an entry in its history.
 
         Args:
-            changes: what the history tells of this edit: numbers and texts by their names.
+            changed: the changed map.
+            name: the name of the edit.
+            changes: numbers and texts for the history, by name.
 
         Raises:
-            MapError: the map or its undo file cannot be written; the map is as it was.
+            MapError: the map or its undo file cannot be written. The map stays unchanged.
         """
         edits = self.topomap.edits
         edit = Edit(self.topomap.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
@@ -72,28 +73,32 @@ class MapEdit:
 
 @contextmanager
 def edit_map(path: str | Path, on_wait: WaitCallback | None = None) -> Iterator[MapEdit]:
-    """A map file to edit; while another process edits it, this one waits.
+    """Open a map file for an edit. Waits while another process edits it.
+
+    Args:
+        path: the map file.
+        on_wait: is called once before waiting.
 
     Raises:
-        MapError: missing, damaged, or not to be written.
-        MapVersionError: of a schema that this version does not know.
+        MapError: the file is missing, damaged, or read-only.
+        MapVersionError: the schema is unknown to this version.
     """
     path = Path(os.path.realpath(path))
     with _lock_map_file(path, on_wait):
         if (
             not os.access(path, os.W_OK) or not path.stat().st_mode & _WRITABLE
-        ):  # nobody's to write, though root may
+        ):  # read-only for all, even if root may write
             raise MapError(f"cannot write map {path}: it is read-only")
         with TopoMetricMap.load(path) as topomap:
             yield MapEdit(path, topomap)
 
 
 def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
-    """Take the last edit of a map file back, to the byte; it is what is returned.
+    """Undo the last edit of a map file and return it. The file is byte-identical to the one before.
 
     Raises:
-        MapError: there is nothing to take back; the undo file is damaged; the map cannot be
-            written. The map is as it was.
+        MapError: there is nothing to undo, the undo file is damaged, or the map cannot be written.
+            The map stays unchanged.
     """
     with edit_map(path, on_wait) as edit:
         assert edit.topomap.file is not None, "a map that was just opened"
@@ -117,8 +122,8 @@ def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
 
 
 def count_undoable_edits(path: str | Path, log: Path | None = None) -> int:
-    """How many of the last edits of a map file can be taken back, by the undo file beside it or
-    another one. Raises MapError."""
+    """Count the edits of a map file that can be undone, by the undo file beside it or by `log`.
+    Raises MapError."""
     path = Path(os.path.realpath(path))
     with closing(MapFile(path)) as file:
         return len(find_undo_entries(log or undo_log_path(path), file.digest))
@@ -126,7 +131,7 @@ def count_undoable_edits(path: str | Path, log: Path | None = None) -> int:
 
 @contextmanager
 def _lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[None]:
-    """The lock of the file that is at `path`: who had it may have put another file there."""
+    """Lock the file at `path`. Repeats if the previous owner of the lock replaced the file."""
     while True:
         try:
             descriptor = os.open(path, os.O_RDONLY)
@@ -155,7 +160,7 @@ def _wait_for_lock(descriptor: int, on_wait: WaitCallback | None) -> None:
 
 
 def _check_restored_map(previous_file: Path, digest: str, log: Path) -> None:
-    """Hold that an undone map is the one that it should be, row by row."""
+    """Check by the digest of its rows that a restored map is the previous one. Raises MapError."""
     with closing(MapFile(previous_file)) as file:
         rows = (
             digest

@@ -1,5 +1,5 @@
-"""What a map consists of: nodes with their points, what they were made from, and the walls beside
-them. Data only."""
+"""Define the entries of a map as data: nodes with their points, mapping images, and virtual
+nodes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from topoloc.retrieval.coarse import CoarseModel
 
 @dataclass(frozen=True, eq=False)
 class NodeSummary:
-    """What is known of a node without reading its points: where it stands and where it comes from.
+    """Hold the properties of a node without its points.
 
-    `node_id` never changes and is never used again; it is not the node's row
-    (`TopoMetricMap.row_of`). `recording` is the name of the session `session_id`, which two
-    sessions may share. `of_node` is the id of the node that a side node belongs to.
+    `node_id` never changes and is never reused. It is not the node's row (`TopoMetricMap.row_of`).
+    `recording` is the name of the session `session_id`. Two sessions may have the same name.
+    `of_node` is the id of the node that a virtual node belongs to.
     """
 
     node_id: int
@@ -42,13 +42,13 @@ class TopoNode:
     """One topological node: "a single template node image, its global SE(3) pose and a point cloud
     comprising of 2D SURF features and their 3D positions".
 
-    `features.points_img` are pixels of `camera` (of a stereo pair: the rectified left one); row k
-    of `points_cam` (metres, the node's camera frame) is the position of feature k, with covariance
-    ``L @ L.T`` for the lower triangular L in row k of `point_sqrt_covs` (xx, yx, yy, zx, zy, zz;
-    metres). `template_jpeg` is the node's picture, encoded, possibly smaller than `camera`.
-    `session_statistics` are what each session knows of the points, where that was kept.
-    `stored_descriptors` are the descriptors as the file has them, so that a node that was read is
-    written as it was.
+    - `features.points_img` are pixels of `camera` (of a stereo pair: the rectified left one).
+    - Row k of `points_cam` (metres, the node's camera frame) is the position of feature k.
+    - Row k of `point_sqrt_covs` holds the lower triangular L (xx, yx, yy, zx, zy, zz, in metres) of
+      its covariance ``L @ L.T``.
+    - `template_jpeg` is the node's encoded image, possibly smaller than `camera`.
+    - `session_statistics` are each session's statistics of the points, if kept.
+    - `stored_descriptors` are the descriptors of the file, so that saving writes the same ones.
     """
 
     summary: NodeSummary
@@ -63,10 +63,9 @@ class TopoNode:
 
 @dataclass(frozen=True, eq=False)
 class PlaceImage:
-    """A mapping image labelled with the node it belongs to (nearest by Eq. 1): what the coarse
-    localizers learn from.
+    """A mapping image, labelled with its nearest node by Eq. 1, to train the coarse localizers.
 
-    The picture is small and encoded (`jpeg`). `image_id` never changes and is never used again;
+    The image is small and encoded (`jpeg`). `image_id` never changes and is never reused. It is
     None until the map is saved.
     """
 
@@ -79,16 +78,16 @@ class PlaceImage:
     image_id: int | None = None
 
 
-@no_type_check  # at run time: it would read from the file to look at entries' types
+@no_type_check  # a type check at run time would read entries from the file
 @dataclass(frozen=True, eq=False)
 class VirtualNodes:
-    """Nodes seen once more by cameras turned to the left and to the right (`virtual_nodes.py`).
+    """Hold nodes of virtual cameras that look to the left and right of mapping cameras
+    (`virtual_nodes.py`).
 
-    They are described by features of one `kind`. `summaries[i]` and `nodes[i]` describe side node
-    i: session, name and time are those of the node `of_node` whose picture it comes from, the pose
-    is that of the side camera, and there is no template. The one model of `coarse_models` ranks
-    side nodes by looks; its array `centres` (n, 3) holds the world points (metres) in the middle of
-    what each of them shows.
+    Their features have one type, `kind`. `summaries[i]` and `nodes[i]` describe virtual node i. It
+    has the session, name and time of the node `of_node`, the pose of the virtual camera, and no
+    template. The one model of `coarse_models` retrieves virtual nodes. Its array `centres` (n, 3)
+    holds the median world point (metres) of each.
     """
 
     summaries: Sequence[NodeSummary]
@@ -97,24 +96,27 @@ class VirtualNodes:
     kind: str
 
     def is_used_with(self, kind: str) -> bool:
-        """Are they asked together with the nodes' points of this kind of features?"""
+        """Return whether the virtual nodes are queried together with the nodes' points of this
+        feature type."""
         return self.kind in (kind, find_feature_type(kind).virtual_view_type)
 
 
 @dataclass(frozen=True)
 class Edge:
-    """The robot went from node `source_id` to node `target_id`."""
+    """A transition of the camera from node `source_id` to node `target_id`."""
 
     source_id: int
     target_id: int
 
 
-@no_type_check  # as of a side node's
+@no_type_check  # as for virtual nodes
 @dataclass(frozen=True, eq=False)
 class Repetitions:
-    """By node id, the moves (4x4 matrices, world) by which what a node shows is found elsewhere in
-    the map, of nodes that have any, as `map_facts/repetition.py` found them. `digest` stands for
-    the nodes that were looked at: of others it says nothing.
+    """Hold the repetitions of the map's content, as `map_facts/repetition.py` finds them.
+
+    `moves` holds transforms (4x4 matrices, world) by node id. Each maps the content of a node to
+    another place of the map. Nodes without repetitions are left out. `digest` identifies the set of
+    examined nodes. The result holds only for these.
     """
 
     digest: str
@@ -123,11 +125,11 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class CorrelatedErrors:
-    """rho, the share of a match's variance that the map's points have in common, as
-    `map_facts/correlated_errors.py` measured it.
+    """Hold rho, the correlated error share: the part of a match's variance that the map's points
+    share.
 
-    `digest` stands for the nodes and the settings that it was measured of and with: of others it
-    says nothing.
+    `map_facts/correlated_errors.py` measures it. `digest` identifies the nodes and settings. The
+    result holds only for these.
     """
 
     rho: float

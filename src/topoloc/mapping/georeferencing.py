@@ -1,9 +1,10 @@
-"""Where on earth a map's world lies: told of its first picture, or fitted to places of its
-trajectory, or to known points.
+"""Georeference a map's world: from the pose of its first image, the trajectory's places, or control
+points.
 
-The fit is rigid: a map is metric already. It is robust, for GNSS is off by many metres beside a
-wall, and it knows about where up is, for heights of GNSS are poor and a straight walk alone would
-leave a roll open. What the points do not determine is an error, never a guess.
+The fit is rigid, because a map is metric already. It is robust, because GNSS can be off by many
+metres beside a wall. It uses an approximate up direction, because GNSS heights are poor and a
+straight trajectory leaves the roll undetermined. If the points do not determine the transform, an
+error is raised.
 """
 
 from __future__ import annotations
@@ -27,13 +28,10 @@ AXES = {
     for sign in ("", "-")
 }
 _LEVEL_SIGMA, _CAMERA_SIGMA = math.radians(2.0), math.radians(10.0)
-"""How far up is from where it should be: of worlds with z up, which somebody levelled, and of those
-of a camera held by hand."""
+"""Sigmas of the up direction: of levelled worlds with z up, and of worlds of a hand-held camera."""
 _MIN_HORIZONTAL_NORM = math.sin(math.radians(10.0))
-_MAX_HEIGHT = (
-    100_000.0  # metres above the ellipsoid, or below it; a map of what lies there is a mistake
-)
-_MIN_SIGMA = 0.01  # metres; nobody measures better
+_MAX_HEIGHT = 100_000.0  # metres above or below the ellipsoid; larger heights are mistakes
+_MIN_SIGMA = 0.01  # metres; the best realistic accuracy
 _MAX_ROTATION_SIGMA = math.radians(5.0)
 _MAX_RESIDUAL_SHARE = 0.25
 _MAX_SCALE = 1.05
@@ -44,21 +42,21 @@ _GATE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class UpDirection:
-    """The direction of the world that is up, and how far (radians, standard deviation) that may be
-    from the truth."""
+    """Hold the up direction of the world and its standard deviation in radians."""
 
     axis: str
     sigma: float
 
     @property
     def world(self) -> Float[np.ndarray, "3"]:
+        """Return the unit vector of the direction in the world."""
         return AXES[self.axis]
 
 
 @dataclass(frozen=True, eq=False)
 class GeoreferenceFit:
-    """`residuals_m[k]` is what the fit leaves of point k; those that are not `is_inlier` are off by
-    more than the others allow for."""
+    """Hold a georeference and the residual of each point (metres). Points with `is_inlier` False
+    are outliers."""
 
     georeference: Georeference
     residuals_m: Float[np.ndarray, " n"]
@@ -68,11 +66,11 @@ class GeoreferenceFit:
 def estimate_up_direction(
     world_from_cams: Sequence[Rigid3], axis: str | None = None
 ) -> UpDirection:
-    """The axis of the world that is nearest to the mapping cameras' mean up, or the one that is
-    named.
+    """Return the named axis, or the axis of the world nearest to the mean up direction of the
+    mapping cameras.
 
     Raises:
-        GeoreferenceError: no such axis.
+        GeoreferenceError: there is no such axis.
     """
     if axis is None:
         mean = -np.mean([pose.rotation[:, 1] for pose in world_from_cams], axis=0)
@@ -85,12 +83,17 @@ def estimate_up_direction(
 def georeference_from_heading(
     world_from_cam: Rigid3, origin: GeoPoint, heading_deg: float, up: UpDirection
 ) -> Georeference:
-    """The picture `world_from_cam` was taken at `origin`, looking to `heading_deg` (degrees
-    clockwise from true north).
+    """Return the georeference from the place and heading of one image.
+
+    Args:
+        world_from_cam: the pose of the image.
+        origin: the place of the image.
+        heading_deg: the heading of its optical axis, in degrees clockwise from true north.
+        up: the up direction of the world.
 
     Raises:
-        GeoreferenceError: it looks up or down, so that no heading says how the world is turned; or
-            nobody was at this height.
+        GeoreferenceError: the image looks up or down, so it has no heading, or the height is
+            implausible.
     """
     _check_heights([origin])
     view = world_from_cam.rotation[:, 2]
@@ -100,7 +103,7 @@ def georeference_from_heading(
             f"the first picture looks up or down (up is {up.axis}), so it has no heading; known"
             " points do: --points"
         )
-    north = level / np.linalg.norm(level)  # of a world that is turned until the picture looks north
+    north = level / np.linalg.norm(level)  # rows: east, north, up if the image looked north
     axes = np.array([np.cross(north, up.world), north, up.world])
     heading = math.radians(heading_deg)
     turn = np.array(
@@ -120,15 +123,15 @@ def fit_georeference(
     source: str,
     up: UpDirection | None = None,
 ) -> GeoreferenceFit:
-    """The rigid transform that brings points of the world (metres) to their places on earth; its
-    origin is the first place.
+    """Fit the rigid transform from points of the world (metres) to their places on earth.
 
-    Least median of squares over triples, then least squares with Cauchy's weights; four points and
-    fewer are all believed. `up` is one more measurement of the rotation.
+    The origin is the first place. Least median of squares over triples is followed by least squares
+    with Cauchy weights. Up to four points are all used as inliers. `up` is an additional
+    measurement of the rotation.
 
     Raises:
-        GeoreferenceError: fewer than three points, or they leave the rotation open, contradict each
-            other, or are of another scale.
+        GeoreferenceError: there are fewer than three points, or they leave the rotation
+            undetermined, contradict each other, or have another scale.
     """
     if len(points_world) < 3:
         raise GeoreferenceError(
@@ -155,15 +158,15 @@ def fit_georeference(
 
 @dataclass(frozen=True, eq=False)
 class _PointPairs:
-    """Points in the world and east-north-up (metres), and what is known of up."""
+    """Hold points in the world and in east-north-up (metres), and the up direction if known."""
 
     world: Float[np.ndarray, "n 3"]
     enu: Float[np.ndarray, "n 3"]
     up: UpDirection | None
 
     def align(self, weights: Float[np.ndarray, " n"], sigma: float = 1.0) -> Rigid3:
-        """enu_from_world by weighted least squares; `sigma` (metres) says how much the points count
-        beside up."""
+        """Return enu_from_world by weighted least squares. `sigma` (metres) sets the weight of the
+        points relative to the up direction."""
         share = weights / weights.sum()
         centre_world, centre_enu = share @ self.world, share @ self.enu
         correlation = ((self.enu - centre_enu) * weights[:, None] / sigma**2).T @ (
@@ -175,11 +178,12 @@ class _PointPairs:
         return Rigid3(rotation, centre_enu - rotation @ centre_world)
 
     def residuals(self, enu_from_world: Rigid3) -> Float[np.ndarray, " n"]:
+        """Return the distance of each pair after the transform, in metres."""
         return np.linalg.norm(enu_from_world.apply(self.world) - self.enu, axis=1)
 
 
 def _robust_weights(pairs: _PointPairs) -> Float[np.ndarray, " n"]:
-    """Cauchy's weights, 0 for points off by more than `_GATE` standard deviations."""
+    """Return Cauchy weights, 0 for points further off than `_GATE` standard deviations."""
     rng, num_points = np.random.default_rng(0), len(pairs.world)
     best, min_median = Rigid3.identity(), math.inf
     for _ in range(_NUM_SAMPLES):
@@ -204,8 +208,8 @@ def _robust_weights(pairs: _PointPairs) -> Float[np.ndarray, " n"]:
 def _estimate_sigma(
     pairs: _PointPairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n"]
 ) -> float:
-    """Standard deviation of one coordinate of the points that are used, metres; of six numbers that
-    were fitted nothing is learned."""
+    """Estimate the standard deviation of one coordinate of the inliers, in metres. Six fitted
+    parameters reduce the degrees of freedom."""
     is_inlier = weights > 0.0
     squares = float(np.sum(pairs.residuals(enu_from_world)[is_inlier] ** 2))
     return max(math.sqrt(squares / max(3 * int(is_inlier.sum()) - 6, 1)), _MIN_SIGMA)
@@ -220,7 +224,7 @@ def _check_heights(places: Sequence[GeoPoint]) -> None:
 def _check_fit(
     pairs: _PointPairs, enu_from_world: Rigid3, weights: Float[np.ndarray, " n"], sigma: float
 ) -> None:
-    """Hold that the points say where the map lies. Raises GeoreferenceError."""
+    """Check that the points determine the transform. Raises GeoreferenceError."""
     is_inlier = weights > 0.0
     offsets = pairs.world[is_inlier] - pairs.world[is_inlier].mean(axis=0)
     extent, left = (
@@ -256,7 +260,7 @@ def _check_fit(
 
 
 def _check_scale(offsets: Float[np.ndarray, "n 3"], true_offsets: Float[np.ndarray, "n 3"]) -> None:
-    """Hold that no other length of the metre explains the residuals."""
+    """Check that another scale does not explain the residuals. Raises GeoreferenceError."""
     scale = float(np.sum(true_offsets * offsets)) / max(float(np.sum(offsets**2)), 1e-12)
     is_better = np.sum((true_offsets - scale * offsets) ** 2) < 0.1 * np.sum(
         (true_offsets - offsets) ** 2

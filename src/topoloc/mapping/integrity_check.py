@@ -1,5 +1,5 @@
-"""A map file looked at from end to end: every row's checksum, the digest over all of them, and
-every entry as it is read for an answer; and what it says of its coarse localizers."""
+"""Check a whole map file: the checksum of every row, the digest, and the content of every entry.
+Also list its coarse localizers."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from topoloc.retrieval.coarse import open_coarse_localizer
 
 
 def find_map_damage(path: Path) -> list[str]:
-    """What is wrong in the file, a line each, without the map's name; nothing where it is whole.
+    """Return the damages of the file, one line each, without the map's name. Empty if there is
+    none.
 
     Raises:
-        MapError: it cannot even be opened.
+        MapError: the file cannot be opened.
     """
     with TopoMetricMap.load(path) as topomap:
         file = topomap.file
@@ -30,7 +31,8 @@ def find_map_damage(path: Path) -> list[str]:
 
 
 def list_coarse_models(path: Path) -> list[dict[str, Any]]:
-    """Name, bytes, backbone and weights of each coarse localizer of a map file. Raises MapError."""
+    """Return the name, bytes, backbone and weights of each coarse localizer of a map file. Raises
+    MapError."""
     file = MapFile(path)
     try:
         with file.read_connection() as database:
@@ -103,7 +105,7 @@ def _try_read(read: Callable[[], Any]) -> tuple[Any, list[str]]:
         return read(), []
     except MapError as error:
         return None, [str(error)]
-    except KeyError as error:  # of `row_of`
+    except KeyError as error:  # raised by `row_of`
         return None, [f"node {error} is missing"]
 
 

@@ -1,4 +1,5 @@
-"""Numba kernel of `landmarks`: what one image's view of points adds to their normal equations."""
+"""Numba kernel of `landmarks`: add the observations of one image to the normal equations of
+points."""
 
 import numpy as np
 
@@ -18,9 +19,13 @@ def add_observations(
     gradient,
     squares,
 ):
-    """Point `rows[m]` is seen at `normalized[m]` (plane z = 1) by a camera of this pose, within
-    `sigmas[m]`; adds to the last three, of which there is one for each point. A point behind the
-    camera adds to its square alone."""
+    """Add observations of one image to `information`, `gradient` and `squares`, which have one row
+    per point.
+
+    Point `rows[m]` is observed at `normalized[m]` (plane z = 1) with standard deviation
+    `sigmas[m]`. The pose of the camera is `rotation` and `translation`. A point behind the camera
+    adds only to its squared residual.
+    """
     jacobian = np.empty((2, 3))
     residual = np.empty(2)
     for m in range(len(rows)):

@@ -1,16 +1,14 @@
-"""What each session knows of a node's points, as sums that later sessions add to and that can be
-taken away again.
+"""Store each session's statistics of a node's points as sums that can be added and removed later.
 
-A point's position is the least squares of all that was ever measured of it. Around the position p
-that the node keeps, every session contributes information A = sum of J' W J and a pull g = sum of
-J' W r (normal equations, in the node's camera frame; W holds the inverse variances and the robust
-weights). Over all sessions the pulls cancel, for p is where they do; without one session the point
-moves by -A^-1 g of what is left, and its covariance is A^-1. In terms of an information vector: b =
-A p - g.
+A point's position is the least squares estimate of all its measurements. Let p be the position
+stored in the node. Every session contributes its information A = sum of J' W J and its pull g = sum
+of J' W r. These are normal equations in the node's camera frame. W holds inverse variances and
+robust weights. The pulls of all sessions sum to zero, because p is the optimum. Without one session
+the point moves by -A^-1 g of the remaining sums, and its covariance is A^-1. The information vector
+is b = A p - g.
 
-`expected` counts the session's images that should have shown the point (it lies in their view),
-`seen` those that did, which is also the number of its observations: points that are gone are
-expected and no longer seen.
+`expected` counts the session's images that have the point in view. `seen` counts the images that
+observed it. Vanished points are expected but not seen.
 """
 
 from __future__ import annotations
@@ -25,21 +23,22 @@ from jaxtyping import Float, Float16, Int, Int16, UInt16
 from topoloc.mapping.validation import CorruptDataError, array_from_bytes, decompress_bytes
 
 PULL_SCALE = 1024.0
-"""Pulls are kept as L^-1 g with A = L L', which has no unit and is about 1, in steps of one part in
-so many."""
+"""Pulls are stored as L^-1 g with A = L L', in steps of 1 / PULL_SCALE. They have no unit and are
+about 1."""
 MAX_COUNT = 65535
 _MIN_INFORMATION = (
-    1e-6  # 1 / square metres: on the diagonal, so that the root of no information is defined
+    # 1 / square metres; added to the diagonal, so that the Cholesky root of zero information exists
+    1e-6
 )
 _MAX_EMPTY_ROOT = 1.01 * _MIN_INFORMATION**0.5
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkStatistics:
-    """One session's sums for the points `rows` of a node, as the file keeps them.
+    """Hold one session's sums for the points `rows` of a node, as stored in the file.
 
-    `roots` are the lower triangles (xx, yx, yy, zx, zy, zz; 1 / metres) of the Cholesky roots L of
-    the information, `pulls` are L^-1 g times `PULL_SCALE`.
+    `roots` are the lower triangles (xx, yx, yy, zx, zy, zz, in 1 / metres) of the Cholesky roots L
+    of the information. `pulls` are L^-1 g times `PULL_SCALE`.
     """
 
     session_id: int
@@ -58,10 +57,9 @@ class LandmarkStatistics:
         expected: Int[np.ndarray, " m"],
         seen: Int[np.ndarray, " m"],
     ) -> LandmarkStatistics:
-        """From information (1 / square metres) and pulls (1 / metres). Points of which the session
-        knows nothing have information 0."""
-        # what three pixels of noise leave unknown is no information: a little on the diagonal keeps
-        # the root defined
+        """Create the statistics from information (1 / square metres) and pulls (1 / metres). The
+        information is 0 for points the session did not measure."""
+        # a small value on the diagonal keeps the root defined without adding real information
         scale = np.einsum("mii->m", information) / 3.0
         lower = np.linalg.cholesky(
             information + (1e-9 * scale + _MIN_INFORMATION)[:, None, None] * np.eye(3)
@@ -78,7 +76,7 @@ class LandmarkStatistics:
 
     @property
     def is_count_only(self) -> bool:
-        """Whether the session says nothing of where the points are."""
+        """Return whether the session contains only counts and no information on positions."""
         return (
             len(self.rows) > 0
             and not self.pulls.any()
@@ -86,18 +84,18 @@ class LandmarkStatistics:
         )
 
     def is_reobserved(self, min_seen_share: float) -> bool:
-        """Whether the session saw at least this share of what it should have seen."""
+        """Return whether the session saw at least this share of its expected observations."""
         return bool(
             self.seen.sum(dtype=np.int64) >= min_seen_share * self.expected.sum(dtype=np.int64)
         )
 
     def information(self) -> Float[np.ndarray, "m 3 3"]:
-        """A of each point, 1 / square metres."""
+        """Return A of each point, in 1 / square metres."""
         lower = self._lower()
         return lower @ lower.transpose(0, 2, 1)
 
     def pull(self) -> Float[np.ndarray, "m 3"]:
-        """g of each point, 1 / metres."""
+        """Return g of each point, in 1 / metres."""
         return (self._lower() @ (self.pulls.astype(np.float64) / PULL_SCALE)[:, :, None])[:, :, 0]
 
     def _lower(self) -> Float[np.ndarray, "m 3 3"]:
@@ -108,8 +106,8 @@ class LandmarkStatistics:
 
 @dataclass(frozen=True, eq=False)
 class AccumulatedStatistics:
-    """Sums of all points of a node over some sessions; `first_session` and `last_session` are -1
-    where none saw the point."""
+    """Hold the sums of all points of a node over some sessions. `first_session` and `last_session`
+    are -1 if no session saw the point."""
 
     information: Float[np.ndarray, "n 3 3"]
     pulls: Float[np.ndarray, "n 3"]
@@ -122,7 +120,7 @@ class AccumulatedStatistics:
     def accumulate(
         statistics: Sequence[LandmarkStatistics], num_points: int
     ) -> AccumulatedStatistics:
-        """Added up in the order of the sessions."""
+        """Add up the statistics in the order of the sessions."""
         information, pulls = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
         expected, seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
         first, last = np.full(num_points, -1), np.full(num_points, -1)
@@ -140,8 +138,8 @@ class AccumulatedStatistics:
     def solve(
         self, points_cam: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-        """Positions (metres) and covariances of points kept at `points_cam`, as these sums have
-        them."""
+        """Return the positions (metres) and covariances according to these sums, for points stored
+        at `points_cam`."""
         covariances = np.linalg.inv(self.information)
         return points_cam - (covariances @ self.pulls[:, :, None])[:, :, 0], covariances
 
@@ -149,9 +147,11 @@ class AccumulatedStatistics:
 def merge_count_statistics(
     statistics: Iterable[LandmarkStatistics], min_seen_share: float
 ) -> list[LandmarkStatistics]:
-    """The same with the sessions that only counted as two at most, under the ids of the last of
-    each: those that saw at least this share of what they should have seen, and the others (another
-    light). A node then takes the same room however many sessions passed by it."""
+    """Merge the count-only sessions into at most two, each with the id of its last session.
+
+    One holds the sessions that saw at least `min_seen_share` of their expected observations. The
+    other holds the rest (other light). So a node's size does not grow with the number of sessions.
+    """
     kept, counted = list[LandmarkStatistics](), dict[bool, list[LandmarkStatistics]]()
     for of_session in statistics:
         if of_session.is_count_only:
@@ -162,7 +162,7 @@ def merge_count_statistics(
 
 
 def _add_counts(parts: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
-    """Counts of several sessions as those of the last one."""
+    """Add up the counts of several sessions under the id of the last one."""
     last = max(parts, key=lambda part: part.session_id)
     if len(parts) == 1:
         return last
@@ -177,8 +177,8 @@ def _add_counts(parts: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
 
 
 def encode_statistics(statistics: LandmarkStatistics) -> bytes:
-    """Rows, roots, pulls and counts as 16-bit words, all low bytes before all high ones, packed by
-    zlib."""
+    """Encode rows, roots, pulls and counts as 16-bit words, with all low bytes before all high
+    bytes, compressed by zlib."""
     parts = (
         (statistics.rows, "<u2"),
         (statistics.roots, "<f2"),
@@ -193,7 +193,7 @@ def encode_statistics(statistics: LandmarkStatistics) -> bytes:
 def decode_statistics(
     session_id: int, data: bytes, num_rows: int, num_points: int
 ) -> LandmarkStatistics:
-    """Sums as `encode_statistics` packed them."""
+    """Decode the bytes of `encode_statistics`. Raises CorruptDataError."""
     what = f"sums of session {session_id}"
     planes = array_from_bytes(
         decompress_bytes(data, 24 * num_rows, what), "u1", (2, 12 * num_rows), what

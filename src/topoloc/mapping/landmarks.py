@@ -1,10 +1,9 @@
-"""A node's points made better by the other mapping images that see them too.
+"""Refine a node's points with observations in other mapping images.
 
-One stereo pair or depth image measures a point once, over a short baseline. The mapping images near
-the node see it from elsewhere, at poses that are known; triangulating from all of them, with the
-first measurement as the prior, shrinks the long axis of its uncertainty, and shows up points that
-are not where they seemed (mismatched, or moving). What each session contributed to that is kept as
-sums (`landmark_statistics.py`).
+One stereo pair or depth image measures a point once, over a short baseline. Near mapping images see
+it from other known poses. Each point is triangulated from all of them, with the first measurement
+as the prior. This shortens the long axis of its covariance and reveals mismatched or moving points.
+Each session's contribution is kept as sums (`landmark_statistics.py`).
 """
 
 from __future__ import annotations
@@ -23,38 +22,37 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_kernels import add_observations
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
 
-_CAUCHY_SCALE = 2.385  # of a residual in standard deviations
+_CAUCHY_SCALE = 2.385  # in standard deviations of a residual
 
 
 @dataclass(frozen=True)
 class LandmarkConfig:
-    """How points are re-observed and refined."""
+    """Configure how points are observed and refined."""
 
     nodes_per_image: Annotated[int, Between(0, 1000)] = 3
-    """Each mapping image is matched with this many of its nearest nodes; 0 leaves every point as it
-    was first measured."""
+    """Each mapping image is matched with this many nearest nodes. 0 keeps the first
+    measurements."""
     matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
     gate: Annotated[float, Above(0)] = 4.0
-    """An observation further from the point's projection than this many standard deviations (of
-    both) is none."""
+    """Maximum distance of an observation from the point's projection, in standard deviations of
+    both."""
     pose_sigma_px: Annotated[float, AtLeast(0)] = 0.7
-    """What the errors of the mapping poses and of rectification add to a key point's own
-    uncertainty, pixels."""
+    """Sigma in pixels added to a key point's own sigma, for errors of mapping poses and
+    rectification."""
     num_iterations: Annotated[int, Between(0, 1000)] = 6
-    """Steps of the least squares that refine a point."""
+    """Number of Gauss-Newton steps that refine a point."""
     max_disagreement: Annotated[float, Above(0)] = 3.0
-    """Points whose refined residuals stay above this many standard deviations (root mean square)
-    are dropped."""
+    """Points are dropped if the root mean square of their refined residuals exceeds this, in
+    standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """One mapping image's view of a node's points: point `rows[k]` is seen at `normalized[k]`
-    (plane z = 1).
+    """Hold one mapping image's observations of a node's points.
 
-    `sigmas` are standard deviations on that plane, `cam_from_node` the transform into the image's
-    camera. `in_view` are the points that lie in the image's view, seen or not; the image is one of
-    the session `session_id`.
+    Point `rows[k]` is observed at `normalized[k]` (plane z = 1) with standard deviation
+    `sigmas[k]`. `cam_from_node` is the transform into the image's camera. `in_view` lists the
+    points inside the image, observed or not. The image belongs to the session `session_id`.
     """
 
     rows: Int[np.ndarray, " m"]
@@ -67,8 +65,8 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class RefinedPoints:
-    """`is_consistent` is False for points that their observations contradict; `num_observations`
-    counts images besides the node's own."""
+    """Hold refined points. `is_consistent` is False for points that contradict their observations.
+    `num_observations` counts images other than the node's own."""
 
     points_cam: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
@@ -87,8 +85,8 @@ def observe_points(
     config: LandmarkConfig,
     session_id: int = 0,
 ) -> Observations:
-    """Find a node's points among the features of another mapping image: by descriptor, then by
-    where they must be."""
+    """Find a node's points among the features of another mapping image, by descriptor and by
+    expected projection."""
     matches = match_features(node_features.descriptors, features.descriptors, config.matching)
     rows, columns = matches.query_idx.astype(np.int64), matches.train_idx
     normalized = camera.normalized_from_img(features.points_img[columns].astype(np.float64))
@@ -111,11 +109,11 @@ def refine_points(
     observations: list[Observations],
     config: LandmarkConfig,
 ) -> RefinedPoints:
-    """Triangulate a node's points (node's camera frame, metres) from all observations, poses held
-    fixed.
+    """Triangulate a node's points (node's camera frame, metres) from all observations with fixed
+    poses.
 
-    Gauss-Newton, every point on its own, Cauchy's loss on each observation; the first measurement
-    and its covariance are the prior.
+    Gauss-Newton per point with Cauchy loss on each observation. The first measurement and its
+    covariance are the prior.
     """
     prior = np.linalg.inv(covariances)
     points = points_cam.copy()
@@ -142,12 +140,16 @@ def compute_session_statistics(
     kept: Int[np.ndarray, " k"],
     node_session_id: int,
 ) -> list[LandmarkStatistics]:
-    """What each session contributed to the `refined` positions of the points `kept`, whose rows are
-    counted anew.
+    """Return each session's contribution to the `refined` positions. Rows count within the points
+    `kept`.
 
     Args:
-        points_cam, covariances: the first measurement, which belongs to the session
-            `node_session_id`; its image saw every point.
+        refined: the refined positions of all points.
+        points_cam, covariances: the first measurement. It belongs to the session `node_session_id`,
+            whose image saw every point.
+        observations: the observations of all sessions.
+        kept: the rows of the points that stay.
+        node_session_id: the session of the node.
     """
     prior, statistics = np.linalg.inv(covariances), []
     for session_id in sorted({node_session_id, *(seen.session_id for seen in observations)}):
@@ -181,11 +183,10 @@ def compute_session_statistics(
 def count_session_observations(
     num_points: int, observations: list[Observations], session_id: int
 ) -> LandmarkStatistics | None:
-    """How often a later session's pictures should have shown a node's points, and did; None where
-    they should have shown none.
+    """Count how often a later session's images should have shown a node's points, and how often
+    they did. Return None if no point was expected.
 
-    The points stay where they are, so of information next to nothing is kept, and the counts alone
-    take room in the file.
+    The positions stay, so the information is 0 and only the counts take space in the file.
     """
     expected, num_seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
     for seen in observations:
@@ -201,7 +202,7 @@ def count_session_observations(
 def _in_view(
     points_node: Float[np.ndarray, "n 3"], camera: Camera, cam_from_node: Rigid3
 ) -> Int[np.ndarray, " v"]:
-    """The points that lie in the camera's picture, whatever may stand before them."""
+    """Return the points that project into the image, regardless of occlusion."""
     with np.errstate(invalid="ignore"):
         pixels = camera.img_from_cam(cam_from_node.apply(points_node))
         inside = (
@@ -218,8 +219,8 @@ def _normal_equations(
     prior: Float[np.ndarray, "n 3 3"],
     observations: list[Observations],
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Information, gradient, and the summed squared residuals (in standard deviations) of each
-    point."""
+    """Return the information, the gradient and the sum of squared residuals (in standard
+    deviations) of each point."""
     offset = points - first
     information, gradient = prior.copy(), np.einsum("nij,nj->ni", prior, offset)
     squares = np.einsum("ni,ni->n", gradient, offset)
@@ -245,8 +246,8 @@ def _project(
     normalized: Float[np.ndarray, "m 2"],
     cam_from_node: Rigid3,
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2 3"], Bool[np.ndarray, " m"]]:
-    """Residuals on the plane z = 1, their derivatives by the points, and which points are in front
-    of the camera."""
+    """Return residuals on the plane z = 1, their derivatives by the points, and which points are in
+    front of the camera."""
     points = cam_from_node.apply(points_node)
     in_front = points[:, 2] > 1e-3
     z = np.where(in_front, points[:, 2], 1.0)

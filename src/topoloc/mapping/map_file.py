@@ -1,8 +1,8 @@
-"""The map file opened: rows of its tables, each checked before anybody sees it.
+"""Open a map file and read validated rows of its tables.
 
-The file may come from anywhere. Its tables must be ours to the letter, so that no view, trigger or
-virtual table runs; the lengths of a row are looked at before its bytes are read, its types and its
-checksum after; SQLite itself runs within limits of time and size.
+The file is untrusted. Its tables must match the schema exactly, so that no view, trigger or virtual
+table runs. The lengths of a row are checked before its bytes are read. Types and checksum are
+checked after. SQLite runs with limits of time and size.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from topoloc.mapping.schema import (
 from topoloc.mapping.validation import CorruptDataError, parse_counts
 
 MAX_SECONDS = 5.0
-"""What one reading may take: the slowest honest one, all node summaries of a large map, takes a
-tenth of a second."""
+"""Time limit of one read. The slowest valid read (all node summaries of a large map) takes a tenth
+of a second."""
 MAX_ROWS = 1_000_000
 MAX_BYTES = 50_000_000
 MAX_ARRAYS_BYTES = 800_000_000
-"""Of one value: a picture, a node's points, a text; and of a coarse localizer's arrays (VGG-11
-whole has 258 MB)."""
+"""Limits of one value in bytes. MAX_BYTES holds for an image, a node's points or a text.
+MAX_ARRAYS_BYTES holds for a coarse localizer's arrays (the whole VGG-11 has 258 MB)."""
 _PYTHON_TYPES = {"INTEGER": int, "TEXT": str, "BLOB": bytes}
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: MAX_ARRAYS_BYTES + 1_000_000,
@@ -61,13 +61,14 @@ _LIMITS = {
 
 
 class MapFile:
-    """The open database; one reader at a time, since a query server may call from several threads.
+    """Hold an open map database. A lock allows one reader at a time, because several threads may
+    read.
 
-    What was opened stays what it is when another file is renamed over it.
+    The content stays the same if another file is renamed over it.
 
     Raises:
-        MapError: missing, no topoloc map, truncated, or of other tables than a map has.
-        MapVersionError: written with a schema that this version does not know.
+        MapError: the file is missing, not a topoloc map, truncated, or has unexpected tables.
+        MapVersionError: the schema is unknown to this version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -78,8 +79,8 @@ class MapFile:
         self._cache: dict[str, Any] = {}
         self.version = check_header(path)
         with self._guarded_read():
-            # The file is never changed in place, so SQLite needs no locks on it (and works on
-            # read-only media).
+            # The file is never changed in place, so SQLite needs no locks. This also works on
+            # read-only media.
             address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
             self._database = sqlite3.connect(
                 address, uri=True, check_same_thread=False, isolation_level=None
@@ -107,7 +108,7 @@ class MapFile:
             raise
 
     def close(self) -> None:
-        """Let go of the file; every reading afterwards is a MapError."""
+        """Close the file. Every later read raises MapError."""
         with self._lock:
             if self._database is not None:
                 self._database.close()
@@ -118,8 +119,8 @@ class MapFile:
 
     @contextmanager
     def read_connection(self) -> Iterator[sqlite3.Connection]:
-        """The database, for one reading; what is wrong with the file becomes a MapError. Our own
-        mistakes do not."""
+        """Yield the database for one read. Errors of the file become MapError, programming errors
+        do not."""
         with self._guarded_read():
             if self._database is None:
                 raise MapError(f"map {self.path} is closed")
@@ -131,7 +132,7 @@ class MapFile:
         try:
             with self._lock:
                 yield
-        except (sqlite3.ProgrammingError, sqlite3.InterfaceError):  # a call of ours that is wrong
+        except (sqlite3.ProgrammingError, sqlite3.InterfaceError):  # a programming error
             raise
         except (
             sqlite3.Error,
@@ -147,8 +148,8 @@ class MapFile:
             ) from error
 
     def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
-        """All rows of a table of small ones, in its order. With `columns` only these, without their
-        checksum."""
+        """Return all rows of a table with small rows, in its order. With `columns`, only these
+        columns are read, without checking the checksum."""
         wanted = (
             TABLES[table] if columns is None else {name: TABLES[table][name] for name in columns}
         )
@@ -163,8 +164,8 @@ class MapFile:
             return [self._verify_checksum(table, row) for row in database.execute(query)]
 
     def row(self, table: str, **key: int | str) -> dict[str, Any] | None:
-        """One row, with its lengths looked at before it is read, and its checksum; None where there
-        is none."""
+        """Return one row, or None if there is none. Its lengths are checked before it is read, its
+        checksum after."""
         wanted, where = TABLES[table], " AND ".join(f"{name} = ?" for name in key)
         with self.read_connection() as database:
             lengths = ", ".join(f"length({name})" for name in wanted)
@@ -182,7 +183,7 @@ class MapFile:
             )
 
     def checksums(self, table: str) -> list[bytes]:
-        """Those of all rows in their order, but for that of the digest itself."""
+        """Return the checksums of all rows of a table in order, without the row of the digest."""
         with self.read_connection() as database:
             where = " WHERE key != 'digest'" if table == "map" else ""
             found = database.execute(
@@ -194,16 +195,16 @@ class MapFile:
             return [checksum for (checksum,) in found]
 
     def cached(self, name: str, make: Callable[[], Any]) -> Any:
-        """What `make` gave when it was first asked for under this name. The lock is that of
-        reading: with two, threads could wait for each other."""
+        """Return the value of `make` from its first call under this name. It shares the lock of
+        reading, because two locks could deadlock."""
         with self._lock:
             if name not in self._cache:
                 self._cache[name] = make()
             return self._cache[name]
 
     def count(self, table: str) -> int:
-        """Rows of a table, as the file says of itself; schema 1 said nothing, so they are
-        counted."""
+        """Return the number of rows of a table as stored in the file. Schema 1 stores none, so its
+        rows are counted."""
         if self.counts is not None:
             return self.counts[table]
         with self.read_connection() as database:
@@ -220,7 +221,7 @@ class MapFile:
 
     @property
     def digest(self) -> str:
-        """What tells this map's content from every other's."""
+        """Return the digest that identifies the content of the map."""
         if self.version == 1:
             return blake2b(self.path.read_bytes(), digest_size=16).hexdigest()
         if "digest" not in self.facts:
@@ -237,7 +238,8 @@ class MapFile:
         return typed
 
     def _check_tables(self, database: sqlite3.Connection) -> set[str]:
-        """Hold that the file has our tables and nothing else that SQLite would run. Their names."""
+        """Check that the file has exactly the tables of its schema and nothing else that SQLite
+        would run. Return their names."""
         wanted = (
             SCHEMA_1
             if self.version == 1
@@ -272,8 +274,8 @@ class MapFile:
 
 
 def check_header(path: Path) -> int:
-    """The 100 bytes that every SQLite file begins with: is it one, is it ours, is it whole, is it
-    of a schema that we know? Which one?"""
+    """Check the 100-byte header of a map file and return its schema version. Raises MapError,
+    MapVersionError."""
     try:
         with path.open("rb") as file:
             header = file.read(100)
@@ -281,7 +283,7 @@ def check_header(path: Path) -> int:
     except IsADirectoryError:
         hint = "an atlas" if (path / "atlas.json").is_file() else "a folder"
         raise MapError(f"{path} is no map but {hint}") from None
-    except (OSError, ValueError) as error:  # ValueError: a name with a null character
+    except (OSError, ValueError) as error:  # ValueError: the name contains a null character
         raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from error
     if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
         raise MapError(

@@ -1,5 +1,4 @@
-"""A map from its file: its nodes, images and coarse localizers are read one by one, when they are
-asked for."""
+"""Read a map from its file. Nodes, images and coarse localizers are read when accessed."""
 
 from __future__ import annotations
 
@@ -53,14 +52,15 @@ _MAX_MOVES = 1000
 
 
 def open_map(path: Path, digest: str | None = None) -> tuple[MapContents, MapFile]:
-    """Open a map file without reading its nodes; it stays open.
+    """Open a map file without reading its nodes. It stays open.
 
     Args:
-        digest: of the map that is expected; another one is an error.
+        path: the map file.
+        digest: the expected digest. Another one is an error.
 
     Raises:
-        MapError: missing, no topoloc map, truncated, damaged, or not the one expected.
-        MapVersionError: written with another schema.
+        MapError: the file is missing, not a topoloc map, truncated, damaged, or has another digest.
+        MapVersionError: the schema is unknown to this version.
     """
     file = MapFile(path)
     try:
@@ -139,7 +139,7 @@ def _read_contents(file: MapFile) -> MapContents:
 
 
 def _read_feature_types(facts: Mapping[str, str], config: MapConfig) -> list[str]:
-    """The kinds of features that the map holds, the one that answers first."""
+    """Return the feature types of the map, the first type first."""
     kinds = parse_json(facts["kinds"]) if "kinds" in facts else [config.features.kind]
     if (
         not isinstance(kinds, list)
@@ -206,7 +206,7 @@ def _session_from_row(row: Mapping[str, Any]) -> Session:
 
 
 class _LazySequence(Sequence[T]):
-    """Rows of the map, numbered from 0, each read when asked for."""
+    """Show rows of the map, numbered from 0, and read each when accessed."""
 
     def __init__(self, length: Callable[[], int], read: Callable[[int], T]) -> None:
         self._length, self._read = length, read
@@ -223,17 +223,18 @@ class _LazySequence(Sequence[T]):
         return self._read(int(position))
 
 
-# No return types: to hold them, at run time, an entry would be read.
+# No return types: a type check at run time would read an entry.
 def _lazy_summaries(file: MapFile, prefix: str = ""):
-    """The summaries of all nodes, read together at the first question: a few dozen bytes a node."""
+    """Return the summaries of all nodes. They are read together at the first access, a few dozen
+    bytes per node."""
     return _LazySequence(
         partial(file.count, f"{prefix}nodes"), partial(_read_summary, file, prefix)
     )
 
 
 def _lazy_nodes(file: MapFile, kind: str, prefix: str = "", is_default: bool = True):
-    """Nodes with their points of one kind; of that which answers first, summaries tell the
-    number."""
+    """Return nodes with their points of one feature type. For the first type (`is_default`), the
+    number of points is checked against the summary."""
     return _LazySequence(
         partial(file.count, f"{prefix}nodes"), partial(_read_node, file, kind, prefix, is_default)
     )
@@ -260,7 +261,8 @@ def _read_summaries(file: MapFile, prefix: str) -> list[NodeSummary]:
 def _summary_from_row(
     row: Mapping[str, Any], file: MapFile, nodes: Mapping[int, NodeSummary] | None
 ) -> NodeSummary:
-    """A node's, or, with `nodes`, a side node's, which is of the session of its node."""
+    """Return the summary of a node. With `nodes` it is a virtual node, whose session is that of its
+    node."""
     node_id = check_count(row["node_id"], 0, MAX_ID, "a node's id")
     num_points = check_count(
         row["num_points"], 0, MAX_POINTS, f"the number of points of node {node_id}"
@@ -282,8 +284,8 @@ def _summary_from_row(
 
 
 def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: int) -> TopoNode:
-    """The node of a row with its points of a kind; with the prefix `VIRTUAL_PREFIX` a side node,
-    which has no template. Raises MapError."""
+    """Read the node of a row with its points of a feature type. With the prefix `VIRTUAL_PREFIX` it
+    is a virtual node, which has no template. Raises MapError."""
     with file.read_connection():
         summary = _read_summaries(file, prefix)[row]
         node_id, what = summary.node_id, f"{prefix}node {summary.node_id}"
@@ -330,8 +332,8 @@ def _read_camera(file: MapFile, prefix: str, node_id: int) -> Camera:
 
 
 class _LazyStatistics:
-    """What each session knows of a node's points; no answer needs it, so it is read when asked
-    for."""
+    """Show each session's statistics of a node's points. Localization does not need them, so they
+    are read when accessed."""
 
     def __init__(self, file: MapFile, node_id: int, kind: str, num_points: int) -> None:
         self._file, self._node_id, self._kind, self._num_points = file, node_id, kind, num_points
@@ -389,7 +391,7 @@ def _read_place_image(file: MapFile, row: int) -> PlaceImage:
 
 
 class _LazyMapping(Mapping[K, V]):
-    """Rows of a table by their key, each read when asked for."""
+    """Show rows of a table by their key, and read each when accessed."""
 
     def __init__(self, file: MapFile, table: str, read: Callable[[dict[str, Any]], V]) -> None:
         self._file, self._table, self._read = file, table, read

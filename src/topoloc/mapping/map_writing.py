@@ -1,8 +1,8 @@
-"""The map file written: one SQLite database (see docs/map-format.md), at once or not at all;
-`map_reading.py` opens it.
+"""Write a map file atomically: one SQLite database (see docs/map-format.md), which `map_reading.py`
+reads.
 
-A node costs about 100 bytes a point and a small JPEG: `point_encoding.py` and
-`landmark_statistics.py` say how points, and what sessions know of them, are kept.
+A node takes about 100 bytes per point and a small JPEG. `point_encoding.py` and
+`landmark_statistics.py` define the encoding of points and session statistics.
 """
 
 from __future__ import annotations
@@ -42,19 +42,18 @@ from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.coarse import CoarseModel
 
 _PAGE_BYTES = 1024
-"""A row leaves half of its last page empty, and a node has about eight; with larger pages a node
-takes 1 to 5 kB more."""
+"""A row leaves half of its last page empty on average, and a node has about eight rows. Larger
+pages cost 1 to 5 kB more per node."""
 
 
 def save_map(topomap: MapContents, path: Path) -> None:
-    """Write the map to `path`: beside it first, then renamed over it, so that a reader sees the old
-    map or the new one.
+    """Write the map to `path` atomically. A reader sees the old map or the new one.
 
     Raises:
-        MapError: the folder does not exist or cannot be written, or the disk is full; nothing is
+        MapError: the folder does not exist or cannot be written, or the disk is full. Nothing is
             left behind.
     """
-    if os.path.isdir(path):  # Path.is_dir raises for names that are too long
+    if os.path.isdir(path):  # Path.is_dir raises an error for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
     try:
         with atomic_write(path) as temporary:
@@ -62,15 +61,15 @@ def save_map(topomap: MapContents, path: Path) -> None:
     except (OSError, ValueError) as error:
         if isinstance(error, ValueError) and "null" not in str(
             error
-        ):  # of a file's name; any other is a bug
+        ):  # a null character in the name; any other ValueError is a bug
             raise
         raise MapError(f"cannot write map {path}: {error}") from error
 
 
 def write_map(topomap: MapContents, path: Path) -> None:
-    """Write the map to the empty file `path`. Raises MapError where the disk is full."""
+    """Write the map to the empty file `path`. Raises MapError if the disk is full."""
     try:
-        # an empty name is a database of nobody else's, gone when it is closed
+        # an empty name creates a private temporary database, removed at closing
         with closing(sqlite3.connect("", isolation_level=None)) as database:
             _Writer(database).write(topomap)
             copy_sorted_tables(database, path)
@@ -79,12 +78,12 @@ def write_map(topomap: MapContents, path: Path) -> None:
 
 
 _PointBlobs = tuple[list[bytes], list[bytes]]
-"""A node's points, and what each session knows of them."""
+"""Encoded points of a node, and encoded statistics of each session."""
 
 
 class _Writer:
-    """Rows put in, with their checksums, counted; what all of them are goes into the table `map` at
-    the end."""
+    """Insert rows with checksums and count them. The table `map` is written last, with the counts
+    and the digest."""
 
     def __init__(self, database: sqlite3.Connection) -> None:
         self._database = database
@@ -94,6 +93,7 @@ class _Writer:
         self._camera_ids: dict[str, int] = {}
 
     def write(self, topomap: MapContents) -> None:
+        """Write all tables of the map in one transaction."""
         self._database.execute("PRAGMA journal_mode = OFF")
         self._database.execute("BEGIN")
         for table in TABLES:
@@ -145,7 +145,8 @@ class _Writer:
                 self._insert_points(*of_other)
 
     def _write_images(self, topomap: MapContents, session_ids: Mapping[str, int]) -> int:
-        """Images without an id get the next ones; returns the one after them."""
+        """Write the images. Images without an id receive the next ones. Return the id after the
+        last."""
         next_id = max(topomap.next_ids.place_image, 1)
         for image in topomap.place_images:
             image_id = next_id if image.image_id is None else image.image_id
@@ -278,8 +279,8 @@ class _Writer:
 
 
 def _encode_nodes(nodes: Sequence[tuple[TopoNode, str]]) -> list[tuple[TopoNode, str, _PointBlobs]]:
-    """Nodes by kinds of features, with their points and sums as the file keeps them; several
-    threads may do so at a time."""
+    """Encode points and statistics of nodes by feature type. Several threads may do so in
+    parallel."""
     return [
         (
             node,
@@ -297,13 +298,13 @@ def _encode_nodes(nodes: Sequence[tuple[TopoNode, str]]) -> list[tuple[TopoNode,
 
 
 def copy_sorted_tables(database: sqlite3.Connection, path: Path) -> None:
-    """Write the tables of a map, table by table, each in its order, to the empty file `path`.
+    """Write the tables of a map, each sorted, to the empty file `path`.
 
-    The same rows make the same bytes then, in whatever order they came together: an edit can be
-    undone to the byte.
+    The same rows give byte-identical files for any order of insertion. So an edit can be undone
+    exactly.
     """
     database.execute("ATTACH ? AS file", (str(path),))
-    # the file is nobody's until it is renamed: no journal is needed to undo what is half done
+    # nobody uses the file before it is renamed, so no journal is needed
     for pragma in (
         f"page_size = {_PAGE_BYTES}",
         "journal_mode = OFF",
@@ -325,8 +326,8 @@ def copy_sorted_tables(database: sqlite3.Connection, path: Path) -> None:
 
 
 def compute_map_digest(checksums: Mapping[str, Sequence[bytes]]) -> str:
-    """One digest of a whole map: of the checksums of all its rows, table by table in their order,
-    but for that of the digest itself."""
+    """Return the digest of a map, from the checksums of all rows by table, without the row of the
+    digest."""
     digest = blake2b(digest_size=16)
     for table in TABLES:
         digest.update(f"{table} {len(checksums[table])}\n".encode() + b"".join(checksums[table]))

@@ -1,7 +1,7 @@
-"""The frames that a map is made of: read, described, and their features given 3-D positions.
+"""Read the frames of a map, extract their features and locate these in 3-D.
 
-A stereo pair or a depth image locates its features itself. Those of a single picture are located by
-the pictures around it, under the poses that all of them have.
+A stereo pair or depth image locates its own features. Features of a monocular image are
+triangulated with images around it, from their poses.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.sessions import Illumination, measure_illumination
+from topoloc.mapping.sessions import Illumination
 from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.points.motion_triangulation import (
     SourceImage,
@@ -36,15 +36,15 @@ from topoloc.recordings.recording import has_scale, read_left_frame
 
 R = TypeVar("R")
 
-PLACE_JPEG_QUALITY = 60  # of the place images' JPEG
+PLACE_JPEG_QUALITY = 60  # JPEG quality of place images
 _MAX_CACHED_IMAGES = (
-    48  # single pictures locate the points of several nodes; their features are found once
+    48  # monocular images locate the points of several nodes, so their features are cached
 )
 
 
 @dataclass(frozen=True, eq=False)
 class MappingFrame:
-    """A frame with a pose, not yet read."""
+    """Hold a frame with a pose that is not read yet."""
 
     sequence: StereoSequence
     session_id: int
@@ -54,22 +54,23 @@ class MappingFrame:
     world_from_cam: Rigid3
 
     def read(self) -> StereoFrame:
-        """Recordings are read by one thread, and videos best in their order."""
+        """Read the frame. Recordings are read by one thread, and videos are fastest in order."""
         return self.sequence[self.index]
 
     def read_left(self) -> StereoFrame:
-        """As `read`, but for the right or depth picture: whoever only describes the frame needs
-        none."""
+        """Read the frame without its right or depth image, which feature extraction does not
+        need."""
         return read_left_frame(self.sequence, self.index)
 
     def view(self, with_depth: bool = True) -> PreparedFrame:
+        """Read the frame and prepare it for measurements."""
         return prepare_view(self.read(), with_depth)
 
 
 @dataclass(frozen=True, eq=False)
 class MappingImage:
-    """What the map needs of a frame once its pixels are let go: its features, by their kinds. The
-    pose is that of `camera`, which rectification may have turned."""
+    """Hold the data of a frame without its pixels. Features are by feature type. The pose belongs
+    to `camera`, which rectification may have rotated."""
 
     camera: Camera
     world_from_cam: Rigid3
@@ -79,8 +80,7 @@ class MappingImage:
 
 
 def prepare_view(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
-    """A frame that was read, made ready for measuring; a single picture has no depth in any
-    case."""
+    """Prepare a frame for measurements. Monocular images have no depth in any case."""
     return prepare_frame(frame, with_depth and not _is_monocular(frame))
 
 
@@ -89,10 +89,10 @@ def _is_monocular(frame: StereoFrame) -> bool:
 
 
 def select_posed_frames(sequence: StereoSequence, session_id: int) -> list[MappingFrame]:
-    """The frames of a recording that have a pose.
+    """Return the frames of a recording that have a pose.
 
     Raises:
-        TrajectoryError: none has one, or the poses are of a model without a scale.
+        TrajectoryError: no frame has a pose, or the poses have no metric scale.
     """
     if not has_scale(sequence):
         raise TrajectoryError(
@@ -116,19 +116,19 @@ def select_posed_frames(sequence: StereoSequence, session_id: int) -> list[Mappi
 def extract_mapping_image(
     frame: MappingFrame, view: PreparedFrame, config: MapConfig
 ) -> MappingImage:
-    """A frame that has been read, described by all kinds of features."""
+    """Extract the features of all types from a frame that has been read."""
     jpeg = encode_thumbnail(view.picture, config.place_side_px, PLACE_JPEG_QUALITY)
     world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     features = {
         kind: extract_features(view.grey, config.feature_config_for(kind)) for kind in config.kinds
     }
     return MappingImage(
-        view.camera, world_from_view, features, jpeg, measure_illumination(view.picture)
+        view.camera, world_from_view, features, jpeg, Illumination.of_image(view.picture)
     )
 
 
 def encode_thumbnail(picture: Image, side_px: int, quality: int) -> bytes:
-    """The picture as JPEG, its shorter side at most `side_px`."""
+    """Encode the image as JPEG, with its shorter side at most `side_px`."""
     scale = side_px / min(picture.shape[:2])
     if scale < 1.0:
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -136,8 +136,7 @@ def encode_thumbnail(picture: Image, side_px: int, quality: int) -> bytes:
 
 
 class PointLocator:
-    """Gives the features of mapping frames their 3-D positions; keeps the last pictures that it
-    looked at for others."""
+    """Locate the features of mapping frames in 3-D. The last monocular images are cached."""
 
     def __init__(self, frames: Sequence[MappingFrame], config: MapConfig) -> None:
         self._config = config
@@ -153,8 +152,8 @@ class PointLocator:
     def map_frames(
         self, work: Callable[[tuple[MappingFrame, StereoFrame]], R], frames: Sequence[MappingFrame]
     ) -> Iterator[R]:
-        """What work(frame, as read) gives, in their order; several frames at a time, but for single
-        pictures, for which others are read."""
+        """Yield the results of work(frame, frame as read) in order. Frames are processed in
+        parallel, except monocular ones, which read further frames."""
         for _, of_session in groupby(frames, lambda frame: frame.session_id):
             read = ((frame, frame.read()) for frame in of_session)
             first = next(read)
@@ -163,7 +162,7 @@ class PointLocator:
             )
 
     def image(self, frame: MappingFrame, view: PreparedFrame) -> MappingImage:
-        """The frame described, from memory where that is possible."""
+        """Return the extracted mapping image of a frame, from the cache if possible."""
         if id(frame) not in self._image_cache:
             image = extract_mapping_image(frame, view, self._config)
             if view.right_grey is not None or view.depth is not None:
@@ -177,8 +176,8 @@ class PointLocator:
     def locate(
         self, frame: MappingFrame, view: PreparedFrame, image: MappingImage
     ) -> tuple[dict[str, MetricPoints], list[MappingFrame]]:
-        """The positions of a frame's features, by their kinds, and the other frames that these
-        stand on."""
+        """Return the positions of a frame's features by type, and the other frames used to
+        triangulate them."""
         if view.right_grey is not None or view.depth is not None:
             return {
                 kind: locate_points(features, view, self._config.points)

@@ -1,5 +1,5 @@
-"""Nodes read from maps and made ready to be matched with, kept while there is room: one budget for
-all open maps of a process."""
+"""Cache nodes that were read and prepared for matching. All open maps of a process share one
+budget."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ DEFAULT_MAX_BYTES = 256_000_000
 
 
 class NodeCache:
-    """The entries used last, of several owners, up to a number of bytes in all. Threads may share
-    it."""
+    """Keep the most recently used entries of several owners within a number of bytes.
+    Thread-safe."""
 
     def __init__(self, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
         self._lock = threading.Lock()
@@ -28,17 +28,18 @@ class NodeCache:
 
     @property
     def num_bytes(self) -> int:
-        """Bytes kept now."""
+        """Return the number of bytes in the cache."""
         return self._num_bytes
 
     def resize(self, max_bytes: int) -> None:
-        """Another budget from now on; what is beyond it is let go at once."""
+        """Set a new budget. Entries beyond it are dropped at once."""
         with self._lock:
             self._max_bytes = max_bytes
             self._shrink()
 
     def get(self, owner: int, row: int) -> Any:
-        """An entry, which becomes the one used last; None where it is not kept."""
+        """Return an entry and mark it as the most recently used. Return None if it is not
+        cached."""
         with self._lock:
             entry = self._entries.get((owner, row))
             if entry is None:
@@ -47,8 +48,8 @@ class NodeCache:
             return entry[0]
 
     def put(self, owner: int, row: int, value: Any, num_bytes: int) -> None:
-        """Keep an entry, and let go of those used longest ago where that is too much; one beyond
-        the whole budget is not kept."""
+        """Add an entry and drop the least recently used ones beyond the budget. An entry larger
+        than the budget is not kept."""
         with self._lock:
             _, before = self._entries.pop((owner, row), (None, 0))
             self._entries[owner, row] = value, num_bytes
@@ -56,8 +57,8 @@ class NodeCache:
             self._shrink()
 
     def remove_owner(self, owner: int) -> None:
-        """Let go of all entries of an owner. Garbage collection may call this anywhere, also while
-        this thread holds the lock."""
+        """Drop all entries of an owner. Garbage collection may call this anywhere, even while this
+        thread holds the lock."""
         self._removed_owners.append(owner)
         if self._lock.acquire(blocking=False):
             try:
@@ -75,18 +76,17 @@ class NodeCache:
 
 
 NODE_CACHE = NodeCache()
-"""That of the process."""
+"""The cache of the process."""
 
 
 def set_node_cache_size(max_bytes: int) -> None:
-    """How many bytes of nodes all open maps of this process keep in memory together (256 MB where
-    nobody says)."""
+    """Set the number of bytes of nodes that all open maps of this process keep in memory together.
+    Defaults to 256 MB."""
     NODE_CACHE.resize(max_bytes)
 
 
 class CachedNodes(Generic[T]):
-    """Calls `read` for a row of a map, or gives what it gave before where that is still in
-    memory."""
+    """Call `read` for a row of a map, or return its cached value."""
 
     _next_owner = 0
     _owner_lock = threading.Lock()

@@ -1,5 +1,5 @@
-"""Nodes in the making: points as first measured, what other mapping images saw of them since, and
-the node that comes of both."""
+"""Create nodes from frames: first measurements, observations in other images, and the refined
+node."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from topoloc.retrieval.vlad import append_positions
 
 @dataclass(frozen=True, eq=False)
 class DraftPoints:
-    """Points of a node in the making as first measured, and what other images saw of them so
+    """Hold a draft node's points as first measured, and their observations in other images so
     far."""
 
     features: Features
@@ -45,8 +45,8 @@ class DraftPoints:
 
 @dataclass(frozen=True, eq=False)
 class NodeDraft:
-    """A node in the making, its points by their kinds of features; `sources` are the frames that
-    these were first measured in."""
+    """Hold a draft node with its points by feature type. `sources` are the frames of the first
+    measurement."""
 
     frame: MappingFrame
     image: MappingImage
@@ -56,12 +56,12 @@ class NodeDraft:
     sources: list[MappingFrame]
 
     def add(self, observed: dict[str, Observations]) -> None:
-        """What one more image saw of the points (`observe_draft`)."""
+        """Add the observations of one more image (`observe_draft`)."""
         for kind, observations in observed.items():
             self.points[kind].observations.append(observations)
 
     def vlad_descriptors(self, kind: str, config: MapConfig) -> Float32[np.ndarray, "n d"]:
-        """The descriptors of its points of a kind, as the coarse localizer takes them
+        """Return the descriptors of a feature type for the coarse localizer
         (`append_positions`)."""
         return append_positions(
             self.points[kind].features,
@@ -73,9 +73,11 @@ class NodeDraft:
 
 @dataclass(frozen=True, eq=False)
 class NodeDrafts:
-    """The nodes of a map in the making, by their rows; most of them lie on disk (`disk_list`).
-    `rows` are those of the frames that they come from, `cameras` the first one of each session, and
-    `num_points` how many points each has, by kind."""
+    """Hold the draft nodes of a map by row. Most of them are on disk (`disk_list`).
+
+    `rows` holds the row of each frame that is a node. `cameras` holds the first camera of each
+    session. `num_points` holds the number of points of each node, by feature type.
+    """
 
     disk_list: DiskList[NodeDraft]
     world_from_nodes: list[Rigid3] = field(default_factory=list)
@@ -84,6 +86,7 @@ class NodeDrafts:
     num_points: dict[str, list[int]] = field(default_factory=dict)
 
     def append(self, draft: NodeDraft) -> None:
+        """Add a draft as the last row."""
         self.rows[draft.frame] = len(self.disk_list)
         self.world_from_nodes.append(draft.image.world_from_cam)
         self.cameras.setdefault(draft.frame.session_id, draft.image.camera)
@@ -92,7 +95,8 @@ class NodeDrafts:
         self.disk_list.append(draft)
 
     def image(self, frame: MappingFrame) -> MappingImage:
-        """What was found in a frame that became a node. Raises KeyError of any other."""
+        """Return the mapping image of a frame that became a node. Raises KeyError for other
+        frames."""
         return self.disk_list[self.rows[frame]].image
 
 
@@ -103,7 +107,7 @@ def create_node_draft(
     has_virtual_views: bool,
     config: MapConfig,
 ) -> NodeDraft:
-    """A node of this frame, of which `view` is what was read."""
+    """Create a draft node from a frame. `view` is the prepared frame."""
     image = locator.image(frame, view)
     located, sources = locator.locate(frame, view, image)
     points = {}
@@ -136,7 +140,7 @@ def create_node_draft(
 def observe_draft(
     draft: NodeDraft, image: MappingImage, session_id: int, config: MapConfig
 ) -> dict[str, Observations]:
-    """What an image sees of a draft's points, by their kinds."""
+    """Return an image's observations of a draft's points, by feature type."""
     cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
     observed = {}
     for kind, features in image.features.items():
@@ -150,8 +154,8 @@ def observe_draft(
 
 
 def finish_node(node_id: int, draft: NodeDraft, kind: str, config: MapConfig) -> TopoNode:
-    """Refine the points of a kind by what was observed; keep those seen again first, the strongest
-    among them."""
+    """Refine the points of a feature type and return the node. Points observed again are preferred,
+    then the strongest."""
     points, frame, image = draft.points[kind], draft.frame, draft.image
     refined = refine_points(
         points.points_cam, points.covariances, points.observations, config.landmarks

@@ -1,9 +1,9 @@
-"""A node's points as the map file keeps them: descriptors as signed bytes, roots of covariances as
-half floats, all else as single floats; each array packed without loss.
+"""Encode a node's points for the map file.
 
-Exponents and signs of neighbouring numbers are alike, their last digits are noise: packed by zlib,
-the bytes of one significance of one column stand together. Descriptors are noise around nothing,
-for which zlib's search for repetitions is of no use (`Z_FILTERED`).
+Descriptors are signed bytes, roots of covariances are half floats, and the rest are single floats.
+Each array is compressed without loss by zlib. Exponents and signs of neighbouring numbers are
+similar, but their last digits are noise. So bytes of the same significance and column are stored
+together. Descriptors have no repetitions for zlib to find, so `Z_FILTERED` is used.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from topoloc.mapping.validation import (
 )
 
 FIRST_COMPRESSED_SCHEMA = 3
-"""The schema from which on arrays are packed; before, they stand as they are."""
+"""The first schema with compressed arrays. Older schemas store raw arrays."""
 
 StoredPoints = tuple[
     Features, Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 6"], Int8[np.ndarray, "n d"]
 ]
-"""Features, positions in the node's camera (metres), roots of their covariances, and descriptors as
-the file has them."""
+"""Features, positions in the node's camera frame (metres), roots of their covariances, and stored
+descriptors."""
 
 
 def node_to_arrays(node: TopoNode, kind: str) -> list[np.ndarray]:
-    """The node's arrays as they are kept, in the order of the table's columns."""
+    """Return the node's arrays for the file, in the order of the table's columns."""
     f = node.features
     shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
     descriptors = _quantize_descriptors(node, find_feature_type(kind).descriptor_scale)
@@ -52,7 +52,7 @@ def node_to_arrays(node: TopoNode, kind: str) -> list[np.ndarray]:
 
 
 def points_from_row(row: Mapping[str, Any], kind: str, schema: int, what: str) -> StoredPoints:
-    """The points of a row of `node_points`, written in this schema. Raises Damage."""
+    """Decode the points of a row of `node_points` of this schema. Raises CorruptDataError."""
     n, size = (
         check_count(row["num_points"], 0, MAX_POINTS, f"the points of {what}"),
         find_feature_type(kind).descriptor_size,
@@ -79,8 +79,8 @@ def points_from_row(row: Mapping[str, Any], kind: str, schema: int, what: str) -
 
 
 def compress_array(array: np.ndarray) -> bytes:
-    """An array (n, columns): for each column all first bytes of its numbers, then all second ones
-    ..., packed by zlib."""
+    """Compress an array (n, columns) by zlib. For each column, all first bytes of its numbers come
+    first, then all second ones, and so on."""
     n, width = array.shape
     planes = (
         np.frombuffer(array.tobytes(), np.uint8)
@@ -92,7 +92,8 @@ def compress_array(array: np.ndarray) -> bytes:
 
 
 def decompress_array(data: bytes, dtype: str, shape: tuple[int, int], what: str) -> np.ndarray:
-    """The inverse of `compress_array`, checked as `array_from_bytes` does. Raises Damage."""
+    """Decode the bytes of `compress_array` with the checks of `array_from_bytes`. Raises
+    CorruptDataError."""
     (n, width), num_bytes = shape, np.dtype(dtype).itemsize
     planes = np.frombuffer(
         decompress_bytes(data, math.prod(shape) * num_bytes, what), np.uint8
@@ -101,15 +102,15 @@ def decompress_array(data: bytes, dtype: str, shape: tuple[int, int], what: str)
 
 
 def dequantize_descriptors(stored: Int8[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
-    """Descriptors of length 1 from the file's signed bytes."""
+    """Return descriptors of length 1 from the file's signed bytes."""
     descriptors = stored.astype(np.float32)
     descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-6)
     return descriptors
 
 
 def _quantize_descriptors(node: TopoNode, scale: float) -> Int8[np.ndarray, "n d"]:
-    """The descriptors as signed bytes; of a node that was read from a file, those that it was read
-    from."""
+    """Return the descriptors as signed bytes. A node read from a file keeps the bytes of the
+    file."""
     descriptors, stored = node.features.descriptors, node.stored_descriptors
     if (
         stored is not None

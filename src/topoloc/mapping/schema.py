@@ -1,5 +1,5 @@
-"""The tables of a map file (docs/map-format.md), what makes one row of them checkable, and what
-older files are read as."""
+"""Define the tables of a map file (docs/map-format.md), the checksum of a row, and the views for
+older files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NODE: Columns = {
     "num_points": "INTEGER NOT NULL",
 }
 
-# table -> column -> how SQL declares it. Each row also has the column `checksum`.
+# table -> column -> SQL declaration. Each row also has the column `checksum`.
 TABLES: dict[str, Columns] = {
     "map": {"key": "TEXT PRIMARY KEY", "value": "TEXT NOT NULL"},
     "edits": {
@@ -98,7 +98,7 @@ _CONSTRAINTS = {
     "landmark_sums": "PRIMARY KEY (node_id, kind, session_id)",
     "edges": "PRIMARY KEY (source_id, target_id)",
 }
-# In whose order rows are written, read and digested.
+# the columns that sort rows when they are written, read and digested
 SORT_COLUMNS = {table: next(iter(columns)) for table, columns in TABLES.items()} | {
     "node_points": "node_id, kind",
     "side_node_points": "node_id, kind",
@@ -106,7 +106,7 @@ SORT_COLUMNS = {table: next(iter(columns)) for table, columns in TABLES.items()}
     "edges": "source_id, target_id",
 }
 
-# What schema 1 had; a file may lack the tables of side nodes.
+# the tables of schema 1; those of virtual nodes are optional
 SCHEMA_1 = {
     "map": "CREATE TABLE map (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
     "cameras": "CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, json TEXT NOT NULL UNIQUE)",
@@ -141,16 +141,16 @@ for _prefix in ("", VIRTUAL_PREFIX):
 
 
 def create_table_statement(table: str) -> str:
-    """The statement that makes a table, to the letter: a file with other tables than these is not
-    read."""
+    """Return the SQL statement that creates a table. A file is read only if its statements are
+    identical."""
     declared = [f"{name} {declaration}" for name, declaration in TABLES[table].items()]
     constraint = [_CONSTRAINTS[table]] if table in _CONSTRAINTS else []
     return f"CREATE TABLE {table} ({', '.join([*declared, _CHECKSUM, *constraint])})"
 
 
 def compute_checksum(table: str, row: Sequence[Any]) -> bytes:
-    """8 bytes (BLAKE2b) that change with the table's name and every bit of its row, columns in the
-    order of `TABLES`."""
+    """Return 8 bytes (BLAKE2b) of the table's name and a row, with columns in the order of
+    `TABLES`."""
     digest = blake2b(table.encode(), digest_size=8)
     for value in row:
         data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogatepass")
@@ -159,12 +159,10 @@ def compute_checksum(table: str, row: Sequence[Any]) -> bytes:
     return digest.digest()
 
 
-# Maps of schema 1, shown to the reader as schema 2: views of the connection's own stand before the
-# file's tables; nothing is written, and `save` makes a file of schema 2 of what they show. Sessions
-# follow from the names of the recordings (two of one name cannot be told apart any more), a side
-# node's node from recording and
-# picture; there are no checksums, no counts
-# and no landmark sums.
+# Maps of schema 1 are shown to the reader as schema 2. Temporary views of the connection hide the
+# file's tables. Nothing is written, and saving the map writes the current schema. Sessions follow
+# from the recordings' names, so two recordings of one name are one session. The node of a virtual
+# node follows from recording and image name. There are no checksums, counts or landmark sums.
 _COMMON_VIEWS = """
 CREATE TEMP TABLE sessions (session_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, json TEXT NOT NULL, checksum BLOB);
 INSERT INTO sessions (session_id, name, json)
@@ -184,7 +182,7 @@ CREATE TEMP VIEW place_images AS SELECT image_id, session_id, i.name AS name, no
 CREATE TEMP VIEW landmark_sums AS SELECT 0 AS node_id, '' AS kind, 0 AS session_id, 0 AS num_rows, x'' AS sums, NULL AS checksum WHERE 0;
 CREATE TEMP VIEW repetitions AS SELECT 0 AS node_id, 0 AS num_moves, x'' AS moves, NULL AS checksum WHERE 0;
 """  # noqa: E501
-# Of nodes and of side nodes. Every map of schema 1 has one kind of features, named in its
+# views of nodes and virtual nodes. Maps of schema 1 have one feature type, named in their
 # configuration.
 _POINT_VIEWS = """
 CREATE TEMP VIEW {0}node_points AS SELECT node_id, k.kind AS kind, num_points, descriptor_size, points_img, shapes, descriptors, points_cam,

@@ -1,5 +1,4 @@
-"""Which sessions of a map were taken in one light: by the names that their users gave, else as
-their pictures show it."""
+"""Group the sessions of a map by illumination, by user-given names or by measured values."""
 
 from __future__ import annotations
 
@@ -12,25 +11,26 @@ from topoloc.mapping.entries import NodeSummary
 from topoloc.mapping.sessions import Illumination, Session
 
 _MAX_SAME_DISTANCE = 0.1
-"""Lights that differ by less are one. Two walks of one path by day differ by 0.02, two of a lab
-0.04, floors of a tower up to 0.06; day and night of that path by 0.17."""
+"""Sessions closer than this have the same illumination. Two walks of one path by day differ by
+0.02, two of a lab by 0.04, floors of a tower by up to 0.06. Day and night of that path differ by
+0.17."""
 
 
 def compute_illumination_distance(a: Illumination, b: Illumination) -> float:
-    """How far two lights are apart: grey levels, contrast, shares of dark and bright pixels, and,
-    half as much, their colours."""
+    """Return the distance between two illuminations: grey level, contrast, shares of dark and
+    bright pixels, and colours with half the weight."""
     return float(np.linalg.norm(_to_vector(a) - _to_vector(b)))
 
 
 def group_by_illumination(
     sessions: Sequence[Session], weights: Mapping[int, int]
 ) -> dict[int, int]:
-    """A number for the light of each session by its id; number 0 is the light of the session that
-    weighs most.
+    """Return the illumination group of each session by its id. Group 0 is the illumination of the
+    session with the largest weight.
 
-    Sessions are taken in the order of their `weights` (by their ids), the heaviest first; each
-    joins the first light that is like its own. Names decide where both have one; a session of which
-    nothing is known counts for the light of number 0.
+    Sessions are processed by decreasing weight (`weights` by id). Each joins the first group with
+    similar illumination. If both have names, the names decide. A session without any information
+    joins group 0.
     """
     leaders, groups = list[Session](), dict[int, int]()
     for session in sorted(sessions, key=lambda one: -weights.get(one.session_id, 0)):
@@ -48,8 +48,8 @@ def group_by_illumination(
 def find_node_illumination_groups(
     summaries: Sequence[NodeSummary], sessions: Sequence[Session]
 ) -> Int[np.ndarray, " nodes"]:
-    """The number of the light (`group_by_illumination`) in which each node's session was taken; 0
-    where a session is unknown."""
+    """Return the illumination group (`group_by_illumination`) of each node's session. It is 0 if
+    the session is unknown."""
     ids, counts = np.unique([summary.session_id for summary in summaries], return_counts=True)
     groups = group_by_illumination(sessions, dict(zip(ids.tolist(), counts.tolist(), strict=True)))
     return np.array([groups.get(summary.session_id, 0) for summary in summaries], np.int64)

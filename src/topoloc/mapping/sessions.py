@@ -1,5 +1,4 @@
-"""Where a map comes from: the sessions in which its pictures were taken, and the edits that made it
-what it is."""
+"""Define the sessions and edits of a map."""
 
 from __future__ import annotations
 
@@ -16,16 +15,16 @@ from topoloc.recordings.frame import Image, StereoSequence
 from topoloc.recordings.recording import Recording, SequenceView
 
 _YEAR_2000_NS = 946_684_800 * 1_000_000_000
-"""Recordings whose clock begins at 0 tell no date."""
+"""Earlier times belong to clocks that start at 0 and have no date."""
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """The light of a session as its pictures show it, means over them; grey levels are 0 to 1.
+    """Hold the illumination of a session, averaged over its images. Grey levels are 0 to 1.
 
-    `level` is the mean grey level, `contrast` the standard deviation of the grey levels within a
-    picture, `dark` and `bright` the shares of pixels below 1/16 and above 15/16. `red` and `blue`
-    are the mean levels of these colours divided by that of green, 1 in grey pictures.
+    `level` is the mean grey level, `contrast` the standard deviation of grey levels within an
+    image. `dark` and `bright` are the shares of pixels below 1/16 and above 15/16. `red` and `blue`
+    are the mean levels of these colours divided by green, 1 in grey images.
     """
 
     level: float
@@ -35,16 +34,34 @@ class Illumination:
     red: float
     blue: float
 
+    @staticmethod
+    def of_image(image: Image) -> Illumination:
+        """Measure the illumination of an image (uint8) on every fourth pixel in each direction."""
+        sample = image[::4, ::4].astype(np.float64) / 255.0
+        grey = sample if sample.ndim == 2 else sample @ np.array([0.299, 0.587, 0.114])
+        red, green, blue = (
+            (1.0, 1.0, 1.0) if sample.ndim == 2 else sample.reshape(-1, 3).mean(axis=0) + 1e-3
+        )
+        dark, bright = float((grey < 1 / 16).mean()), float((grey > 15 / 16).mean())
+        return Illumination(
+            float(grey.mean()),
+            float(grey.std()),
+            dark,
+            bright,
+            float(red / green),
+            float(blue / green),
+        )
+
 
 @dataclass(frozen=True)
 class Session:
-    """One recording that the map was made from.
+    """Hold one recording of the map.
 
-    `session_id` never changes and is never used again; two sessions may have one name. `recording`
-    is the folder or file, as far as known. `poses_from` is `truth`, `slam`, the name of a
-    trajectory file, or `given` where the caller brought the poses. Times are those of the first and
-    the last mapping image, nanoseconds of the recording's clock. `light` is measured, `light_name`
-    what the user calls it.
+    `session_id` never changes and is never reused. Two sessions may have the same name. `recording`
+    is the folder or file, if known. `poses_from` is `truth`, `slam`, `map`, the name of a
+    trajectory file, or `given` if the caller provided the poses. Times are those of the first and
+    last mapping image, in nanoseconds of the recording's clock. `light` is measured, and
+    `light_name` is set by the user.
     """
 
     session_id: int
@@ -59,18 +76,23 @@ class Session:
 
     @property
     def start_date(self) -> str | None:
-        """ISO date and time (UTC); None where the recording's clock tells none."""
+        """Return the ISO date and time (UTC) of the first mapping image, or None if the recording's
+        clock has no date."""
         return _format_date(self.start_ns)
 
     @property
     def end_date(self) -> str | None:
+        """Return the ISO date and time (UTC) of the last mapping image, or None as `start_date`."""
         return _format_date(self.end_ns)
 
 
 @dataclass(frozen=True)
 class Edit:
-    """One change of the map: its name, the day (ISO, UTC), the schema of the file that it was
-    written in, and what it changed: numbers and texts by their names."""
+    """Hold one edit of the map.
+
+    This is: its name, its day (ISO, UTC), the schema of the file it was written in, and its changes
+    (numbers and texts by name).
+    """
 
     edit_id: int
     name: str
@@ -80,22 +102,22 @@ class Edit:
 
 
 def today() -> str:
-    """The day (ISO, UTC); SOURCE_DATE_EPOCH (seconds), where it is set, stands for now: builds can
-    then be repeated to the byte."""
+    """Return the day (ISO, UTC). SOURCE_DATE_EPOCH (seconds) replaces the current time if set, for
+    byte-identical builds."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     now = datetime.fromtimestamp(int(epoch), UTC) if epoch.isdigit() else datetime.now(UTC)
     return now.date().isoformat()
 
 
 def find_source_path(sequence: StereoSequence) -> str | None:
-    """The folder or file that a sequence was opened from, where it has one."""
+    """Return the folder or file of a sequence, or None."""
     while isinstance(sequence, SequenceView):
         sequence = sequence.base
     return str(sequence.root) if isinstance(sequence, Recording) else None
 
 
 def find_pose_source(sequence: StereoSequence) -> str:
-    """`truth` where the poses are those that the recording came with, else `given`."""
+    """Return `truth` if the poses are the recording's own, else `given`."""
     if isinstance(sequence, SequenceView):
         before = sequence.base.poses
         is_same = all(
@@ -106,21 +128,8 @@ def find_pose_source(sequence: StereoSequence) -> str:
     return "truth" if isinstance(sequence, Recording) else "given"
 
 
-def measure_illumination(image: Image) -> Illumination:
-    """The light in one picture (uint8), of every fourth pixel each way."""
-    sample = image[::4, ::4].astype(np.float64) / 255.0
-    grey = sample if sample.ndim == 2 else sample @ np.array([0.299, 0.587, 0.114])
-    red, green, blue = (
-        (1.0, 1.0, 1.0) if sample.ndim == 2 else sample.reshape(-1, 3).mean(axis=0) + 1e-3
-    )
-    dark, bright = float((grey < 1 / 16).mean()), float((grey > 15 / 16).mean())
-    return Illumination(
-        float(grey.mean()), float(grey.std()), dark, bright, float(red / green), float(blue / green)
-    )
-
-
 def average_illumination(lights: Sequence[Illumination]) -> Illumination | None:
-    """The mean of many, rounded to what is worth reading."""
+    """Return the mean illumination, rounded to four decimals, or None if `lights` is empty."""
     if not lights:
         return None
     rows = np.array(
@@ -133,8 +142,8 @@ def average_illumination(lights: Sequence[Illumination]) -> Illumination | None:
 
 
 def sessions_from_names(names: Sequence[str]) -> list[Session]:
-    """A session for each distinct name, in the order of their first mention: all that an older map
-    knows of them."""
+    """Return a session for each distinct name, in order of first occurrence, for maps without
+    sessions."""
     return [Session(number, name) for number, name in enumerate(dict.fromkeys(names))]
 
 

@@ -1,11 +1,11 @@
-"""The topo-metric map of the paper (section III-A): nodes with features and their 3-D positions,
+"""Define the topo-metric map (section III-A of the paper): nodes with features and 3-D positions,
 edges, place images.
 
-`build.py` makes it, `map_writing.py` writes and `map_reading.py` reads it, `localization` asks it.
+`build.py` creates it, `map_writing.py` writes it, `map_reading.py` reads it, and `localization`
+uses it.
 
-Everything in a map has an id that never changes and is never used again. Whoever computes works on
-rows, which the open map derives: row i is `summaries[i]` and `nodes[i]`, and `row_of` leads there
-from an id.
+Every entry has an id that never changes and is never reused. Computations use rows: row i is
+`summaries[i]` and `nodes[i]`. `row_of` converts an id to a row.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from topoloc.mapping.entries import (
 from topoloc.mapping.map_file import MapFile
 from topoloc.mapping.map_reading import open_map
 from topoloc.mapping.map_writing import save_map
+from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.session_illumination import find_node_illumination_groups
 from topoloc.mapping.sessions import Edit, Session
 from topoloc.retrieval.coarse import (
@@ -57,30 +58,43 @@ __all__ = [
 ]
 
 
-@no_type_check  # as of its contents
+@no_type_check  # as for MapContents
 @dataclass(frozen=True, eq=False)
 class TopoMetricMap(MapContents):
-    """The map, see `MapContents` for what it holds. In one that was loaded, every sequence and
-    mapping reads the file only when an entry is asked for.
+    """A topo-metric map, see `MapContents` for its fields.
 
-    A map that was loaded holds its file open; ``with TopoMetricMap.load(path) as topomap`` or
-    `close` let go of it. It is pickled as its path, and several threads may read it.
+    The sequences and mappings of a loaded map read the file when an entry is accessed. A loaded map
+    keeps its file open until `close` or the end of ``with TopoMetricMap.load(path) as topomap``. It
+    is pickled as its path. Several threads may read it.
     """
 
     def row_of(self, node_id: int) -> int:
-        """The row of a node. Raises KeyError where the map has no node of this id."""
+        """Return the row of a node. Raises KeyError if the map has no node with this id."""
         return self._rows[node_id]
+
+    def find_neighbours(self, rows: Sequence[int], max_neighbours: int) -> list[list[int]]:
+        """Return for each of these nodes the nearest others of them, by the distance of Eq. 1.
+
+        Entries are positions in `rows`, the nearest first.
+        """
+        poses = [self.summaries[row].world_from_cam for row in rows]
+        stacked, neighbours = NodePoses.of(poses), list[list[int]]()
+        for k, pose in enumerate(poses):
+            distances = node_distances(pose, stacked, self.config.lambda_rot)
+            order = np.argsort(distances, kind="stable")[: max_neighbours + 1]
+            neighbours.append([int(other) for other in order if other != k])
+        return neighbours
 
     @cached_property
     def _rows(self) -> dict[int, int]:
         return {summary.node_id: row for row, summary in enumerate(self.summaries)}
 
     def with_feature_type(self, kind: str) -> TopoMetricMap:
-        """The map as if it were made of this one of its kinds of features alone, its walls too;
-        itself by its first kind.
+        """Return the map reduced to one of its feature types, including its virtual nodes. The
+        first type returns the map itself.
 
         Raises:
-            FeatureKindError: it holds no such features.
+            FeatureTypeError: the map has no features of this type.
         """
         if kind == self.kind:
             return self
@@ -101,17 +115,16 @@ class TopoMetricMap(MapContents):
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the map file at once or not at all. Raises MapError."""
+        """Write the map file atomically. Raises MapError."""
         save_map(self, Path(path))
 
     @staticmethod
     def load(path: str | Path) -> TopoMetricMap:
-        """Open a map file; nodes are read when asked for. Raises MapError, MapVersionError."""
+        """Open a map file. Nodes are read when accessed. Raises MapError, MapVersionError."""
         return _wrap_contents(open_map(Path(path)))
 
     def close(self) -> None:
-        """Let go of the file, where the map was loaded; what is asked of it afterwards is a
-        MapError."""
+        """Close the file if the map was loaded. Later reads raise MapError."""
         if self.file is not None:
             self.file.close()
 
@@ -128,8 +141,8 @@ class TopoMetricMap(MapContents):
 
     @property
     def file(self) -> MapFile | None:
-        """Where the map comes from as it is; a changed one (`dataclasses.replace`) is no longer
-        that of the file."""
+        """Return the file of a loaded, unchanged map. It is None for a copy changed by
+        `dataclasses.replace`."""
         return self.__dict__.get("_opened")
 
     def __reduce__(self) -> Any:
@@ -139,21 +152,26 @@ class TopoMetricMap(MapContents):
 
 
 def _reload_map(path: str, digest: str) -> TopoMetricMap:
-    """The map that was pickled. Raises MapError where another one is in its place by now."""
+    """Open the map of a pickle. Raises MapError if the file was replaced."""
     return _wrap_contents(open_map(Path(path), digest))
 
 
 def _wrap_contents(read: tuple[MapContents, MapFile]) -> TopoMetricMap:
     contents, file = read
     topomap = TopoMetricMap(**vars(contents))
-    topomap.__dict__["_opened"] = file  # no field: a changed copy is not that of the file
+    topomap.__dict__["_opened"] = file  # not a field, so that a changed copy has no file
     return topomap
 
 
 def open_map_coarse_localizer(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
-    """A map's coarse localizer, which names nodes by their rows. In `surf-vlad` what sets lights
-    apart counts for less, where the map's sessions were taken in several. Raises MapError where the
-    map has none of this name, or it is damaged."""
+    """Open a map's coarse localizer, which identifies nodes by row.
+
+    If the sessions have several illuminations, descriptor localizers reduce the weight of
+    differences between these.
+
+    Raises:
+        MapError: the map has no localizer of this name, or it is damaged.
+    """
     if (of_kind := f"{name}@{topomap.kind}") in topomap.coarse_models:
         name = of_kind
     if name not in topomap.coarse_models:
@@ -177,18 +195,18 @@ def open_map_coarse_localizer(topomap: TopoMetricMap, name: str) -> CoarseLocali
 
 
 def node_ids_to_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
-    """A stored model, which names nodes by their `ids`, as one that names them by their rows; what
-    it knows of others is left out."""
+    """Return a stored model with the ids of its nodes replaced by rows. Descriptors of other nodes
+    are removed."""
     known = model.arrays.get("node_ids", _output_node_ids(model))
     if known is None or known.ndim != 1 or known.dtype.kind not in "iu":
-        return model  # it says itself what is wrong with it
+        return model  # opening the model reports the error
     if list(ids) == list(range(len(ids))) and (
         len(known) == 0 or 0 <= known.min() <= known.max() < len(ids)
     ):
         return model
     rows = {node_id: row for row, node_id in enumerate(ids)}
     of_known = np.array([rows.get(int(node_id), -1) for node_id in known], np.int64)
-    if "vectors" not in model.arrays:  # one output a node
+    if "vectors" not in model.arrays:  # one output per node
         return replace(model, arrays={**model.arrays, "node_ids": of_known})
     kept = of_known >= 0
     if not kept.any():
@@ -202,8 +220,7 @@ def node_ids_to_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
 
 
 def _output_node_ids(model: CoarseModel) -> np.ndarray | None:
-    """Of a model with an output for each node there was when it was made, in the order of their
-    ids."""
+    """Return the node ids of a model with one output per node, in the order of ids."""
     num_nodes = model.settings.get("num_nodes")
     return (
         np.arange(num_nodes) if isinstance(num_nodes, int) and 0 <= num_nodes <= 1_000_000 else None

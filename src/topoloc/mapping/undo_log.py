@@ -1,9 +1,9 @@
-"""What it takes to take the last edits of a map file back: `lab.topo.undo`, beside `lab.topo`.
+"""Store the data to undo the last edits of a map file: `lab.topo.undo`, beside `lab.topo`.
 
-An SQLite database with one entry an edit: the rows that the edit removed or changed, and the keys
-of those that it added. The map needs it for nothing else; who removes it can take nothing back. An
-entry holds for the file that its digest names: where a process was killed between writing the one
-file and the other, the next edit sees it and drops the entry.
+It is an SQLite database with one entry per edit: the rows that the edit removed or changed, and the
+keys of the rows it added. The map does not need it otherwise. Without it, no edit can be undone. An
+entry is valid for the file with its digest. If a process is killed between writing the two files,
+the next edit drops the invalid entry.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _MAX_BYTES = 4_000_000_000
 
 @dataclass(frozen=True)
 class UndoEntry:
-    """One edit that can be taken back: from the file of digest `after` to that of `before`."""
+    """Hold one edit that can be undone: from the file of digest `after` to that of `before`."""
 
     depth: int
     before: str
@@ -52,13 +52,13 @@ class UndoEntry:
 
 
 def undo_log_path(path: Path) -> Path:
-    """The undo file of a map."""
+    """Return the path of a map's undo file."""
     return path.with_name(f"{path.name}.undo")
 
 
 def find_undo_entries(log_path: Path, digest: str) -> list[UndoEntry]:
-    """The entries of an undo file that lead back from the map file of this digest, the last edit's
-    first. Raises MapError."""
+    """Return the entries of an undo file that lead back from the map file of this digest, the last
+    edit first. Raises MapError."""
     with closing(_open_log(log_path)) as log:
         rows = [
             UndoEntry(*row)
@@ -75,8 +75,8 @@ def find_undo_entries(log_path: Path, digest: str) -> list[UndoEntry]:
 
 
 def add_undo_entry(path: Path, changed: Path) -> None:
-    """What leads back from the file `changed` to that at `path`. Entries that lead elsewhere are
-    dropped. Raises MapError, OSError."""
+    """Add the entry that leads from the file `changed` back to the file at `path`. Entries that do
+    not lead there are dropped. Raises MapError, OSError."""
     before, after = (_read_digest(one) for one in (path, changed))
     depth = (
         max((entry.depth for entry in find_undo_entries(undo_log_path(path), before)), default=0)
@@ -89,7 +89,7 @@ def add_undo_entry(path: Path, changed: Path) -> None:
             _store_changed_rows(log, depth, path, changed)
         if not _restores_previous(
             log, depth, path, changed
-        ):  # an older file, or one that another version of SQLite laid out
+        ):  # an older schema, or a file layout of another SQLite version
             log.execute("DELETE FROM old_rows WHERE depth = ?", (depth,))
             log.execute(
                 "UPDATE entries SET whole = ? WHERE depth = ?",
@@ -98,8 +98,7 @@ def add_undo_entry(path: Path, changed: Path) -> None:
 
 
 def drop_undo_entries(path: Path, depth: int) -> None:
-    """Drop the entries from `depth` on; an undo file without any is removed. Raises MapError,
-    OSError."""
+    """Drop the entries from `depth` on. An empty undo file is removed. Raises MapError, OSError."""
     if depth <= 1:
         undo_log_path(path).unlink(missing_ok=True)
         return
@@ -108,8 +107,8 @@ def drop_undo_entries(path: Path, depth: int) -> None:
 
 
 def write_previous_map(path: Path, entry: UndoEntry, target: Path) -> None:
-    """The map file as it was before an edit, from the one at `path`, which is that after it. Raises
-    MapError where the log is damaged."""
+    """Write the map file before an edit to `target`. The file at `path` is the one after it. Raises
+    MapError if the log is damaged."""
     try:
         with closing(_open_log(undo_log_path(path))) as log:
             _write_previous(log, entry.depth, path, target)
@@ -118,7 +117,7 @@ def write_previous_map(path: Path, entry: UndoEntry, target: Path) -> None:
 
 
 def _open_log(file: Path) -> sqlite3.Connection:
-    """An undo file, or an empty one in memory where there is none."""
+    """Open an undo file, or an empty one in memory if there is none. Raises MapError."""
     remove_stale_files(file)
     if not file.exists():
         log = sqlite3.connect(":memory:", isolation_level=None)
@@ -147,7 +146,7 @@ def _open_log(file: Path) -> sqlite3.Connection:
 
 @contextmanager
 def _rewrite_log(path: Path) -> Iterator[sqlite3.Connection]:
-    """The undo file of a map, copied to be changed, and put in its place at the end."""
+    """Yield a copy of the undo file to change. It replaces the undo file at the end."""
     with (
         atomic_write(undo_log_path(path)) as temporary,
         closing(_open_log(undo_log_path(path))) as before,
@@ -170,8 +169,7 @@ def _delete_entries(log: sqlite3.Connection, depth: int) -> None:
 
 
 def _store_changed_rows(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -> None:
-    """All rows of the old file that are not in the new one, and the keys of all of the new that are
-    not in the old."""
+    """Store all rows of the old file that are not in the new one, and the keys of the new rows."""
     for name, of in (("old", path), ("new", changed)):
         log.execute(f"ATTACH ? AS {name}", (str(of),))
     log.execute("BEGIN")
@@ -197,7 +195,7 @@ def _store_changed_rows(log: sqlite3.Connection, depth: int, path: Path, changed
 
 
 def _restores_previous(log: sqlite3.Connection, depth: int, path: Path, changed: Path) -> bool:
-    """Whether what is kept makes the file at `path` of the changed one, to the byte."""
+    """Return whether the stored rows restore a file byte-identical to `path`."""
     if check_header(path) != SCHEMA_VERSION:
         return False
     with temporary_file(undo_log_path(path)) as tried:
@@ -219,7 +217,7 @@ def _write_previous(log: sqlite3.Connection, depth: int, path: Path, target: Pat
                 database,
                 table,
                 [*columns, "checksum"],
-                lambda *asked: _select_old_rows(log, depth, *asked),
+                lambda *args: _select_old_rows(log, depth, *args),
             )
         database.execute("COMMIT")
         database.execute("DETACH now")
@@ -229,8 +227,8 @@ def _write_previous(log: sqlite3.Connection, depth: int, path: Path, target: Pat
 def _restore_table(
     database: sqlite3.Connection, table: str, columns: list[str], rows_of: Any
 ) -> None:
-    """A table as it was before: without what was added or changed since, with what is kept of
-    then."""
+    """Restore a table: remove rows added or changed since, and insert the stored rows. Raises
+    MapError."""
     keys = SORT_COLUMNS[table].split(", ")
     at = [columns.index(key) for key in keys]
     kept, added = rows_of(table, 1, len(columns)), rows_of(table, 0, len(keys))

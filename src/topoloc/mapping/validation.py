@@ -1,5 +1,5 @@
-"""What a map file says, held against what can be: shapes, types, bounds. What is not is a
-`CorruptDataError`, before any kernel sees it."""
+"""Validate the data of a map file: shapes, types and bounds. Invalid data raises `CorruptDataError`
+before any kernel uses it."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from topoloc.geometry.rigid import Rigid3
 
 MAX_POINTS = 100_000
 MAX_SIDE_PX = 32_768
-_MAX_MAGNITUDE = 1e7  # metres and pixels; nothing that was measured is farther
+_MAX_MAGNITUDE = 1e7  # metres and pixels; larger than any measurement
 
 
 class CorruptDataError(Exception):
-    """Something in a map file that no map can hold; the text says what."""
+    """Invalid data in a map file. The message describes it."""
 
 
 def array_from_bytes(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """An array of exactly this shape; finite and within ± `_MAX_MAGNITUDE`, where it is of floating
-    point."""
+    """Return an array of exactly this shape. Floating point numbers must be finite and within ±
+    `_MAX_MAGNITUDE`. Raises CorruptDataError."""
     if len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
         raise CorruptDataError(
             f"{what}: {len(data)} bytes are not {' x '.join(map(str, shape))} {dtype}"
@@ -44,7 +44,8 @@ def array_from_bytes(data: bytes, dtype: str, shape: tuple[int, ...], what: str)
 
 
 def pose_from_bytes(data: bytes) -> Rigid3:
-    """A rigid transform: 3x4 float64, the left 3x3 a rotation."""
+    """Return the rigid transform of 3x4 float64 numbers. The left 3x3 must be a rotation. Raises
+    CorruptDataError."""
     matrix = array_from_bytes(data, "<f8", (3, 4), "a pose")
     rotation = matrix[:, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0.0:
@@ -53,7 +54,7 @@ def pose_from_bytes(data: bytes) -> Rigid3:
 
 
 def camera_from_text(text: str) -> Camera:
-    """A camera of a size that pictures have. Raises CalibrationError, Damage."""
+    """Parse a camera model of plausible size. Raises CalibrationError, CorruptDataError."""
     camera = Camera.from_json(parse_json(text))
     if (
         max(camera.width, camera.height) > MAX_SIDE_PX
@@ -67,7 +68,7 @@ def camera_from_text(text: str) -> Camera:
 
 
 def parse_json(text: str) -> Any:
-    """The value of a JSON text."""
+    """Parse a JSON text. Raises CorruptDataError."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -77,13 +78,14 @@ def parse_json(text: str) -> Any:
 
 
 def check_count(value: int, least: int, most: int, what: str) -> int:
+    """Return `value` if it is within `least` and `most`. Raises CorruptDataError otherwise."""
     if not least <= value <= most:
         raise CorruptDataError(f"{what}: {value} is not within {least} and {most}")
     return value
 
 
 def parse_counts(text: str | None, tables: Iterable[str]) -> dict[str, int]:
-    """Rows of each table, from the JSON that a map keeps."""
+    """Return the number of rows of each table from the map's JSON. Raises CorruptDataError."""
     counts = parse_json(text) if text is not None else None
     if (
         not isinstance(counts, dict)
@@ -95,7 +97,7 @@ def parse_counts(text: str | None, tables: Iterable[str]) -> dict[str, int]:
 
 
 def decompress_bytes(data: bytes, num_bytes: int, what: str) -> bytes:
-    """What zlib packed, which must be of this length."""
+    """Decompress zlib data of exactly this length. Raises CorruptDataError."""
     unpacker = zlib.decompressobj()
     try:
         found = unpacker.decompress(data, num_bytes + 1)
@@ -107,8 +109,8 @@ def decompress_bytes(data: bytes, num_bytes: int, what: str) -> bytes:
 
 
 def arrays_from_npz(data: bytes, what: str) -> dict[str, np.ndarray]:
-    """The arrays of a NumPy `.npz` as we write it: stored, not compressed, so that they are no
-    larger than their bytes; no objects."""
+    """Return the arrays of an uncompressed NumPy `.npz` without objects. So arrays are no larger
+    than the data. Raises CorruptDataError."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
@@ -136,7 +138,7 @@ def arrays_from_npz(data: bytes, what: str) -> dict[str, np.ndarray]:
 
 
 def _array_from_npy(data: bytes, what: str) -> np.ndarray:
-    """One `.npy`, whose header must agree with its length before anything is made of it."""
+    """Parse one `.npy`. Its header must agree with its length before an array is created."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     read_header: Any = {
@@ -152,7 +154,7 @@ def _array_from_npy(data: bytes, what: str) -> np.ndarray:
         TypeError,
         RecursionError,
         MemoryError,
-    ) as error:  # of Python's own parser, on what is no header
+    ) as error:  # raised by Python's parser if the header is invalid
         raise CorruptDataError(f"{what}: an array without a header") from error
     left = len(data) - stream.tell()
     if (

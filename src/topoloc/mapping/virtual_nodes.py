@@ -1,11 +1,11 @@
-"""Side nodes: what the mapping cameras saw of the walls along their way, for those who come the
-other way.
+"""Create virtual nodes: the walls beside the trajectory as virtual cameras see them, for queries in
+the reverse direction.
 
-A node's points are known from where the mapping camera looked, and found again from there. Its
-picture also holds the walls to the left and to the right, slanted; `features/side_views.py` shows
-them as from before them. Some of the nodes are therefore described once more as two cameras in the
-same place that look to the sides, with features and points of their own. They are no nodes of Eq.
-1: the localizer asks them only where nothing else gave a pose (`localization/walls/`).
+A node's points are found again only from similar directions. Its image also shows the walls on the
+left and right at a slant. `features/virtual_views.py` renders them as seen from the front. Selected
+nodes therefore get up to two virtual cameras at the same place that look to the sides, with their
+own features and points. They are not nodes of Eq. 1. The localizer uses them only if nothing else
+gives a pose (`localization/walls/`).
 """
 
 from __future__ import annotations
@@ -37,29 +37,29 @@ from topoloc.retrieval.vlad import (
 
 @dataclass(frozen=True)
 class VirtualNodesConfig:
-    """Which nodes have side nodes, and what these keep."""
+    """Configure which nodes have virtual nodes, and their content."""
 
     spacing: Annotated[float, AtLeast(0)] = 3.0
-    """Eq. 1 with so many times the map's D_thresh chooses among the nodes, a turn counting half; 0
-    makes no side nodes."""
+    """Nodes are selected by Eq. 1 with this many times the map's D_thresh and half the weight of
+    rotation. 0 creates no virtual nodes."""
     opposite: Annotated[float, AtLeast(0)] = 10.0
-    """Nodes that have another one looking the other way within so many D_thresh need no side
-    nodes."""
+    """A node needs no virtual nodes if another node within this many D_thresh looks in the opposite
+    direction."""
     views: VirtualViewConfig = field(default_factory=VirtualViewConfig)
     max_points: Annotated[int, Between(1, 100_000)] = 400
-    """Features that a side node keeps, the strongest ones."""
+    """Maximum number of features per virtual node. The strongest are kept."""
     min_points: Annotated[int, Between(1, 100_000)] = 20
-    """With fewer a side view becomes no side node."""
+    """A virtual view with fewer features becomes no virtual node."""
     vlad: VladConfig = field(default_factory=lambda: VladConfig(position_weight=0.0))
-    """Where on a wall things are seen depends on where the camera stands, so places in the picture
-    do not count."""
+    """Positions in the image have no weight, because they depend on the camera's position along the
+    wall."""
 
 
 def select_virtual_view_nodes(
     world_from_nodes: list[Rigid3], node_config: NodeConfig, config: VirtualNodesConfig
 ) -> set[int]:
-    """Which of the nodes with these poses are seen to the sides, too. `node_config` (of the map)
-    must be resolved."""
+    """Return the rows of the poses that need virtual views. `node_config` (of the map) must be
+    resolved."""
     if config.spacing == 0.0:
         return set()
     assert node_config.d_thresh is not None, "resolve the configuration first"
@@ -87,7 +87,7 @@ def create_virtual_nodes(
     points: MetricPointsConfig,
     config: VirtualNodesConfig,
 ) -> list[TopoNode]:
-    """The side nodes of a node's picture, none to two of them, not numbered yet."""
+    """Return the virtual nodes of a node's image, at most two, without ids."""
     sides = (
         _create_virtual_node(of_node, view, virtual_view, features, points, config)
         for virtual_view in make_virtual_views(view.camera, config.views)
@@ -98,8 +98,8 @@ def create_virtual_nodes(
 def collect_virtual_nodes(
     described: Sequence[TopoNode], kind: str, config: VirtualNodesConfig
 ) -> VirtualNodes | None:
-    """All side nodes of a map, by features of one kind, numbered, with what ranks them by looks;
-    None without any. Each knows the node that it is of."""
+    """Number all virtual nodes of a map, of one feature type, and fit their retrieval model. Return
+    None if there are none. `of_node` must be set."""
     if len(described) == 0:
         return None
     nodes = DiskList(
@@ -125,7 +125,7 @@ def _create_virtual_node(
         extract_features(virtual_view.picture(view.grey), feature_config)
     )
     located = locate_points(virtual_view.to_image_pixels(features, view.camera), view, points)
-    # seen from the side camera's place at such a slant, a point says nothing of the wall before it
+    # points too slanted from the virtual camera are not on the wall in front of it
     side_from_cam = virtual_view.cam_from_virtual.inverse()
     points_side = side_from_cam.apply(located.points_cam)
     with np.errstate(invalid="ignore"):
@@ -151,7 +151,7 @@ def _create_virtual_node(
 
 
 def _median_point_world(node: TopoNode) -> Float[np.ndarray, " 3"]:
-    """The world point in the middle of what the node shows."""
+    """Return the median point of a node in the world."""
     return node.summary.world_from_cam.apply(
         np.median(node.points_cam.astype(np.float64), axis=0)[None]
     )[0]

@@ -1,8 +1,8 @@
-"""How far left and right see a point apart, to a fraction of a pixel; depth images answer as a
-stereo pair would.
+"""Measure the disparity between left and right image at points, to a fraction of a pixel. Depth
+images are converted to disparity.
 
-SLAM speaks of disparity only: its noise hardly depends on depth, and points far away stay harmless.
-A depth image becomes the disparity that a second camera 8 cm to the right would measure.
+SLAM uses disparity only: its noise hardly depends on depth, and distant points do no harm. A depth
+image is converted to the disparity that a second camera 8 cm to the right would measure.
 """
 
 from __future__ import annotations
@@ -28,52 +28,52 @@ _MIN_DEPTH_SIGMA_PX = 0.03
 
 @dataclass(frozen=True)
 class DisparityConfig:
-    """How disparities are measured."""
+    """Hold the settings of disparity measurement."""
 
     half_px: Annotated[int, Between(1, 50)] = 5
     """Half side of the window that is correlated along the row."""
     min_correlation: Annotated[float, Between(-1, 1)] = 0.8
-    """Least normalised correlation of the two pictures."""
+    """Minimum normalised correlation of the two images."""
     max_second_correlation: Annotated[float, Between(0, 1)] = 0.95
-    """A second place on the row that correlates with this share of the best makes the point
-    ambiguous."""
+    """A point is ambiguous if a second place on the row reaches this fraction of the best
+    correlation."""
     search_px: Annotated[int, Between(0, 1000)] = 4
-    """A disparity that is known already is sought again this far on either side."""
+    """Search range on either side of a disparity guess."""
     min_sigma_px: Annotated[float, Above(0)] = 0.15
-    """Stereo: what calibration and interpolation leave even of a perfect correlation."""
+    """Stereo: standard deviation that calibration and interpolation leave even at perfect
+    correlation."""
     max_sigma_px: Annotated[float, Above(0)] = 1.0
-    """Disparities that are less certain than this are not used."""
+    """Disparities with a larger standard deviation are not used."""
     max_share_of_width: Annotated[float, Between(0, 1)] = 0.2
-    """Largest disparity, as a share of the picture's width."""
+    """Maximum disparity, as a fraction of the image width."""
     max_depth_step: Annotated[float, Between(0, 1)] = 0.05
-    """RGB-D: largest spread of depth around a point, as a share of depth; more is the edge of
-    something."""
+    """RGB-D: maximum spread of depth around a point, as a fraction of depth. A larger spread is a
+    depth edge."""
 
 
 @dataclass(frozen=True)
 class StereoCamera:
-    """A pinhole that measures disparity, too: ``disparity = bf / depth``, bf in pixels times
+    """Hold a pinhole that also measures disparity: ``disparity = bf / depth``, bf in pixels times
     metres."""
 
     camera: Camera
     bf: float
 
     def points_cam(self, measured: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Points (metres) of pixels and disparities (x, y, d); rows of NaN where d is unknown or
-        not positive."""
+        """Return points (metres) of pixels and disparities (x, y, d). Rows are NaN if d is unknown
+        or not positive."""
         z = self.bf / np.where(measured[:, 2] > 0.0, measured[:, 2], np.nan)
         return np.column_stack([self.camera.normalized_from_img(measured[:, :2]) * z[:, None], z])
 
     def project(self, points_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """(x, y, d) of points in the camera's frame; NaN behind it."""
+        """Return (x, y, d) of points in the camera's frame (metres), NaN for points behind it."""
         z = np.where(points_cam[:, 2] > 1e-9, points_cam[:, 2], np.nan)
         return np.column_stack([self.camera.img_from_cam(points_cam), self.bf / z])
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredView:
-    """A view of a frame with what measuring in it needs: `left` and `right` are its pictures as
-    floats."""
+    """Hold a prepared frame with its stereo camera. `left` and `right` are its images as floats."""
 
     view: PreparedFrame
     stereo: StereoCamera
@@ -82,7 +82,8 @@ class MeasuredView:
 
 
 def measured_view(frame: StereoFrame) -> MeasuredView:
-    """Raises CalibrationError, RecordingError as `prepare_frame`."""
+    """Prepare a frame for measurements. Raises CalibrationError and RecordingError like
+    `prepare_frame`."""
     view = prepare_frame(frame)
     left = view.grey.astype(np.float32)
     if view.right_grey is not None and view.rig is not None:
@@ -103,11 +104,11 @@ def measure_disparities(
     guesses_px: Float[np.ndarray, " n"],
     config: DisparityConfig,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Disparity of points of the left picture, that of an infinitely far one being 0, and its
-    standard deviation, pixels.
+    """Return the disparity of points of the left image and its standard deviation, pixels. The
+    disparity of an infinitely distant point is 0.
 
-    A point with a guess (not NaN) is sought around it, others on the whole row. NaN where it is not
-    found.
+    A point with a guess (not NaN) is searched around it, others on the whole row. Points without a
+    result are NaN.
     """
     if measured.right is None:
         return _disparities_from_depth(measured, points_img, config)
@@ -126,7 +127,7 @@ def measure_disparities(
         np.empty(len(points_img), np.float32),
         np.empty(len(points_img), np.float32),
     )
-    # The long searches are shared out evenly.
+    # Distribute the long searches evenly over the threads.
     order = np.argsort(range_lengths, kind="stable")
     order = np.concatenate([order[0::2], order[1::2]])
     points, min_disparities, range_lengths = (

@@ -1,9 +1,9 @@
-"""Numba kernels: the disparity of single points of a rectified pair, by correlation along the row
-and refinement.
+"""Implement the Numba kernels for the disparity of single points of a rectified pair: correlation
+along the row and refinement.
 
-Dense stereo would spend its time on pixels that no key point needs; matching descriptors of the
-right picture would lose the points that the detector did not find twice. A thousand points cost a
-few milliseconds this way.
+Dense stereo would compute many pixels that no key point needs. Descriptor matching would lose the
+points that are not detected in both images. This method takes a few milliseconds for a thousand
+points.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ _OPTIONS = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
 
 @kernel(**_OPTIONS)
 def _sample_row(image, x, y, row):
-    """Bilinear samples at x, x + 1, ... of one height, all at the same fraction of a pixel: a loop
-    that vectorises."""
+    """Sample bilinearly at x, x + 1, ... of one row. All samples have the same subpixel offset, so
+    that the loop vectorises."""
     left, top = int(np.floor(x)), int(np.floor(y))
     fx, fy = np.float32(x - left), np.float32(y - top)
     upper, lower = (
@@ -33,8 +33,8 @@ def _sample_row(image, x, y, row):
 
 @kernel(**_OPTIONS)
 def _normalized_patch(image, x, y, half, patch):
-    """Fill `patch` with the zero-mean, unit-norm patch around (x, y); return its norm before (0: no
-    texture)."""
+    """Fill `patch` with the zero-mean, unit-norm patch around (x, y). Return its norm before
+    normalisation (0: no texture)."""
     side = 2 * half + 1
     mean = np.float32(0)
     for j in range(side):
@@ -58,14 +58,14 @@ def _normalized_patch(image, x, y, half, patch):
 
 @kernel(**_OPTIONS)
 def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, sums, scores):
-    """NCC of `patch` (centre (x, y) in its own picture) with `image` at x + shift_sign * d for d =
-    0 .. num_disparities - 1."""
+    """Compute the normalised correlation of `patch` (centre (x, y) in its own image) with `image`
+    at x + shift_sign * d, for d = 0 .. num_disparities - 1."""
     side = 2 * half + 1
     width = image.shape[1]
     length = num_disparities + side - 1
     start = x - half if shift_sign > 0 else x - half - (num_disparities - 1)
-    # All samples of a strip lie at the same fraction of a pixel. Slices that are walked through
-    # from 0 on: only of these does the compiler make vectors.
+    # All samples of a strip have the same subpixel offset. The loops run over slices from 0 on,
+    # because the compiler vectorises only these.
     first, top = int(np.floor(start)), int(np.floor(y)) - half
     fx, fy = np.float32(start - np.floor(start)), np.float32(y - np.floor(y))
     begin, end = max(0, -first), min(length, width - 1 - first)
@@ -108,8 +108,8 @@ def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, 
 
 @kernel(**_OPTIONS)
 def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
-    """Gauss-Newton on the disparity with gain and offset eliminated; returns (disparity, standard
-    deviation in pixels)."""
+    """Refine a disparity with Gauss-Newton, with gain and offset eliminated. Return (disparity,
+    standard deviation in pixels)."""
     side = 2 * half + 1
     width = right.shape[1]
     sigma = np.float32(np.inf)
@@ -151,7 +151,7 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
         if hessian < 1.0:
             return disparity, np.float32(np.inf)
         step = gradient / hessian
-        # the window moves by +step in x when the disparity falls by it
+        # the window moves by +step in x if the disparity falls by step
         disparity -= min(max(step, np.float32(-0.7)), np.float32(0.7))
         sigma = np.sqrt(squares / (side * side - 3) / hessian)
         if abs(step) < 0.01:
@@ -176,8 +176,8 @@ def _match_point(
     sums,
     scores,
 ):
-    """(disparity, sigma) of one point, sought among low .. low + num_disparities - 1; NaN as
-    `match_in_ranges` says."""
+    """Return (disparity, sigma) of one point, searched among min_disparity .. min_disparity +
+    num_disparities - 1. Both are NaN under the conditions of `match_in_ranges`."""
     height, width = left.shape
     side = 2 * half + 1
     nothing = np.float32(np.nan), np.float32(np.nan)
@@ -210,7 +210,8 @@ def _match_point(
         or xr >= width - half - 1
     ):
         return nothing
-    # found back within a pixel? a point seen by one camera only is not
+    # The search back must return within a pixel. For a point visible in one camera only it does
+    # not.
     _normalized_patch(right, xr, y, half, back)
     _correlations(back, half, left, xr + min_disparity, y, 1, num_disparities, strip, sums, scores)
     if abs(min_disparity + int(np.argmax(scores[:num_disparities])) - disparity) > 1.0:
@@ -231,13 +232,16 @@ def match_in_ranges(
     disparities,
     sigmas,
 ):
-    """Disparity of each point (x, y) of `left` in `right` (float32 pictures of one size) with its
-    standard deviation; fills the last two.
+    """Write the disparity and standard deviation of each point (x, y) of `left` in `right` (float32
+    images of one size).
 
-    That of point n is sought among lows[n] .. lows[n] + nums[n] - 1. NaN where the point is too
-    near the border, without texture, not distinct along the row (the best score elsewhere reaches
-    `max_ratio` of the best), below `min_score`, or not found back from the right picture within a
-    pixel.
+    Point n is searched among min_disparities[n] .. min_disparities[n] + range_lengths[n] - 1. The
+    result is NaN if
+
+    * the point is too near the border or has no texture,
+    * its best score is below `min_score`,
+    * the best score elsewhere on the row reaches `max_ratio` of it, or
+    * the search back from the right image misses the point by more than a pixel.
     """
     side = 2 * half + 1
     most = 1

@@ -1,14 +1,14 @@
-"""3-D positions of a frame's features, with their covariance: from a rectified stereo pair or from
-depth.
+"""Compute the 3-D positions of a frame's features with covariances, from a rectified stereo pair or
+from depth.
 
-What is dropped, and why:
+These points are dropped:
 
-* points that the other camera does not see distinctly, and depths beside a jump in depth: the
-  position would be that of another surface, an outlier that lies on the right ray and so deceives
-  the robust estimator;
-* points whose depth is uncertain by more than a share of itself: as the query moves away from the
-  map's node they slide along their ray by more than the inlier threshold, and their first-order
-  covariance is no longer true.
+* Points without a distinct match in the other camera, and depths beside a jump in depth. Such a
+  position may be that of another surface. It lies on the right ray, so that a robust estimator
+  does not detect it.
+* Points whose relative depth uncertainty is large. As the query moves away from the node, they
+  move along their ray by more than the inlier threshold. Their first-order covariance is then no
+  longer valid.
 """
 
 from __future__ import annotations
@@ -39,29 +39,31 @@ SCALES_PER_SIZE = 1.2 / 9.0
 
 @dataclass(frozen=True)
 class MetricPointsConfig:
-    """How features get their 3-D position."""
+    """Hold the settings for the 3-D positions of features."""
 
     max_relative_sigma: Annotated[float, Above(0)] = 0.3
-    """Points whose depth is uncertain (one sigma) by more than this share of it are dropped."""
+    """Points whose depth has a larger standard deviation than this fraction of it are dropped."""
     correlation_half_px: Annotated[int, Between(1, 50)] = 5
     """Stereo: half side of the window that is correlated along the row."""
     min_correlation: Annotated[float, Between(-1, 1)] = 0.8
-    """Stereo: least normalised correlation of the two pictures."""
+    """Stereo: minimum normalised correlation of the two images."""
     max_second_correlation: Annotated[float, Between(0, 1)] = 0.97
-    """Stereo: a second place on the row that correlates with this share of the best makes the point
-    ambiguous."""
+    """Stereo: a point is ambiguous if a second place on the row reaches this fraction of the best
+    correlation."""
     min_sigma_disparity_px: Annotated[float, Above(0)] = 0.12
-    """Stereo: what calibration and interpolation leave even of a perfect correlation."""
+    """Stereo: standard deviation that calibration and interpolation leave even at perfect
+    correlation."""
     max_depth_step: Annotated[float, Between(0, 1)] = 0.05
-    """RGB-D: largest spread of depth over the 5x5 neighbourhood, as a share of depth; more is the
-    edge of something."""
+    """RGB-D: maximum spread of depth over the 5x5 neighbourhood, as a fraction of depth. A larger
+    spread is a depth edge."""
     sigma_scale: Annotated[float, Above(0)] = 0.4
     """Standard deviation of a key point's position, in units of its scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class MetricPoints:
-    """Row k belongs to feature k; `points_cam` in metres, rows of NaN where `valid` is False."""
+    """Hold one 3-D point per feature, in the features' order. `points_cam` is in metres. Rows are
+    NaN where `valid` is False."""
 
     points_cam: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
@@ -71,8 +73,12 @@ class MetricPoints:
 def locate_points(
     features: Features, view: PreparedFrame, config: MetricPointsConfig
 ) -> MetricPoints:
-    """The 3-D positions (camera frame of the view) of `features`, which were found in
-    `view.grey`."""
+    """Return the 3-D positions (camera frame of the view) of `features`, which were detected in
+    `view.grey`.
+
+    Raises:
+        RecordingError: the view has neither a right image nor depth.
+    """
     if view.right_grey is not None and view.rig is not None:
         points_cam, sigma_z = _points_from_stereo(features, view, config)
     elif view.depth is not None:
@@ -92,8 +98,8 @@ def locate_points(
 
 
 def keypoint_sigmas(features: Features, config: MetricPointsConfig) -> Float[np.ndarray, " n"]:
-    """Standard deviation (pixels) of where a key point is: it grows with the scale it was found
-    at."""
+    """Return the standard deviation (pixels) of each key point's position. It grows with the key
+    point's scale."""
     return np.maximum(
         config.sigma_scale * SCALES_PER_SIZE * features.sizes_px.astype(np.float64), 0.3
     )
@@ -104,8 +110,8 @@ def _points_from_stereo(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.right_grey is not None
     assert view.rig is not None
-    # Nearer than a quarter of the picture's width in disparity nothing is seen well by both
-    # cameras.
+    # Points with a disparity above a quarter of the image width are too near to be visible well in
+    # both cameras.
     max_disparity, num = max(16, view.camera.width // 4), len(features)
     disparity, sigma = np.empty(num, np.float32), np.empty(num, np.float32)
     match_in_ranges(
@@ -132,8 +138,8 @@ def _points_from_depth(
 def smooth_depth(
     depth: np.ndarray, points_img: np.ndarray, max_step: float
 ) -> Float[np.ndarray, " n"]:
-    """Mean depth of the 5x5 neighbourhood of each pixel; NaN at its edges, and where half of it is
-    unknown."""
+    """Return the mean depth of the 5x5 neighbourhood of each pixel. It is NaN at depth edges, and
+    if half of the neighbourhood is unknown."""
     height, width = depth.shape
     columns = np.rint(points_img[:, 0]).astype(np.int64)[:, None] + np.tile(np.arange(-2, 3), 5)
     rows = np.rint(points_img[:, 1]).astype(np.int64)[:, None] + np.repeat(np.arange(-2, 3), 5)

@@ -1,9 +1,9 @@
-"""3-D positions of a single picture's features from other pictures whose poses are known: structure
-from known motion.
+"""Compute the 3-D positions of a single image's features from other images with known poses:
+structure from known motion.
 
-Each other picture gives every matched feature a depth along its ray, where the match lies on the
-epipolar line; the depths of a feature that agree are joined, weighted by how certain they are. A
-lone match may lie on its line by chance, so one picture alone is not believed.
+Each other image gives a depth for every matched feature, if the match lies on the epipolar line.
+Depths of a feature that agree are fused, weighted by their certainty. A single match may lie on its
+line by chance, so depths from several other images must agree.
 """
 
 from __future__ import annotations
@@ -26,26 +26,27 @@ from topoloc.points.metric_points import MetricPoints
 
 @dataclass(frozen=True)
 class MotionTriangulationConfig:
-    """How features of single pictures with poses get their 3-D position."""
+    """Hold the settings of triangulation from single images with known poses."""
 
     steps: Annotated[tuple[float, ...], Above(0)] = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
-    """Distances of the other pictures, in those of consecutive ones (median)."""
+    """Distances of the other images, in units of the median distance of consecutive images."""
     max_turn: Annotated[float, Between(0, 3.2)] = 0.6
-    """Angle between the views of two pictures, radians; beyond it hardly anything matches."""
+    """Maximum angle between the viewing directions of two images, radians. Beyond it hardly any
+    feature matches."""
     matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
     gate: Annotated[float, Above(0)] = 3.0
-    """A match further off its epipolar line, and a depth further off another one, than so many
-    standard deviations is another point."""
+    """Maximum distance of a match from its epipolar line, and of two depths from each other, in
+    standard deviations."""
     pose_sigma_px: Annotated[float, AtLeast(0)] = 0.5
-    """What the errors of the poses add to a key point's own uncertainty, pixels."""
+    """Standard deviation that pose errors add to that of a key point, pixels."""
     min_pictures: Annotated[int, Between(1, 100)] = 2
-    """Other pictures whose depths of a point must agree."""
+    """Minimum number of other images whose depths of a point agree."""
 
 
 @dataclass(frozen=True, eq=False)
 class SourceImage:
-    """Another picture of the place: its features with the standard deviation (pixels) of each, its
-    camera, and where that was."""
+    """Hold another image of the place: its features, their standard deviations (pixels), its camera
+    and its pose relative to the image."""
 
     features: Features
     sigmas_px: Float[np.ndarray, " m"]
@@ -61,10 +62,11 @@ def triangulate_from_motion(
     max_relative_sigma: float,
     config: MotionTriangulationConfig,
 ) -> MetricPoints:
-    """The 3-D positions (camera frame, metres) of the features of a picture, seen by `camera`, with
-    standard deviations `sigmas_px`.
+    """Return the 3-D positions (camera frame, metres) of the features of an image taken by
+    `camera`. `sigmas_px` are their standard deviations.
 
-    Points whose depth is uncertain (one sigma) by more than `max_relative_sigma` of it are dropped.
+    Points whose depth has a larger standard deviation than `max_relative_sigma` times the depth are
+    dropped.
     """
     normalized = camera.normalized_from_img(features.points_img.astype(np.float64))
     own_sigma = sigmas_px / camera.fx
@@ -97,9 +99,12 @@ def _estimate_inverse_depths(
     other: SourceImage,
     config: MotionTriangulationConfig,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Of each feature, by one other picture: inverse depth (1/m), its standard deviation without
-    that of the feature's own place (`own`, plane z = 1), and by how much that place adds to it; NaN
-    where there is no match on the epipolar line.
+    """Return each feature's inverse depth (1/m) from one other image, and two parts of its
+    uncertainty.
+
+    The second value is its standard deviation without the uncertainty of the feature's own position
+    (`own_sigma`, plane z = 1). The third is the factor by which that position's uncertainty adds to
+    it. All are NaN without a match on the epipolar line.
     """
     inverse, sigma, per_sigma = (np.full(len(features), np.nan) for _ in range(3))
     matches = match_features(features.descriptors, other.features.descriptors, config.matching)
@@ -107,8 +112,8 @@ def _estimate_inverse_depths(
     found = other.camera.normalized_from_img(other.features.points_img[columns].astype(np.float64))
     rays = np.column_stack([normalized[rows], np.ones(len(rows))]) @ other.other_from_cam.rotation.T
     t = other.other_from_cam.translation
-    # A point at depth 1/w is seen at (rays + w t)[:2] / (rays + w t)[2]; w from the least squares
-    # of that, multiplied out.
+    # A point at depth 1/w is projected to (rays + w t)[:2] / (rays + w t)[2]. w is the least
+    # squares solution of this equation times its denominator.
     along = found * t[2] - t[:2]
     with np.errstate(divide="ignore", invalid="ignore"):
         w = np.sum(along * (rays[:, :2] - found * rays[:, 2:]), axis=1) / np.sum(along**2, axis=1)
@@ -135,11 +140,11 @@ def _fuse_depths(
     own_sigma: Float[np.ndarray, " n"],
     config: MotionTriangulationConfig,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """One inverse depth a feature with its standard deviation: of those that the most others agree
-    with; NaN where too few do.
+    """Return one inverse depth per feature with its standard deviation. It is fused from the
+    largest set of agreeing depths, or NaN if the set is too small.
 
-    What the feature's own place makes of it (`own`) is common to all, so that joining does not
-    lessen it.
+    The uncertainty of the feature's own position (`own_sigma`) is common to all depths, so fusion
+    does not reduce it.
     """
     num, columns = len(inverse), np.arange(inverse.shape[1])
     if num < config.min_pictures:
@@ -148,7 +153,7 @@ def _fuse_depths(
     with np.errstate(invalid="ignore"):
         agrees = (
             np.abs(inverse[:, None] - inverse[None]) <= spread
-        )  # a depth that is not known agrees with none
+        )  # an unknown depth (NaN) agrees with none
     support = agrees.sum(axis=1)
     best = np.lexsort((np.nan_to_num(sigma, nan=np.inf), -support), axis=0)[0]
     chosen = agrees[best, :, columns].T
@@ -162,7 +167,7 @@ def _fuse_depths(
 
 
 def _column_minimum(values: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]:
-    """The least of each column's numbers; 0 where it has none."""
+    """Return the minimum of each column without NaN, or 0 if it has no number."""
     least = np.nan_to_num(values, nan=np.inf).min(axis=0, initial=np.inf)
     return np.where(np.isfinite(least), least, 0.0)
 
@@ -170,11 +175,11 @@ def _column_minimum(values: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]
 def select_source_images(
     world_from_cams: Sequence[Rigid3], index: int, step: float, config: MotionTriangulationConfig
 ) -> list[int]:
-    """Which of the pictures with these poses locate the features of picture `index`: at several
-    distances, looking about the same way.
+    """Return the images that locate the features of image `index`: at several distances, with
+    similar viewing directions.
 
     Args:
-        step: the usual distance from one picture to the next, metres.
+        step: typical distance between consecutive images, metres.
     """
     centres = np.array([pose.translation for pose in world_from_cams])
     axes = np.array([pose.rotation[:, 2] for pose in world_from_cams])
@@ -192,7 +197,8 @@ def select_source_images(
 
 
 def compute_median_step(world_from_cams: Sequence[Rigid3]) -> float:
-    """The median distance (m) of consecutive pictures that were not taken in one place."""
+    """Return the median distance (m) of consecutive images, without pairs taken at one place.
+    Return 0 if there is none."""
     centres = np.array([pose.translation for pose in world_from_cams]).reshape(-1, 3)
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     moved = steps[steps > 1e-6]

@@ -1,9 +1,9 @@
-"""Points followed from picture to picture: corners spread over a grid, pyramidal Lucas-Kanade, then
-the key frame's own patch.
+"""Track points from image to image: corners on a grid, pyramidal Lucas-Kanade, then alignment with
+the key frame.
 
-Bouguet, *Pyramidal implementation of the Lucas Kanade feature tracker*, 2000, as in OpenCV, finds a
-point again across a step of motion; alignment with the patch of the last key frame takes the drift
-of many such steps away and says whether it is still the same point.
+Bouguet's *Pyramidal implementation of the Lucas Kanade feature tracker*, 2000, as in OpenCV, finds
+a point after one step of motion. Alignment with the patch of the last key frame removes the drift
+of many such steps. It also checks that the point is still the same.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from topoloc.points.point_tracking_kernels import refine_tracks, select_cell_cor
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """What is followed, and how."""
+    """Hold the settings of point tracking."""
 
     num_corners: Annotated[int, Between(1, 100_000)] = 450
-    """Cells of the grid; each holds a point where the picture has one."""
+    """Number of grid cells. Each cell holds at most one new corner."""
     min_quality: Annotated[float, Between(0, 1)] = 0.002
-    """Least corner strength (smaller eigenvalue), as a share of the strongest in the picture."""
+    """Minimum corner strength (smaller eigenvalue), as a fraction of the strongest in the image."""
     min_eigenvalue: Annotated[float, AtLeast(0)] = 2e-4
-    """Least corner strength at all: weaker ones are noise."""
+    """Absolute minimum corner strength. Weaker corners are noise."""
     window_px: Annotated[int, Between(3, 101)] = 15
-    """Side of the window that optical flow (Lucas and Kanade) compares."""
+    """Side of the window of optical flow (Lucas and Kanade)."""
     levels: Annotated[int, Between(0, 10)] = 3
-    """Half-sized pictures above the full one that optical flow begins with."""
+    """Number of pyramid levels above the full image for optical flow."""
     patch_half_px: Annotated[int, Between(1, 50)] = 5
-    """Half side of the patch by which a point is compared with what it looked like first."""
+    """Half side of the patch that is compared with the point's first appearance."""
     min_correlation: Annotated[float, Between(-1, 1)] = 0.7
-    """Least normalised correlation of the two patches."""
+    """Minimum normalised correlation of the two patches."""
     max_shift_px: Annotated[float, Above(0)] = 2.5
-    """A point whose patch wants it further away than this has been lost."""
+    """A point is lost if the alignment of its patch moves it farther than this."""
 
 
 def track_points(
@@ -49,8 +49,8 @@ def track_points(
     guesses_img: Float32[np.ndarray, "n 2"],
     config: TrackingConfig,
 ) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Where the points of the previous picture are in the current one, sought from `guesses_img`;
-    and which were found."""
+    """Return the positions of the previous image's points in the current one, searched from
+    `guesses_img`, and which points were found."""
     if len(points_img) == 0:
         return guesses_img.copy(), np.zeros(0, np.bool_)
     window = (config.window_px, config.window_px)
@@ -65,8 +65,8 @@ def track_points(
 
 @dataclass(frozen=True, eq=False)
 class AlignedPoints:
-    """Where points are found, which look like the reference there, and how uncertain their places
-    are by what does not fit (pixels)."""
+    """Hold aligned points, whether each one matches the reference, and the standard deviation
+    (pixels) of its position from the patch residuals."""
 
     points_img: Float32[np.ndarray, "n 2"]
     is_matched: Bool[np.ndarray, " n"]
@@ -81,8 +81,8 @@ def align_with_reference(
     scales: Float32[np.ndarray, " n"],
     config: TrackingConfig,
 ) -> AlignedPoints:
-    """Points of `image` moved to where they look most like `points_ref` of the reference enlarged
-    by `scales`."""
+    """Return the points of `image` moved to the best match with `points_ref` of the reference. The
+    reference patches are enlarged by `scales`."""
     refined, (scores, sigmas) = (
         np.empty_like(points_img),
         np.empty((2, len(points_img)), np.float32),
@@ -103,8 +103,8 @@ def find_corners(
     existing_img: Float[np.ndarray, "n 2"] | Float32[np.ndarray, "n 2"],
     config: TrackingConfig,
 ) -> Float32[np.ndarray, "m 2"]:
-    """The strongest corner of each cell of a grid that holds no point yet (Shi and Tomasi, 1994),
-    row by row."""
+    """Return the strongest corner (Shi and Tomasi, 1994) of each grid cell without an existing
+    point, row by row."""
     height, width = grey.shape
     side = max(8, round(np.sqrt(height * width / config.num_corners)))
     rows, columns = height // side, width // side

@@ -1,8 +1,8 @@
-"""Numba kernels: a tracked point brought to where it looks most like the picture it was first seen
-in; corners to begin with.
+"""Implement the Numba kernels of `point_tracking`: alignment of tracked points with the key frame,
+and corner selection.
 
-Point trackers step from frame to frame and drift a little at each; the patch of the last key frame
-does not.
+Point trackers step from frame to frame and drift a little at each step. The patch of the last key
+frame does not drift.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from topoloc.compiled import kernel
 _OPTIONS = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp"}}
 
 
-@kernel(error_model="numpy", inline="always")  # inlined, it obeys the caller's rules of arithmetic
+@kernel(error_model="numpy", inline="always")  # inlined, so that the caller's fastmath applies
 def sample_bilinear(image, x, y):
-    """Bilinear; the caller keeps (x, y) inside."""
+    """Return the bilinear sample at (x, y), which must lie inside the image."""
     ix, iy = int(x), int(y)
     fx, fy = np.float32(x - ix), np.float32(y - iy)
     top = image[iy, ix] * (1 - fx) + image[iy, ix + 1] * fx
@@ -26,8 +26,8 @@ def sample_bilinear(image, x, y):
 
 @kernel(**_OPTIONS)
 def _prepare_patch(image, x, y, half, patch, slope_x, slope_y):
-    """The zero-mean patch around (x, y) and its zero-mean slopes; returns its norm and the inverse
-    of the 2x2 normal matrix."""
+    """Fill the zero-mean patch around (x, y) and its zero-mean slopes. Return the patch's norm and
+    the sums xx, xy, yy of the 2x2 normal matrix."""
     side = 2 * half + 1
     mean, mean_x, mean_y = np.float32(0), np.float32(0), np.float32(0)
     for j in range(side):
@@ -59,8 +59,8 @@ def _prepare_patch(image, x, y, half, patch, slope_x, slope_y):
 
 @kernel(**_OPTIONS)
 def _sample_patch(image, x, y, scale, half, patch, window):
-    """Fill `window` with the zero-mean patch around (x, y), `scale` times as large; returns its sum
-    of squares and product with `patch`."""
+    """Fill `window` with the zero-mean patch around (x, y), enlarged by `scale`. Return its sum of
+    squares and its product with `patch`."""
     side = 2 * half + 1
     mean = np.float32(0)
     for j in range(side):
@@ -95,12 +95,12 @@ def refine_tracks(
 ):
     """Fill `refined`, `scores` and `sigmas` for the rows first .. last - 1.
 
-    The patch around a point of the image is `scales` times as large as that of the reference.
-    Gauss-Newton on a shift, gain and offset of the light eliminated, slopes taken from the
-    reference (inverse compositional alignment, Baker and Matthews, IJCV 2004). The score is the
-    normalised correlation at the end; -1 where the point is near a border, has no texture, or
-    wanders further than `max_shift` pixels from where it was. What does not fit, taken for noise,
-    leaves the shift uncertain by the sigma (pixels, the mean of both directions).
+    A patch of the image is `scales` times as large as that of the reference. Gauss-Newton estimates
+    a shift with gain and offset of the light eliminated. Slopes are those of the reference (inverse
+    compositional alignment, Baker and Matthews, IJCV 2004). The score is the final normalised
+    correlation. It is -1 if the point is near a border, has no texture, or moves farther than
+    `max_shift` pixels. The sigma is the standard deviation of the shift if the residuals are noise
+    (pixels, mean of both directions).
     """
     side = 2 * half + 1
     patch = np.empty((side, side), np.float32)
@@ -174,12 +174,12 @@ def _is_peak(strength, y, x):
 
 @kernel()
 def select_cell_corners(strength, is_free, side, top, left, border, threshold, corners):
-    """Fill `corners` with x, y of the strongest peak of each free cell, row by row of the grid;
-    returns their number.
+    """Fill `corners` with x, y of the strongest peak of each free cell, row by row of the grid.
+    Return their number.
 
-    `is_free` (rows, columns) are the cells, `side` pixels wide, the first of them at (left, top).
-    Only what is stronger than `threshold` and at least `border` (1 or more) pixels inside the
-    picture counts; of equal ones the first.
+    `is_free` (rows, columns) are the cells, `side` pixels wide, starting at (left, top). A peak
+    must be stronger than `threshold` and at least `border` (1 or more) pixels inside the image. Of
+    equal peaks the first counts.
     """
     height, width = strength.shape
     count = 0

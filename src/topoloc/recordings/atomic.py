@@ -1,11 +1,10 @@
-"""Files written at once or not at all: a reader sees the old file or the new one, and a failure
-leaves nothing behind.
+"""Write files and folders atomically.
 
-What is written goes to a file beside the target, of a name that nobody else has, and is renamed
-over it when it is whole and on the disk. Its writer holds a lock on it (`flock`), which ends with
-the process however that ends: a temporary file whose lock can be had belongs to nobody, and the
-next writer of the same target removes it. Several writers, also of other containers, do not meet;
-the last one wins whole.
+A reader sees the old file or the new one, and a failure leaves nothing behind. Data is written to a
+temporary file of a unique name beside the target. It is renamed over the target when it is complete
+and on the disk. The writer holds a lock (`flock`) on the temporary file, which ends with its
+process. A temporary file without a lock is stale, and the next writer of the same target removes
+it. Several writers do not interfere, even from different containers. The last one wins.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from topoloc.errors import TopolocError
 
 try:
     import fcntl
-except ImportError:  # Windows: leftovers stay there
+except ImportError:  # Windows: stale files are not removed
     fcntl = None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text as UTF-8. Raises TopolocError where the file cannot be written."""
+    """Write text as UTF-8. Raises TopolocError if the file cannot be written."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write the whole file. Raises TopolocError where it cannot be written."""
+    """Write the whole file. Raises TopolocError if it cannot be written."""
     try:
         with atomic_write(path) as temporary:
             temporary.write_bytes(data)
@@ -43,8 +42,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """An empty file beside `path` to write to; it is renamed over `path` when all went well, and
-    removed when not.
+    """Yield an empty file beside `path` to write to.
+
+    It is renamed over `path` if the body succeeds, and removed otherwise.
 
     Raises:
         OSError: the folder or the file cannot be written.
@@ -60,17 +60,17 @@ def atomic_write(path: Path) -> Iterator[Path]:
     finally:
         with suppress(
             OSError
-        ):  # renamed already, or the folder is gone: the error that led here says more
+        ):  # already renamed, or the folder is missing and an error is on its way
             temporary.unlink()
         os.close(lock)
 
 
 @contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
-    """An empty file beside `path` that is removed afterwards; those of writers that were killed are
-    removed by the next one.
+    """Yield an empty file beside `path` that is removed afterwards.
 
-    It must be written to as it is: what is renamed over it is nobody's.
+    Files of killed writers are removed by the next writer. Write into the file itself: a file
+    renamed over it would not be locked.
 
     Raises:
         OSError: the folder cannot be written.
@@ -88,8 +88,14 @@ def temporary_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(prefix: str) -> Iterator[Path]:
-    """A new folder among this machine's temporary files, its name beginning so, that is removed
-    afterwards; those of owners that were killed go, too. Raises OSError where none can be made."""
+    """Yield a new folder for temporary files that is removed afterwards.
+
+    Its name begins with `prefix`. Unlocked folders of that prefix, left by killed processes, are
+    removed first.
+
+    Raises:
+        OSError: the folder cannot be created.
+    """
     for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
         _remove_unlocked(left)
     folder, lock = _create_locked_folder(prefix)
@@ -101,12 +107,12 @@ def temporary_folder(prefix: str) -> Iterator[Path]:
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
-    """Write a folder with these files (names may have folders), all of it or nothing.
+    """Write a folder with these files, all of it or nothing. File names may contain folders.
 
-    A folder that is there already is replaced if it holds no files but such as are written now.
+    An existing folder is replaced if it holds no other files than the new ones.
 
     Raises:
-        TopolocError: it holds others, or cannot be written.
+        TopolocError: the folder holds other files, or cannot be written.
     """
     path = _resolve_link(path)
     temporary = path.with_name(f"{_temporary_prefix(path)}{secrets.token_hex(8)}.folder")
@@ -127,12 +133,13 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
         raise TopolocError(f"cannot write {path}: {error.strerror}") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        if path.is_dir():  # else what was there before is all there is
+        if path.is_dir():  # else the old folder is the only copy
             shutil.rmtree(before, ignore_errors=True)
 
 
 def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
-    """Hold that no file is lost that nobody means to write anew."""
+    """Check that `path` is not a file and that the folder holds no file that would be lost. Raises
+    TopolocError."""
     if path.exists() and not path.is_dir():
         raise TopolocError(f"cannot write {path}: it is no folder")
     found = (
@@ -146,23 +153,22 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _resolve_link(path: Path) -> Path:
-    """Where a symbolic link leads: that file is replaced, not the link."""
+    """Return the target of a symbolic link, so that the target is replaced and not the link."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def remove_stale_files(path: Path) -> None:
-    """Remove what writers of `path` left beside it that were killed; what a living process writes
-    stays."""
+    """Remove temporary files of `path` left by killed writers. Files of running processes stay."""
     path = _resolve_link(path)
     prefix = _temporary_prefix(path)
     try:
         names = [entry.name for entry in os.scandir(path.parent) if entry.name.startswith(prefix)]
-    except OSError:  # no such folder: whoever writes there will say so
+    except OSError:  # no such folder: the writer reports it
         return
     parts = {name for name in names if name.endswith(".part")}
     for name in parts:
         _remove_unlocked(path.parent / name)
-    for name in names:  # of SQLite, beside a temporary file that is gone
+    for name in names:  # journals of SQLite whose temporary file does not exist any more
         owner = name.removesuffix("-journal")
         if owner != name and owner.endswith(".part") and not (path.parent / owner).exists():
             with suppress(OSError):
@@ -170,8 +176,8 @@ def remove_stale_files(path: Path) -> None:
 
 
 def remove_all_stale_files(folder: Path) -> None:
-    """Remove what killed writers of whatever file left in a folder; what a living process writes
-    stays."""
+    """Remove temporary files of any target in a folder, left by killed writers. Files of running
+    processes stay."""
     try:
         names = [
             entry.name
@@ -185,8 +191,8 @@ def remove_all_stale_files(folder: Path) -> None:
 
 
 def _temporary_prefix(path: Path) -> str:
-    """What the names of all temporary files of `path` begin with; short enough for any file
-    system."""
+    """Return the prefix of the names of all temporary files of `path`. It is short enough for any
+    file system."""
     name = (
         path.name
         if len(os.fsencode(path.name)) <= 200
@@ -196,11 +202,11 @@ def _temporary_prefix(path: Path) -> str:
 
 
 def _create_locked_file(path: Path) -> tuple[Path, int]:
-    """A new empty file beside `path`, and its descriptor, which holds its lock."""
+    """Create an empty file beside `path`. Return it and its descriptor, which holds its lock."""
     while True:
         temporary = path.with_name(f"{_temporary_prefix(path)}{secrets.token_hex(8)}.part")
         descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        # between these two lines another writer may have taken it for a leftover
+        # another writer may have removed the file as stale before it was locked
         if _try_lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
             return temporary, descriptor
         os.close(descriptor)
@@ -209,12 +215,12 @@ def _create_locked_file(path: Path) -> tuple[Path, int]:
 
 
 def _create_locked_folder(prefix: str) -> tuple[Path, int]:
-    """A new folder, and its descriptor, which holds its lock."""
+    """Create a folder. Return it and its descriptor, which holds its lock."""
     while True:
         folder = Path(tempfile.mkdtemp(prefix=prefix))
         try:
             descriptor = os.open(folder, os.O_RDONLY)
-        except FileNotFoundError:  # another one took it for a leftover
+        except FileNotFoundError:  # another process removed it as stale
             continue
         if _try_lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
             return folder, descriptor
@@ -222,11 +228,11 @@ def _create_locked_folder(prefix: str) -> tuple[Path, int]:
 
 
 def _remove_unlocked(temporary: Path) -> None:
-    """A file, or a folder with all that is in it, unless a writer holds its lock."""
+    """Remove a file, or a folder with its content, unless a writer holds its lock."""
     is_folder = temporary.is_dir()
     try:
         descriptor = os.open(temporary, os.O_RDONLY if is_folder else os.O_RDWR)
-    except OSError:  # removed by another writer, or not ours to remove
+    except OSError:  # already removed, or no permission
         return
     try:
         if not _try_lock(descriptor):
@@ -241,7 +247,8 @@ def _remove_unlocked(temporary: Path) -> None:
 
 
 def _try_lock(descriptor: int) -> bool | None:
-    """Take the lock of an open file; False where another has it, None where there are no locks."""
+    """Lock an open file. Return False if another process has the lock, None if locks are not
+    supported."""
     if fcntl is None:
         return None
     try:
@@ -254,11 +261,11 @@ def _try_lock(descriptor: int) -> bool | None:
 
 
 def _fsync(path: Path) -> None:
-    """Hold until a file, or the names in a folder, are on the disk."""
+    """Wait until a file, or the names in a folder, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
-    except OSError:  # file systems that cannot; the rename is atomic there, too
+    except OSError:  # not supported by this file system, whose rename is still atomic
         pass
     finally:
         os.close(descriptor)

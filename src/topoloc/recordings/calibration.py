@@ -1,9 +1,8 @@
-"""What a calibration is given as: a file of one of the known kinds, or four numbers; and recordings
-with a calibration from outside.
+"""Read calibrations and apply them to recordings.
 
-`camera.json`, YAML of OpenCV or Kalibr, or ``fx,fy,cx,cy`` in pixels. Four numbers and some of the
-files do not say of which picture size they are, so a calibration is asked for with that of the
-pictures.
+A calibration is a `camera.json`, YAML of OpenCV or Kalibr, or four numbers ``fx,fy,cx,cy`` in
+pixels. Four numbers and some files do not contain the image size. So a calibration is a function of
+the size of the images.
 """
 
 from __future__ import annotations
@@ -24,37 +23,38 @@ from topoloc.recordings.stereo_yaml import YAML_SUFFIXES, is_calibration, read_c
 from topoloc.recordings.video import Video
 
 CalibrationForSize = Callable[[int, int], CameraCalibration]
-"""The calibration of pictures of this width and height (pixels). Raises CalibrationError."""
-# Principal points of lenses lie within a few percent of the centre; further off they are those of
-# another size or of a part of a picture.
+"""Returns the calibration for images of this width and height (pixels). Raises CalibrationError."""
+# The principal point of a camera lies within a few percent of the image centre. A larger offset
+# indicates another image size or a cropped image.
 _SIZE_TOLERANCE, _SCALE_TOLERANCE = 0.12, 0.08
 
 
 def parse_calibration(text: str | Path) -> CalibrationForSize:
-    """A calibration by its file, or by four numbers ``fx,fy,cx,cy``.
+    """Read a calibration from a file or from four numbers ``fx,fy,cx,cy``.
 
     Raises:
-        CalibrationError: neither, or the file is not usable; names it.
+        CalibrationError: the text is neither, or the file is not usable. Names the file.
     """
     path = Path(text)
     if "," in str(text) and not path.exists():
         return parse_intrinsics(str(text))
     if path.suffix.lower() in YAML_SUFFIXES:
-        read_calibration_yaml(path, 1000, 1000)  # complains before the first picture is read
+        read_calibration_yaml(path, 1000, 1000)  # raises errors before the first image is read
         return lambda width, height: read_calibration_yaml(path, width, height)
     camera_calibration = read_camera_json(path)
     return lambda width, height: camera_calibration
 
 
 def parse_intrinsics(text: str) -> CalibrationForSize:
-    """The pinhole camera of four numbers ``fx,fy,cx,cy`` (pixels). Raises CalibrationError."""
+    """Return the pinhole calibration of four numbers ``fx,fy,cx,cy`` (pixels). Raises
+    CalibrationError."""
     try:
         fx, fy, cx, cy = map(float, text.split(","))
     except ValueError:
         raise CalibrationError(
             f"{text[:80]}: neither a file nor four numbers fx,fy,cx,cy"
         ) from None
-    Camera.pinhole(1, 1, fx, fy, cx, cy)  # complains before the first picture is read
+    Camera.pinhole(1, 1, fx, fy, cx, cy)  # raises errors before the first image is read
     return lambda width, height: CameraCalibration(
         camera_from_intrinsics(fx, fy, cx, cy, width, height)
     )
@@ -63,10 +63,10 @@ def parse_intrinsics(text: str) -> CalibrationForSize:
 def camera_from_intrinsics(
     fx: float, fy: float, cx: float, cy: float, width: int, height: int
 ) -> Camera:
-    """The pinhole camera of four numbers (pixels).
+    """Return the pinhole camera model of four numbers and an image size (pixels).
 
     Raises:
-        CalibrationError: the principal point is that of a picture of another size, or of one turned
+        CalibrationError: the principal point belongs to another image size, or to an image rotated
             by 90 degrees.
     """
     camera = Camera.pinhole(width, height, fx, fy, cx, cy)
@@ -95,11 +95,11 @@ def camera_from_intrinsics(
 
 
 def find_calibration(folder: Path) -> CalibrationForSize | None:
-    """The calibration that lies in a recording's folder: camera.json, else the only YAML file that
-    holds one.
+    """Return the calibration in a recording's folder: camera.json, or the only YAML file with a
+    calibration. Return None if there is none.
 
     Raises:
-        CalibrationError: it is not usable, or there are several.
+        CalibrationError: the calibration is not usable, or there are several.
     """
     if (folder / FILE_NAME).is_file():
         return parse_calibration(folder / FILE_NAME)
@@ -117,8 +117,8 @@ def find_calibration(folder: Path) -> CalibrationForSize | None:
 
 
 def complete_calibration(given: CalibrationForSize, folder: Path) -> CalibrationForSize:
-    """A calibration from outside; what it does not say of a rectified pair's baseline and of depth
-    is as in the recording's folder."""
+    """Return `given` with the missing parts taken from the calibration in the recording's folder.
+    These are the baseline of a rectified stereo pair and the depth factor."""
 
     def for_size(width: int, height: int) -> CameraCalibration:
         calibration = given(width, height)
@@ -142,14 +142,15 @@ def complete_calibration(given: CalibrationForSize, folder: Path) -> Calibration
 
 
 def with_calibration(sequence: StereoSequence, calibration: CalibrationForSize) -> StereoSequence:
-    """A recording that brings a calibration of its own, with another one in its place.
+    """Return a recording with its own calibration replaced.
 
-    A single camera takes the place of both of a rectified pair, and of that of registered depth.
+    A calibration of one camera replaces both cameras of a rectified stereo pair, and the camera of
+    registered depth.
 
     Raises:
-        CalibrationError: the calibration is not usable, or is of one camera and the pair is not
-            rectified.
-        RecordingError: a recording of a kind that keeps its own.
+        CalibrationError: the calibration is not usable, or it is of one camera and the stereo pair
+            is not rectified.
+        RecordingError: the calibration of this type of recording cannot be replaced.
     """
     if isinstance(sequence, Video):
         camera = calibration(*sequence.size).camera
@@ -185,8 +186,8 @@ def with_calibration(sequence: StereoSequence, calibration: CalibrationForSize) 
 
 
 def first_image_size(images: Sequence[Path]) -> tuple[int, int]:
-    """Width and height of the first picture that can be read; (0, 0) where none can, which is said
-    when they are asked for."""
+    """Return the width and height of the first readable image. Return (0, 0) if none can be read,
+    because reading the images reports the error later."""
     for path in images:
         with suppress(UnreadableImageError):
             return image_size(path)

@@ -1,5 +1,5 @@
-"""``camera.json``: the calibration of a recording whose format has none of its own, or of a
-query."""
+"""Read ``camera.json``, the calibration of a recording or a query without a calibration of its
+own."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ FILE_NAME = "camera.json"
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A camera; of a stereo pair the left one, with its `rig`. `depth_factor` is that of depth
-    pictures: file units a metre."""
+    """Hold a camera model, and the `rig` of a stereo pair. The camera is the left one of the pair.
+    `depth_factor` is in file units per metre."""
 
     camera: Camera
     rig: StereoRig | None = None
@@ -26,12 +26,15 @@ class CameraCalibration:
 
 
 def read_camera_json(path: Path) -> CameraCalibration:
-    """Read a camera.json: one camera, with a "baseline" (metres) where it is the left one of a
-    rectified pair; or two of any calibration, "left" and "right", with "right_from_left" (4x4,
-    metres).
+    """Read a camera.json.
+
+    It holds one camera, optionally with the "baseline" (metres) of a rectified stereo pair whose
+    left camera it is. Or it holds a stereo pair of any calibration: "left", "right" and
+    "right_from_left" (4x4, metres).
 
     Raises:
-        CalibrationError: missing, not JSON, a key is missing or out of range; names the file.
+        CalibrationError: the file is missing, is not JSON, or a key is missing or out of range.
+            Names the file.
     """
     data = read_json(path, CalibrationError, "no such camera file")
     if not isinstance(data, dict):

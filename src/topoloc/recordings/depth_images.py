@@ -1,5 +1,4 @@
-"""Depth files, 16-bit pictures, OpenEXR (Record3D) or NumPy arrays: read in metres, and refused
-where no camera has such depths."""
+"""Read depth images in metres: 16-bit images, OpenEXR (Record3D) or NumPy arrays."""
 
 from __future__ import annotations
 
@@ -14,21 +13,21 @@ from topoloc.geometry.camera import Camera
 from topoloc.recordings.image_io import MAX_PIXELS, read_depth
 
 MIN_MEDIAN_DEPTH, MAX_MEDIAN_DEPTH = 0.05, 100.0
-"""Metres: the median depth of a whole picture lies between these, or its unit is another one."""
+"""Limits of the median depth of an image, in metres. A median outside of them indicates a wrong
+unit."""
 _TYPICAL_MEDIAN_DEPTH = (
-    2.5  # metres; the power of ten that brings a median nearest to it is the likely unit
+    2.5  # metres; the most likely unit is the power of ten that brings the median nearest to this
 )
 _SAMPLE_STEP = 8  # pixels
 
 
 def read_depth_image(path: Path, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
-    """Depth along z in metres, NaN where unknown (0, and 65535 of 16 bits).
+    """Read depth along z in metres. Unknown depth is NaN (0 in the file, and 65535 of 16 bits).
 
     Raises:
-        UnreadableImageError: missing, damaged, no depth, too large.
-        RecordingError: the median depth is none that a camera has, so that `units_per_metre` cannot
-            be right.
-        MissingExtraError: an EXR file, without the extra `exr`.
+        UnreadableImageError: the file is missing, damaged, not a depth image, or too large.
+        RecordingError: the median depth is implausible, so `units_per_metre` must be wrong.
+        MissingExtraError: the file is EXR and the extra `exr` is not installed.
     """
     suffix = path.suffix.lower()
     if suffix in (".exr", ".npy"):
@@ -45,8 +44,8 @@ def read_depth_image(path: Path, units_per_metre: float) -> Float32[np.ndarray, 
 
 
 def find_depth_problem(depth: Float32[np.ndarray, "h w"]) -> str | None:
-    """What is wrong with the unit of a depth picture, where no camera has such depths; names the
-    likely factor."""
+    """Describe the problem if the median depth is implausible, with the likely factor. Return None
+    otherwise."""
     sample = depth[::_SAMPLE_STEP, ::_SAMPLE_STEP]
     known = sample[np.isfinite(sample)]
     if len(known) == 0:
@@ -69,18 +68,17 @@ def find_depth_problem(depth: Float32[np.ndarray, "h w"]) -> str | None:
 def resize_depth(
     path: Path, depth: Float32[np.ndarray, "h w"], camera: Camera
 ) -> Float32[np.ndarray, "h2 w2"]:
-    """Depth of a picture of another number of pixels, as the picture of `camera` shows it; unknown
-    beside unknown pixels.
+    """Resize a depth image to the image of `camera`. Pixels beside unknown depth become unknown.
 
     Raises:
-        UnreadableImageError: its sides have another ratio than the picture's.
+        UnreadableImageError: its aspect ratio differs from the image's.
     """
     height, width = depth.shape
     if (width, height) == (camera.width, camera.height):
         return depth
     if abs(width * camera.height - height * camera.width) > max(
         camera.width, camera.height
-    ):  # more than a pixel's rounding
+    ):  # more than the rounding of a pixel
         raise UnreadableImageError(
             f"{path}: depth of {width}x{height} is not of the shape of its"
             f" {camera.width}x{camera.height} picture"
@@ -106,8 +104,8 @@ def _read_npy(path: Path) -> np.ndarray:
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    """The first channel. OpenCV's wheels are built without OpenEXR, so it takes the format's own
-    library."""
+    """Read the first channel of an EXR file. OpenCV's wheels lack OpenEXR, so this uses the OpenEXR
+    package."""
     try:
         import OpenEXR  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -132,7 +130,7 @@ def _read_exr(path: Path) -> np.ndarray:
         raise
     except (
         Exception
-    ) as error:  # the binding raises RuntimeError, TypeError, ValueError and others of its own
+    ) as error:  # the binding raises RuntimeError, TypeError, ValueError and its own errors
         raise UnreadableImageError(
             f"{path}: damaged picture ({' '.join(str(error).split())[:80]})"
         ) from None

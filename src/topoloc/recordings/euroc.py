@@ -1,9 +1,9 @@
-"""EuRoC / ASL recordings (Burri et al., IJRR 2016): ``mav0/cam0``, ``mav0/cam1``, distorted and
-unrectified.
+"""Read EuRoC / ASL recordings (Burri et al., IJRR 2016): ``mav0/cam0`` and ``mav0/cam1``.
 
-Pairs are the pictures of equal time stamp; a picture without its partner is left out, as some of
-the published recordings lack frames of one camera. Truth is ``state_groundtruth_estimate0`` (or
-``mocap0``): poses of the body, brought to the left camera.
+Images are distorted and not rectified. Images of equal time stamps form a stereo pair. An image
+without a partner is skipped, because some published recordings lack frames of one camera. Ground
+truth is ``state_groundtruth_estimate0`` (or ``mocap0``). Its body poses are converted to poses of
+the left camera.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ _TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0")
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """One camera's sensor.yaml."""
+    """Hold the camera model and mounting of one sensor.yaml."""
 
     camera: Camera
     body_from_cam: Rigid3
 
 
 def can_open(path: Path) -> bool:
-    """Whether this folder is a mav0, or has one."""
+    """Return whether this folder is a mav0 or contains one."""
     return any((path / below / "cam0" / "data.csv").is_file() for below in ("mav0", ""))
 
 
 def open_euroc(path: Path) -> Recording:
-    """Open a recording by its folder or its mav0; a plain recording of the left camera where there
-    is no cam1.
+    """Open a recording by its folder or its mav0. Without cam1 it is a monocular recording of the
+    left camera.
 
     Raises:
-        RecordingError: no data.csv, a malformed one, or no two pictures of the same time.
+        RecordingError: data.csv is missing or malformed, or no two images have the same time.
         CalibrationError: a sensor.yaml is missing or not usable.
-        TrajectoryError: the truth is malformed, or fits no frame.
+        TrajectoryError: the ground truth is malformed, or matches no frame.
     """
     mav = next(
         (folder for folder in (path / "mav0", path) if (folder / "cam0" / "data.csv").is_file()),
@@ -78,10 +78,10 @@ def open_euroc(path: Path) -> Recording:
 
 
 def read_sensor(path: Path) -> Sensor:
-    """Camera and mounting of a sensor.yaml.
+    """Read the camera model and mounting of a sensor.yaml.
 
     Raises:
-        CalibrationError: missing, a key or number is missing, or a model that is not known.
+        CalibrationError: the file, a key or a number is missing, or the model is unknown.
     """
     text = read_yaml(path)
     camera = kalibr_camera(path, text)
@@ -106,7 +106,7 @@ def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:
 
 
 def _read_csv(path: Path) -> dict[int, Path]:
-    """Picture of each time stamp."""
+    """Return the image of each time stamp."""
     t_ns, names = read_file_list(path, RecordingError)
     return {time: path.parent / "data" / name for time, name in zip(t_ns, names, strict=True)}
 

@@ -1,10 +1,10 @@
-"""A plain folder of pictures, or one picture; with a calibration in it also a stereo pair or RGB-D.
+"""Read a folder of images or a single image. With a calibration it can be a stereo pair or RGB-D.
 
-Stereo: ``left/ right/``, ``image_0/ image_1/`` or ``cam0/ cam1/`` with a ``camera.json`` of a
-"baseline" (m) or of two cameras, or with YAML of OpenCV or Kalibr. RGB-D: ``rgb/`` or ``color/``,
-``depth/`` registered to it, and a "depth_factor" (units a metre). Else the pictures of the folder
-itself, or of ``rgb/``, ``color/``, ``left/``, ``image_0/``, ``cam0/`` or ``images/`` in it.
-``times.txt``, ``truth.tum`` and ``poses.txt`` (KITTI rows) are read where they are there.
+Stereo: ``left/ right/``, ``image_0/ image_1/`` or ``cam0/ cam1/``. It needs a ``camera.json`` with
+a "baseline" (m) or two cameras, or YAML of OpenCV or Kalibr. RGB-D: ``rgb/`` or ``color/``,
+``depth/`` registered to it, and a "depth_factor" (units per metre). Otherwise the images are in the
+folder itself or in ``rgb/``, ``color/``, ``left/``, ``image_0/``, ``cam0/`` or ``images/``.
+``times.txt``, ``truth.tum`` and ``poses.txt`` (KITTI rows) are optional.
 """
 
 from __future__ import annotations
@@ -39,24 +39,27 @@ _MONO = ("rgb", "color", "left", "image_0", "cam0", "images")
 
 
 def can_open(path: Path) -> bool:
-    """Whether this is a picture, or a folder with pictures in it or in one of the known folders
-    below it."""
+    """Return whether this is an image, or a folder with images in it or in one of the known
+    subfolders."""
     if path.is_file():
         return path.suffix.lower() in IMAGE_SUFFIXES
     return any(_has_images(folder) for folder in (path, *(path / name for name in _MONO)))
 
 
 def open_folder(path: Path, calibration: CalibrationForSize | None = None) -> Recording:
-    """Open a folder of pictures, or a single picture as a recording of one frame. Without a
-    calibration the camera is unknown.
+    """Open a folder of images, or a single image as a recording of one frame.
+
+    The camera model is unknown if there is no calibration.
 
     Args:
-        calibration: instead of the one in the folder.
+        path: the folder or the image.
+        calibration: replaces the calibration in the folder.
 
     Raises:
-        RecordingError: no pictures, or left, right, depth and times differ in number.
-        CalibrationError: the calibration is missing for stereo or RGB-D folders, or not usable.
-        TrajectoryError: the truth is malformed or fits no frame.
+        RecordingError: there are no images, or the numbers of left, right or depth images and times
+            differ.
+        CalibrationError: the calibration of stereo or RGB-D images is missing or not usable.
+        TrajectoryError: the ground truth is malformed or matches no frame.
     """
     if path.is_file():
         beside = path.parent / FILE_NAME

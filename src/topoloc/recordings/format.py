@@ -1,4 +1,4 @@
-"""The interface of a recording format: how it is recognised and opened."""
+"""Define the interface of a recording format."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from topoloc.recordings.frame import StereoSequence
 
 @dataclass(frozen=True)
 class RecordingFormat:
-    """A recording format: the function that recognises it and the function that opens it."""
+    """Hold the functions that recognise and open recordings of a format."""
 
     expected_files: str
     can_open: Callable[[Path], bool]
     open: Callable[..., StereoSequence]
     open_options: tuple[str, ...] = ()
-    """Keywords that `open` accepts: the `topics` of a bag, the folder of a model's `images`, a
-    `calibration` if the format may have none (otherwise `open_sequence` replaces the format's own
-    calibration), or the file of a calibration as it is (`calibration_file`)."""
+    """Keywords that `open` accepts. `topics`: the topics of a bag. `images`: the image folder of a
+    model. `calibration`: a calibration, if recordings of the format may lack one (otherwise
+    `open_sequence` replaces the format's own). `calibration_file`: the path of a calibration,
+    passed on as `calibration`."""

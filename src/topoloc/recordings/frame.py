@@ -1,5 +1,5 @@
-"""One moment of a recording, in one type whatever the format: a stereo pair, or an image with
-depth."""
+"""Define the frames of a recording, independent of its format: stereo pair, RGB-D or single
+image."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """Depth along z in metres, NaN where unknown, as its own camera sees it; registered if
-    `cam_from_depth` is the identity."""
+    """Hold depth along z in metres, in pixels of its own camera. Unknown depth is NaN. It is
+    registered if `cam_from_depth` is the identity."""
 
     depth: Float32[np.ndarray, "h w"]
     camera: Camera
@@ -28,13 +28,12 @@ class DepthImage:
 
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """A frame of a recording. `image` is the left (or colour) picture: grey (H, W) or RGB (H, W,
-    3), uint8, seen by `camera`.
+    """Hold a frame of a recording.
 
-    Either `right` and `rig` are there (stereo), or `depth` (RGB-D), or neither (a plain picture).
-    `world_from_cam` is the truth or an attached trajectory: the pose of the camera of `image`.
-    `exif_focal_px` (pixels) is what the picture's file says of a camera that is not known
-    otherwise.
+    `image` is the left (or colour) image: grey (H, W) or RGB (H, W, 3), uint8, taken by `camera`. A
+    stereo frame has `right` and `rig`, an RGB-D frame has `depth`, a single image has neither.
+    `world_from_cam` is the pose of the image's camera, from ground truth or an attached trajectory.
+    `exif_focal_px` (pixels) is the focal length in the file of an image without a camera model.
     """
 
     name: str
@@ -50,27 +49,27 @@ class StereoFrame:
 
 @runtime_checkable
 class StereoSequence(Protocol):
-    """A recording, read lazily: nothing but names, times and poses is in memory until a frame is
-    asked for."""
+    """A recording that is read lazily. Only names, times and poses are in memory until a frame is
+    accessed."""
 
     @property
     def name(self) -> str:
-        """The recording's name, for reports."""
+        """Return the recording's name, for reports."""
         ...
 
     @property
     def names(self) -> list[str]:
-        """The name of each frame: the path of its picture relative to the recording."""
+        """Return the name of each frame: the path of its image relative to the recording."""
         ...
 
     @property
     def t_ns(self) -> list[int]:
-        """The time of each frame, integer nanoseconds."""
+        """Return the time of each frame, in integer nanoseconds."""
         ...
 
     @property
     def poses(self) -> list[Rigid3 | None]:
-        """world_from_cam of each frame, None where unknown; known without reading a picture."""
+        """Return world_from_cam of each frame, None if unknown. No image is read."""
         ...
 
     def __len__(self) -> int: ...

@@ -1,9 +1,8 @@
-"""What is wrong with pictures, times and frames that a program hands over: arrays of another type,
-shape or unit than is meant.
+"""Find problems of images, times and frames passed in memory, such as a wrong type, shape or unit.
 
-A float or 16-bit picture, seconds for nanoseconds or millimetres for metres would not fail by
-themselves: they would be answered with "not here". Red and blue swapped cannot be told from a
-picture; features are taken from its grey levels and hardly change with it.
+A float or 16-bit image, seconds instead of nanoseconds, or millimetres instead of metres would not
+cause an error by themselves. Queries would only fail to localize. Swapped red and blue channels
+cannot be detected. Features use grey values, which change little with the swap.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _EXPECTED_IMAGE = "pictures are uint8, grey (height, width) or RGB (height, widt
 
 
 def find_image_problem(image: Any) -> str | None:
-    """What keeps an array from being a picture; None where it is one."""
+    """Describe why an array is not a valid image. Return None if it is valid."""
     if not isinstance(image, np.ndarray):
         return f"a picture is a NumPy array, not {type(image).__name__}; {_EXPECTED_IMAGE}"
     shape = "x".join(map(str, image.shape))
@@ -61,7 +60,7 @@ def find_image_problem(image: Any) -> str | None:
 
 
 def find_time_problem(t_ns: Any) -> str | None:
-    """What keeps a value from being a time in integer nanoseconds."""
+    """Describe why a value is not a time in integer nanoseconds. Return None if it is one."""
     if isinstance(t_ns, bool | np.bool_) or not isinstance(t_ns, int | np.integer):
         return (
             f"t_ns is a time in integer nanoseconds, not {t_ns!r:.40}; of seconds: round(seconds *"
@@ -71,8 +70,8 @@ def find_time_problem(t_ns: Any) -> str | None:
 
 
 def find_times_problem(t_ns: Sequence[int]) -> str | None:
-    """What keeps the times of a recording, one by one good, from being those of frames one after
-    another."""
+    """Describe why the times of a recording are not those of successive frames. Return None if they
+    are."""
     for before, after in pairwise(t_ns):
         if after <= before:
             return f"t_ns {after} is not after the one before, {before}"
@@ -85,7 +84,7 @@ def find_times_problem(t_ns: Sequence[int]) -> str | None:
 
 
 def find_frame_problem(frame: StereoFrame) -> str | None:
-    """What is wrong with a frame in memory, one line; None where all fits together."""
+    """Describe in one line the problem of a frame in memory. Return None if it is consistent."""
     problem = (
         find_image_problem(frame.image)
         or find_time_problem(frame.t_ns)

@@ -1,5 +1,5 @@
-"""A frame made ready for measuring: the picture that features are taken from, its camera, and where
-depth comes from."""
+"""Prepare a frame for measurements: the image for feature extraction, its camera model and its
+depth."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from topoloc.recordings.registration_kernels import (
 
 @dataclass(frozen=True, eq=False)
 class PreparedFrame:
-    """`picture` is what a person would look at, `grey` what features are taken from; both seen by
-    `camera`.
+    """Hold a frame after rectification or depth registration.
 
-    Stereo pairs are rectified: `right_grey` and the rectified `rig` are there. RGB-D frames have
-    `depth`, in metres and pixels of `camera`, NaN where unknown. `view_from_cam` is how
-    rectification turned the frame's camera.
+    `picture` is the image for display, and `grey` the image for feature extraction. Both belong to
+    `camera`. Stereo pairs are rectified and have `right_grey` and the rectified `rig`. RGB-D frames
+    have `depth` in metres, in pixels of `camera`, NaN if unknown. `view_from_cam` is the rotation
+    of the frame's camera by rectification.
     """
 
     picture: Image
@@ -43,14 +43,16 @@ class PreparedFrame:
 
 
 def prepare_frame(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
-    """Rectify a stereo pair, or bring depth into the picture's camera.
+    """Rectify a stereo pair, or register depth to the camera of the image.
 
-    Without `with_depth` only the picture itself is made ready; what was read without its right
-    picture (`read_left_frame`) is rectified, too.
+    Args:
+        frame: the frame.
+        with_depth: False prepares only the image itself. A frame read without its right image
+            (`read_left_frame`) is rectified, too.
 
     Raises:
-        CalibrationError: the frame has no camera.
-        RecordingError: the frame has neither a right picture nor depth, which are asked for.
+        CalibrationError: the frame has no camera model.
+        RecordingError: `with_depth` is True and the frame has neither a right image nor depth.
     """
     if frame.camera is None:
         raise CalibrationError(
@@ -74,11 +76,11 @@ def prepare_frame(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
 
 
 def undistort_frame(frame: StereoFrame, max_side_px: int) -> PreparedFrame:
-    """The frame's own picture without distortion, smaller where a side is longer than
+    """Return the frame's own image without distortion, scaled down if a side is longer than
     `max_side_px`.
 
     Raises:
-        CalibrationError: the frame has no camera.
+        CalibrationError: the frame has no camera model.
     """
     view = prepare_frame(frame, with_depth=False)
     camera, grey = view.camera, view.grey
@@ -120,7 +122,7 @@ def _prepare_stereo(image: Image, right: Image | None, rig: StereoRig) -> Prepar
 
 
 def _remap(picture: Image, pixel_map: Float32[np.ndarray, "h w 2"]) -> Image:
-    # None is right here, whatever the stubs say: OpenCV 5 takes an empty second map for a map.
+    # None is correct here although the stubs disagree: OpenCV 5 uses an empty second map as a map.
     return cv2.remap(picture, pixel_map, None, cv2.INTER_LINEAR)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
@@ -130,8 +132,8 @@ def _rectification(rig: StereoRig) -> Rectification:
 
 
 def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarray, "h w"]:
-    """Depth as `camera` sees it: every pixel moved to where `camera` images it, the nearest surface
-    winning."""
+    """Register depth to `camera`. Each pixel moves to its projection, and the nearest surface
+    wins."""
     identity = np.allclose(depth_image.cam_from_depth.matrix(), np.eye(4), atol=1e-9)
     if identity and depth_image.camera == camera:
         return depth_image.depth
@@ -163,7 +165,7 @@ def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarra
 
 @lru_cache(maxsize=4)
 def _normalized_pixels(camera: Camera, width: int, height: int) -> Float[np.ndarray, "n 2"]:
-    """Every pixel of a picture, row by row, on the plane z = 1."""
+    """Return every pixel of an image, row by row, on the plane z = 1."""
     columns, rows = np.meshgrid(
         np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)
     )

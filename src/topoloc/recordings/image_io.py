@@ -1,9 +1,8 @@
-"""Picture files: checked by their headers, decoded once by Pillow, and brought to this house's
-types.
+"""Read image files: check the header, decode once with Pillow and convert to grey or RGB.
 
-A broken file must not become a half-grey picture, nor a small file fill the memory: size and type
-are known before anything is decoded, and files that end early are refused. A picture is turned as
-its EXIF orientation says, and its size is that of the turned picture.
+Size and type are checked before decoding, so that a small file cannot fill the memory. Truncated
+files are errors, so that no image is half grey. Images are rotated by their EXIF orientation. Their
+size is the size after rotation.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
-from PIL import (  # the readers make themselves known to Pillow
+from PIL import (  # importing the readers registers them in Pillow
     BmpImagePlugin,  # noqa: F401
     ExifTags,
     ImageFile,
@@ -44,13 +43,13 @@ IMAGE_SUFFIXES = frozenset(
 )
 MAX_PIXELS = 100_000_000
 _IMAGE_TYPES = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP")
-# Pillow warns of odd metadata, and of pictures larger than it likes; the limit here is ours.
+# Pillow warns of odd metadata and of large images. `MAX_PIXELS` is the limit here.
 warnings.filterwarnings("ignore", module=r"PIL\.")
 _GREY_MODES, _GREY_16_MODES = ("L", "1"), ("I;16", "I;16L", "I;16B", "I")
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}  # inch, centimetre, millimetre
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
-_TRANSPOSED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that lay a picture on its side
-# What Pillow raises about damaged files of one kind or another.
+_TRANSPOSED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
+# errors that Pillow raises for damaged files
 _DAMAGE_ERRORS = (
     OSError,
     SyntaxError,
@@ -67,8 +66,8 @@ _DAMAGE_ERRORS = (
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """An encoded picture that is no file of its own, such as a message's; `name` is what errors
-    call it."""
+    """Hold an encoded image that is not a file, such as the image of a message. Errors refer to it
+    by `name`."""
 
     name: str
     data: bytes
@@ -79,12 +78,12 @@ class EncodedImage:
 
 
 def read_image(path: Path | EncodedImage) -> Image:
-    """A picture as grey (H, W) or RGB (H, W, 3), uint8; alpha is dropped, 16 bits are scaled down
-    to 8.
+    """Read an image as grey (H, W) or RGB (H, W, 3), uint8. Alpha is dropped, and 16 bits are
+    scaled to 8.
 
     Raises:
-        UnreadableImageError: missing, empty, truncated, damaged, no picture, or of more than 100
-            megapixels.
+        UnreadableImageError: the file is missing, empty, truncated, damaged, not an image, or
+            larger than 100 megapixels.
     """
     with _decode_image(path) as picture:
         if picture.mode in _GREY_MODES:
@@ -97,15 +96,16 @@ def read_image(path: Path | EncodedImage) -> Image:
 
 
 def to_grey(image: Image) -> UInt8[np.ndarray, "h w"]:
-    """The picture in grey, by the luma weights of Rec. 601; a grey one is returned as it is."""
+    """Convert an image to grey with the luma weights of Rec. 601. A grey image is returned
+    unchanged."""
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
 def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
-    """A 16-bit depth picture in metres; NaN where unknown (0 and 65535 in the file).
+    """Read a 16-bit depth image in metres. Unknown depth is NaN (0 and 65535 in the file).
 
     Raises:
-        UnreadableImageError: as `read_image`, or not a picture of one channel of 16 bits.
+        UnreadableImageError: as `read_image`, or the image is not one channel of 16 bits.
     """
     with _decode_image(path) as picture:
         if picture.mode not in _GREY_16_MODES:
@@ -119,16 +119,16 @@ def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.
 
 
 def encode_jpeg(image: Image, quality: int) -> bytes:
-    """The picture encoded; the same picture gives the same bytes."""
+    """Encode an image as JPEG. The same image gives the same bytes."""
     bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def image_size(path: Path | EncodedImage) -> tuple[int, int]:
-    """Width and height in pixels, from the header.
+    """Read width and height in pixels from the header, after EXIF rotation.
 
     Raises:
-        UnreadableImageError: as `read_image`, but of what the header says alone.
+        UnreadableImageError: as `read_image`, as far as the header shows it.
     """
     with _open_image(path) as picture:
         width, height = picture.size
@@ -140,11 +140,12 @@ def image_size(path: Path | EncodedImage) -> tuple[int, int]:
 
 
 def exif_focal_length(path: Path | EncodedImage, width: int, height: int) -> float | None:
-    """Focal length in pixels of a picture of this size, by its EXIF data; None where the file says
-    nothing usable.
+    """Return the focal length in pixels from EXIF data, for an image of this size. Return None if
+    the data is not usable.
 
-    The focal length equivalent on 35 mm film counts first (its diagonal stands for the picture's),
-    then the one in millimetres with the resolution of the sensor (EXIF 2.32, JEITA CP-3451).
+    The focal length equivalent on 35 mm film is used first, relative to the image's diagonal. The
+    second choice is the focal length in millimetres with the sensor's resolution (EXIF 2.32, JEITA
+    CP-3451).
     """
     try:
         with _open_image(path) as picture:
@@ -158,7 +159,7 @@ def exif_focal_length(path: Path | EncodedImage, width: int, height: int) -> flo
         exif_width = tags[ExifTags.Base.ExifImageWidth]
         scale = (
             max(width, height) / exif_width if exif_width > 0.0 else 1.0
-        )  # the width as taken, before it was turned
+        )  # the original width, before rotation
         focal = (
             tags[ExifTags.Base.FocalLength]
             * tags[ExifTags.Base.FocalPlaneXResolution]
@@ -170,7 +171,7 @@ def exif_focal_length(path: Path | EncodedImage, width: int, height: int) -> flo
 
 
 def _exif_number(value: Any) -> float:
-    """Of an EXIF tag; 0 where it is none that makes sense."""
+    """Return an EXIF tag as a number, or 0 if it is not a finite number."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -184,14 +185,14 @@ def _read_bytes(path: Path | EncodedImage) -> bytes:
             return path.data
         if (
             not stat.S_ISREG(path.stat().st_mode) and not path.is_dir()
-        ):  # a FIFO would be waited for
+        ):  # reading a FIFO would block
             raise UnreadableImageError(f"{path}: not a file")
         data = path.read_bytes()
     except FileNotFoundError:
         raise UnreadableImageError(f"{path}: no such picture") from None
     except OSError as error:
         raise UnreadableImageError(f"{path}: {error.strerror}") from None
-    except ValueError:  # a name with a NUL in it
+    except ValueError:  # the name contains a NUL
         raise UnreadableImageError(f"{str(path)!r}: not the name of a file") from None
     if not data:
         raise UnreadableImageError(f"{path}: the file is empty")
@@ -200,13 +201,13 @@ def _read_bytes(path: Path | EncodedImage) -> bytes:
 
 @contextmanager
 def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
-    """The picture with its header read. What the body raises of a damaged file comes as
-    UnreadableImageError, too."""
+    """Yield the image with its header read. Errors of damaged files raised in the body become
+    UnreadableImageError."""
     data = _read_bytes(path)
     try:
         types = _supported_types(path)
         picture = Pillow.open(io.BytesIO(data), formats=types)
-        if picture.format == "PNG":  # its checksums are not looked at otherwise
+        if picture.format == "PNG":  # its checksums are not verified otherwise
             picture.verify()
             picture = Pillow.open(io.BytesIO(data), formats=types)
     except Pillow.UnidentifiedImageError:
@@ -243,7 +244,8 @@ def _decode_image(path: Path | EncodedImage) -> Iterator[Pillow.Image]:
 
 
 def _supported_types(path: Path | EncodedImage) -> tuple[str, ...]:
-    """What is tried; HEIF only where the name says so, for its decoder is an extra."""
+    """Return the types to try. HEIF is included only for its suffixes, because its decoder is an
+    extra."""
     if path.suffix.lower() not in (".heic", ".heif"):
         return _IMAGE_TYPES
     try:

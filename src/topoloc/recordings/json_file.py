@@ -1,4 +1,7 @@
-"""JSON files that others wrote: read, or refused in one line."""
+"""Read and validate JSON files of other programs.
+
+The `where` argument names the position of a value in error messages.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,8 @@ from topoloc.recordings.text_files import read_text
 
 
 def read_json(path: Path, error: type[TopolocError], missing: str = "no such file") -> Any:
-    """What a JSON file holds. Raises `error`, which names it, where it is missing, no JSON, or
-    nested without end."""
+    """Return the content of a JSON file. Raises `error` with the file name if it is missing, not
+    JSON, or nested too deeply."""
     try:
         return json.loads(read_text(path, error, missing))
     except (ValueError, RecursionError) as failure:
@@ -27,7 +30,7 @@ def read_json(path: Path, error: type[TopolocError], missing: str = "no such fil
 def json_numbers(
     value: Any, count: int, where: str, error: type[TopolocError]
 ) -> Float[np.ndarray, " n"]:
-    """A list of `count` finite numbers. Raises `error`, which says `where`."""
+    """Return a list of `count` finite numbers as an array. Raises `error` otherwise."""
     try:
         numbers = np.array(value, dtype=np.float64).ravel()
     except (TypeError, ValueError, OverflowError):
@@ -38,7 +41,7 @@ def json_numbers(
 
 
 def json_number(value: Any, where: str, error: type[TopolocError]) -> float:
-    """A finite number. Raises `error`, which says `where`."""
+    """Return a finite number. Raises `error` otherwise."""
     try:
         number = (
             math.nan
@@ -53,7 +56,7 @@ def json_number(value: Any, where: str, error: type[TopolocError]) -> float:
 
 
 def json_rigid(value: Any, where: str, error: type[TopolocError]) -> Rigid3:
-    """A 4x4 (or 3x4) matrix, metres. Raises `error`, which says `where`."""
+    """Return the transform of a 4x4 (or 3x4) matrix, in metres. Raises `error` otherwise."""
     rows = value if isinstance(value, list) else []
     matrix = json_numbers(rows, 16 if len(rows) == 4 else 12, where, error).reshape(-1, 4)
     if len(matrix) == 4 and not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
@@ -65,7 +68,7 @@ def json_rigid(value: Any, where: str, error: type[TopolocError]) -> Rigid3:
 
 
 def parse_relative_path(name: Any, where: str, error: type[TopolocError]) -> str:
-    """A file name that stays below its folder. Raises `error`, which says `where`."""
+    """Return a file name that stays inside its folder. Raises `error` otherwise."""
     path = PurePath(name) if isinstance(name, str) else None
     if (
         path is None

@@ -1,8 +1,8 @@
-"""KITTI odometry (Geiger et al., CVPR 2012), and any folder of the same layout.
+"""Read KITTI odometry (Geiger et al., CVPR 2012) and folders of the same layout.
 
-``image_0/ image_1/`` (or, where these are missing, the colour ``image_2/ image_3/``), ``calib.txt``
-and ``times.txt``. Truth is ``truth.tum`` or ``poses.txt`` in the folder, or KITTI's own
-``poses/<name>.txt`` beside ``sequences/``.
+A folder holds ``image_0/ image_1/`` (otherwise the colour images ``image_2/ image_3/``),
+``calib.txt`` and ``times.txt``. Ground truth is ``truth.tum`` or ``poses.txt`` in the folder, or
+KITTI's own ``poses/<name>.txt`` beside ``sequences/``.
 """
 
 from __future__ import annotations
@@ -27,20 +27,21 @@ _PAIRS = ((0, 1), (2, 3))
 
 
 def can_open(path: Path) -> bool:
-    """Whether this folder has KITTI's picture folders; with a camera.json instead of a calib.txt it
-    is a plain folder."""
+    """Return whether this folder has KITTI's image folders. With a camera.json instead of a
+    calib.txt it is a plain folder."""
     has_pictures = any((path / f"image_{left}").is_dir() for left, _ in _PAIRS)
     return has_pictures and ((path / "calib.txt").is_file() or not (path / "camera.json").is_file())
 
 
 def open_kitti(path: Path) -> Recording:
-    """Open a KITTI-like folder; a plain recording of the left camera where there is no right
-    folder.
+    """Open a KITTI-like folder. Without the right folder it is a monocular recording of the left
+    camera.
 
     Raises:
-        RecordingError: no pictures, or left, right and times differ in number.
+        RecordingError: there are no images, or the numbers of left images, right images and times
+            differ.
         CalibrationError: calib.txt is missing or not usable.
-        TrajectoryError: the truth is malformed or fits no frame.
+        TrajectoryError: the ground truth is malformed or matches no frame.
     """
     pair = next((pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir()), None)
     if pair is None:
@@ -62,10 +63,11 @@ def open_kitti(path: Path) -> Recording:
 
 
 def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
-    """The projection matrices P0, P1, ... of a calib.txt.
+    """Read the projection matrices P0, P1, ... of a calib.txt.
 
     Raises:
-        CalibrationError: missing, or a P line is not 12 finite numbers.
+        CalibrationError: the file is missing, or a P line is not a projection matrix of 12 finite
+            numbers.
     """
     lines = read_text(
         path,
@@ -106,8 +108,8 @@ def _rig(
     path: Path, projections: dict[str, np.ndarray], pair: tuple[int, int], size: tuple[int, int]
 ) -> StereoRig:
     left, right = (_camera(path, projections, number, size) for number in pair)
-    # The colour cameras' P has some millimetres in y and z as well; the pictures are rectified to
-    # equal rows all the same.
+    # P of the colour cameras has some millimetres in y and z, too. The images are still rectified
+    # to equal rows.
     shift = (
         _cam_from_cam0(projections[f"P{pair[1]}"])[0]
         - _cam_from_cam0(projections[f"P{pair[0]}"])[0]
@@ -121,7 +123,7 @@ def _rig(
 
 
 def _cam_from_cam0(projection: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3"]:
-    """The translation t of P = K [I | t]."""
+    """Return the translation t of P = K [I | t]."""
     return np.linalg.solve(projection[:, :3], projection[:, 3])
 
 
@@ -131,7 +133,7 @@ def _read_ground_truth(path: Path, t_ns: list[int], cam0_from_cam: Rigid3) -> li
     poses = read_ground_truth(path / "truth.tum", rows, t_ns)
     if (path / "truth.tum").is_file():
         return poses
-    # KITTI's rows are the poses of camera 0 whichever pair is used.
+    # KITTI's rows are the poses of camera 0 for all image folders.
     return [pose @ cam0_from_cam if pose is not None else None for pose in poses]
 
 

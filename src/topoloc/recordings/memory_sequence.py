@@ -1,5 +1,4 @@
-"""Frames that are in memory, as a recording: what a program has read itself is mapped as a file
-would be."""
+"""Use frames in memory as a recording."""
 
 from __future__ import annotations
 
@@ -13,15 +12,13 @@ from topoloc.recordings.frame_checks import find_frame_problem, find_times_probl
 
 
 class MemorySequence:
-    """A recording of frames in memory: stereo pairs, pictures with depth, or single pictures, with
-    poses or without.
+    """A recording of frames in memory: stereo pairs, RGB-D or single images, with or without poses.
 
-    The frames are looked at once, so that a picture of another type, size or unit is named before
-    anything is built of it.
+    All frames are checked at construction, so that a wrong type, size or unit is reported early.
 
     Raises:
-        RecordingError: no frames, or one whose parts do not fit together; names the frame and what
-            would mend it.
+        RecordingError: there are no frames, or a frame is inconsistent. Names the frame and a
+            remedy.
     """
 
     def __init__(self, frames: Iterable[StereoFrame], name: str = "memory") -> None:
@@ -52,22 +49,22 @@ class MemorySequence:
 
     @property
     def names(self) -> list[str]:
-        """The name of each frame."""
+        """Return the name of each frame."""
         return [frame.name for frame in self._frames]
 
     @property
     def t_ns(self) -> list[int]:
-        """The time of each frame, integer nanoseconds."""
+        """Return the time of each frame, in integer nanoseconds."""
         return [frame.t_ns for frame in self._frames]
 
     @property
     def poses(self) -> list[Rigid3 | None]:
-        """world_from_cam of each frame, None where unknown."""
+        """Return world_from_cam of each frame, None if unknown."""
         return [frame.world_from_cam for frame in self._frames]
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __getitem__(self, index: int) -> StereoFrame:
-        """One frame, as it was given. Raises IndexError."""
+        """Return one frame as it was given. Raises IndexError."""
         return self._frames[index]

@@ -1,4 +1,4 @@
-"""Open a recording of any known format by looking at its folder."""
+"""Open a recording of any known format."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from functools import cache
 from pathlib import Path
 
 from topoloc.errors import RecordingError, UnknownFormatError
-from topoloc.recordings import video
 from topoloc.recordings.calibration import parse_calibration, with_calibration
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.recording import parse_selection, sequence_subset
+from topoloc.recordings.video import Video
 
-# name -> "module:attribute" of a SequenceFormat, in the order of recognition: the plain folder
-# accepts whatever is left. A format's module is loaded when the format is tried.
+# name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
+# accepts any other folder with images. A format's module is imported when the format is tried.
 FORMATS = {
     "euroc": "topoloc.recordings.euroc:FORMAT",
     "tum": "topoloc.recordings.tum:FORMAT",
@@ -36,7 +36,7 @@ FORMATS = {
 
 @cache
 def load_format(name: str) -> RecordingFormat:
-    """Return the format of a name of `FORMATS`."""
+    """Return the format with this name of `FORMATS`."""
     module, _, attribute = FORMATS[name].partition(":")
     return getattr(importlib.import_module(module), attribute)
 
@@ -48,28 +48,27 @@ def open_sequence(
     images: str | Path | None = None,
     topics: str | Mapping[str, str] | None = None,
 ) -> StereoSequence:
-    """Open a recording, or some frames of it. Pictures are read frame by frame, when asked for.
+    """Open a recording, or a selection of its frames. Images are read when a frame is accessed.
 
     Args:
-        path: a folder, a video, or one picture file. A part is chosen by a suffix:
-            ``PATH@START:STOP:STEP`` as Python slices, several of them by commas (``@0:10,50:60``);
-            ``PATH@0-59/100`` are the frames whose number modulo 100 is 0 to 59.
-        format: one of `FORMATS`; recognised where None.
-        camera: the calibration instead of the recording's: a camera.json, YAML of OpenCV or Kalibr,
+        path: a folder, a video, or one image file. A suffix selects frames:
+            ``PATH@START:STOP:STEP`` as Python slices, separated by commas (``@0:10,50:60``).
+            ``PATH@0-59/100`` selects the frames whose number modulo 100 is 0 to 59.
+        format: one of `FORMATS`. None detects it.
+        camera: replaces the recording's calibration. A camera.json, YAML of OpenCV or Kalibr,
             Stereolabs' ``SN*.conf``, or ``"fx,fy,cx,cy"`` in pixels.
-        images: the folder of the pictures that a model of COLMAP names, where it is not `images`
-            beside the model.
-        topics: of bags, which topic is what:
-            ``left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom``, or a dictionary of these.
+        images: the image folder of a COLMAP model, if it is not `images` beside the model.
+        topics: the topics of a bag: ``left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom``, or a
+            dictionary of these.
 
     Raises:
-        UnknownFormatError: `format` is none of these, or no format recognises the folder.
-        RecordingError: nothing is there, the format takes no `topics` or `calibration`, nothing is
-            chosen, or the recording is broken; CalibrationError is one of these.
-        TrajectoryError: the recording's truth is malformed or fits no frame.
+        UnknownFormatError: `format` is unknown, or no format recognises the folder.
+        RecordingError: the path does not exist, the format takes no `topics` or `images`, no frame
+            is selected, or the recording is broken. CalibrationError is a subclass.
+        TrajectoryError: the recording's ground truth is malformed or matches no frame.
     """
     folder, selection = split_selection(str(path))
-    is_side_by_side = format is None and str(camera).endswith(".conf") and video.can_open(folder)
+    is_side_by_side = format is None and str(camera).endswith(".conf") and Video.can_open(folder)
     name = "zed" if is_side_by_side else find_format(path, format)
     sequence = _open_recording(
         folder, name, camera, {"images": images and Path(images), "topics": topics}
@@ -101,24 +100,24 @@ def _open_recording(
 
 
 def find_format(path: str | Path, format: str | None = None) -> str:
-    """The name of a recording's format, which `open_sequence` opens it by; `format` where it is
-    named.
+    """Return the name of the format that `open_sequence` uses. A given `format` is returned after
+    checks.
 
     Raises:
-        UnknownFormatError: `format` is none of `FORMATS`, or no format recognises the folder.
-        RecordingError: nothing is there.
+        UnknownFormatError: `format` is not in `FORMATS`, or no format recognises the folder.
+        RecordingError: the path does not exist.
     """
     if format is not None and format not in FORMATS:
         raise UnknownFormatError(f"format {format!r} is not known; there are {', '.join(FORMATS)}")
     folder, _ = split_selection(str(path))
-    if not os.path.exists(folder):  # no error of a name that is too long
+    if not os.path.exists(folder):  # os.path.exists raises no error if the name is too long
         raise RecordingError(f"{folder}: no such file or folder")
     return format or _detect_format(folder)
 
 
 def split_selection(path: str) -> tuple[Path, str | None]:
-    """The recording's folder or file, and the part of it that is chosen behind an @; None: all of
-    it."""
+    """Split a path into the recording's folder or file and the selection after an @. The selection
+    is None if there is none."""
     folder, at, selection = path.rpartition("@")
     if not at or os.path.exists(path):
         return Path(path), None

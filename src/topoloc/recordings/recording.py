@@ -1,5 +1,4 @@
-"""The one sequence type behind every format: lists in memory, pictures on disk until they are asked
-for."""
+"""Define the sequence type of all recording formats. Lists are in memory, images stay on disk."""
 
 from __future__ import annotations
 
@@ -19,10 +18,9 @@ from topoloc.recordings.depth_images import read_depth_image, resize_depth
 from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
 from topoloc.recordings.image_io import IMAGE_SUFFIXES, exif_focal_length, read_image
 
-# Recordings without times are taken to be of this rate.
+# frame rate of recordings without times
 DEFAULT_RATE_HZ = 10
-# Numbers of up to 18 digits: longer ones name no frame, and Python refuses to read those of
-# thousands.
+# Numbers have up to 18 digits. Python refuses to parse numbers of thousands of digits.
 _SLICE = re.compile(r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?")
 _BLOCK = re.compile(r"(\d{1,18})-(\d{1,18})/([1-9]\d{0,17})")
 _INDEX = re.compile(r"-?\d{1,18}")
@@ -30,7 +28,7 @@ _INDEX = re.compile(r"-?\d{1,18}")
 
 @dataclass(frozen=True, eq=False)
 class RightImages:
-    """The right picture of each frame, and the rig."""
+    """Hold the right image of each frame, and the rig."""
 
     paths: list[Path]
     rig: StereoRig
@@ -38,10 +36,10 @@ class RightImages:
 
 @dataclass(frozen=True, eq=False)
 class DepthImages:
-    """The depth picture of each frame: its scale (file units a metre), its camera, and where that
-    camera sits.
+    """Hold the depth image of each frame, the scale (file units per metre), and the camera and its
+    pose.
 
-    Without a camera it shows what the frame's own picture shows, in pixels of any size.
+    If `camera` is None, depth has the view of the frame's own image, in any resolution.
     """
 
     paths: list[Path]
@@ -52,11 +50,11 @@ class DepthImages:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A StereoSequence on disk. `names` are picture paths relative to `root`; `camera` is that of
-    the left or colour picture.
+    """A StereoSequence on disk.
 
-    `cameras` are those of the frames one by one, where they are not of one camera. Poses of a model
-    of pictures alone are in no metres (`has_scale`).
+    `names` are image paths relative to `root`. `camera` belongs to the left or colour image.
+    `cameras` holds a camera per frame if the frames have different cameras. `has_scale` is False if
+    the poses are not in metres, such as those of a model from monocular images.
     """
 
     name: str
@@ -74,15 +72,15 @@ class Recording:
         return len(self.names)
 
     def monocular(self) -> Recording:
-        """The same recording without its right and depth pictures."""
+        """Return the recording without its right and depth images."""
         return replace(self, right=None, depth=None)
 
     def __getitem__(self, index: int) -> StereoFrame:
         """Read one frame.
 
         Raises:
-            IndexError: no such frame.
-            UnreadableImageError: a picture is missing, broken, or of another size than its camera.
+            IndexError: there is no such frame.
+            UnreadableImageError: an image is missing, damaged, or of another size than its camera.
         """
         frame = self.read_left_frame(index)
         if self.right is not None:
@@ -94,7 +92,7 @@ class Recording:
         return frame
 
     def read_left_frame(self, index: int) -> StereoFrame:
-        """Read one frame but for its right or depth picture. Raises as the whole frame does."""
+        """Read one frame without its right or depth image. Raises as `__getitem__`."""
         path = self.root / self.names[index]
         camera, rig = (
             self.camera if self.cameras is None else self.cameras[index],
@@ -115,28 +113,28 @@ class Recording:
 
 @runtime_checkable
 class _SupportsMonocular(Protocol):
-    """A sequence that may have right or depth pictures."""
+    """A sequence that may have right or depth images."""
 
     def monocular(self) -> StereoSequence:
-        """The same recording without them."""
+        """Return the recording without right and depth images."""
         ...
 
 
 @runtime_checkable
 class _SupportsLeftFrame(Protocol):
-    """A sequence whose right and depth pictures are files of their own."""
+    """A sequence that can read a frame without its right and depth images."""
 
     def read_left_frame(self, index: int) -> StereoFrame:
-        """A frame without them, which are not read."""
+        """Read a frame without them."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceView:
-    """Some frames of another sequence, in this order, with these poses.
+    """Show selected frames of another sequence in the given order with the given poses.
 
-    `apart` are poses of stretches of which nobody knows how they lie to the others: each in a world
-    of its own, a pose a frame, None outside of the stretch.
+    `apart` holds the poses of stretches whose transforms to each other are unknown. Each stretch
+    has its own world and one pose per frame, None outside of the stretch.
     """
 
     base: StereoSequence
@@ -146,15 +144,18 @@ class SequenceView:
 
     @property
     def name(self) -> str:
+        """Return the name of the base sequence."""
         return self.base.name
 
     @property
     def names(self) -> list[str]:
+        """Return the name of each frame."""
         names = self.base.names
         return [names[index] for index in self.indices]
 
     @property
     def t_ns(self) -> list[int]:
+        """Return the time of each frame, in integer nanoseconds."""
         t_ns = self.base.t_ns
         return [t_ns[index] for index in self.indices]
 
@@ -162,25 +163,25 @@ class SequenceView:
         return len(self.indices)
 
     def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame. Raises as the sequence below does."""
+        """Read one frame. Raises as the base sequence."""
         return replace(self.base[self.indices[index]], world_from_cam=self.poses[index])
 
 
 def has_scale(sequence: StereoSequence) -> bool:
-    """Whether the poses are in metres, as far as is known."""
+    """Return whether the poses are in metres, as far as is known."""
     while isinstance(sequence, SequenceView):
         before = sequence.base.poses
         if any(
             pose is not before[index]
             for index, pose in zip(sequence.indices, sequence.poses, strict=True)
         ):
-            return True  # poses from elsewhere
+            return True  # replaced poses are metric
         sequence = sequence.base
     return not isinstance(sequence, Recording) or sequence.has_scale
 
 
 def scale_poses(sequence: StereoSequence, metres: float) -> StereoSequence:
-    """The same recording with poses of which a unit is so many metres."""
+    """Return the recording with its positions multiplied by `metres`, the metres per unit."""
     poses = [
         None if pose is None else Rigid3(pose.rotation, metres * pose.translation)
         for pose in sequence.poses
@@ -189,17 +190,19 @@ def scale_poses(sequence: StereoSequence, metres: float) -> StereoSequence:
 
 
 def as_monocular(sequence: StereoSequence) -> StereoSequence:
-    """The same recording without its right and depth pictures, which are then not read either."""
+    """Return the recording without its right and depth images, which are then not read."""
     if isinstance(sequence, SequenceView):
         return replace(sequence, base=as_monocular(sequence.base))
     return sequence.monocular() if isinstance(sequence, _SupportsMonocular) else sequence
 
 
 def read_left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
-    """A frame of which only the left (or colour) picture is asked: right and depth pictures are not
-    read, where that is possible. A pair's rig is there, for it says how the left picture is
-    rectified. Raises as the sequence does."""
-    if type(sequence) is SequenceView:  # one that reads otherwise is asked itself
+    """Read the left (or colour) image of a frame. Right and depth images are not read, if the
+    sequence supports that.
+
+    The rig of a stereo pair is kept, because it defines the rectification. Raises as the sequence.
+    """
+    if type(sequence) is SequenceView:  # a subclass may read frames in another way
         return replace(
             read_left_frame(sequence.base, sequence.indices[index]),
             world_from_cam=sequence.poses[index],
@@ -212,8 +215,8 @@ def read_left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
 
 
 def recording_notes(sequence: StereoSequence) -> list[str]:
-    """What a user should know of a recording that could be opened all the same: what was cut off,
-    what was guessed."""
+    """Return notes for the user on a recording that could be opened, such as truncated or guessed
+    data."""
     return (
         recording_notes(sequence.base)
         if isinstance(sequence, SequenceView)
@@ -222,25 +225,26 @@ def recording_notes(sequence: StereoSequence) -> list[str]:
 
 
 def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoSequence:
-    """These frames of a sequence, in this order, with their poses; pictures are still read one by
-    one.
+    """Return the given frames of a sequence, in this order, with their poses. Images are still read
+    one by one.
 
     Raises:
-        IndexError: an index lies outside the sequence.
+        IndexError: an index is outside of the sequence.
     """
     poses = sequence.poses
     return SequenceView(sequence, list(indices), [poses[index] for index in indices])
 
 
 def parse_selection(text: str, num_frames: int) -> list[int]:
-    """Frame numbers, increasing and once each, of a selection such as ``0::2``, ``0:10,50:60``,
-    ``-1`` or ``0-59/100``.
+    """Return the frame numbers of a selection such as ``0::2``, ``0:10,50:60``, ``-1`` or
+    ``0-59/100``.
 
-    A slice is Python's, with a positive step; ``FIRST-LAST/PERIOD`` are the frames whose number
-    modulo PERIOD lies in FIRST to LAST, both included.
+    The numbers are increasing and unique. A slice is Python's, with a positive step.
+    ``FIRST-LAST/PERIOD`` selects the frames whose number modulo PERIOD is in FIRST to LAST, both
+    included.
 
     Raises:
-        RecordingError: it is none of these, or a single number lies outside the recording.
+        RecordingError: the text is none of these, or a single number is outside of the recording.
     """
     chosen: set[int] = set()
     for part in text.split(","):
@@ -266,11 +270,11 @@ def parse_selection(text: str, num_frames: int) -> list[int]:
 
 
 def list_images(folder: Path, suffix: str = "") -> list[Path]:
-    """The picture files of a folder in natural order (2 before 10), those only whose name ends in
-    `suffix` if given.
+    """Return the image files of a folder in natural order (2 before 10). A `suffix` limits them to
+    names that end with it.
 
     Raises:
-        RecordingError: the folder is missing or holds no picture.
+        RecordingError: the folder is missing or contains no image.
     """
     try:
         paths = [
@@ -287,8 +291,7 @@ def list_images(folder: Path, suffix: str = "") -> list[Path]:
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """A sort key by which numbers inside names compare as numbers, however many digits they
-    have."""
+    """Return a sort key that compares numbers inside names as numbers of any length."""
     parts = re.split(r"([0-9]+)", name)
     return [
         (len(number := part.lstrip("0")), number) if part.isdigit() else (-1, part)
@@ -297,11 +300,10 @@ def natural_key(name: str) -> list[tuple[int, str]]:
 
 
 def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
-    """Hold that two lists of pictures go together, frame by frame.
+    """Check that two lists of images correspond frame by frame.
 
     Raises:
-        RecordingError: of unequal lengths, or the numbers in two names that would go together
-            differ.
+        RecordingError: the lengths differ, or the last numbers of two corresponding names differ.
     """
     if len(left) != len(right):
         raise RecordingError(
@@ -317,7 +319,7 @@ def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
 
 
 def find_nearest_idx(times: np.ndarray, others: np.ndarray) -> list[int]:
-    """The row of the nearest of `others` (increasing) for each time."""
+    """Return the row of the nearest of `others` (increasing) for each time."""
     after = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(others) - 1)
@@ -327,12 +329,12 @@ def find_nearest_idx(times: np.ndarray, others: np.ndarray) -> list[int]:
 
 
 def times_from_rate(num_frames: int, rate_hz: int = DEFAULT_RATE_HZ) -> list[int]:
-    """Times in nanoseconds of frames at a steady rate from 0."""
+    """Return times in nanoseconds at a constant rate, starting at 0."""
     return [index * 1_000_000_000 // rate_hz for index in range(num_frames)]
 
 
 def _depth_image(depth: DepthImages, index: int, camera: Camera | None) -> DepthImage:
-    """The depth of a frame whose own picture is seen by `camera`."""
+    """Read the depth of a frame whose own image has the camera `camera`."""
     path = depth.paths[index]
     metres = read_depth_image(path, depth.units_per_metre)
     if depth.camera is not None:

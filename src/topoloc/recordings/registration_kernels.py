@@ -1,5 +1,4 @@
-"""Numba kernels of depth registration: one pass over a depth picture's pixels each, no array in
-between but the points."""
+"""Numba kernels of depth registration. Each makes one pass over the pixels or points."""
 
 from __future__ import annotations
 
@@ -10,10 +9,10 @@ from topoloc.compiled import kernel
 
 @kernel(error_model="numpy")
 def back_project(depth, normalized, rotation, translation, points):
-    """Fill `points` (n, 3) with what the known pixels see, in the other camera's frame; returns n.
+    """Fill `points` (n, 3) with the points of known depth, in the other camera's frame. Return n.
 
-    `normalized` (h * w, 2) are the pixels on the depth camera's plane z = 1; `points` has room for
-    every pixel.
+    `normalized` (h * w, 2) holds the pixels on the depth camera's plane z = 1. `points` has a row
+    for every pixel.
     """
     height, width = depth.shape
     count = 0
@@ -40,15 +39,17 @@ def _update_z_buffer_pixel(x, y, depth, registered):
     if x >= -0.5 and y >= -0.5 and x < width - 0.5 and y < height - 0.5:
         row, column = int(np.rint(y)), int(np.rint(x))
         z = np.float32(depth)
-        if not registered[row, column] <= z:  # also where it is still NaN
+        if not registered[row, column] <= z:  # also true for NaN
             registered[row, column] = z
 
 
 @kernel(error_model="numpy")
 def register_undistorted(depth, normalized, rotation, translation, focal, centre, registered):
-    """`back_project`, the pixels of a camera without distortion (focal lengths and principal point,
-    x and y) and `update_z_buffer` in one pass, without the points in between; the same numbers to
-    the bit."""
+    """Register depth to a camera without distortion in one pass.
+
+    Combines `back_project`, the projection (focal lengths and principal point, x and y) and
+    `update_z_buffer` without storing points. The results are bit-identical.
+    """
     height, width = depth.shape
     for row in range(height):
         for column in range(width):
@@ -67,7 +68,7 @@ def register_undistorted(depth, normalized, rotation, translation, focal, centre
 
 @kernel(error_model="numpy")
 def update_z_buffer(pixels, points, registered):
-    """Write each point's z into `registered` at its rounded pixel (NaN: none), where nothing nearer
-    is."""
+    """Write the z of each point to `registered` at its rounded pixel, if no nearer point is there.
+    NaN marks empty pixels."""
     for i in range(len(pixels)):
         _update_z_buffer_pixel(pixels[i, 0], pixels[i, 1], points[i, 2], registered)

@@ -1,9 +1,8 @@
-"""7-Scenes (Shotton et al., CVPR 2013): RGB-D runs of a Kinect, ``frame-000000.color.png .depth.png
-.pose.txt`` in ``seq-01/``.
+"""Read 7-Scenes (Shotton et al., CVPR 2013): RGB-D sequences of a Kinect in folders ``seq-01/``.
 
-Depth is not registered to colour, and the poses are the depth camera's. No calibration comes with
-the recordings; the focal lengths and the transform between the two cameras are those in use for the
-first Kinect.
+Files are ``frame-000000.color.png``, ``.depth.png`` and ``.pose.txt``. Depth is not registered to
+colour, and the poses belong to the depth camera. The recordings contain no calibration. The focal
+lengths and the transform between the two cameras are common values of the first Kinect.
 """
 
 from __future__ import annotations
@@ -30,19 +29,20 @@ RATE_HZ = 30
 
 
 def can_open(path: Path) -> bool:
-    """Whether this folder is a run of 7-Scenes, or a scene with runs in it."""
+    """Return whether this folder is a sequence of 7-Scenes, or a scene with sequences."""
     return path.is_dir() and (
         _is_run(path) or any(_is_run(folder) for folder in path.glob("seq-*"))
     )
 
 
 def open_seven_scenes(path: Path) -> Recording:
-    """Open a run (``seq-01``), or a scene with a single run. Frames are 1/30 s apart by their
-    number.
+    """Open a sequence (``seq-01``), or a scene with a single sequence. Times are frame numbers
+    times 1/30 s.
 
     Raises:
-        RecordingError: no run, several runs, or depth for some of the frames only.
-        TrajectoryError: a .pose.txt is no pose.
+        RecordingError: there is no sequence, there are several, or depth exists for some frames
+            only.
+        TrajectoryError: a .pose.txt contains no pose.
     """
     run = _find_run(path)
     colour = list_images(run, ".color")
@@ -99,7 +99,7 @@ def _frame_number(path: Path) -> int:
 
 
 def _read_pose(path: Path) -> Rigid3:
-    """world_from_depth of one frame."""
+    """Read world_from_depth of one frame."""
     try:
         return Rigid3.from_matrix(
             np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(4, 4)

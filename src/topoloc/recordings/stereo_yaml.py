@@ -1,9 +1,9 @@
-"""Calibrations of one camera or of a stereo rig in YAML: OpenCV's FileStorage, Kalibr's camchain,
-ROS's camera files.
+"""Read calibrations of a camera or a stereo rig in YAML: OpenCV FileStorage, Kalibr camchain and
+ROS.
 
-OpenCV: `M1 D1 M2 D2 R T` as its stereo sample writes them (`R` and `T` may stand in an
-extrinsics.yml beside), or the longer names of other programs; `R`, `T` take a point of the left
-camera into the right one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`. Metres.
+OpenCV: `M1 D1 M2 D2 R T` as in its stereo sample, or the longer names of other programs. `R` and
+`T` may be in an extrinsics.yml beside it. They transform points from the left camera to the right
+one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`. Lengths are in metres.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from topoloc.recordings.camera_json import CameraCalibration
 from topoloc.recordings.yaml_numbers import read_yaml, require_numbers, yaml_numbers, yaml_word
 
 YAML_SUFFIXES = frozenset({".yaml", ".yml"})
-_MAX_BASELINE = 5.0  # metres; a wider rig is taken for one in millimetres
-# COLMAP's model of each of Kalibr's distortions, with the number of its coefficients.
+_MAX_BASELINE = 5.0  # metres; a larger baseline is probably in millimetres
+# COLMAP's camera model for each distortion model of Kalibr, with its number of coefficients
 _DISTORTIONS = {
     "radial-tangential": ("OPENCV", 4),
     "radtan": ("OPENCV", 4),
@@ -31,8 +31,7 @@ _DISTORTIONS = {
     "none": ("PINHOLE", 0),
 }
 _FISHEYE_WORDS = ("equidistant", "fisheye", "KANNALA_BRANDT")
-# The names that programs give to matrix and distortion of the left, the right, and of an only
-# camera.
+# names of the camera matrix and the distortion of the left, the right, and a single camera
 _LEFT_KEYS = (
     (
         "M1",
@@ -64,7 +63,7 @@ _MONO_KEYS = (
 
 
 def is_calibration(path: Path) -> bool:
-    """Whether a YAML file holds a camera by the keys looked for here."""
+    """Return whether a YAML file contains a camera with a known key."""
     try:
         text = read_yaml(path)
     except CalibrationError:
@@ -75,11 +74,11 @@ def is_calibration(path: Path) -> bool:
 
 
 def read_calibration_yaml(path: Path, width: int, height: int) -> CameraCalibration:
-    """The calibration of pictures of this size (pixels), which counts where the file names none.
+    """Read a calibration. The size (pixels) is used if the file contains none.
 
     Raises:
-        CalibrationError: missing, no calibration, a number is missing, a model that is not known,
-            or a baseline of no rig; names the file.
+        CalibrationError: the file is missing or is no calibration, a number is missing, the model
+            is unknown, or the baseline is implausible. Names the file.
     """
     text = read_yaml(path)
     if _is_kalibr(text):
@@ -102,7 +101,7 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraCalibrat
 
 
 def kalibr_camera(path: Path, section: str) -> Camera:
-    """The camera of a sensor.yaml, or of a section of a camchain. Raises CalibrationError."""
+    """Read the camera of a sensor.yaml, or of a section of a camchain. Raises CalibrationError."""
     distortion = yaml_word(section, "distortion_model", "none")
     if yaml_word(section, "camera_model", "pinhole") != "pinhole" or distortion not in _DISTORTIONS:
         known = ", ".join(_DISTORTIONS)
@@ -138,7 +137,7 @@ def _read_kalibr(path: Path, text: str) -> CameraCalibration:
 def _opencv_camera(
     path: Path, text: str, names: tuple[Sequence[str], Sequence[str]], size: tuple[float, float]
 ) -> Camera:
-    """The camera whose matrix and distortion have one of these names."""
+    """Read the camera whose matrix and distortion have one of these names."""
     matrix, distortion = names
     fx, skew, cx, _, fy, cy, *_ = require_numbers(path, text, 9, *matrix)
     if abs(skew) > 1e-6 * abs(fx):
@@ -167,7 +166,7 @@ def _camera(path: Path, model: str, size: tuple[float, float], params: list[floa
 
 
 def _image_size(text: str) -> tuple[float, float] | None:
-    """Width and height, where the file names them."""
+    """Return width and height, or None if the file contains no size."""
     pair = yaml_numbers(text, "image_size", "imageSize", "size", "resolution")
     if len(pair) >= 2:
         return pair[0], pair[1]

@@ -1,4 +1,4 @@
-"""Text files of one record a line: the lists, times and poses of recordings."""
+"""Read text files with one record per line: lists, times and poses of recordings."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from jaxtyping import Float
 from topoloc.errors import TopolocError
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
-# Above this a time is taken for nanoseconds (ORB-SLAM3 writes EuRoC's so): as seconds it would be
-# 30 000 years.
+# Larger times are nanoseconds (as ORB-SLAM3 writes them for EuRoC). In seconds they would be 30 000
+# years.
 _MAX_SECONDS = 10**12
-# before the decimal point; no clock counts further, and an integer of a million digits takes
-# minutes
+# Maximum number of digits before the decimal point. Parsing an integer of a million digits takes
+# minutes.
 _MAX_DIGITS = 25
 
 
 def read_text(path: Path, error: type[TopolocError], missing: str = "no such file") -> str:
-    """The text of a file. Raises `error`, which names it."""
+    """Return the text of a file. Raises `error` with the file name."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -34,11 +34,11 @@ def read_text(path: Path, error: type[TopolocError], missing: str = "no such fil
 
 
 def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str]]]:
-    """Line number and columns (split at spaces and commas) of each line; blank lines and comments
-    (``#``) are left out.
+    """Return line number and columns (split at spaces and commas) of each line. Blank lines and
+    comments (``#``) are skipped.
 
     Raises:
-        error: the file is missing, no text, or holds no row; names it.
+        error: the file is missing, not text, or has no rows. Names it.
     """
     rows = [
         (number, columns)
@@ -51,7 +51,7 @@ def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str
 
 
 def _read_lines(path: Path, error: type[TopolocError]) -> list[str]:
-    """The file's lines without comments, commas as spaces."""
+    """Return the lines without comments, with spaces instead of commas."""
     text = read_text(path, error).replace(",", " ")
     return (
         text.splitlines()
@@ -62,18 +62,18 @@ def _read_lines(path: Path, error: type[TopolocError]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class NumericTable:
-    """Numbers of lines that have equally many of them, and the lines."""
+    """Hold the numbers of a table with equally long rows, and its lines."""
 
     numbers: Float[np.ndarray, "n c"]
     lines: list[str]
 
 
 def read_numeric_table(path: Path, error: type[TopolocError]) -> NumericTable | None:
-    """A file of finite numbers alone, equally many a line (comments are left out), read at once;
-    None where it is another.
+    """Read a file that contains only finite numbers, equally many per line, in one pass. Comments
+    are skipped. Return None for any other file.
 
     Raises:
-        error: the file is missing or no text.
+        error: the file is missing or not text.
     """
     lines = [line for line in _read_lines(path, error) if line and not line.isspace()]
     if not lines:
@@ -90,8 +90,8 @@ def read_numeric_table(path: Path, error: type[TopolocError]) -> NumericTable | 
 
 
 def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
-    """As `parse_times`, of lines whose times are all written alike, such as
-    ``1403636579.763555584``; None of any other."""
+    """Parse times as `parse_times`, if all are written alike, such as ``1403636579.763555584``.
+    Return None otherwise."""
     width = len(lines[0].split(None, 1)[0])
     try:
         characters = np.frombuffer(
@@ -109,7 +109,7 @@ def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
     digits = columns[:at] + columns[at + 1 :]
     if (
         (dots and (columns[at] != ord(".")).any()) or not 1 <= at <= 10 or len(digits) - at > 9
-    ):  # ten digits: seconds, no nanoseconds
+    ):  # up to ten digits: seconds, not nanoseconds
         return None
     t_ns = np.zeros(len(lines), dtype=np.int64)
     for column in digits:
@@ -123,11 +123,12 @@ def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
 def parse_times(
     rows: Sequence[tuple[int, list[str]]], path: Path, error: type[TopolocError]
 ) -> list[int]:
-    """Integer nanoseconds of the first column, exact to the last decimal; it is in seconds, or
-    nanoseconds where one is above 1e12.
+    """Parse the first column to integer nanoseconds, exact to the last decimal. Times are in
+    seconds, or in nanoseconds if one is above 1e12.
 
     Raises:
-        error: not a finite number, or the times do not increase strictly; names file and line.
+        error: a time is not a finite number, or the times do not increase strictly. Names file and
+            line.
     """
     times: list[Decimal] = []
     for line, columns in rows:
@@ -147,11 +148,12 @@ def parse_times(
 
 
 def read_file_list(path: Path, error: type[TopolocError]) -> tuple[list[int], list[str]]:
-    """Times in nanoseconds and file names of a list of pictures, which lie below the list's folder.
+    """Read the times in nanoseconds and the file names of a list of images. The files are below the
+    list's folder.
 
     Raises:
-        error: as `read_rows` and `parse_times`, a line has no second column, or a name leads out of
-            the folder.
+        error: as `read_rows` and `parse_times`, a line has no second column, or a name leaves the
+            folder.
     """
     rows = read_rows(path, error)
     for line, columns in rows:

@@ -1,8 +1,8 @@
-"""Trajectories: TUM files and KITTI rows, read, written, and looked up at the times of frames.
+"""Read and write trajectories (TUM files, KITTI rows) and interpolate them at the times of frames.
 
-TUM (Sturm et al., IROS 2012): a line is ``t tx ty tz qx qy qz qw``, seconds, comments start with
-``#``. KITTI (Geiger et al., CVPR 2012): a line is the upper 3x4 of a pose matrix, row by row, one
-line a frame. Both are world_from_cam, in metres.
+A TUM line is ``t tx ty tz qx qy qz qw`` in seconds, and comments start with ``#`` (Sturm et al.,
+IROS 2012). A KITTI line is the upper 3x4 of a pose matrix, row by row, one line per frame (Geiger
+et al., CVPR 2012). Both are world_from_cam, in metres.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from topoloc.recordings.text_files import (
     read_rows,
 )
 
-# Times written with few decimals still mean the frame they were made from.
+# tolerance for times written with few decimals
 _TIME_TOLERANCE_NS = 1_000_000
 _ROTATION_TOLERANCE = 1e-2
-_MIN_OVERLAP_SHARE = 0.8  # of the time that the frames take, for two clocks to tell of the same
+_MIN_OVERLAP_SHARE = 0.8  # minimum overlap of two clocks, as a share of the frames' duration
 TUM_HEADER = "# t tx ty tz qx qy qz qw (s, m; world_from_cam)"
 _Rows = Sequence[tuple[int, list[str]]]
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses in order of time. `t_ns` are their times, strictly increasing, or None where a pose
-    goes with a frame by its row."""
+    """Hold poses in order of time. `t_ns` are their times, strictly increasing, or None if poses
+    belong to frames by row."""
 
     world_from_cam: Sequence[Rigid3]
     t_ns: list[int] | None = None
@@ -50,21 +50,30 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.world_from_cam)
 
+    @staticmethod
+    def from_quaternions(rows: Float[np.ndarray, "n 7"], t_ns: list[int]) -> Trajectory:
+        """Return the trajectory of rows x, y, z (metres), qx, qy, qz, qw at these times.
+
+        A pose is computed when it is read. A quaternion need not be of unit length; reading the
+        pose of one without length raises TrajectoryError.
+        """
+        return Trajectory(LazyPoses(rows, pose_from_quaternion), t_ns)
+
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a TUM file (8 columns; times in seconds, or nanoseconds by their size) or KITTI rows (12
-    columns).
+    """Read a TUM file (8 columns) or KITTI rows (12 columns). TUM times are in seconds, or in
+    nanoseconds if they are large.
 
     Raises:
-        TrajectoryError: missing, empty, a wrong number of columns, NaN, no rotation, or times that
-            do not increase; with the line.
+        TrajectoryError: the file is missing or empty, the number of columns is wrong, a number is
+            NaN, a rotation is invalid, or times do not increase. Names the line.
     """
     return _read_numeric_trajectory(path) or _trajectory_from_rows(path)
 
 
 def _read_numeric_trajectory(path: Path) -> Trajectory | None:
-    """A file of numbers alone, all of them good, read at once; None of any other, which is then
-    read line by line."""
+    """Read a valid file of numbers in one pass. Return None for any other file, which is then read
+    line by line."""
     table = read_numeric_table(path, TrajectoryError)
     if table is None or table.numbers.shape[1] not in (8, 12):
         return None
@@ -73,7 +82,7 @@ def _read_numeric_trajectory(path: Path) -> Trajectory | None:
         return Trajectory(poses) if is_rotation.all() else None
     t_ns, rows = parse_uniform_times(table.lines), table.numbers[:, 1:]
     is_good = t_ns is not None and _is_unit_quaternion(rows[:, 3:]).all()
-    return Trajectory(LazyPoses(rows, pose_from_quaternion), t_ns) if is_good else None
+    return Trajectory.from_quaternions(rows, t_ns) if t_ns is not None and is_good else None
 
 
 def _trajectory_from_rows(path: Path) -> Trajectory:
@@ -98,20 +107,19 @@ def _trajectory_from_rows(path: Path) -> Trajectory:
 
 
 def _timed_trajectory(path: Path, rows: _Rows, columns: Iterable[int]) -> Trajectory:
-    """Of rows that begin with a time, and whose other columns are, in this order, x, y, z (metres)
-    and a quaternion (x, y, z, w)."""
+    """Read rows of a time and the given columns: x, y, z (metres) and a quaternion (x, y, z, w)."""
     t_ns, numbers = parse_times(rows, path, TrajectoryError), _parse_numbers(path, rows, columns)
     _check_rows(_is_unit_quaternion(numbers[:, 3:]), "not a rotation", path, rows)
-    return Trajectory(LazyPoses(numbers, pose_from_quaternion), t_ns)
+    return Trajectory.from_quaternions(numbers, t_ns)
 
 
 def read_asl_poses(path: Path) -> Trajectory:
-    """Read the poses of an ASL ground truth data.csv: ``t [ns], px, py, pz, qw, qx, qy, qz``, and
-    columns beyond, which are left.
+    """Read the poses of an ASL ground truth data.csv: ``t [ns], px, py, pz, qw, qx, qy, qz``.
+    Further columns are ignored.
 
     Raises:
-        TrajectoryError: missing, empty, columns missing, NaN, no rotation, or times that do not
-            increase; with the line.
+        TrajectoryError: the file is missing or empty, columns are missing, a number is NaN, a
+            rotation is invalid, or times do not increase. Names the line.
     """
     rows = read_rows(path, TrajectoryError)
     for line, tokens in rows:
@@ -121,7 +129,7 @@ def read_asl_poses(path: Path) -> Trajectory:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a TUM file, atomically.
+    """Write a TUM file atomically.
 
     Raises:
         TrajectoryError: the trajectory has no times.
@@ -132,18 +140,22 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     write_text(path, tum_text(trajectory))
 
 
-def tum_text(trajectory: Trajectory) -> str:
-    """A TUM file's lines, of a trajectory with times."""
+def tum_text(trajectory: Trajectory, header: bool = True) -> str:
+    """Return the lines of a TUM file of a trajectory with times.
+
+    Args:
+        header: begin with the comment that names the columns.
+    """
     assert trajectory.t_ns is not None
     rows = (
         tum_line(t_ns, pose)
         for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True)
     )
-    return "\n".join([TUM_HEADER, *rows]) + "\n"
+    return "".join(f"{line}\n" for line in ([TUM_HEADER] if header else []) + list(rows))
 
 
 def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
-    """One line of a TUM file, without its end."""
+    """Return one line of a TUM file without the line break."""
     w, x, y, z = world_from_cam.quat_wxyz()
     return " ".join(
         [
@@ -153,17 +165,13 @@ def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
     )
 
 
-def kitti_text(trajectory: Trajectory) -> str:
-    """A line a pose: the upper 3x4 of its matrix, row by row."""
-    rows = (pose.matrix()[:3].ravel().tolist() for pose in trajectory.world_from_cam)
-    return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
-
-
 def interpolate_poses(
     trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2
 ) -> list[Rigid3 | None]:
-    """The pose at each time: interpolated where its neighbours are at most `max_gap` seconds apart,
-    else the pose within 1 ms, else None.
+    """Return the pose at each time.
+
+    It is interpolated if its neighbours are at most `max_gap` seconds apart. Otherwise it is a pose
+    within 1 ms, or None.
 
     Raises:
         TrajectoryError: the trajectory has no times.
@@ -184,11 +192,11 @@ def interpolate_poses(
 def match_frame_poses(
     trajectory: Trajectory, t_ns: Sequence[int], path: Path
 ) -> list[Rigid3 | None]:
-    """The pose of each frame: by time, or by row where the trajectory has no times.
+    """Return the pose of each frame by time, or by row if the trajectory has no times.
 
     Raises:
-        TrajectoryError: rows and frames differ in number, or no frame has a pose; names `path`, and
-            where the clocks seem to differ, how.
+        TrajectoryError: the numbers of rows and frames differ, or no frame has a pose. Names `path`
+            and a likely difference of the clocks.
     """
     if trajectory.t_ns is None:
         if len(trajectory) != len(t_ns):
@@ -208,13 +216,12 @@ def match_frame_poses(
 def with_trajectory(
     sequence: StereoSequence, path: Path, conventions: PoseConventions | None = None
 ) -> StereoSequence:
-    """The same recording with the poses of a trajectory file: TUM by time, KITTI rows frame by
-    frame.
+    """Return the recording with the poses of a trajectory file: TUM by time, KITTI rows by frame.
 
-    Rows for a part of a recording may be those of the part or of the whole.
+    For a selection of frames, KITTI rows may belong to the selection or to the whole recording.
 
     Raises:
-        TrajectoryError: the file is malformed, or fits no frame.
+        TrajectoryError: the file is malformed, or matches no frame.
     """
     trajectory, conventions = read_trajectory(path), conventions or PoseConventions()
     if (
@@ -230,10 +237,10 @@ def with_trajectory(
 
 
 def with_pose_conventions(sequence: StereoSequence, conventions: PoseConventions) -> StereoSequence:
-    """The same recording, its own poses read so.
+    """Return the recording with its own poses converted from the given conventions.
 
     Raises:
-        TrajectoryError: no frame has a pose then.
+        TrajectoryError: no frame has a pose after the conversion.
     """
     if conventions == PoseConventions():
         return sequence
@@ -270,7 +277,8 @@ def _to_frame_clock(trajectory: Trajectory, conventions: PoseConventions) -> Tra
 
 
 def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
-    """How the clocks of poses and frames seem to differ: by a unit, or by when they began."""
+    """Describe the likely difference between the clocks of poses and frames: another unit or
+    another start."""
     for factor in (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9):
         overlap = min(of_poses[-1] * factor, of_frames[-1]) - max(
             of_poses[0] * factor, of_frames[0]
@@ -285,11 +293,11 @@ def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
 
 
 def read_ground_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
-    """The pose of each frame from the first of these files that is there: TUM by time, KITTI rows
-    one a frame.
+    """Return the pose of each frame from the first existing file: TUM by time, KITTI rows by frame.
+    Return None for all frames if no file exists.
 
     Raises:
-        TrajectoryError: the file is malformed, or fits no frame.
+        TrajectoryError: the file is malformed, or matches no frame.
     """
     for path in (tum, *kitti_rows):
         if path.is_file():
@@ -298,10 +306,12 @@ def read_ground_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> lis
 
 
 def read_times(path: Path, num_frames: int) -> list[int]:
-    """Times in nanoseconds from a file of one time in seconds a line; 10 Hz where there is no file.
+    """Read times in nanoseconds from a file with one time in seconds per line. Without a file the
+    rate is 10 Hz.
 
     Raises:
-        RecordingError: malformed, not increasing, or their number is not that of the frames.
+        RecordingError: the file is malformed, times do not increase, or their number differs from
+            `num_frames`.
     """
     if not path.is_file():
         return times_from_rate(num_frames)
@@ -330,7 +340,7 @@ def _interpolate_pose(
 
 
 def _parse_numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarray, "n c"]:
-    """These columns of the rows."""
+    """Return these columns of the rows as finite numbers. Raises TrajectoryError."""
     wanted = list(columns)
     try:
         numbers = np.array(
@@ -353,7 +363,7 @@ def _parse_number(path: Path, line: int, token: str) -> float:
 
 
 def _is_unit_quaternion(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
-    """But for rounding."""
+    """Return which quaternions have length 1 up to rounding."""
     with np.errstate(over="ignore", invalid="ignore"):
         return (
             np.abs(np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions)) - 1.0)

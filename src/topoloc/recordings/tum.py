@@ -1,8 +1,8 @@
-"""TUM RGB-D (Sturm et al., IROS 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth
-registered to colour.
+"""Read TUM RGB-D (Sturm et al., IROS 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``. Depth
+is registered to colour.
 
-The intrinsics are those the data set's authors give for its three cameras, taken by the freiburg1 /
-2 / 3 in the folder's name; any other recording of this layout needs a ``camera.json``.
+The intrinsics are those published with the data set for its three cameras. The freiburg1 / 2 / 3 in
+the folder's name selects one. Other recordings of this layout need a ``camera.json``.
 """
 
 from __future__ import annotations
@@ -43,20 +43,21 @@ _FREIBURG = {
 
 
 def can_open(path: Path) -> bool:
-    """Whether the two lists are there."""
+    """Return whether both lists exist."""
     return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
 
 
 def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recording:
-    """Open a recording; a colour picture without depth within 20 ms is left out.
+    """Open a recording. A colour image without depth within 20 ms is skipped.
 
     Args:
-        calibration: instead of the folder's.
+        path: the folder.
+        calibration: replaces the folder's calibration.
 
     Raises:
-        RecordingError: a list is missing or malformed, or no colour picture has depth.
-        CalibrationError: neither a camera.json nor a freiburg in the folder's name.
-        TrajectoryError: the truth is malformed or fits no frame.
+        RecordingError: a list is missing or malformed, or no colour image has depth.
+        CalibrationError: there is neither a camera.json nor a freiburg in the folder's name.
+        TrajectoryError: the ground truth is malformed or matches no frame.
     """
     colour_times, colour = read_file_list(path / "rgb.txt", RecordingError)
     camera_calibration = (

@@ -1,8 +1,8 @@
-"""A video file (MP4, AVI, ...) as a recording of single pictures, by OpenCV's reader.
+"""Read a video file (MP4, AVI, ...) as a monocular recording with OpenCV.
 
-Calibration is the ``camera.json`` beside it, truth is ``NAME.tum`` for ``NAME.mp4``. Times are the
-container's, so that a camera of varying rate keeps its own. A turn that the file asks players for
-is not applied: a calibration is of the pixels as they are stored.
+The calibration is the ``camera.json`` beside it, and ground truth is ``NAME.tum`` for ``NAME.mp4``.
+Times come from the container, so variable frame rates are kept. The rotation flag of the container
+is ignored, because a calibration refers to the stored pixels.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.frame import Image, StereoFrame
 from topoloc.recordings.trajectory import read_ground_truth
 
-# FFmpeg prints its own lines about broken files on stderr, beside the error that says it; read once
-# a process, at its first use.
+# Suppress FFmpeg's messages about broken files on stderr, because an error reports them. FFmpeg
+# reads the variable once per process.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
@@ -34,14 +34,9 @@ _LOG_LEVEL_LOCK = threading.Lock()
 EXPECTED_FILES = "a video file (.mp4, .mov, .avi, .mkv, .webm)"
 
 
-def can_open(path: Path) -> bool:
-    """Whether this is a video file, by its name."""
-    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
-
-
 @dataclass(eq=False)
 class _Reader:
-    """An open video and the number of the frame that it gives next."""
+    """Hold an open video and the number of its next frame."""
 
     capture: Any
     next_idx: int = 0
@@ -49,8 +44,8 @@ class _Reader:
 
 @dataclass(eq=False)
 class Video:
-    """A StereoSequence in one file. Frames are decoded in their order; to ask for an earlier one
-    begins anew."""
+    """A StereoSequence in one video file. Frames are decoded in order. Accessing an earlier frame
+    restarts the video."""
 
     name: str
     path: Path
@@ -61,6 +56,31 @@ class Video:
     size: tuple[int, int]
     _reader: _Reader | None = field(default=None, repr=False)
 
+    @staticmethod
+    def can_open(path: Path) -> bool:
+        """Whether this is a video file, by its name."""
+        return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+    @staticmethod
+    def open(path: Path) -> Video:
+        """Open a video without a camera, whatever calibration lies beside it.
+
+        Raises:
+            RecordingError: no video, no frame in it that can be decoded, or its clock goes
+                backwards.
+            TrajectoryError: the truth is malformed or fits no frame.
+        """
+        size, rate = _read_frame_size(path)
+        t_ns = _read_times(path, rate)
+        poses = read_ground_truth(path.with_suffix(".tum"), [], t_ns)
+        names = [f"{index:06d}" for index in range(len(t_ns))]
+        return Video(path.name, path, names, t_ns, poses, None, size)
+
+    @staticmethod
+    def read_size(path: Path) -> tuple[int, int]:
+        """Return width and height of the first frame, in pixels. Raises RecordingError."""
+        return _read_frame_size(path)[0]
+
     def __len__(self) -> int:
         return len(self.names)
 
@@ -68,8 +88,9 @@ class Video:
         """Read one frame.
 
         Raises:
-            IndexError: no such frame.
-            UnreadableImageError: it cannot be decoded, or is of another size than the first.
+            IndexError: there is no such frame.
+            UnreadableImageError: the frame cannot be decoded, or its size differs from the first
+                frame's.
         """
         if index < 0:
             index += len(self)
@@ -106,15 +127,16 @@ class Video:
 
 
 def open_video(path: Path) -> Video:
-    """Open a video file. It is gone through once for its times; a file that was cut off ends with
-    its last whole frame.
+    """Open a video file. One pass over the file reads its times. A truncated file ends with its
+    last complete frame.
 
     Raises:
-        RecordingError: no video, no frame in it that can be decoded, or its clock goes backwards.
-        CalibrationError: camera.json is not usable, or is of another size than the frames.
-        TrajectoryError: the truth is malformed or fits no frame.
+        RecordingError: the file is not a video, no frame can be decoded, or its times do not
+            increase.
+        CalibrationError: camera.json is not usable, or its size differs from the frames'.
+        TrajectoryError: the ground truth is malformed or matches no frame.
     """
-    video = open_uncalibrated_video(path)
+    video = Video.open(path)
     if not (path.parent / FILE_NAME).is_file():
         return video
     camera, (width, height) = read_camera_json(path.parent / FILE_NAME).camera, video.size
@@ -126,19 +148,9 @@ def open_video(path: Path) -> Video:
     return replace(video, camera=camera)
 
 
-def open_uncalibrated_video(path: Path) -> Video:
-    """The video as it is, whatever calibration lies beside it. Raises as `open_video`."""
-    size, rate = read_frame_size(path)
-    t_ns = _read_times(path, rate)
-    poses = read_ground_truth(path.with_suffix(".tum"), [], t_ns)
-    return Video(
-        path.name, path, [f"{index:06d}" for index in range(len(t_ns))], t_ns, poses, None, size
-    )
-
-
-def read_frame_size(path: Path) -> tuple[tuple[int, int], float]:
-    """Width and height of the first frame, in pixels, and the rate that the container names. Raises
-    RecordingError."""
+def _read_frame_size(path: Path) -> tuple[tuple[int, int], float]:
+    """Return width and height of the first frame in pixels, and the frame rate of the container.
+    Raises RecordingError."""
     capture = _open_capture(path)
     decoded, first = capture.read()
     if not decoded or first is None:
@@ -156,7 +168,8 @@ def _open_capture(path: Path) -> cv2.VideoCapture:
 
 
 def _read_times(path: Path, rate: float) -> list[int]:
-    """The time of each frame; by the rate where the container gives none."""
+    """Return the time of each frame in nanoseconds, from the frame rate if the container has no
+    times."""
     capture = _open_capture(path)
     t_ns = []
     while capture.grab():
@@ -176,10 +189,10 @@ def _read_times(path: Path, rate: float) -> list[int]:
 
 @contextmanager
 def silence_opencv() -> Iterator[None]:
-    """No OpenCV messages on stderr beside the error that says it."""
+    """Suppress OpenCV's messages on stderr, because an error reports the problem."""
     logging: Any = getattr(
         cv2.utils, "logging", cv2
-    )  # OpenCV 4 has these functions in its own name space
+    )  # OpenCV 4 has these functions in the module cv2
     with _LOG_LEVEL_LOCK:
         level = logging.getLogLevel()
         logging.setLogLevel(0)
@@ -189,4 +202,4 @@ def silence_opencv() -> Iterator[None]:
             logging.setLogLevel(level)
 
 
-FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_video)
+FORMAT = RecordingFormat(EXPECTED_FILES, Video.can_open, open_video)

@@ -1,7 +1,7 @@
-"""The numbers of calibration files in YAML, as EuRoC, Kalibr, OpenCV and ROS write them.
+"""Read numbers from calibration files in YAML, as written by EuRoC, Kalibr, OpenCV and ROS.
 
-The files come with OpenCV's header or without it and in several styles of YAML, so only the words
-and numbers after the needed keys are read: no tag is obeyed, no alias followed.
+The files come with or without OpenCV's header and in several styles of YAML. So only words and
+numbers after the needed keys are read. Tags and aliases are ignored.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 def read_yaml(path: Path) -> str:
-    """The text of a calibration without its comments. Raises CalibrationError, which names the
-    file."""
+    """Return the text of a calibration without comments. Raises CalibrationError with the file
+    name."""
     text = read_text(path, CalibrationError, "no calibration here")
     if len(text) > _MAX_CHARS:
         raise CalibrationError(f"{path}: {len(text)} characters are no calibration")
@@ -26,14 +26,14 @@ def read_yaml(path: Path) -> str:
 
 
 def yaml_word(text: str, key: str, default: str) -> str:
-    """The word after a key."""
+    """Return the word after a key, or `default`."""
     found = re.search(rf"^\s*{key}:\s*[\"']?([\w-]+)", text, re.MULTILINE)
     return found[1] if found else default
 
 
 def yaml_numbers(text: str, *keys: str) -> list[float]:
-    """All numbers after the first of these keys that is there, up to the next key that is not
-    `cols`, `rows`, `dt` or `data`."""
+    """Return all numbers after the first existing key, up to the next key other than `cols`,
+    `rows`, `dt` or `data`."""
     for key in keys:
         found = re.search(
             rf"^[ \t]*{key}:(.*?)(?=^[ \t]*(?!(?:cols|rows|dt|data)\b)[A-Za-z_]\w*:|\Z)",
@@ -49,8 +49,8 @@ def yaml_numbers(text: str, *keys: str) -> list[float]:
 
 
 def require_numbers(path: Path, text: str, count: int, *keys: str) -> list[float]:
-    """The first `count` numbers after one of these keys. Raises CalibrationError, which names the
-    file."""
+    """Return the first `count` numbers after one of these keys. Raises CalibrationError with the
+    file name."""
     numbers = yaml_numbers(text, *keys)
     if len(numbers) < count:
         raise CalibrationError(f"{path}: {' or '.join(keys[:3])} with {count} numbers is missing")

@@ -1,9 +1,10 @@
-"""The networks that the learned coarse localizers stand on: VGG-11, VGG-16 (Simonyan & Zisserman
-2014), SqueezeNet 1.1 (Iandola et al. 2016), EfficientNet-lite0 (`efficientnet.py`), and a small one
-of our own for training from nothing, in PyTorch.
+"""Define the backbone networks of the learned coarse localizers, in PyTorch.
 
-Layers of the first three carry torchvision's names and order, so that the ImageNet weights that
-torchvision publishes load as they are.
+They are VGG-11, VGG-16 (Simonyan & Zisserman 2014), SqueezeNet 1.1 (Iandola et al. 2016),
+EfficientNet-lite0 (`efficientnet.py`), and a small network for training from scratch.
+
+Layers of the first three have torchvision's names and order, so that torchvision's ImageNet weights
+load unchanged.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from topoloc.retrieval.efficientnet import NUM_CHANNELS as EFFICIENTNET_CHANNELS
 from topoloc.retrieval.efficientnet import efficientnet_features
 from topoloc.retrieval.network_config import BackboneName
 
-# Of ImageNet, which all these networks were trained on: input is (RGB in [0, 1] - mean) /
-# deviation.
+# Statistics of ImageNet, for the pretrained networks. The input is (RGB in [0, 1] - mean)
+# / deviation.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 NUM_IMAGENET_CLASSES = 1000
@@ -51,14 +52,15 @@ _VGG_LAYERS: dict[str, tuple[int | str, ...]] = {
 }
 _COMPACT_LAYERS = (24, 48, 96, 128, 128)
 VGG_GRID = 7
-"""Rows and columns that VGG's features are pooled to before its classifier."""
+"""Rows and columns to which VGG's features are pooled before its classifier."""
 
 
 class Backbone(nn.Module):
-    """A network in torchvision's layout: `features` (convolutions), then `classifier`.
+    """Hold a network in torchvision's layout: `features` (convolutions), then `classifier`.
 
-    With `num_outputs` None there is no classifier (VGG's is nine tenths of its weights). `depth`
-    keeps that many layers of `features` only. `num_channels` are those of the feature maps.
+    Without `num_outputs` (None) there is no classifier, which has nine tenths of VGG's weights.
+    `depth` is the number of layers of `features` to keep. `num_channels` is that of the feature
+    maps.
     """
 
     def __init__(
@@ -76,10 +78,10 @@ class Backbone(nn.Module):
         self.classifier = None if num_outputs is None else _classifier(name, num_outputs)
 
     def forward(self, images: Tensor, first: int = 0) -> Tensor:
-        """Outputs (n, num_outputs) of normalised images (n, 3, h, w); without classifier feature
-        maps (n, c, h', w').
+        """Return the outputs (n, num_outputs) of normalised images (n, 3, h, w), or feature maps
+        (n, c, h', w') without a classifier.
 
-        With `first`, `images` are what the layers of `features` before that one have made of them.
+        With `first`, `images` are the outputs of the layers of `features` before that one.
         """
         maps = self.features[first:](images)
         if self.classifier is None:
@@ -90,13 +92,13 @@ class Backbone(nn.Module):
 
 
 def has_wide_classifier(name: BackboneName) -> bool:
-    """Whether the classifier looks at the places of features, as VGG's does, and not at their mean
-    over the picture."""
+    """Return whether the classifier uses the positions of features, like VGG's, and not their mean
+    over the image."""
     return name in _VGG_LAYERS
 
 
 def normalize_images(rgb_images: Tensor) -> Tensor:
-    """RGB bytes (n, h, w, 3) as the networks take them: float32 (n, 3, h, w), channels last in
+    """Convert RGB bytes (n, h, w, 3) to the networks' input: float32 (n, 3, h, w), channels last in
     memory."""
     mean = torch.tensor(IMAGENET_MEAN, device=rgb_images.device) * 255.0
     deviation = torch.tensor(IMAGENET_DEVIATION, device=rgb_images.device) * 255.0
@@ -104,8 +106,8 @@ def normalize_images(rgb_images: Tensor) -> Tensor:
 
 
 class _Fire(nn.Module):
-    """SqueezeNet's module: few channels squeezed out of many, then spread by 1x1 and by 3x3
-    convolutions, side by side."""
+    """Implement SqueezeNet's module: many channels are reduced to few, then expanded by parallel
+    1x1 and 3x3 convolutions."""
 
     def __init__(self, num_inputs: int, num_squeezed: int, num_expanded: int) -> None:
         super().__init__()
@@ -137,8 +139,8 @@ def _features(name: BackboneName) -> nn.Sequential:
 
 
 def _compact_features() -> nn.Sequential:
-    """Ours: five convolutions, each halving the picture but the last, normalised by batch so that
-    it learns from nothing fast."""
+    """Return five convolutions with batch normalisation, for fast training from scratch. Each but
+    the last halves the image."""
     modules: list[nn.Module] = []
     num_channels = 3
     for number, width in enumerate(_COMPACT_LAYERS):

@@ -1,12 +1,13 @@
-"""What a network of local features saw in each cell of the picture (`Features.cells`): it tells
-places apart where VLAD does not.
+"""Compare images by the mean network output of each image cell (`Features.cells`), as a complement
+to VLAD.
 
-VLAD of key points is sharp, but knows a place only from about where it was mapped, for it counts
-where in the picture things are. Cells are blunt and keep through the night; whoever comes by beside
-the map's way sees the same things in other columns, so two grids are compared at several shifts,
-and the best one counts. Each cell is the mean of one of the network's levels there, less what that
-cell shows in the mapping images on average, its channels whitened by their PCA, brought to unit
-length.
+VLAD of key points is precise but depends on the image positions of features, so it fails away from
+the mapped path. Cells are less precise but robust to darkness. Beside the mapped path, the same
+objects appear in other columns. So two grids are compared at several column shifts, and the best
+one counts.
+
+Each cell is the mean of a network level there. The mean of that cell over the mapping images is
+subtracted. The channels are whitened by PCA, and the cell is scaled to unit length.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ from topoloc.retrieval.coarse import CoarseModel, model_array
 from topoloc.retrieval.descriptor_kernels import max_shifted_products
 
 DIMENSION = 32
-"""Numbers of a cell after PCA, at most."""
+"""Maximum length of a cell's vector after PCA."""
 _VARIANCE_REGULARIZATION = (
-    0.1  # so many times the mean variance is added to each axis's: the weakest axes are noise
+    0.1  # this fraction of the mean variance is added to each axis: the weakest axes are noise
 )
 _MAX_SHIFT = 1  # columns
-_MAX_VALUE = 1e6  # no network's level comes near it
-_SCALE = np.float32(127.0)  # of the numbers of a cell, which are kept as signed bytes
+_MAX_VALUE = 1e6  # far above the values of any network
+_SCALE = np.float32(127.0)  # of a cell's components, which are stored as signed bytes
 
 
 class CellGrid:
-    """The cells of all mapping images.
+    """Hold the cells of all mapping images.
 
     Args:
-        mean: (columns, rows, c) of the mapping images' cells. Columns come first, so that a shifted
-            grid lies in one piece.
-        projection: (d, c) of a cell's channels.
-        vectors: (n, columns * rows * d) the mapping images, each cell of length 127.
+        mean: (columns, rows, c) mean over the mapping images. Columns come first, so that a shifted
+            grid is contiguous.
+        projection: (d, c) projection of a cell's channels.
+        vectors: (n, columns * rows * d) vectors of the mapping images, each cell with length 127.
     """
 
     def __init__(
@@ -49,13 +50,13 @@ class CellGrid:
 
     @staticmethod
     def fit(cells: Float32[np.ndarray, "n rows columns c"], dimension: int = DIMENSION) -> CellGrid:
-        """From the cells of all mapping images."""
+        """Create the grid from the cells of all mapping images."""
         by_column = np.ascontiguousarray(cells.transpose(0, 2, 1, 3))
         mean, channels = by_column.mean(axis=0), by_column.shape[3]
         centred = (by_column - mean).reshape(-1, channels)
         if (
             float(np.abs(centred).max()) < 1e-6
-        ):  # one picture, or all alike: what they show in common is all there is
+        ):  # one image, or all alike: without the common part nothing would remain
             mean, centred = np.zeros_like(mean), by_column.reshape(-1, channels)
         variances, axes = np.linalg.eigh(centred.T.astype(np.float64) @ centred / len(centred))
         variances, axes = variances[::-1][:dimension], axes[:, ::-1][:, :dimension]
@@ -63,7 +64,7 @@ class CellGrid:
             np.maximum(variances, 0.0) / max(float(variances.mean()), 1e-12)
             + _VARIANCE_REGULARIZATION
         )
-        # as the map file keeps it, so that a map says the same before and after
+        # rounded as in the map file, so that results do not change when the map is stored
         projection = (axes / regularized).T.astype(np.float16).astype(np.float32)
         vectors = np.concatenate(
             [
@@ -74,8 +75,8 @@ class CellGrid:
         return CellGrid(mean, projection, np.rint(_SCALE * vectors).astype(np.int8))
 
     def with_cells(self, cells: Float32[np.ndarray, "n rows columns c"]) -> CellGrid:
-        """With the cells of further mapping images, less the same mean and by the same
-        projection."""
+        """Return the grid with the cells of further mapping images. Mean and projection are
+        unchanged."""
         added = _normalize_cells(
             np.ascontiguousarray(cells.transpose(0, 2, 1, 3)), self._mean, self._projection
         )
@@ -88,11 +89,11 @@ class CellGrid:
     def compute_similarity(
         self, cells: Float32[np.ndarray, "rows columns c"], images: Int[np.ndarray, " k"]
     ) -> Float32[np.ndarray, " k"]:
-        """The mean cosine between the cells of a picture and those of each of these mapping images,
-        at the best shift.
+        """Return the mean cosine between the cells of a query image and those of each of these
+        mapping images, at the best shift.
 
         Raises:
-            MapError: the cells are not of the form that the map's have.
+            MapError: the cells have another form than the map's.
         """
         columns, rows = self._mean.shape[:2]
         by_column = np.ascontiguousarray(cells.transpose(1, 0, 2)[None])
@@ -113,7 +114,7 @@ class CellGrid:
         return products / np.float32(rows)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """What the map file keeps: a byte for each of an image's numbers."""
+        """Return the arrays stored in the map file, with one byte per vector component."""
         return {
             "cell_mean": self._mean,
             "cell_projection": self._projection.astype(np.float16),
@@ -122,8 +123,8 @@ class CellGrid:
 
     @staticmethod
     def from_model(model: CoarseModel, num_images: int) -> CellGrid | None:
-        """The inverse of `to_arrays`; None of a model without. Raises MapError where the arrays do
-        not belong together."""
+        """Create the grid from `to_arrays`. Return None if the model has no cells. Raises MapError
+        if the arrays are inconsistent."""
         if "cell_vectors" not in model.arrays:
             return None
         mean = model_array(model, "cell_mean", "f", (None, None, None)).astype(
@@ -150,8 +151,8 @@ def _normalize_cells(
     mean: Float32[np.ndarray, "columns rows c"],
     projection: Float32[np.ndarray, "d c"],
 ) -> Float32[np.ndarray, "n m"]:
-    """Each cell centred, projected and brought to unit length; the cells of a picture one after the
-    other, column by column."""
+    """Centre and project each cell and scale it to unit length. The cells of an image are
+    concatenated column by column."""
     projected = (cells - mean) @ projection.T
     projected /= np.maximum(np.linalg.norm(projected, axis=3, keepdims=True), 1e-6)
     return np.ascontiguousarray(projected.reshape(len(cells), -1), np.float32)

@@ -1,8 +1,9 @@
-"""cnn-fc: a network whose output layer has one unit a node, trained on the mapping images.
+"""Rank nodes with a classification network that has one output per node, trained on the mapping
+images: cnn-fc.
 
-The paper's first classifier (section III-A): VGG-11 with its last layer replaced, or a smaller
-backbone. Each image is labelled with its nearest node by Eq. 1 (position and heading). Scores are
-probabilities, calibrated on images held out of the training.
+This is the paper's first classifier (section III-A): VGG-11 with its last layer replaced, or a
+smaller backbone. Each image is labelled with its nearest node by Eq. 1 (position and heading).
+Scores are probabilities, calibrated on images held out of the training.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ _SQUEEZED, _ROWS, _COLUMNS = 64, 4, 5
 
 
 class NodeClassifier(nn.Module):
-    """Images to one number a node. VGG keeps its classifier but for the last layer; the mean over
-    the picture, which the small networks end with, forgets where things are in it: their features
-    are squeezed and pooled in cells instead."""
+    """Map images to one score per node.
+
+    VGG keeps its classifier except for the last layer. The small networks end with a mean over the
+    image, which discards positions. Their features are reduced and pooled in cells instead.
+    """
 
     def __init__(self, backbone: BackboneName, num_nodes: int) -> None:
         super().__init__()
@@ -40,15 +43,15 @@ class NodeClassifier(nn.Module):
         )
 
     def forward(self, images: Tensor, first: int = 0) -> Tensor:
-        """As that of `Backbone`."""
+        """Return one score per node. Arguments are those of `Backbone.forward`."""
         return self.head(self.backbone(images, first))
 
 
 class CnnFc:
-    """The coarse localizer `cnn-fc`.
+    """Implement the coarse localizer `cnn-fc`.
 
     Raises:
-        MapError: the model's arrays do not belong together.
+        MapError: the model's arrays are inconsistent.
     """
 
     def __init__(self, model: CoarseModel) -> None:
@@ -75,7 +78,7 @@ class CnnFc:
                 f"the map's coarse localizer {NAME!r} is damaged:"
                 f" {' '.join(str(error).split())[:200]}"
             ) from error
-        # the node of each output, as its row in the map; -1 of nodes that are no more
+        # row in the map of each output's node, -1 for removed nodes
         has_rows = "node_ids" in model.arrays
         self._rows = (
             model_array(model, "node_ids", "iu", (num_outputs,))
@@ -84,12 +87,12 @@ class CnnFc:
         )
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """See `CoarseLocalizer.rank`; scores are probabilities. The local features are not looked
-        at."""
+        """Rank nodes as in `CoarseLocalizer.rank`. Scores are probabilities. The local features are
+        not used."""
         return self.rank_batch([image], num_candidates)[0]
 
     def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
-        """`rank` of many images, which go through the network together."""
+        """Rank nodes for many images, which pass through the network together."""
         ranked = []
         for row in self.probabilities(images):
             outputs = np.argsort(-row, kind="stable")
@@ -100,7 +103,7 @@ class CnnFc:
         return ranked
 
     def probabilities(self, images: Sequence[Image]) -> Float32[np.ndarray, "n nodes"]:
-        """Of each node, for each image."""
+        """Return the probability of each output's node for each image."""
         outputs = self._predict(
             prepare_network_images(images, self._shape, self._input_config)
         ) / np.float32(self._temperature)

@@ -1,9 +1,9 @@
-"""cnn-nn: features of a pretrained network, pooled in cells and whitened; the nodes of the nearest
-mapping images.
+"""Rank nodes by the nearest mapping images under whitened features of a pretrained network, pooled
+in cells: cnn-nn.
 
-The paper's second classifier (section III-B). Features are pooled by the generalised mean of
-Radenovic et al. (2018), in a few cells instead of one: neighbouring nodes see the same things, at
-other places of the picture.
+This is the paper's second classifier (section III-B). Features are pooled by the generalised mean
+of Radenovic et al. (2018). Several cells are used instead of one, because neighbouring nodes see
+the same objects at other image positions.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from topoloc.retrieval.coarse import CoarseModel, read_setting
 from topoloc.retrieval.network_config import BackboneName, PooledNetworkConfig
 from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
 
-# Deeper layers know more of things and less of places: the fifth and sixth of SqueezeNet's fire
+# Deeper layers describe objects more and places less. The fifth and sixth of SqueezeNet's fire
 # modules rank nodes best.
 DEPTHS: dict[BackboneName, int | None] = {
     "squeezenet1_1": 11,
@@ -27,7 +27,7 @@ DEPTHS: dict[BackboneName, int | None] = {
 
 
 class PooledFeatures(nn.Module):
-    """Feature maps pooled over a grid of cells by the generalised mean; unit vectors."""
+    """Pool feature maps over a grid of cells by the generalised mean, into unit vectors."""
 
     def __init__(
         self, backbone: BackboneName, depth: int | None, rows: int, columns: int, power: float
@@ -37,7 +37,7 @@ class PooledFeatures(nn.Module):
         self.rows, self.columns, self.power = rows, columns, power
 
     def forward(self, images: Tensor) -> Tensor:
-        """(n, channels * rows * columns) of normalised images (n, 3, h, w)."""
+        """Return unit vectors (n, channels * rows * columns) of normalised images (n, 3, h, w)."""
         maps = self.backbone(images).float().clamp(min=1e-4)
         pooled = nn.functional.adaptive_avg_pool2d(maps**self.power, (self.rows, self.columns)) ** (
             1.0 / self.power
@@ -46,7 +46,7 @@ class PooledFeatures(nn.Module):
 
 
 def open_model(model: CoarseModel) -> NetworkDescriptorLocalizer:
-    """The localizer of a stored model. Raises MapError, ConfigError."""
+    """Return the localizer of a stored model. Raises MapError and ConfigError."""
     config = read_setting(model, "config", PooledNetworkConfig)
     return NetworkDescriptorLocalizer(
         model,
@@ -56,6 +56,6 @@ def open_model(model: CoarseModel) -> NetworkDescriptorLocalizer:
 
 
 def create_pooled_network(backbone: BackboneName, config: PooledNetworkConfig) -> PooledFeatures:
-    """The network with random weights."""
+    """Return the network with random weights."""
     depth = config.depth if config.depth is not None else DEPTHS[backbone]
     return PooledFeatures(backbone, depth, config.grid_rows, config.grid_columns, config.power)

@@ -1,8 +1,7 @@
-"""Coarse localization: which node of the map is this image of?
+"""Define coarse localization: the selection of the map nodes that an image may show.
 
-Every coarse localizer answers the same question behind `CoarseLocalizer.rank`; what it has learnt
-travels in a `CoarseModel`, which the map file stores. Names are the paper's; `surf-vlad` needs
-neither weights nor torch.
+All coarse localizers implement `CoarseLocalizer.rank`. Their trained state is a `CoarseModel`,
+which the map file stores. Names are the paper's. `surf-vlad` needs neither weights nor torch.
 """
 
 from __future__ import annotations
@@ -28,10 +27,11 @@ Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True)
 class NodeScore:
-    """A candidate node; a higher score is a better one, comparable within one localizer only.
+    """Hold a candidate node and its score. Higher is better. Scores are comparable within one
+    localizer only.
 
-    `node_id` is the node's id in what is reported, and its row in the open map while a query is
-    answered (`CoarseLocalizer.rank`).
+    `node_id` is the node's id in results. Within a query it is the node's row in the open map
+    (`CoarseLocalizer.rank`).
     """
 
     node_id: int
@@ -40,8 +40,8 @@ class NodeScore:
 
 @dataclass(frozen=True, eq=False)
 class CoarseModel:
-    """A coarse localizer as the map keeps it: its settings and its arrays (vocabulary, vectors,
-    node of each vector ...)."""
+    """Hold a coarse localizer as stored in the map: its settings and its arrays (vocabulary,
+    vectors, node of each vector ...)."""
 
     name: str
     settings: Mapping[str, Any]
@@ -51,11 +51,11 @@ class CoarseModel:
 def model_array(
     model: CoarseModel, name: str, kinds: str, shape: tuple[int | None, ...]
 ) -> np.ndarray:
-    """An array of a stored model, of this shape (None: any length but 0) and of one of these kinds
-    of numbers (NumPy's letters).
+    """Return an array of a stored model after a check of its shape (None: any length but 0) and its
+    dtype kind (NumPy's letters).
 
     Raises:
-        MapError: it is missing, of another shape or type, or not finite.
+        MapError: the array is missing, not finite, or has another shape or type.
     """
     array = model.arrays.get(name)
     fits = array is not None and array.dtype.kind in kinds and array.ndim == len(shape)
@@ -81,44 +81,45 @@ def model_array(
 
 @runtime_checkable
 class CoarseLocalizer(Protocol):
-    """Names the nodes that an image may belong to."""
+    """Rank the nodes that an image may show."""
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """Up to `num_candidates` distinct nodes by their rows in the map, best first. `features`
-        are those of `image` that the fine step uses too."""
+        """Return up to `num_candidates` distinct nodes by their rows in the map, best first.
+        `features` are those of `image`, also used by the fine step."""
         ...
 
 
 @runtime_checkable
 class DescriptorLocalizer(CoarseLocalizer, Protocol):
-    """One that compares vectors of pictures."""
+    """Rank nodes by global descriptors of images."""
 
     def suppress_group_differences(
         self, group_of_node: Int[np.ndarray, " nodes"]
     ) -> CoarseLocalizer:
-        """The same with less of what sets groups of nodes, by their rows, apart on the whole."""
+        """Return a localizer with reduced differences between groups of nodes. `group_of_node` is
+        indexed by a node's row."""
         ...
 
 
 @runtime_checkable
 class ExtendableLocalizer(CoarseLocalizer, Protocol):
-    """One that learns a picture by its vector alone."""
+    """Rank nodes with a model to which images can be added without training."""
 
     def extend_with_images(
         self, images: Sequence[Image], node_ids: Int[np.ndarray, " n"]
     ) -> CoarseModel:
-        """The stored model with these pictures, each of the node with this id."""
+        """Return the stored model extended by these images, each with the id of its node."""
         ...
 
 
 def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
-    """The localizer of a stored model.
+    """Return the localizer of a stored model.
 
     Raises:
-        MapError: the model is damaged, or of a name that this version does not know.
-        MissingExtraError: it needs torch, which is not installed.
+        MapError: the model is damaged, or this version does not support it.
+        MissingExtraError: the model needs torch, which is not installed.
     """
-    name = model.name.partition("@")[0]  # behind it stands the kind of features that it ranks by
+    name = model.name.partition("@")[0]  # the feature type may follow
     if name not in COARSE_NAMES:
         raise MapError(
             f"the map's coarse localizer {model.name!r} is not known to this version (known:"
@@ -137,6 +138,6 @@ def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
 
 
 def read_setting(model: CoarseModel, name: str, of: Any) -> Any:
-    """A setting of a stored model, of this type, without the keys of other versions. Raises
-    ConfigError."""
+    """Return a setting of a stored model, converted to the type `of`. Unknown keys are ignored.
+    Raises ConfigError."""
     return parse_value(of, model.settings.get(name), name, is_strict=False)

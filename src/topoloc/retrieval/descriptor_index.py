@@ -1,5 +1,5 @@
-"""Place vectors: whitened (PCA, Jegou & Chum 2012), their nearest neighbours, and the nodes that
-these vote for."""
+"""Search whitened global descriptors (PCA, Jegou & Chum 2012) for nearest images, and rank the
+nodes of these images."""
 
 from __future__ import annotations
 
@@ -15,27 +15,26 @@ from jaxtyping import Float32, Int
 from topoloc.retrieval.coarse import NodeScore
 from topoloc.retrieval.descriptor_kernels import multiply_rows
 
-# Up to here every vector is compared, in 1 to 3 ms; beyond it an inverted file finds the same
-# neighbour nearly always.
+# Up to this number every vector is compared, in 1 to 3 ms. Beyond it an inverted file nearly always
+# finds the same neighbour.
 MAX_EXACT_VECTORS = 8_000
-# Then so many of the nearest are compared by more than their vectors.
+# With an inverted file, this many of the nearest images are compared by more than their vectors.
 NUM_RERANKED_IMAGES = 2_000
-# Of an inverted file: cells that a query looks into, images that its cells are learnt from, of
-# each.
+# Inverted file: cells searched per query, and training images per cell.
 NUM_PROBES, IMAGES_PER_CELL = 24, 48
-# The axes of this many images are those of all; beyond it only memory and time grow (200 MB and 7 s
-# with 2,000).
+# This many images determine the axes. More images only cost memory and time (200 MB and 7 s with
+# 2,000).
 MAX_WHITENING_IMAGES = 1_000
 
 
 class DescriptorIndex:
-    """Inner-product search over the unit vectors of the mapping images: exact, or by cells (FAISS's
-    inverted file) where they are many.
+    """Search the unit vectors of the mapping images by inner product: exactly, or with FAISS's
+    inverted file if there are many.
 
     Args:
-        vectors: (n, d) unit vectors, one a mapping image.
-        node_ids: (n,) the node of each.
-        max_exact: with more vectors than this the search is by cells.
+        vectors: (n, d) unit vectors, one per mapping image.
+        node_ids: (n,) the node of each image.
+        max_exact: maximum number of vectors for the exact search.
     """
 
     def __init__(
@@ -53,8 +52,8 @@ class DescriptorIndex:
         )
 
     def rank_nodes(self, vector: Float32[np.ndarray, " d"], num_candidates: int) -> list[NodeScore]:
-        """The nodes of the nearest images, each once, with the similarity of its best image; of
-        equal ones the earlier image's."""
+        """Return the distinct nodes of the nearest images with the similarity of their best image.
+        Of equal images the earlier one counts."""
         if self._vectors is not None:
             return self.rank_images(*self.nearest(vector), num_candidates)
         num_images = 16 * num_candidates
@@ -63,15 +62,15 @@ class DescriptorIndex:
             ranking = self._best_image_per_node(rows, similarities, num_candidates)
             if (
                 len(ranking) == num_candidates or len(rows) < num_images
-            ):  # enough, or no more in the cells looked into
+            ):  # enough nodes, or no more images in the searched cells
                 return ranking
             num_images *= 8
 
     def nearest(
         self, vector: Float32[np.ndarray, " d"]
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        """All images with their similarities to a vector; where these are many, only the
-        nearest."""
+        """Return all images and their similarities to a vector. With an inverted file, only the
+        nearest images are returned."""
         if self._vectors is None:
             return self._search_inverted_file(vector, NUM_RERANKED_IMAGES)
         similarities = np.empty(len(self._vectors), np.float32)
@@ -84,7 +83,7 @@ class DescriptorIndex:
         similarities: Float32[np.ndarray, " k"],
         num_candidates: int,
     ) -> list[NodeScore]:
-        """The nodes of the most similar of these images, as `rank_nodes`."""
+        """Return the nodes of the most similar of these images, as in `rank_nodes`."""
         order = np.argsort(-similarities, kind="stable")
         return self._best_image_per_node(images[order], similarities[order], num_candidates)
 
@@ -110,8 +109,8 @@ class DescriptorIndex:
 
 
 def _build_inverted_file(vectors: Float32[np.ndarray, "n d"]) -> Any:
-    """Cells about the k-means centres of some of the vectors; the vectors in them as half floats,
-    half a kilobyte at 256 dimensions."""
+    """Build an inverted file with k-means centres of some of the vectors. Vectors are stored as
+    half floats, half a kilobyte each at 256 dimensions."""
     num_cells = max(1, min(round(math.sqrt(len(vectors))), len(vectors) // 40))
     dimension = vectors.shape[1]
     index = faiss.IndexIVFScalarQuantizer(
@@ -131,13 +130,13 @@ def _build_inverted_file(vectors: Float32[np.ndarray, "n d"]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """``projection @ (vector - mean)``, then brought to unit length."""
+    """Compute ``projection @ (vector - mean)``, scaled to unit length."""
 
     mean: Float32[np.ndarray, " d"]
     projection: Float32[np.ndarray, "p d"]
 
     def apply(self, raw: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n p"]:
-        """Unit vectors."""
+        """Return the whitened unit vectors."""
         projected = (raw - self.mean) @ self.projection.T
         return np.ascontiguousarray(
             projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6),
@@ -148,10 +147,11 @@ class Whitening:
 def learn_whitening(
     raw: Float32[np.ndarray, "n d"] | Sequence[Float32[np.ndarray, " d"]], dimension: int
 ) -> Whitening:
-    """Mean and projection to at most `dimension` whitened components, from unit vectors of images.
+    """Return the mean and the projection to at most `dimension` whitened components, from unit
+    vectors of images.
 
-    The variances are softened by the mean one, since the trailing components of few images are
-    noise, which plain whitening would blow up.
+    The mean variance is added to each variance. The trailing components of few images are noise,
+    which plain whitening would amplify.
     """
     rows = np.unique(np.linspace(0, len(raw) - 1, MAX_WHITENING_IMAGES).astype(int)).tolist()
     centred = np.stack([raw[k] for k in rows])
@@ -159,11 +159,11 @@ def learn_whitening(
     centred -= mean
     by_image = (
         len(centred) < centred.shape[1]
-    )  # whichever is smaller: the products of images, or those of dimensions
+    )  # use the smaller matrix: products of images or products of dimensions
     products = centred @ centred.T if by_image else centred.T @ centred
     eigenvalues, vectors = np.linalg.eigh(products)
     order = np.argsort(-eigenvalues, kind="stable")[:dimension]
-    # Vectors are of unit length: below a millionth of that is rounding.
+    # Vectors have unit length, so values below a millionth of it are rounding.
     keep = order[eigenvalues[order] > 1e-6 * max(float(eigenvalues.max()), len(centred) * 1e-6)]
     if len(keep) == 0:  # one image, or all alike
         direction = mean / max(float(np.linalg.norm(mean)), 1e-6)
@@ -180,13 +180,14 @@ def learn_whitening(
 def learn_visual_words(
     descriptors: Float32[np.ndarray, "n d"], num_words: int, seed: int
 ) -> Float32[np.ndarray, "k d"]:
-    """The k-means centres of descriptors, fewer where there are few of them."""
+    """Return the k-means centres of descriptors, fewer than `num_words` if there are few
+    descriptors."""
     num_words = max(1, min(num_words, len(descriptors) // 40))
     kmeans = faiss.Kmeans(
         descriptors.shape[1], num_words, niter=20, seed=seed + 1, min_points_per_centroid=1
     )
-    # A tenth of a second for one thread; several wait for each other by spinning, at two hundred
-    # places, for longer than that.
+    # One thread needs a tenth of a second. Several threads wait for each other in busy loops, at
+    # two hundred places, which takes longer.
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)
     try:

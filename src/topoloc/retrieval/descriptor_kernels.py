@@ -1,7 +1,8 @@
-"""Numba kernels of place vectors: sums of residuals, and products of stored rows with one vector.
+"""Implement the Numba kernels of global descriptors: sums of residuals, and products of stored rows
+with one vector.
 
-BLAS and FAISS would start threads for these products, which take a fraction of a millisecond:
-waking them costs more than they save, and on a busy machine many times more.
+BLAS and FAISS would start threads for these products, which take a fraction of a millisecond.
+Waking the threads costs more than they save, and many times more on a busy machine.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def _dot(a, b):
 
 @kernel(error_model="numpy", fastmath=_FAST_MATH)
 def add_residuals(descriptors, words, half_squares, sums):
-    """Add each descriptor's unit residual from its nearest word to that word's row of `sums`;
+    """Add each descriptor's unit residual from its nearest word to that word's row of `sums`.
     half_squares = |word|^2 / 2."""
     residual = np.empty(words.shape[1], np.float32)
     for n in range(len(descriptors)):
@@ -32,7 +33,7 @@ def add_residuals(descriptors, words, half_squares, sums):
         for k in range(len(words)):
             score = (
                 _dot(descriptor, words[k]) - half_squares[k]
-            )  # of |d - w|^2, all that differs from word to word
+            )  # the part of |d - w|^2 that depends on the word
             if score > best:
                 nearest, best = k, score
         word, total = words[nearest], sums[nearest]
@@ -45,16 +46,18 @@ def add_residuals(descriptors, words, half_squares, sums):
 
 @kernel(error_model="numpy", fastmath=_FAST_MATH)
 def multiply_rows(rows, vector, products):
-    """products[k] = rows[k] . vector."""
+    """Compute products[k] = rows[k] . vector."""
     for k in range(len(rows)):
         products[k] = _dot(rows[k], vector)
 
 
 @kernel(error_model="numpy", fastmath=_FAST_MATH)
 def max_shifted_products(rows, chosen, vector, column, max_shift, products):
-    """products[k] = the best of rows[chosen[k]] . vector over shifts by up to `max_shift` columns
-    (of `column` numbers each) either way, of the columns that both have, divided by their
-    number."""
+    """Compute products[k], the maximum of rows[chosen[k]] . vector over shifts by up to `max_shift`
+    columns of `column` numbers in both directions.
+
+    Only columns present in both are multiplied, and the product is divided by their number.
+    """
     length = len(vector)
     for k in range(len(chosen)):
         best, row = np.float32(-np.inf), rows[chosen[k]]

@@ -1,8 +1,8 @@
-"""EfficientNet-lite0 (Tan & Le 2019, the variant without squeeze and excitation): the layers of a
-backbone, in PyTorch.
+"""Define the layers of EfficientNet-lite0 (Tan & Le 2019, the variant without squeeze and
+excitation), in PyTorch.
 
-Batch normalisation is worked into the convolutions, as it is when such a network answers: what is
-read of published weights are these.
+Batch normalisation is folded into the convolutions, as in inference. The weights are read in this
+form.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch.nn.functional import pad, relu6
 
 NUM_CHANNELS = 1280
 _STEM, _EXPANSION = 32, 6
-# Of each stage: blocks, kernel, stride of the first block, channels.
+# For each stage: blocks, kernel, stride of the first block, channels.
 _STAGES = (
     (1, 3, 1, 16),
     (2, 3, 2, 24),
@@ -23,13 +23,14 @@ _STAGES = (
     (4, 5, 2, 192),
     (1, 3, 1, 320),
 )
-# Its pictures are (RGB bytes - 127) / 128; ours come normalised by ImageNet's mean and deviation.
+# The network's input is (RGB bytes - 127) / 128. Here images are normalised by ImageNet's mean and
+# deviation.
 _MEAN, _DEVIATION = 127.0, 128.0
 
 
 def efficientnet_features(mean: tuple[float, ...], deviation: tuple[float, ...]) -> nn.Sequential:
-    """The stem, 16 blocks, and the last convolution. `mean` and `deviation` (RGB in [0, 1]) are
-    what pictures are normalised by."""
+    """Return the stem, 16 blocks and the last convolution. The input images are normalised by
+    `mean` and `deviation` (RGB in [0, 1])."""
     layers: list[nn.Module] = [_Stem(mean, deviation)]
     num_channels = _STEM
     for num_blocks, kernel, stride, width in _STAGES:
@@ -50,10 +51,10 @@ def efficientnet_features(mean: tuple[float, ...], deviation: tuple[float, ...])
 
 
 class SameConv(nn.Conv2d):
-    """A convolution padded as TensorFlow does: of an odd number of pixels the larger half comes
-    after."""
+    """Convolve with TensorFlow's padding: if the padding is odd, the larger half comes after."""
 
     def forward(self, input: Tensor) -> Tensor:
+        """Return the convolution of the padded input."""
         sizes = zip(input.shape[-2:], self.kernel_size, self.stride, strict=True)
         missing = [
             max((-(-length // stride) - 1) * stride + kernel - length, 0)
@@ -81,8 +82,8 @@ class _Stem(nn.Module):
 
 
 class _Block(nn.Module):
-    """Channels spread, each filtered by itself, and drawn together; beside it what came in, where
-    both are of one shape."""
+    """Expand the channels, filter each one separately, and project them. The input is added if it
+    has the shape of the output."""
 
     def __init__(
         self, num_inputs: int, num_outputs: int, kernel: int, stride: int, expansion: int

@@ -1,9 +1,8 @@
-"""Running a trained network on single pictures and on batches, in the way that this machine's
-processor does fastest.
+"""Run a trained network on single images and on batches, in the fastest way for this processor.
 
-What that is was measured (docs/journal/retrieval.md): bfloat16 where the processor multiplies it in hardware,
-else single precision with the network frozen into TorchScript, whose fused calls save a third of a
-small network's time.
+If the processor multiplies bfloat16 in hardware, bfloat16 is used. Otherwise single precision is
+used, and a network for single images is frozen into TorchScript. Its fused calls save a third of a
+small network's time (docs/journal/retrieval.md).
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ BATCH_SIZE = 16
 
 
 def has_bfloat16() -> bool:
-    """Whether the processor multiplies bfloat16 in hardware (AVX512-BF16, AMX); elsewhere it is
-    emulated, many times slower."""
+    """Return whether the processor multiplies bfloat16 in hardware (AVX512-BF16, AMX). Emulation is
+    many times slower."""
     cpu = torch.cpu
     checks = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     return any(bool(getattr(cpu, name)()) for name in checks if hasattr(cpu, name))
 
 
 class Predictor:
-    """A network ready to answer: pictures in, rows of numbers out.
+    """Run a network: images in, rows of numbers out.
 
     Args:
-        network: takes normalised images (n, 3, h, w), gives (n, d).
+        network: maps normalised images (n, 3, h, w) to (n, d).
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -47,7 +46,7 @@ class Predictor:
         self._freeze_lock = threading.Lock()
 
     def __call__(self, rgb_images: RgbImages) -> Float32[np.ndarray, "n d"]:
-        """One row of outputs for each picture, whatever their number."""
+        """Return one row of outputs per image, for any number of images."""
         rows = []
         with torch.inference_mode():
             for start in range(0, len(rgb_images), BATCH_SIZE):
@@ -61,11 +60,11 @@ class Predictor:
         return np.concatenate(rows)
 
     def _predict_single(self, image: Tensor) -> Tensor:
-        """One picture through the frozen network, which is made at the first call: in small
-        networks calls cost as much as arithmetic."""
+        """Run the frozen network on one image. The first call freezes it. In small networks calls
+        cost as much as arithmetic."""
         shape = tuple(image.shape)
-        # By default one: the last digits follow from the number, and on a busy machine several wait
-        # for one another many times as long.
+        # The default is one thread: the last digits depend on the number, and on a busy machine
+        # several threads wait for each other many times as long.
         with threads(num_threads(1)):
             with self._freeze_lock:
                 if shape not in self._frozen:
@@ -74,12 +73,12 @@ class Predictor:
 
 
 class _ThreadLimit:
-    """`with threads(number)`: this many threads for PyTorch's operations; afterwards as many as
-    before.
+    """Limit the threads of PyTorch's operations within `with threads(number)`, and restore the
+    number afterwards.
 
-    PyTorch has one number for the process and one for each thread of Python. Several of these may
-    be in here at once: what each leaves is the process's number from before the first came, not the
-    one that another thread has set meanwhile.
+    PyTorch has one number for the process and one for each Python thread. Several Python threads
+    may use the context at once. Each one restores the process's number from before the first
+    entered, not a number that another thread has set meanwhile.
     """
 
     def __init__(self) -> None:
@@ -90,8 +89,7 @@ class _ThreadLimit:
     def __call__(self, number: int) -> Iterator[None]:
         outer: int | None = getattr(self._thread_local, "number", None)
         with self._lock:
-            # always asked: it makes a new thread take the process's number, which would else happen
-            # later
+            # always called: it makes a new thread take the process's number now and not later
             own = torch.get_num_threads()
             if self._num_users == 0:
                 self._process_threads = own
@@ -111,9 +109,9 @@ threads = _ThreadLimit()
 
 
 def _freeze(network: nn.Module, image: Tensor) -> torch.jit.ScriptModule:
-    """The network for images of this shape, ready."""
+    """Return the network frozen and compiled for images of this shape."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # TorchScript calls itself outdated at every use
+        warnings.simplefilter("ignore")  # TorchScript warns at every use that it is deprecated
         frozen = torch.jit.freeze(torch.jit.trace(network, image))
     for _ in range(2):  # these compile
         frozen(image)
@@ -121,8 +119,8 @@ def _freeze(network: nn.Module, image: Tensor) -> torch.jit.ScriptModule:
 
 
 def to_channels_last(network: nn.Module) -> nn.Module:
-    """The same network with its convolutions' weights laid out as they are fastest: channels
-    last."""
+    """Change the memory layout of the convolutions' weights to channels last, the fastest one. The
+    network is changed in place and returned."""
     for value in network.state_dict(keep_vars=True).values():
         if value.ndim == 4:
             value.data = value.data.contiguous(memory_format=torch.channels_last)
@@ -130,11 +128,11 @@ def to_channels_last(network: nn.Module) -> nn.Module:
 
 
 def load_network_weights(network: nn.Module, arrays: Mapping[str, np.ndarray]) -> nn.Module:
-    """Puts the weights that a map keeps, half floats under names that begin with ``network.``, into
-    `network`.
+    """Load the weights stored in a map into `network`. They are half floats under names that begin
+    with ``network.``.
 
     Raises:
-        KeyError, RuntimeError: they do not fit.
+        KeyError, RuntimeError: the weights do not fit the network.
     """
     state = {
         name.removeprefix("network."): torch.from_numpy(value)

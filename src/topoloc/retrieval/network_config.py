@@ -1,5 +1,5 @@
-"""What a map says of the networks of its learned coarse localizers. It stands apart from them so
-that reading it needs no torch."""
+"""Define the settings that a map stores for the networks of its learned coarse localizers. This
+module needs no torch."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ BackboneName = Literal["squeezenet1_1", "vgg11", "vgg16", "efficientnet_lite0", 
 
 @dataclass(frozen=True)
 class NetworkInputConfig:
-    """How a picture is brought to the network: cut to the mapping pictures' shape, reduced, and
-    stretched to one size."""
+    """Hold the size of the network's input. An image is cropped to the aspect ratio of the mapping
+    images, reduced, and stretched to this size."""
 
     width_px: Annotated[int, Between(32, 2048)] = 224
-    """Width that the network sees."""
+    """Width of the network's input."""
     height_px: Annotated[int, Between(32, 2048)] = 168
-    """Height that the network sees."""
+    """Height of the network's input."""
 
 
 @dataclass(frozen=True)
 class ClassifierNetworkConfig:
-    """The network of cnn-fc."""
+    """Hold the settings of cnn-fc's network."""
 
     picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
 
 
 @dataclass(frozen=True)
 class PooledNetworkConfig:
-    """The network of cnn-nn: features of a pretrained one, pooled."""
+    """Hold the settings of cnn-nn's network: pooled features of a pretrained network."""
 
     picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
     depth: Annotated[int | None, Between(1, 100)] = None
-    """Layers of the backbone's `features` that are used (None: what measured best for each
-    backbone)."""
+    """Number of layers of the backbone's `features` that are used (None: the best measured number
+    for each backbone)."""
     grid_rows: Annotated[int, Between(1, 32)] = 2
-    """Features are pooled in cells, since neighbouring nodes see the same things at other places of
-    the picture."""
+    """Rows of pooling cells. Cells help because neighbouring nodes see the same objects at other
+    image positions."""
     grid_columns: Annotated[int, Between(1, 32)] = 3
-    """The same, across."""
+    """Columns of pooling cells."""
     power: Annotated[float, Between(1, 100)] = 3.0
     """Exponent of the generalised mean (Radenovic et al. 2018): 1 is the mean, infinity the
     maximum."""
@@ -49,9 +49,9 @@ class PooledNetworkConfig:
 
 @dataclass(frozen=True)
 class VladNetworkConfig:
-    """The network of vlad-nn: NetVLAD of a network's features."""
+    """Hold the settings of vlad-nn's network: NetVLAD of a network's features."""
 
     picture: NetworkInputConfig = field(default_factory=NetworkInputConfig)
     depth: Annotated[int | None, Between(1, 100)] = None
-    """Layers of the backbone's `features` that are used (None: what measured best for each
-    backbone)."""
+    """Number of layers of the backbone's `features` that are used (None: the best measured number
+    for each backbone)."""

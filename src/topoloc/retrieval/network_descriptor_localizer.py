@@ -1,5 +1,5 @@
-"""cnn-nn and vlad-nn as they answer: a network turns a picture into a vector; the nodes of the
-nearest mapping images answer."""
+"""Run cnn-nn and vlad-nn: a network computes a global descriptor, and the nodes of the nearest
+mapping images are ranked."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from topoloc.retrieval.inference import Predictor, load_network_weights
 from topoloc.retrieval.network_config import NetworkInputConfig
 from topoloc.retrieval.network_images import ImageShape, prepare_network_images
 
-_CHUNK = 64  # pictures that go through the network together
+_CHUNK = 64  # images that pass through the network together
 
 
 class NetworkDescriptorLocalizer:
-    """The coarse localizers `cnn-nn` and `vlad-nn`.
+    """Implement the coarse localizers `cnn-nn` and `vlad-nn`.
 
     Raises:
-        MapError: the model's arrays do not belong together.
+        MapError: the model's arrays are inconsistent.
     """
 
     def __init__(
@@ -54,27 +54,33 @@ class NetworkDescriptorLocalizer:
         )
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """See `CoarseLocalizer.rank`; scores are cosines. The local features are not looked at."""
+        """Rank nodes as in `CoarseLocalizer.rank`. Scores are cosines. The local features are not
+        used."""
         return self._index.rank_nodes(self.vectors([image])[0], num_candidates)
 
     def rank_batch(self, images: Sequence[Image], num_candidates: int) -> list[list[NodeScore]]:
-        """`rank` of many images, which go through the network together."""
+        """Rank nodes for many images, which pass through the network together."""
         return [self._index.rank_nodes(vector, num_candidates) for vector in self.vectors(images)]
 
     def extend_with_images(
         self, images: Sequence[Image], node_ids: Int[np.ndarray, " n"]
     ) -> CoarseModel:
-        """See `ExtendableLocalizer`: their vectors join, under the whitening that is there."""
+        """Return the model extended by the descriptors of these images (see `ExtendableLocalizer`).
+        The whitening is unchanged."""
         known = self._model.arrays
         parts = [self.vectors(images[k : k + _CHUNK]) for k in range(0, len(images), _CHUNK)]
         vectors = np.concatenate(
             [known["vectors"], *(part.astype(known["vectors"].dtype) for part in parts)]
         )
-        of_nodes = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
-        return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": of_nodes})
+        all_node_ids = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
+        return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": all_node_ids})
 
     def vectors(self, images: Sequence[Image]) -> Float32[np.ndarray, "n d"]:
-        """The images' unit vectors."""
+        """Return the unit vectors of the images.
+
+        Raises:
+            MapError: the whitening does not fit the network.
+        """
         raw = self._predict(prepare_network_images(images, self._shape, self._input_config))
         if raw.shape[1] != len(self._whitening.mean):
             raise MapError(

@@ -1,4 +1,4 @@
-"""Pictures as the networks of learned coarse localizers take them."""
+"""Convert images to the input of the learned coarse localizers' networks."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ RgbImages = UInt8[np.ndarray, "_ _ _ 3"]
 
 @dataclass(frozen=True)
 class ImageShape:
-    """The mapping pictures' size: queries are cut and reduced to it before they are stretched to
-    the network's."""
+    """Hold the size of the mapping images. Queries are cropped and reduced to it before they are
+    stretched to the network's size."""
 
     width: int
     height: int
 
     def fit(self, image: Image) -> RgbImage:
-        """The middle of the image in this shape, reduced to this size where it is larger;
-        colour."""
+        """Return the centre of the image in this aspect ratio, in colour. It is reduced to this
+        size if it is larger."""
         height, width = image.shape[:2]
         scale = min(width / self.width, height / self.height)
         rows, columns = max(1, round(self.height * scale)), max(1, round(self.width * scale))
@@ -39,7 +39,7 @@ class ImageShape:
 
 
 def decode_stored_image(jpeg: bytes) -> RgbImage:
-    """A stored picture in colour. Raises MapError where it is damaged."""
+    """Return a stored image in colour. Raises MapError if it is damaged."""
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise MapError("the map is damaged: a mapping image is no picture")
@@ -49,8 +49,8 @@ def decode_stored_image(jpeg: bytes) -> RgbImage:
 def prepare_network_images(
     images: Sequence[Image], shape: ImageShape, config: NetworkInputConfig
 ) -> RgbImages:
-    """Images as a network takes them: all in the mapping pictures' shape, stretched to the
-    network's size."""
+    """Return images as network input: cropped to the shape of the mapping images and stretched to
+    the network's size."""
     size = (config.width_px, config.height_px)
     return np.stack([_resize_image(shape.fit(image), size) for image in images])
 

@@ -1,12 +1,14 @@
-"""Place vectors that are comparable between maps: one vocabulary and one whitening for each kind of
-features, shipped.
+"""Compute global descriptors that are comparable between maps, with one shipped vocabulary and
+whitening per feature type.
 
-A map's own `surf-vlad` is sharper inside of it, but its words and axes are its own. These were
-learned once, over recordings of many places (`topoloc_training.shared_vocabulary` in `training/`
-makes them; each file says of what, when and how), so that vectors of tiles that never met can be
-ranked together. The vector itself is `vlad.py`'s: VLAD of local features with their places in the
-picture behind them, whitened. A vocabulary's `version` goes with each vector that is kept: vectors
-of another version are not compared.
+A map's own `surf-vlad` is more precise within the map, but its words and axes are its own. The
+shared ones were learned once over recordings of many places, so that the vectors of separate tiles
+can be ranked together. `topoloc_training.shared_vocabulary` in `training/` learns them, and each
+file documents its data.
+
+The vector is that of `vlad.py`: whitened VLAD of local features with their image positions
+appended. The `version` of a vocabulary is stored with each vector. Vectors of different versions
+are not compared.
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ _FOLDER = "vocabularies"
 
 @dataclass(frozen=True, eq=False)
 class SharedVocabulary:
-    """Words (with the features' weighted places behind them) and whitening of one kind of features;
-    `about` says where they come from."""
+    """Hold the words (with weighted positions appended) and the whitening of one feature type.
+    `about` documents their origin."""
 
     kind: str
     words: Float32[np.ndarray, "k d"]
@@ -41,30 +43,30 @@ class SharedVocabulary:
 
     @property
     def dimension(self) -> int:
-        """Length of a place vector."""
+        """Return the length of a global descriptor."""
         return len(self.whitening.projection)
 
     @cached_property
     def version(self) -> str:
-        """What tells these words and axes from all others, 12 hexadecimal digits."""
+        """Return an identifier of the words and axes, 12 hexadecimal digits."""
         parts = (self.words, self.whitening.mean, self.whitening.projection)
         return blake2b(b"".join(part.tobytes() for part in parts), digest_size=6).hexdigest()
 
     def raw_descriptor(
         self, features: Features, width: int, height: int
     ) -> Float32[np.ndarray, " kd"]:
-        """VLAD of the features of a picture of that size (pixels), before whitening."""
+        """Return the VLAD of the features of an image of that size (pixels), before whitening."""
         return vlad(append_positions(features, width, height, self.config), self.words)
 
     def global_descriptor(
         self, features: Features, width: int, height: int
     ) -> Float32[np.ndarray, " p"]:
-        """The place vector of a picture of that size (pixels): of unit length, the inner product of
-        two is their likeness."""
+        """Return the global descriptor of an image of that size (pixels). It has unit length, and
+        the inner product of two is their similarity."""
         return self.whitening.apply(self.raw_descriptor(features, width, height)[None])[0]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """What the file keeps, half floats."""
+        """Return the arrays stored in the file, as half floats."""
         arrays = {
             "words": self.words,
             "mean": self.whitening.mean,
@@ -80,7 +82,7 @@ class SharedVocabulary:
 
 @cache
 def shared_vocabulary(kind: str) -> SharedVocabulary | None:
-    """That of a kind of features; None where none was learned for it."""
+    """Return the vocabulary of a feature type, or None if there is none."""
     path = resources.files("topoloc.retrieval").joinpath(_FOLDER, f"{kind}.npz")
     if not path.is_file():
         return None

@@ -1,12 +1,13 @@
-"""surf-vlad: VLAD of the map's own local features (Jegou et al. 2010), no weights, no torch.
+"""Rank nodes by VLAD of the map's own local features (Jegou et al. 2010), without weights or torch:
+surf-vlad.
 
-The vocabulary is learnt from the map's descriptors, each with its place in the picture behind it
-(Koniusz et al. 2013, spatial coordinate coding): neighbouring nodes see the same things, but
-elsewhere, and so do places that repeat their doors and lamps. Residuals are normalised one by one
-(Delhumeau et al. 2013), each word's sum is normalised on its own (Arandjelovic & Zisserman 2013),
-and the whole is whitened by the PCA of the mapping images where there are enough of them to learn
-it from. Where the features come from a network that also says what it saw in each cell of the
-picture, that has half of the say (`cell_grid.py`).
+The vocabulary is learned from the map's descriptors, each with its image position appended (Koniusz
+et al. 2013, spatial coordinate coding). Neighbouring nodes see the same objects at other positions,
+and so do similar places with repeated doors and lamps.
+
+Residuals are normalised one by one (Delhumeau et al. 2013). Each word's sum is normalised
+separately (Arandjelovic & Zisserman 2013). The vector is whitened by the PCA of the mapping images.
+If the features have image cells, the cells contribute half of the score (`cell_grid.py`).
 """
 
 from __future__ import annotations
@@ -27,31 +28,31 @@ from topoloc.retrieval.descriptor_index import DescriptorIndex, learn_visual_wor
 from topoloc.retrieval.descriptor_kernels import add_residuals, multiply_rows
 
 _BLOCK = 1024  # vectors whitened at a time
-_MIN_GROUP_SIZE = 8  # images whose mean vector says something of them all
-# of what sets groups apart; all of it costs more where every group covers the whole place
-# (docs/journal/retrieval.md)
+_MIN_GROUP_SIZE = 8  # minimum number of images for a meaningful mean vector
+# Fraction of the group differences that is removed. Removing all costs more if every group covers
+# the whole place (docs/journal/retrieval.md).
 _SUPPRESSED_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class VladConfig:
-    """Settings of surf-vlad."""
+    """Hold the settings of surf-vlad."""
 
     num_words: Annotated[int, Between(1, 65_536)] = 64
     """Visual words of the vocabulary."""
     position_weight: Annotated[float | None, AtLeast(0)] = None
-    """How far two descriptors (of length 1) are apart for lying at opposite borders of the picture;
-    0 leaves their places out. Unset: what suits the kind of features."""
+    """Distance that opposite image borders add between two descriptors (of length 1). 0 ignores
+    positions. Unset: the default of the feature type."""
     dimension: Annotated[int, Between(1, 65_536)] = 128
-    """Length of a place vector after PCA, at most."""
+    """Maximum length of a global descriptor after PCA."""
     max_training_descriptors: Annotated[int, AtLeast(1)] = 100_000
-    """Descriptors that the vocabulary is learnt from, at most."""
+    """Maximum number of descriptors from which the vocabulary is learned."""
     seed: Annotated[int, Between(0, 1_000_000_000)] = 0
-    """Of the vocabulary."""
+    """Seed of the vocabulary."""
 
 
 class SurfVlad:
-    """The coarse localizer `surf-vlad`."""
+    """Implement the coarse localizer `surf-vlad`."""
 
     name = "surf-vlad"
 
@@ -78,9 +79,14 @@ class SurfVlad:
         config: VladConfig,
         cells: Sequence[Float32[np.ndarray, "rows columns c"] | None] = (),
     ) -> SurfVlad:
-        """From the vocabulary (`learn_words`), the `vlad` of each mapping image's
-        `append_positions` features, the node it belongs to and its cells, where the kind of
-        features has them."""
+        """Create the localizer from the mapping images.
+
+        Args:
+            words: vocabulary, from `learn_words`.
+            vlads: `vlad` of each mapping image's `append_positions` features.
+            node_ids: node of each mapping image.
+            cells: cells of each mapping image, or None if the feature type has none.
+        """
         whitening, known = (
             learn_whitening(vlads, config.dimension),
             [one for one in cells if one is not None],
@@ -95,7 +101,7 @@ class SurfVlad:
         )
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
-        """See `CoarseLocalizer.rank`; of the picture itself only the size is looked at. Features
+        """Rank nodes as in `CoarseLocalizer.rank`. Only the size of the image is used. Features
         without cells are ranked by VLAD alone."""
         height, width = image.shape[:2]
         vector = self._global_descriptor(features, width, height)
@@ -127,12 +133,12 @@ class SurfVlad:
         images_with_features: Sequence[tuple[Features, int, int]],
         node_ids: Int[np.ndarray, " m"],
     ) -> SurfVlad:
-        """With further mapping images, by the vocabulary and the whitening that are there.
+        """Return the localizer extended by further mapping images. Vocabulary and whitening are
+        unchanged. If any of these images has no cells, the result ranks by VLAD alone.
 
         Args:
-            pictures: of each its features, width and height (pixels); where the others have cells,
-                these must, too.
-            node_ids: the node that each belongs to.
+            images_with_features: features, width and height (pixels) of each image.
+            node_ids: node of each image.
         """
         vectors = np.stack(
             [self._global_descriptor(*image_features) for image_features in images_with_features]
@@ -157,15 +163,15 @@ class SurfVlad:
         )
 
     def suppress_group_differences(self, group_of_node: Int[np.ndarray, " nodes"]) -> SurfVlad:
-        """The same with less of what sets groups of nodes apart on the whole, such as the light in
-        which they were taken: all vectors are halved along the directions between the mean vectors
-        of the groups' images.
+        """Return a localizer with reduced differences between groups of nodes, such as the light of
+        their recordings.
 
-        A picture would else be like all pictures of its light before it is like any of its place.
-        Groups of fewer than eight images say nothing sure of theirs.
+        All vectors are halved along the directions between the mean vectors of the groups' images.
+        Otherwise a query would resemble all images in its light more than images of its place.
+        Groups of fewer than eight images are ignored, because their mean is too uncertain.
 
         Args:
-            group_of_node: the group of each node that `node_ids` may name.
+            group_of_node: the group of each node, indexed by the numbers in `node_ids`.
         """
         groups = group_of_node[self._node_ids]
         numbers, counts = np.unique(groups, return_counts=True)
@@ -189,8 +195,8 @@ class SurfVlad:
         )
 
     def to_model(self) -> CoarseModel:
-        """What the map file keeps: vectors as half floats, a quarter of a kilobyte to half of one
-        an image."""
+        """Return the model stored in the map file. Vectors are half floats of a quarter to half a
+        kilobyte per image."""
         arrays = {
             "words": self._words,
             "mean": self._mean,
@@ -208,8 +214,8 @@ class SurfVlad:
 
     @staticmethod
     def from_model(model: CoarseModel) -> SurfVlad:
-        """The inverse of `to_model`. Raises MapError where the arrays do not belong together, for
-        kernels trust them, and ConfigError."""
+        """Create the localizer from `to_model`. Raises MapError if the arrays are inconsistent,
+        because the kernels do not check them, and ConfigError."""
         config = parse_settings(VladConfig, {"position_weight": 0.0, **model.settings}, "settings")
         words = model_array(model, "words", "f", (None, None)).astype(np.float32, copy=False)
         projection = model_array(model, "projection", "f", (None, words.size)).astype(np.float32)
@@ -233,18 +239,18 @@ open_model = SurfVlad.from_model
 def append_positions(
     features: Features, width: int, height: int, config: VladConfig
 ) -> Float32[np.ndarray, "n d"]:
-    """Descriptors with their places in a picture of that size behind them; as they are where places
-    do not count."""
+    """Return descriptors with their positions in an image of that size appended. With a position
+    weight of 0 descriptors are unchanged."""
     if not config.position_weight:
         return features.descriptors
-    places = (features.points_img + 0.5) / np.array([width, height], np.float32) - 0.5
-    return np.hstack([features.descriptors, config.position_weight * places]).astype(np.float32)
+    positions = (features.points_img + 0.5) / np.array([width, height], np.float32) - 0.5
+    return np.hstack([features.descriptors, config.position_weight * positions]).astype(np.float32)
 
 
 def vlad(
     descriptors: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "k d"]
 ) -> Float32[np.ndarray, " kd"]:
-    """VLAD of descriptors over `words`; zero for an image without features."""
+    """Return the VLAD of descriptors over `words`, zero for an image without features."""
     sums = np.zeros(words.shape, np.float32)
     half_squares = 0.5 * np.sum(words**2, axis=1)
     add_residuals(
@@ -258,19 +264,19 @@ def vlad(
 def learn_words(
     descriptors: Float32[np.ndarray, "n d"], config: VladConfig
 ) -> Float32[np.ndarray, "k d"]:
-    """The visual words: k-means centres of the map's descriptors, fewer where there are few of
-    them."""
+    """Return the visual words: k-means centres of the map's descriptors, fewer if there are few
+    descriptors."""
     return learn_words_from_parts([len(descriptors)], lambda _: descriptors, config)
 
 
 def learn_words_from_parts(
     num_rows: Sequence[int], part: Callable[[int], Float32[np.ndarray, "_ d"]], config: VladConfig
 ) -> Float32[np.ndarray, "k d"]:
-    """As `learn_words` of many parts one after the other, of which one at a time is in memory.
+    """Learn the words of `learn_words` from several parts, with one part in memory at a time.
 
     Args:
-        num_rows: how many descriptors each part has.
-        part: a part by its number.
+        num_rows: number of descriptors in each part.
+        part: function that returns a part by its number.
     """
     ends = np.cumsum(num_rows)
     chosen, total = np.arange(ends[-1]), int(ends[-1])
@@ -280,10 +286,10 @@ def learn_words_from_parts(
                 total, config.max_training_descriptors, replace=False
             )
         )
-    of_parts = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
+    rows_by_part = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
     rows = [
         part(k)[rows - (ends[k] - num_rows[k])]
-        for k, rows in enumerate(of_parts)
+        for k, rows in enumerate(rows_by_part)
         if len(rows) or k == 0
     ]
     return learn_visual_words(np.concatenate(rows), config.num_words, config.seed)

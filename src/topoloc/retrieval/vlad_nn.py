@@ -1,8 +1,9 @@
-"""vlad-nn: NetVLAD of a network's feature maps, whitened; the nodes of the nearest mapping images.
+"""Rank nodes by the nearest mapping images under whitened NetVLAD of a network's feature maps:
+vlad-nn.
 
-The paper's third classifier (section III-B). The vocabulary comes with the weights where these are
-a NetVLAD checkpoint, else it is learnt from the map's own images, as NetVLAD begins its training;
-it can be tuned to the place by the triplet loss.
+This is the paper's third classifier (section III-B). If the weights are a NetVLAD checkpoint, the
+vocabulary comes with them. Otherwise it is learned from the map's images, as in NetVLAD's
+initialisation. It can be fine-tuned to the place with the triplet loss.
 """
 
 from __future__ import annotations
@@ -15,8 +16,7 @@ from topoloc.retrieval.coarse import CoarseModel, read_setting
 from topoloc.retrieval.network_config import BackboneName, VladNetworkConfig
 from topoloc.retrieval.network_descriptor_localizer import NetworkDescriptorLocalizer
 
-# NetVLAD takes VGG's last convolution before its rectifier and pooling, as the public checkpoints
-# do.
+# NetVLAD uses VGG's last convolution before its rectifier and pooling, like the public checkpoints.
 DEPTHS: dict[BackboneName, int | None] = {
     "squeezenet1_1": 11,
     "vgg11": 19,
@@ -27,11 +27,11 @@ DEPTHS: dict[BackboneName, int | None] = {
 
 
 class NetVlad(nn.Module):
-    """Feature maps (n, c, h, w) -> unit vectors (n, k * c): residuals from each word, summed, each
-    word's sum normalised.
+    """Map feature maps (n, c, h, w) to unit vectors (n, k * c): residuals from each word, summed,
+    and each word's sum normalised.
 
-    VLAD with soft assignment (Arandjelovic et al. 2016). Parameters carry the names of the public
-    PyTorch implementation, whose checkpoints load as they are.
+    VLAD with soft assignment (Arandjelovic et al. 2016). Parameters have the names of the public
+    PyTorch implementation, so that its checkpoints load unchanged.
     """
 
     def __init__(self, num_clusters: int, num_channels: int) -> None:
@@ -40,6 +40,7 @@ class NetVlad(nn.Module):
         self.centroids = nn.Parameter(torch.zeros(num_clusters, num_channels))
 
     def forward(self, maps: Tensor) -> Tensor:
+        """Return the unit vectors of feature maps."""
         maps = nn.functional.normalize(maps.float(), dim=1)
         shares = torch.softmax(self.conv(maps.to(self.conv.weight.dtype)).float(), dim=1).flatten(2)
         sums = (
@@ -50,7 +51,7 @@ class NetVlad(nn.Module):
 
 
 class VladNetwork(nn.Module):
-    """A backbone with a NetVLAD layer."""
+    """Combine a backbone with a NetVLAD layer."""
 
     def __init__(self, backbone: BackboneName, depth: int | None, num_clusters: int) -> None:
         super().__init__()
@@ -58,11 +59,12 @@ class VladNetwork(nn.Module):
         self.pool = NetVlad(num_clusters, self.backbone.num_channels)
 
     def forward(self, images: Tensor) -> Tensor:
+        """Return the unit vectors of normalised images (n, 3, h, w)."""
         return self.pool(self.backbone(images))
 
 
 def open_model(model: CoarseModel) -> NetworkDescriptorLocalizer:
-    """The localizer of a stored model. Raises MapError, ConfigError."""
+    """Return the localizer of a stored model. Raises MapError and ConfigError."""
     config = read_setting(model, "config", VladNetworkConfig)
     backbone, num_clusters = (
         read_setting(model, "backbone", BackboneName),

@@ -1,5 +1,5 @@
-"""Numba kernels of `block_system`: Cholesky's factor of a matrix of 6x6 blocks, column by column,
-and what it solves."""
+"""Numba kernels of `block_system.py`: Cholesky factorisation of a matrix of 6x6 blocks, and
+solution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ _OPTIONS = {"error_model": "numpy"}
 
 @kernel(**_OPTIONS)
 def find_block_idx(starts, rows, row, column):
-    """Where block (row, column) lies, row not above column; it must be there."""
+    """Return the index of block (row, column). `row` must be at or below `column`, and the block
+    must exist."""
     low, high = starts[column], starts[column + 1]
     while high - low > 1:
         middle = (low + high) // 2
@@ -25,7 +26,7 @@ def find_block_idx(starts, rows, row, column):
 
 @kernel(**_OPTIONS)
 def _cholesky(matrix):
-    """The lower triangle becomes the factor."""
+    """Replace the lower triangle by the Cholesky factor."""
     for i in range(6):
         for j in range(i + 1):
             total = matrix[i, j]
@@ -44,7 +45,7 @@ def _solve_lower(factor, vector):
 
 @kernel(**_OPTIONS)
 def _solve_upper(factor, vector):
-    """With the transpose of `factor`."""
+    """Solve with the transpose of `factor`, in place."""
     for i in range(5, -1, -1):
         for k in range(i + 1, 6):
             vector[i] -= factor[k, i] * vector[k]
@@ -53,7 +54,7 @@ def _solve_upper(factor, vector):
 
 @kernel(**_OPTIONS)
 def _subtract_product(block, a, b):
-    """block - a b'."""
+    """Compute block - a b', in place."""
     for r in range(6):
         for s in range(6):
             total = 0.0
@@ -64,8 +65,8 @@ def _subtract_product(block, a, b):
 
 @kernel(**_OPTIONS)
 def factor_blocks(starts, rows, blocks):
-    """In place: `blocks` (b, 6, 6), of which the upper triangles on the diagonal are left as they
-    are."""
+    """Factor `blocks` (b, 6, 6) in place. The upper triangles of the diagonal blocks are not
+    changed."""
     for p in range(len(starts) - 1):
         first, last = starts[p], starts[p + 1]
         _cholesky(blocks[first])
@@ -82,7 +83,7 @@ def factor_blocks(starts, rows, blocks):
 
 @kernel(**_OPTIONS)
 def solve_factored(starts, rows, blocks, vector):
-    """`vector` (n, 6) becomes the solution."""
+    """Replace `vector` (n, 6) by the solution."""
     num = len(starts) - 1
     for p in range(num):
         _solve_lower(blocks[starts[p]], vector[p])

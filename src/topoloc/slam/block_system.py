@@ -1,10 +1,9 @@
-"""Symmetric positive definite systems of 6x6 blocks, most of which are zero: what poses that are
-tied together are solved by.
+"""Solve sparse symmetric positive definite systems of 6x6 blocks, for connected poses.
 
-Cholesky's factor has more blocks than the matrix: whoever is eliminated ties all of its neighbours
-to each other. Where the one with the fewest neighbours goes first (George & Liu, *The evolution of
-the minimum degree ordering algorithm*, 1989), a walk costs time and memory by its length, loops and
-laps included.
+The Cholesky factor has more blocks than the matrix, because eliminating an unknown connects all of
+its neighbours. The unknown with the fewest neighbours is eliminated first (George & Liu, *The
+evolution of the minimum degree ordering algorithm*, 1989). Time and memory then grow linearly with
+the length of a trajectory, also with loops.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ from topoloc.slam.block_kernels import factor_blocks, find_block_idx, solve_fact
 
 @dataclass(frozen=True, eq=False)
 class BlockPattern:
-    """Which blocks of the factor are other than zero: of its column p the rows `rows[starts[p]]`,
-    which is p, to `rows[starts[p + 1] - 1]`.
+    """Hold the pattern of nonzero blocks of the factor.
 
-    Rows and columns are in the order of elimination; `ranks[i]` is the place of unknown i in it.
+    The rows of column p are `rows[starts[p]]`, which is p, to `rows[starts[p + 1] - 1]`. Rows and
+    columns are in elimination order. `elimination_idx[i]` is the position of unknown i in it.
     """
 
     elimination_idx: Int[np.ndarray, " n"]
@@ -33,7 +32,7 @@ class BlockPattern:
 
     @staticmethod
     def from_pairs(num: int, pairs: Iterable[tuple[int, int]]) -> BlockPattern:
-        """That of so many unknowns, these pairs of which are tied together."""
+        """Compute the pattern for `num` unknowns, of which these pairs are connected."""
         tied: list[set[int]] = [set() for _ in range(num)]
         for a, b in pairs:
             if a != b:
@@ -67,17 +66,19 @@ class BlockPattern:
         )
 
     def empty(self) -> Float[np.ndarray, "b 6 6"]:
-        """The blocks of a matrix of this pattern, all zero."""
+        """Return zero blocks for a matrix of this pattern."""
         return np.zeros((len(self.rows), 6, 6))
 
     @property
     def diagonal(self) -> Int[np.ndarray, " n"]:
-        """Where the diagonal's blocks lie, in the order of elimination."""
+        """Return the indices of the diagonal blocks, in elimination order."""
         return self.starts[:-1]
 
     def block_idx(self, i: int, j: int) -> tuple[int, bool]:
-        """Where the block of unknowns i and j lies, which must be tied, and whether i is its column
-        (its row in the upper half)."""
+        """Return the index of the block of two connected unknowns, and whether i is its column.
+
+        If i is its column, i is the row in the upper half.
+        """
         low, high = sorted((int(self.elimination_idx[i]), int(self.elimination_idx[j])))
         return int(find_block_idx(self.starts, self.rows, high, low)), bool(
             low == self.elimination_idx[i]
@@ -89,8 +90,10 @@ def solve_blocks(
     blocks: Float[np.ndarray, "b 6 6"],
     right_hand_sides: Float[np.ndarray, "k n 6"],
 ) -> Float[np.ndarray, "k n 6"]:
-    """x with ``H x = right`` for each right-hand side, all in the order of elimination; `blocks`,
-    H's lower half, become its factor."""
+    """Solve ``H x = right`` for each right-hand side, all in elimination order.
+
+    `blocks` holds the lower half of H and is replaced by its factor.
+    """
     factor_blocks(pattern.starts, pattern.rows, blocks)
     solved = np.array(right_hand_sides)
     for right in solved:

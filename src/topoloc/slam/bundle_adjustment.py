@@ -1,10 +1,10 @@
-"""Bundle adjustment: key frames and the landmarks they see, moved to where they explain pixels and
-disparities best.
+"""Bundle adjustment: optimise key frames and landmarks for minimal pixel and disparity errors.
 
-Levenberg-Marquardt with the points eliminated (Triggs et al., *Bundle adjustment: a modern
-synthesis*, 2000, section 6) and Cauchy's loss. What is left of the poses is sparse
-(`block_system`), and observations are gone through part by part (`bundle_parts`): the window of the
-odometry and a walk of kilometres are one problem, whose time and memory grow with its length.
+It uses Levenberg-Marquardt with eliminated points (Triggs et al., *Bundle adjustment: a modern
+synthesis*, 2000, section 6) and Cauchy's loss. The reduced system of the poses is sparse
+(`block_system.py`). Observations are processed in chunks (`observation_chunks.py`). The odometry
+window and a trajectory of kilometres are the same problem, whose time and memory grow with its
+length.
 """
 
 from __future__ import annotations
@@ -33,27 +33,28 @@ from topoloc.slam.observation_chunks import ObservationChunk, ObservationChunks
 
 @dataclass(frozen=True)
 class BundleConfig:
-    """How long and how robustly to optimise; residuals are in standard deviations of the
-    measurements."""
+    """Configure the optimisation. Residuals are in standard deviations of the measurements."""
 
     max_steps: Annotated[int, Between(0, 1000)] = 6
-    """Steps of Levenberg and Marquardt, at most."""
+    """Maximum number of Levenberg-Marquardt steps."""
     cauchy_scale: Annotated[float, Above(0)] = 2.0
-    """Residuals beyond this count less and less."""
+    """Scale of Cauchy's loss. Larger residuals have less and less weight."""
     min_decrease: Annotated[float, Between(0, 1)] = 1e-3
-    """A step that lowers the cost by less than this share of it is the last one."""
+    """The optimisation ends when a step lowers the cost by less than this share."""
     outlier_square: Annotated[float, Above(0)] = 25.0
-    """Squared residual, summed over x, y and disparity, from which on an observation is wrong and
-    used no more."""
+    """Squared residual, summed over x, y and disparity, above which an observation is
+    deactivated."""
     part_observations: Annotated[int, AtLeast(1)] = 100_000
-    """Observations that are laid side by side at once, about; of longer walks one part after the
-    other."""
+    """Approximate number of observations in a chunk. Longer trajectories are processed in several
+    chunks."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """What is known of a key frame's pose from elsewhere; `information` (6, 6) is that of its left
-    perturbation (metres, radians)."""
+    """Hold a prior on a key frame's pose.
+
+    `information` (6, 6) is that of its left perturbation (metres, radians).
+    """
 
     keyframe: KeyFrame
     cam_from_world: Rigid3
@@ -62,7 +63,7 @@ class PosePrior:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What is moved. A camera is (fx, fy, cx, cy, bf, bias of the disparities)."""
+    """Hold the optimised values. A camera is (fx, fy, cx, cy, bf, disparity bias)."""
 
     rotations: Float[np.ndarray, "k 3 3"]
     translations: Float[np.ndarray, "k 3"]
@@ -70,7 +71,7 @@ class _State:
     points: Float[np.ndarray, "n 3"]
 
     def squares(self, chunk: ObservationChunk) -> Float[np.ndarray, " m"]:
-        """Squared residuals of the part's observations."""
+        """Return the squared residuals of a chunk's observations."""
         squares = np.empty(len(chunk.keyframe_idx))
         points = self.points[chunk.first : chunk.last]
         squared_residuals(
@@ -81,8 +82,11 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What does not move: the observations, which poses are free (`slots`, by the order of
-    elimination; -1: held), and whose bias is."""
+    """Hold the constant data of the optimisation.
+
+    `slots` is the position of each key frame's pose in elimination order, -1 if it is fixed.
+    `columns` is the index of its disparity bias, -1 if that is fixed.
+    """
 
     chunks: ObservationChunks
     pattern: BlockPattern
@@ -92,7 +96,7 @@ class _Problem:
     pose_priors: list[tuple[int, PosePrior]]
 
     def prior_cost(self, state: _State, scale_squared: float) -> float:
-        """Of biases other than expected, and of poses other than the anchors say."""
+        """Return the cost of biases and poses that differ from their priors."""
         of_biases = sum(
             bias.information * (state.cameras[k, 5] - bias.value_px) ** 2
             for bias, k in self.find_bias_keyframes()
@@ -108,8 +112,8 @@ class _Problem:
     def compute_prior_residuals(
         self, state: _State
     ) -> Iterator[tuple[int, PosePrior, Float[np.ndarray, "6"], float]]:
-        """Of each anchor: its key frame, how far that one is off, and the square of that in
-        sigma."""
+        """Generate the key frame, prior, pose error and squared error (in sigma) of each pose
+        prior."""
         for k, pose_prior in self.pose_priors:
             off = (
                 Rigid3(state.rotations[k], state.translations[k])
@@ -128,11 +132,11 @@ def adjust_bundle(
     config: BundleConfig,
     pose_priors: Sequence[PosePrior] = (),
 ) -> None:
-    """Move the poses of `free` and the landmarks that they see; `fixed` key frames see some of
-    these too, and stay.
+    """Optimise the poses of `free` and the landmarks that they see.
 
-    With nothing held, and no anchors of key frames of `free`, the first of `free` stays.
-    Observations found to be wrong become inactive in all of these key frames.
+    `fixed` key frames see some of these landmarks too and do not move. Without fixed key frames and
+    pose priors, the first of `free` is fixed. Outlier observations become inactive in all of these
+    key frames.
     """
     if not fixed and not pose_priors:
         free, fixed = free[1:], free[:1]
@@ -171,7 +175,10 @@ def adjust_bundle(
 
 
 def _collect_landmark_ids(keyframes: Sequence[KeyFrame]) -> Int[np.ndarray, " n"]:
-    """Ascending. All of a long walk's observations are never side by side."""
+    """Return the ids of the active landmarks, ascending.
+
+    It never concatenates all observations of a long trajectory.
+    """
     of_each = [k.observations.landmark_ids[k.observations.active] for k in keyframes]
     first = min((int(ids.min()) for ids in of_each if len(ids)), default=0)
     is_seen = np.zeros(
@@ -231,8 +238,10 @@ def _optimize(problem: _Problem, state: _State, config: BundleConfig) -> _State:
 def _solve_steps(
     problem: _Problem, state: _State, scale: float, damping: float
 ) -> tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]]:
-    """Of the free poses in the order of elimination, and of the biases: the reduced system made and
-    solved."""
+    """Build and solve the reduced system.
+
+    Return the steps of the free poses, in elimination order, and of the biases.
+    """
     p, pattern = problem, problem.pattern
     blocks, vector = pattern.empty(), np.zeros((len(pattern.elimination_idx), 6))
     border, corner = np.zeros((len(p.biases), *vector.shape)), np.zeros((len(p.biases), 2))
@@ -246,7 +255,7 @@ def _solve_steps(
         pull = pose_prior.information / (1.0 + square / scale)
         blocks[pattern.diagonal[p.slots[k]]] += pull
         vector[p.slots[k]] -= pull @ off
-    for row, (bias, k) in enumerate(p.find_bias_keyframes()):  # what is known of the biases already
+    for row, (bias, k) in enumerate(p.find_bias_keyframes()):  # priors on the biases
         corner[row] += [bias.information, bias.information * (bias.value_px - state.cameras[k, 5])]
     along = np.arange(6)
     blocks[pattern.diagonal[:, None], along, along] *= 1.0 + damping
@@ -268,7 +277,7 @@ def _apply_steps(
     scale: float,
     damping: float,
 ) -> tuple[_State, float]:
-    """All after these steps, and what it costs."""
+    """Return the state after these steps, and its cost."""
     p, (of_poses, of_biases) = problem, steps
     rotations, translations, cameras = (
         state.rotations.copy(),

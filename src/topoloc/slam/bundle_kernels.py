@@ -1,9 +1,8 @@
-"""Numba kernels of bundle adjustment: normal equations with the points eliminated, and what a step
-changes.
+"""Numba kernels of bundle adjustment: normal equations with eliminated points, and point updates.
 
-A key frame sees a point at (x, y, d): pixel and disparity, d = bf / depth + bias. Poses move by
-left perturbations ``exp(xi) @ cam_from_world``, xi = (translation, rotation). Cameras are rows (fx,
-fy, cx, cy, bf, bias).
+A key frame sees a point at (x, y, d), pixel and disparity, with d = bf / depth + bias. Poses are
+updated by left perturbations ``exp(xi) @ cam_from_world``, xi = (translation, rotation). Cameras
+are rows (fx, fy, cx, cy, bf, bias).
 """
 
 from __future__ import annotations
@@ -15,15 +14,17 @@ from topoloc.slam.block_kernels import find_block_idx
 
 _OPTIONS = {"error_model": "numpy"}
 _MIN_DEPTH = 0.02
-# What an observation costs whose point is behind the camera: as much as one that is off by a
-# hundred sigma.
+# Squared residual of an observation whose point is behind the camera, equal to an error of 100
+# sigma.
 _BEHIND_CAMERA_COST = 1e4
 
 
 @kernel(**_OPTIONS)
 def _residual(rotation, translation, camera, point, measured, weights, residual, point_cam):
-    """Whitened (measured - predicted), and the point in the camera's frame; returns its square,
-    negative behind the camera."""
+    """Compute the whitened residual (measured - predicted) and the point in the camera frame.
+
+    Return the squared residual, negative if the point is behind the camera.
+    """
     for axis in range(3):
         point_cam[axis] = (
             rotation[axis, 0] * point[0]
@@ -44,8 +45,10 @@ def _residual(rotation, translation, camera, point, measured, weights, residual,
 def squared_residuals(
     rotations, translations, cameras, points, keyframe_idx, rows, measured, weights, squares
 ):
-    """Fill the squared whitened residual of each observation (frame and point rows given); infinite
-    behind the camera."""
+    """Compute the squared whitened residual of each observation, infinite behind the camera.
+
+    Each observation is given by the rows of its frame and its point.
+    """
     residual, point_cam = np.empty(3), np.empty(3)
     for k in range(len(keyframe_idx)):
         f = keyframe_idx[k]
@@ -64,7 +67,7 @@ def squared_residuals(
 
 @kernel(**_OPTIONS)
 def robust_cost(squares, scale_squared):
-    """Cauchy's loss, summed."""
+    """Return the sum of Cauchy's loss."""
     total = 0.0
     for k in range(len(squares)):
         total += scale_squared * np.log1p(min(squares[k], _BEHIND_CAMERA_COST) / scale_squared)
@@ -73,7 +76,7 @@ def robust_cost(squares, scale_squared):
 
 @kernel(**_OPTIONS)
 def _jacobians(rotation, camera, point_cam, weights, jacobian_pose, jacobian_point):
-    """Derivatives of the whitened prediction by the pose's xi and by the point."""
+    """Compute the derivatives of the whitened prediction by the pose's xi and by the point."""
     inverse = 1.0 / point_cam[2]
     jacobian_cam = np.zeros((3, 3))
     jacobian_cam[0, 0] = weights[0] * camera[0] * inverse
@@ -112,7 +115,8 @@ def _invert_symmetric(m, inverse):
 
 @kernel(**_OPTIONS)
 def count_covisible_pairs(starts, keyframe_idx, slots):
-    """How many pairs of free key frames `find_covisible_pairs` says, repetitions included."""
+    """Count the pairs of free key frames that `find_covisible_pairs` writes, including
+    repetitions."""
     total = 0
     for n in range(len(starts) - 1):
         free = 0
@@ -124,8 +128,7 @@ def count_covisible_pairs(starts, keyframe_idx, slots):
 
 @kernel(**_OPTIONS)
 def find_covisible_pairs(starts, keyframe_idx, slots, num_free, keys):
-    """Into `keys`, i * num_free + j for all slots i and j that see a point in common, as often as
-    they do."""
+    """Write i * num_free + j to `keys` for each pair of slots i, j and each point that both see."""
     at = 0
     for n in range(len(starts) - 1):
         for k in range(starts[n], starts[n + 1]):
@@ -141,11 +144,11 @@ def _linearize_point(
     point, rotations, translations, cameras, slots, column, keyframe_idx, measured, weights, scale_squared, damping, is_accumulating,  # noqa: E501
     pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,
 ):  # fmt: skip
-    """What the observations of one point say of it, and where `is_accumulating` what they say of
-    the poses and the bias that see it.
+    """Linearise the observations of one point.
 
-    Filled: `couplings` (k, 6, 3) with the poses, the `inverse` (3, 3) of the point's own block, its
-    `gradient` and `bias_coupling` (3,).
+    If `is_accumulating`, their terms for the poses and the bias are added to the system. It fills
+    `couplings` (k, 6, 3) with the poses, the `inverse` (3, 3) of the point's own block, its
+    `gradient` and its `bias_coupling` (3,).
     """
     residual, point_cam = np.empty(3), np.empty(3)
     jacobian_pose, jacobian_point, block = np.empty((3, 6)), np.empty((3, 3)), np.zeros((3, 3))
@@ -205,8 +208,10 @@ def _add_observation(
     border,
     corner,
 ):
-    """What one observation says of the pose in `slot` and of the bias in `column`, -1 where these
-    are held."""
+    """Add the terms of one observation for the pose in `slot` and the bias in `column`.
+
+    They are -1 if fixed.
+    """
     if column >= 0:
         corner[column, 0] += robust * disparity_weight**2
         corner[column, 1] += robust * disparity_weight * residual[2]
@@ -226,8 +231,7 @@ def _add_observation(
 def _eliminate_point(
     slots, column, keyframe_idx, couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows, blocks, vector, border, corner  # noqa: E501
 ):  # fmt: skip
-    """Take a point out of the system: what the poses and the bias that it ties together still know
-    without it."""
+    """Eliminate a point from the system by the Schur complement of its poses and bias."""
     step, product = inverse @ gradient, np.empty((6, 3))
     if column >= 0:
         corner[column, 0] -= bias_coupling @ (inverse @ bias_coupling)
@@ -275,15 +279,15 @@ def eliminate_points(
     rotations, translations, cameras, slots, columns, points, starts, keyframe_idx, measured, weights, scale_squared, damping,  # noqa: E501
     pattern_starts, pattern_rows, blocks, vector, border, corner,
 ):  # fmt: skip
-    """Add to the reduced system of the free poses and biases what the observations of some points
-    say, these points eliminated.
+    """Add the observations of some points to the reduced system, with these points eliminated.
 
-    `slots[f]` is the place of key frame f among the free ones in the order of elimination, -1 where
-    it is held; `columns[f]` that of its disparity's bias among the biases, -1 where that is held;
-    the key frames that see a point share it. Observations are sorted by point: those of point n are
-    starts[n] .. starts[n + 1] - 1. The system: the `blocks` (b, 6, 6) of the pattern and the
-    right-hand side `vector` (k, 6) of the poses, their `border` (c, k, 6) with the biases, and of
-    each bias its own information and right-hand side, `corner` (c, 2).
+    `slots[f]` is the position of key frame f in elimination order, -1 if it is fixed. `columns[f]`
+    is the index of its disparity bias, -1 if that is fixed. All key frames that see a point share
+    the bias. Observations are sorted by point: those of point n are starts[n] .. starts[n + 1] - 1.
+
+    The system consists of the pattern's `blocks` (b, 6, 6) and the right-hand side `vector` (k, 6)
+    of the poses. `border` (c, k, 6) couples them with the biases. `corner` (c, 2) holds the
+    information and the right-hand side of each bias.
     """
     longest = 0
     for n in range(len(points)):
@@ -308,8 +312,10 @@ def update_points(
     rotations, translations, cameras, slots, columns, points, starts, keyframe_idx, measured, weights, scale_squared, damping,  # noqa: E501
     pattern_starts, blocks, border, corner, steps, bias_steps, moved,
 ):  # fmt: skip
-    """The points after the `steps` (k, 6) of poses and those of biases, into `moved`; all else as
-    in `eliminate_points`."""
+    """Write the points after the `steps` (k, 6) of the poses and those of the biases to `moved`.
+
+    The other arguments are as in `eliminate_points`.
+    """
     longest = 0
     for n in range(len(points)):
         longest = max(longest, starts[n + 1] - starts[n])

@@ -1,5 +1,5 @@
-"""The whole map brought to agree: sub-maps joined by links, the pose graph, then all key frames and
-landmarks together."""
+"""Optimise the whole map: join sub-maps by links, optimise the pose graph, then adjust the
+bundle."""
 
 from __future__ import annotations
 
@@ -25,32 +25,34 @@ from topoloc.slam.pose_graph import (
 
 @dataclass(frozen=True)
 class GlobalMapConfig:
-    """How the map is brought to agree."""
+    """Configure the optimisation of the whole map."""
 
     graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     bundle: BundleConfig = field(
         default_factory=lambda: BundleConfig(max_steps=12, min_decrease=1e-4)
     )
     motion_sigma: Annotated[float, Above(0)] = 0.004
-    """Uncertainty of a motion between two key frames: this share of its length ..."""
+    """Sigma of a motion between two key frames, as a share of its length."""
     motion_sigma_deg: Annotated[float, Above(0)] = 0.02
-    """... and this angle, besides what tracking says."""
+    """Sigma of a motion between two key frames, degrees, in addition to that of tracking."""
     link_sigma: Annotated[float, Above(0)] = 0.01
-    """Metres; of a link, besides what PnP says."""
+    """Sigma of a link, metres, in addition to that of PnP."""
     link_sigma_deg: Annotated[float, Above(0)] = 0.1
-    """The same, in degrees."""
+    """Sigma of a link, degrees, in addition to that of PnP."""
     link_covariance_scale: Annotated[float, Above(0)] = 4.0
-    """Matched features of one view share their errors: more than independent ones would be wrong
-    by."""
+    """Factor of the PnP covariance of a link, because matched features of one view have correlated
+    errors."""
     sigma_feature_px: Annotated[float, Above(0)] = 0.8
-    """Standard deviation of a feature's place in the picture, in the adjustment of all."""
+    """Standard deviation of a feature's pixel in the global bundle adjustment."""
 
 
 def join_submaps(
     keyframes: Sequence[KeyFrame], links: Sequence[Link], landmarks: Landmarks, first: int
 ) -> list[int]:
-    """Bring every sub-map that a link reaches into the world of sub-map `first`; the sub-maps that
-    are joined, `first` among them."""
+    """Move every linked sub-map into the world of sub-map `first`.
+
+    Return the joined sub-maps, including `first`.
+    """
     joined = [first]
     remaining = list(links)
     while True:
@@ -97,8 +99,10 @@ def close_loops(
     landmarks: Landmarks,
     config: GlobalMapConfig,
 ) -> list[Link]:
-    """Optimise the pose graph of joined key frames, and move the landmarks along; the links that
-    agree with it in the end."""
+    """Optimise the pose graph of joined key frames, and move the landmarks with them.
+
+    Return the links that agree with the result.
+    """
     if not links:
         return []
     index = {id(keyframe): i for i, keyframe in enumerate(keyframes)}
@@ -108,7 +112,7 @@ def close_loops(
         if keyframe.motion is not None
     ]
     kept, poses = list(links), [keyframe.cam_from_world for keyframe in keyframes]
-    for _ in range(2):  # the second time without the links that the first found wrong
+    for _ in range(2):  # the second round omits the links that the first rejected
         edges = motions + [_link_edge(link, config) for link in kept]
         poses = optimize_pose_graph(
             [keyframe.cam_from_world for keyframe in keyframes], edges, config.graph
@@ -149,7 +153,7 @@ def _diagonal_covariance(metres: float, degrees: float) -> np.ndarray:
 def _move_keyframes(
     keyframes: Sequence[KeyFrame], poses: Sequence[Rigid3], landmarks: Landmarks
 ) -> None:
-    """New poses; each landmark goes with the first key frame that sees it."""
+    """Set new poses. Each landmark moves with the first key frame that sees it."""
     moved = np.zeros(landmarks.num, np.bool_)
     for keyframe, pose in zip(keyframes, poses, strict=True):
         ids = keyframe.observations.landmark_ids
@@ -167,8 +171,8 @@ def adjust_global_bundle(
     landmarks: Landmarks,
     config: GlobalMapConfig,
 ) -> None:
-    """Bundle adjustment of everything, links included as landmarks that both of their key frames
-    see."""
+    """Adjust all key frames and landmarks. Matches of links become landmarks seen by both key
+    frames."""
     landmark_of: dict[tuple[int, int], int] = {}
     for link in links:
         _add_link_landmarks(link, keyframes, landmarks, landmark_of, config)
@@ -204,7 +208,7 @@ def _add_link_landmarks(
 def _feature_observation(
     keyframe: KeyFrame, row: int, landmark_id: int, config: GlobalMapConfig
 ) -> Observations:
-    """A local feature as an observation: its pixel, and its disparity where it has one."""
+    """Return a local feature as an observation: its pixel, and its disparity if it has a depth."""
     place, stereo = keyframe.place, keyframe.stereo
     assert place is not None
     measured = np.array([[*place.features.points_img[row].astype(np.float64), np.nan]])

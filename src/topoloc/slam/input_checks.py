@@ -1,5 +1,8 @@
-"""Recordings that SLAM would quietly make nonsense of: left and right swapped, a baseline in
-millimetres, pairs that are none."""
+"""Check recordings for inputs that would give wrong SLAM results.
+
+These are swapped left and right images, a baseline in millimetres, and images that are no stereo
+pairs.
+"""
 
 from __future__ import annotations
 
@@ -19,35 +22,39 @@ from topoloc.slam.keyframes import KeyFrame, Landmarks
 
 @dataclass(frozen=True)
 class InputCheckConfig:
-    """From when on a recording is refused."""
+    """Configure the conditions under which a recording is rejected."""
 
     max_baseline: Annotated[float, Above(0)] = 5.0
-    """A stereo rig this wide (metres) is taken for one whose baseline is in millimetres."""
+    """Maximum baseline of a stereo rig, metres. A larger one is assumed to be in millimetres."""
     min_start_points: Annotated[int, AtLeast(4)] = 40
-    """Points with disparity that tracking can begin with."""
+    """Minimum number of points with disparity to start tracking."""
     max_vertical_px: Annotated[float, Above(0)] = 0.9
-    """Vertical distance of left and right (median over a key frame's points, then over key frames):
-    beyond it they are no pair."""
+    """Maximum vertical distance of left and right points, pixels (median over points, then over key
+    frames). Beyond it the images are no stereo pairs."""
     min_keyframes: Annotated[int, AtLeast(1)] = 3
-    """Key frames seen before such a verdict."""
+    """Minimum number of key frames for this check."""
     tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=5.0))
     sampled_points: Annotated[int, Between(1, 100_000)] = 80
-    """Points a key frame at which the vertical distance is measured."""
+    """Number of points of a key frame at which the vertical distance is measured."""
 
 
 class InputChecks:
-    """What has been seen of one recording so far."""
+    """Accumulate the checks of one recording."""
 
     def __init__(self, recording: str, config: InputCheckConfig) -> None:
         self._recording, self._config = recording, config
         self._vertical_px: list[float] = []
         self._has_started = False
         self.right_residuals_px: list[Float[np.ndarray, " n"]] = []
-        """Per key frame: distance between where landmarks are in the right picture and where they
-        should be."""
+        """Distances between measured and predicted landmarks in the right image, pixels, one array
+        for each key frame."""
 
     def check_rig(self, frame: StereoFrame) -> None:
-        """Raises CalibrationError for a baseline that cannot be in metres."""
+        """Check the baseline of the rig.
+
+        Raises:
+            CalibrationError: the baseline cannot be in metres.
+        """
         if frame.rig is not None and frame.rig.baseline > self._config.max_baseline:
             raise CalibrationError(
                 f"{self._recording}: a baseline of {frame.rig.baseline:g} m; is it in millimetres?"
@@ -60,7 +67,7 @@ class InputChecks:
         corners: Float32[np.ndarray, "n 2"],
         config: DisparityConfig,
     ) -> bool:
-        """Whether enough of the corners have a disparity for tracking to begin.
+        """Return whether enough corners have a disparity to start tracking.
 
         Raises:
             RecordingError: they have, but only with left and right swapped.
@@ -68,8 +75,7 @@ class InputChecks:
         num_found = _count_disparities(measured, corners, config)
         if measured.right is None or self._has_started:
             return num_found >= self._config.min_start_points
-        # What the right camera sees to the right of the left one moves to the left where both
-        # pictures are mirrored.
+        # A point farther right in the right image is farther left if both images are mirrored.
         mirrored = replace(
             measured, left=_mirror_image(measured.left), right=_mirror_image(measured.right)
         )
@@ -99,8 +105,8 @@ class InputChecks:
     def check_keyframe(
         self, keyframe: KeyFrame, landmarks: Landmarks, measured: MeasuredView
     ) -> None:
-        """Seek landmarks of a new key frame in the right picture, and compare with where they
-        should be there."""
+        """Match landmarks of a new key frame in the right image and compare them with their
+        predictions."""
         if measured.right is None or measured.view.rig is None:
             return
         seen = keyframe.observations
@@ -123,8 +129,11 @@ class InputChecks:
         self.right_residuals_px.append(np.linalg.norm(found - expected_right, axis=1))
 
     def check_stereo_pairs(self) -> None:
-        """Raises RecordingError where left and right pictures were no pairs: at other moments, or
-        not rectified as calibrated."""
+        """Check that left and right images are stereo pairs.
+
+        Raises:
+            RecordingError: they were taken at different times, or are not rectified as calibrated.
+        """
         if len(self._vertical_px) < self._config.min_keyframes:
             return
         vertical = float(np.median(self._vertical_px))
@@ -141,8 +150,11 @@ class InputChecks:
         points: Float32[np.ndarray, "n 2"],
         guesses: Float32[np.ndarray, "n 2"],
     ) -> Float[np.ndarray, "n 2"]:
-        """Where points of the left picture are in the right one, up and down as well; NaN where not
-        found. Keeps the median height."""
+        """Match points of the left image in the right one, also vertically, and record the vertical
+        median.
+
+        Return their pixels, NaN if not found.
+        """
         assert measured.right is not None
         found = align_with_reference(
             measured.left,

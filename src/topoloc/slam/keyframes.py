@@ -1,5 +1,4 @@
-"""Key frames and the landmarks that they see: what SLAM remembers. Data, and the few questions
-asked of it."""
+"""Data structures of SLAM: key frames, landmarks and observations."""
 
 from __future__ import annotations
 
@@ -18,12 +17,11 @@ from topoloc.points.metric_points import MetricPoints
 
 @dataclass(eq=False)
 class DisparityBias:
-    """What a recording's measured disparities are too large by, pixels, and how well that is known
-    (1 / px^2).
+    """Hold the common bias of a recording's disparities (pixels) and its information (1 / px^2).
 
-    Rectification is never perfect: an angle of one milliradian between the two cameras shifts all
-    disparities by f / 1000, most of a pixel in a street camera, and makes all that is far too far
-    or too near. Motion tells: see `bundle`.
+    Rectification is never exact. An angle of one milliradian between the two cameras shifts all
+    disparities by f / 1000. For a street camera this is most of a pixel, and distant points get
+    wrong depths. Bundle adjustment estimates the bias from the motion (`bundle_adjustment.py`).
     """
 
     value_px: float = 0.0
@@ -32,7 +30,7 @@ class DisparityBias:
 
 @dataclass(eq=False)
 class Landmarks:
-    """Positions of all landmarks by their id, each in the world of its sub-map (metres)."""
+    """Hold the positions of all landmarks by id, each in the world of its sub-map (metres)."""
 
     positions: Float[np.ndarray, "capacity 3"] = field(
         default_factory=lambda: np.full((1024, 3), np.nan)
@@ -40,11 +38,11 @@ class Landmarks:
     num: int = 0
 
     def add(self, points_world: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-        """Their new ids."""
+        """Add landmarks and return their ids."""
         ids = np.arange(self.num, self.num + len(points_world))
         self.num += len(points_world)
         if self.num > len(self.positions):
-            # by a quarter: of a long walk's landmarks no more room stays empty than that
+            # grows by a quarter, so at most that much stays unused
             more = max(self.num - len(self.positions), len(self.positions) // 4)
             self.positions = np.concatenate([self.positions, np.full((more, 3), np.nan)])
         self.positions[ids] = points_world
@@ -53,12 +51,12 @@ class Landmarks:
 
 @dataclass(eq=False)
 class Observations:
-    """What one key frame sees of landmarks: pixel and disparity (x, y, d) and the inverse of their
-    standard deviations.
+    """Hold the landmark observations of one key frame.
 
-    An unknown disparity has weight 0. `active` is False for what has been found to be wrong. All of
-    it is kept in single precision, which is that of the pictures' measurements: of a long walk
-    nothing else takes as much memory.
+    `measured` is pixel and disparity (x, y, d), `weights` the inverse standard deviations. An
+    unknown disparity has weight 0. `active` is False for outliers. The values have single
+    precision, which suffices for image measurements, because they take most of the memory of a long
+    trajectory.
     """
 
     landmark_ids: Int[np.ndarray, " n"]
@@ -74,6 +72,7 @@ class Observations:
         )
 
     def append(self, other: Observations) -> None:
+        """Append the rows of other observations."""
         self.landmark_ids = np.concatenate([self.landmark_ids, other.landmark_ids])
         self.measured = np.concatenate([self.measured, other.measured])
         self.weights = np.concatenate([self.weights, other.weights])
@@ -82,7 +81,7 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class PlaceFeatures:
-    """How a key frame looks: local features, and their metric points in the key frame's camera."""
+    """Hold the local features of a key frame, and their metric points in its camera frame."""
 
     features: Features
     points: MetricPoints
@@ -90,8 +89,10 @@ class PlaceFeatures:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How a key frame follows from an earlier one, `source`: covariance of the left perturbation of
-    cam_from_source (m, rad)."""
+    """Link a key frame to the earlier key frame `source`.
+
+    `covariance` is that of the left perturbation of cam_from_source (m, rad).
+    """
 
     source: KeyFrame
     covariance: Float[np.ndarray, "6 6"]
@@ -99,11 +100,11 @@ class Motion:
 
 @dataclass(eq=False)
 class KeyFrame:
-    """A frame that SLAM keeps. `cam_from_world` is that of the rectified view and changes as the
-    map is optimised.
+    """Hold a frame that SLAM keeps.
 
-    `motion` is None for the first of a sub-map. How it looks lies on a shelf that it shares with
-    others (`places`), at `place_idx`.
+    `cam_from_world` is that of the rectified view and changes with the optimisation. `motion` is
+    None for the first key frame of a sub-map. The place features are stored in the shared on-disk
+    list `places`, at `place_idx`.
     """
 
     recording: int
@@ -121,13 +122,15 @@ class KeyFrame:
 
     @property
     def has_place(self) -> bool:
-        """Whether it is known how it looks, or will be."""
+        """Return whether place features exist or are being extracted."""
         return self.place_idx is not None or self.pending_place is not None
 
     @property
     def place(self) -> PlaceFeatures | None:
-        """How it looks, where that is known; waits for what a thread still looks at
-        (`pending_place`)."""
+        """Return the place features, None if there are none.
+
+        It waits for the extraction if that is still running (`pending_place`).
+        """
         if self.pending_place is not None:
             self.place, self.pending_place = self.pending_place.result(), None
         return None if self.place_idx is None else self.places[self.place_idx]
@@ -140,7 +143,7 @@ class KeyFrame:
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """Where a frame is: relative to a key frame, so that it moves with it."""
+    """Hold the pose of a frame relative to a key frame, so that it moves with it."""
 
     frame_idx: int
     keyframe: KeyFrame
@@ -148,7 +151,7 @@ class FramePose:
     view_from_cam: Rigid3
 
     def world_from_cam(self) -> Rigid3:
-        """The pose of the frame's own camera, which rectification may have turned."""
+        """Return the pose of the frame's original camera, which rectification may have rotated."""
         return (
             self.cam_from_keyframe @ self.keyframe.cam_from_world
         ).inverse() @ self.view_from_cam

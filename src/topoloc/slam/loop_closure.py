@@ -1,10 +1,9 @@
-"""Loops: key frames that see a place that another one, long before or in another recording, has
-seen.
+"""Detect loops: key frames that see a place again, much later or in another recording.
 
-The coarse place search proposes, local features and PnP verify (`place_matching`), and three guards
-keep what is left from ruining the map: within a sub-map a link may not ask for more drift than the
-odometry can have, none beside it may say otherwise as well as it does (of equal panels, one is as
-good as the next), and a second one beside it must say the same.
+Image retrieval proposes pairs. Local features and PnP verify them (`place_matching.py`). Three
+checks prevent wrong links. Within a sub-map, a link must not imply more drift than the odometry can
+have. No other link of nearly equal strength may contradict it, which repetitive structures cause. A
+second link nearby must agree with it.
 """
 
 from __future__ import annotations
@@ -24,43 +23,45 @@ from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words_from_parts,
 from topoloc.slam.keyframes import KeyFrame
 from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_places
 
-_MAX_VLAD_BYTES = 4_000_000  # in memory: each is looked at once or twice, in their order
+_MAX_VLAD_BYTES = 4_000_000  # in memory: each is read once or twice, in order
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Which places are compared, and which links are believed."""
+    """Configure the comparison of places and the acceptance of links."""
 
     vlad: VladConfig = field(default_factory=lambda: VladConfig(num_words=32, position_weight=0.0))
     matching: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
     num_candidates: Annotated[int, Between(0, 1000)] = 4
-    """Places that look most alike, which each one is compared with."""
+    """Number of most similar places that each place is compared with."""
     min_places_between: Annotated[int, AtLeast(0)] = 12
-    """Places nearer than this along one sub-map are no loop."""
+    """Minimum number of places between the ends of a loop within a sub-map."""
     support_places: Annotated[int, AtLeast(0)] = 5
-    """A link is supported by another one whose ends are within so many places of its own."""
+    """A link supports another one if its ends are within this many places."""
     max_disagreement: Annotated[float, Above(0)] = 0.05
-    """Two links that support each other may differ by this (metres), and by this share of the way
+    """Maximum difference between two supporting links, metres, plus this share of the distance
     between their ends."""
     max_disagreement_deg: Annotated[float, Above(0)] = 2.0
-    """The same, in degrees."""
+    """Maximum rotation difference between two supporting links, degrees."""
     rival_share: Annotated[float, Between(0, 1)] = 0.5
-    """A link is contradicted by another one of the same place that has this share of its matches,
-    and puts it elsewhere."""
+    """A link is rejected if another link of the same place has this share of its matches and
+    contradicts it."""
     rival_places: Annotated[int, AtLeast(0)] = 15
-    """Such links are looked for among so many places before and after its own, too."""
+    """Number of places before and after the link's own that are searched for contradicting
+    links."""
     max_drift: Annotated[float, AtLeast(0)] = 0.05
-    """Share of the way travelled by which the odometry may be wrong, besides half a metre."""
+    """Maximum drift of the odometry, as a share of the travelled distance, in addition to half a
+    metre."""
     max_drift_deg: Annotated[float, AtLeast(0)] = 15.0
-    """The same in degrees, whatever the way."""
+    """Maximum rotation drift of the odometry, degrees, for any distance."""
     max_speedup: Annotated[float, Above(0)] = 2.0
-    """Between two sub-maps of a recording a camera goes no faster than so many times its fastest
-    within them, but for half a metre."""
+    """Maximum speed between two sub-maps of a recording, relative to the maximum speed within them,
+    in addition to half a metre."""
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """Key frames `source` and `target` (rows of the list of all) see the same place."""
+    """Link key frames `source` and `target` (rows in the list of all) that see the same place."""
 
     source: int
     target: int
@@ -72,7 +73,7 @@ def find_links(
     config: LoopConfig,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> list[Link]:
-    """All links that passed the guards, in the order of their targets."""
+    """Return all links that pass the checks, in the order of their targets."""
     places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
     if len(places) < 2:
         return []
@@ -110,7 +111,7 @@ def find_links(
 def _propose_pairs(
     keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig
 ) -> list[tuple[int, int]]:
-    """(target, source) of pairs that look alike, source the earlier one."""
+    """Return (target, source) of similar pairs. The source is the earlier one."""
     pairs, num = (
         set(),
         config.num_candidates + 2 * config.min_places_between,
@@ -129,8 +130,10 @@ def _propose_pairs(
 def rank_places(
     keyframes: Sequence[KeyFrame], config: VladConfig, num: int | None = None
 ) -> Iterator[list[int]]:
-    """For each key frame, which must have places, the `num` of them (rows; else all) that look most
-    like it, in this order; nothing where there are no features.
+    """Generate, for each key frame, the rows of the `num` most similar ones (default: all), in
+    order.
+
+    Each key frame must have place features. Nothing is generated if there are no features at all.
     """
 
     def features(row: int) -> Features:
@@ -176,8 +179,10 @@ def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConf
 
 
 def is_reachable(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
-    """Whether the camera can have come from the end of the earlier sub-map to the beginning of the
-    later one, as the link has it."""
+    """Return whether a link is possible at the camera's maximum speed.
+
+    The camera must travel from the end of the earlier sub-map to the start of the later one.
+    """
     source, target, target_from_source = (
         keyframes[link.source],
         keyframes[link.target],
@@ -195,7 +200,7 @@ def is_reachable(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) 
 
 
 def _max_speed(submap: Sequence[KeyFrame]) -> float:
-    """Metres a second."""
+    """Return the maximum speed within a sub-map, metres per second."""
     positions = np.array([k.cam_from_world.inverse().translation for k in submap])
     seconds = 1e-9 * np.diff([k.t_ns for k in submap])
     return float(
@@ -207,7 +212,7 @@ def _max_speed(submap: Sequence[KeyFrame]) -> float:
 
 
 def _path_length(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
-    """Metres between two key frames of the same sub-map, along the way."""
+    """Return the travelled distance (metres) between two key frames of the same sub-map."""
     submap, (first, last) = keyframes[first].submap, sorted((first, last))
     between = [
         k.cam_from_world.inverse().translation
@@ -220,8 +225,8 @@ def _path_length(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
 def _is_contradicting(
     other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig
 ) -> bool:
-    """Whether one of the link's ends is linked nearly as well with another place, and cannot be at
-    both."""
+    """Return whether another link of the same key frame contradicts this one with nearly as many
+    matches."""
     if (other.target == link.target) == (other.source == link.source):
         return False
     if len(other.match.source_rows) < config.rival_share * len(link.match.source_rows):
@@ -236,7 +241,8 @@ def _is_contradicting(
 def _has_rival(
     link: Link, keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig
 ) -> bool:
-    """Whether the target looks as if it were near a neighbour of the source, somewhere else."""
+    """Return whether the target also matches a neighbour of the source, at another relative
+    pose."""
     at = places.index(link.source)
     around = places[max(at - config.rival_places, 0) : at + config.rival_places + 1]
     for source in (
@@ -268,7 +274,7 @@ def _match_keyframes(
 def _is_supporting(
     other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int], config: LoopConfig
 ) -> bool:
-    """Whether a link of other key frames nearby says the same."""
+    """Return whether a link of other key frames nearby agrees."""
     if other is link or other.target == link.target:
         return False
     near = config.support_places
@@ -283,11 +289,10 @@ def _is_supporting(
 def _are_consistent(
     other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig, drift: float = 0.0
 ) -> bool | None:
-    """Whether going from source to target by the one link and back by the other ends where it
-    began; None across sub-maps.
+    """Return whether a round trip over both links ends near its start. None across sub-maps.
 
     Args:
-        drift: metres by which the odometry may be wrong between them.
+        drift: allowed error of the odometry between them, metres.
     """
     a, b, c, d = (keyframes[i] for i in (link.source, link.target, other.source, other.target))
     if a.submap != c.submap or b.submap != d.submap:
@@ -310,5 +315,5 @@ def _are_consistent(
 
 
 def _pose_difference(a: Rigid3, b: Rigid3) -> tuple[float, float]:
-    """Metres and radians."""
+    """Return the difference in metres and radians."""
     return float(np.linalg.norm(a.translation - b.translation)), (a @ b.inverse()).angle()

@@ -1,5 +1,7 @@
-"""How the camera moved between pictures of a recording, measured from the pictures alone: what a
-trajectory can be held against."""
+"""Measure the camera motion between images of a recording, from the images alone.
+
+A trajectory can be compared with these steps.
+"""
 
 from __future__ import annotations
 
@@ -26,15 +28,15 @@ from topoloc.recordings.recording import read_left_frame
 
 @dataclass(frozen=True)
 class MeasuredStepsConfig:
-    """Between which pictures, and what is asked of a measurement."""
+    """Configure the selection of image pairs and the acceptance of a measurement."""
 
     num_steps: Annotated[int, Between(1, 1000)] = 16
-    """Pictures that a step begins at, spread over the recording."""
+    """Number of first images of steps, spread over the recording."""
     gaps: tuple[int, ...] = (12, 5, 2, 1)
-    """Frames from a step's first picture to its last; the first gap over which enough is recognised
-    is taken."""
+    """Numbers of frames between the two images of a step, tried in order until one has enough
+    matches."""
     min_inliers: Annotated[int, AtLeast(6)] = 40
-    """Points of the first picture that must be recognised in the last."""
+    """Minimum number of points of the first image that match in the last."""
     pose: AbsolutePoseConfig = field(default_factory=AbsolutePoseConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
@@ -42,9 +44,11 @@ class MeasuredStepsConfig:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredStep:
-    """`first_from_last` is the motion between the cameras of two frames; `median_depth` (metres)
-    that of the points it stands on. Of a single camera (`has_scale` is False) the way has the
-    length 1, and the depth is unknown (0)."""
+    """Hold the measured motion between the cameras of two frames.
+
+    `median_depth` (metres) is that of the inliers. For a single camera `has_scale` is False, the
+    translation has length 1 and the depth is 0 (unknown).
+    """
 
     first: int
     last: int
@@ -56,14 +60,14 @@ class MeasuredStep:
 def measure_steps(
     sequence: StereoSequence, usable_idx: list[int], config: MeasuredStepsConfig
 ) -> list[MeasuredStep]:
-    """Steps spread over the frames `usable_idx` (their rows, increasing), by the left pictures and
-    the depth of each step's first frame; of a single camera by its pictures alone.
+    """Measure steps spread over the frames `usable_idx` (rows, ascending).
 
-    A step that cannot be measured, as too little is recognised, is left out. All steps over one gap
-    are sought before those over the next, so that the recording is read in its order.
+    A step uses the left images and the depth of its first frame, or the images alone for a single
+    camera. Steps with too few matches are skipped. All steps with one gap are measured before those
+    with the next, so that the recording is read in order.
 
     Raises:
-        RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
+        RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
     """
     starts = np.unique(np.linspace(0, len(usable_idx) - 1, config.num_steps).astype(int)).tolist()
     firsts: dict[int, _ViewFeatures] = {}
@@ -92,7 +96,7 @@ def measure_steps(
             ),
         )
 
-    for gap in config.gaps:  # backwards where the recording ends
+    for gap in config.gaps:  # backwards at the end of the recording
         pairs = (
             (start, start + gap if start + gap < len(usable_idx) else start - gap)
             for start in starts
@@ -138,8 +142,11 @@ def _extract_view(frame: StereoFrame, config: MeasuredStepsConfig, is_first: boo
 def _estimate_motion(
     first: _ViewFeatures, last: _ViewFeatures, config: MeasuredStepsConfig
 ) -> tuple[Rigid3, float] | None:
-    """last_from_first of the views, and the median depth of what it stands on; of a single camera
-    0, and the way has the length 1."""
+    """Estimate last_from_first of the views, and the median depth of the inliers.
+
+    For a single camera the depth is 0 and the translation has length 1. None if too few points
+    match.
+    """
     matches = match_features(
         last.features.descriptors, first.features.descriptors, MatchingConfig()
     )

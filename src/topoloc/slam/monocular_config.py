@@ -1,4 +1,4 @@
-"""How a single camera's odometry (`monocular_odometry.py`) works."""
+"""Settings of the odometry of a single camera (`monocular_odometry.py`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from topoloc.slam.step_estimation import OdometryConfig
 
 @dataclass(frozen=True)
 class MonocularOdometryConfig:
-    """When a stretch begins, and when a point has shown its depth."""
+    """Configure the initialisation of a sub-map and the triangulation of points."""
 
     odometry: OdometryConfig = field(
         default_factory=lambda: OdometryConfig(
@@ -24,29 +24,30 @@ class MonocularOdometryConfig:
             min_tracked=15,
         )
     )
-    """More is followed than by a stereo camera, for few corners live until they have shown their
-    depth; and what is adjusted together reaches further back, for nothing but that holds the
-    unit."""
+    """More points are tracked than with a stereo camera, because few of them survive until they are
+    triangulated. The window is longer, because it alone preserves the scale."""
     max_side_px: Annotated[int, Between(64, 16_384)] = 800
-    """Points are followed in pictures reduced to this width or height."""
+    """Images are reduced to this width or height for point tracking."""
     start_motion: Annotated[float, Above(0)] = 0.03
-    """A stretch may begin where points have moved by this share of the picture's width (median)
-    ..."""
+    """Minimum median displacement of the points to start a sub-map, as a share of the image
+    width."""
     start_points: Annotated[int, AtLeast(8)] = 50
-    """... and so many of them show their depth."""
+    """Minimum number of triangulated points to start a sub-map."""
     start_share: Annotated[float, Between(0, 1)] = 0.2
-    """With fewer of its points left, the first picture is given up for a later one."""
+    """If fewer than this share of its points are left, the first image is replaced by a later
+    one."""
     max_beginning: Annotated[int, Between(2, 10_000)] = 60
-    """... as it is after so many frames: who stands still shows no depth."""
+    """The first image is also replaced after this many frames, because a camera at rest gives no
+    depth."""
     max_return_px: Annotated[float, Above(0)] = 0.7
-    """A point followed there and back must come back to within so many pixels."""
+    """Maximum error of a point tracked forwards and backwards, pixels."""
     clear_px: Annotated[float, Above(0)] = 0.05
-    """Where what does not look alike, taken for noise, makes a point's place so uncertain, it is
-    off by `sigma_px`; elsewhere by the square of the ratio as much, for what slides along an edge
-    looks less alike than noise alone would make it."""
+    """Tracking uncertainty (pixels, from the appearance difference taken as noise) at which a point
+    has an error of `sigma_px`. Otherwise the error scales with the square of the ratio, because
+    points that slide along an edge differ more than noise suggests."""
     min_parallax_deg: Annotated[float, Above(0)] = 1.0
-    """Angle between rays from which on a point is a landmark ..."""
+    """Minimum angle between the rays of a landmark, degrees."""
     min_rays: Annotated[int, Between(2, 100)] = 2
-    """... if so many key frames have seen it ..."""
+    """Minimum number of key frames that see a landmark."""
     max_triangulation_px: Annotated[float, Above(0)] = 1.5
-    """... and its rays meet to within so many pixels in all of them."""
+    """Maximum reprojection error of a new landmark in all its key frames, pixels."""

@@ -1,11 +1,11 @@
-"""Odometry of a single camera: its motion in a unit of its own, stretch by stretch.
+"""Odometry of a single camera: its motion, sub-map by sub-map, each with an unknown scale.
 
-Read from `MonocularOdometry.process`. Two pictures with enough parallax begin a stretch
-(five-point method), and their distance is its unit. From there on points are followed and give each
-frame's pose as in the odometry of stereo (`step_estimation.py`); what has not shown its depth yet
-is followed beside them, and becomes a landmark as soon as its rays meet at an angle. The last key
-frames are adjusted together. Where too few points are left a stretch ends, and another one begins
-with a unit of its own: nothing is guessed in between. What a unit is in metres is not known here.
+`MonocularOdometry.process` is the entry point. Two images with enough parallax start a sub-map
+(five-point method). Their distance is its unit of length. From there on, points are tracked and
+give each frame's pose, as in stereo odometry (`step_estimation.py`). Points without depth are
+tracked too, and become landmarks once their rays meet at a sufficient angle. The last key frames
+are adjusted together. If too few points are left, the sub-map ends and another one starts with its
+own unit. The motion between them is not estimated. The scale in metres is unknown.
 """
 
 from __future__ import annotations
@@ -40,29 +40,33 @@ _SIGMA_SCALE_RANGE = 0.5, 10.0
 
 @dataclass(frozen=True, eq=False)
 class MonocularSubmap:
-    """A motion without a break, in a world and a unit of its own: where its frames are, relative to
-    key frames, and what these see."""
+    """Hold an uninterrupted motion in its own world and unit: frames, key frames and landmarks.
+
+    The frames' poses are relative to key frames.
+    """
 
     landmarks: Landmarks
     frames: list[FramePose] = field(default_factory=list)
     keyframes: list[KeyFrame] = field(default_factory=list)
 
     def submap_from_cams(self) -> dict[int, Rigid3]:
-        """world_from_cam of its frames in its own world and unit, by their numbers."""
+        """Return world_from_cam of its frames by frame index, in its own world and unit."""
         return {pose.frame_idx: pose.world_from_cam() for pose in self.frames}
 
 
 @dataclass(eq=False)
 class _Initialization:
-    """The first picture of a stretch that has not begun yet, the points still followed from it, and
-    the frames since, with their points."""
+    """Hold the first image of a sub-map that has not started yet, and the frames since.
+
+    `tracks` are the points of the first image. Each frame comes with its remaining points.
+    """
 
     frames: list[tuple[int, StereoFrame, MeasuredView, Tracks]]
     tracks: Tracks
 
 
 class MonocularOdometry:
-    """The state of one recording's odometry. `submaps` are those so far."""
+    """Hold the state of one recording's odometry. `submaps` holds the sub-maps so far."""
 
     def __init__(self, config: MonocularOdometryConfig) -> None:
         self._config = config
@@ -78,7 +82,7 @@ class MonocularOdometry:
         self._num_lost = 0
 
     def process(self, frame_idx: int, frame: StereoFrame) -> None:
-        """The next frame."""
+        """Process the next frame."""
         measured = _make_view(frame, self._config.max_side_px)
         if self._reference is None:
             self._initialize(frame_idx, frame, measured)
@@ -92,7 +96,7 @@ class MonocularOdometry:
                 self._initialize(frame_idx, frame, measured)
 
     def _initialize(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> None:
-        """Follow the corners of a first picture until two pictures show a motion."""
+        """Track the corners of a first image until two images show enough motion."""
         if self._initialization is not None:
             tracks = self._track_bidirectional(self._initialization, measured)
             left = len(tracks.landmark_ids) / max(len(self._initialization.tracks.landmark_ids), 1)
@@ -116,7 +120,7 @@ class MonocularOdometry:
     def _track_bidirectional(
         self, initialization: _Initialization, measured: MeasuredView
     ) -> Tracks:
-        """The points that are found in the next picture, and from there again where they were."""
+        """Return the points found in the next image that are tracked back to their start."""
         _, _, before, tracks = initialization.frames[-1]
         config = self._config.odometry.tracking
         found, there = track_points(
@@ -129,7 +133,7 @@ class MonocularOdometry:
         return replace(tracks, points_img=found).select(np.flatnonzero(there & again & returned))
 
     def _start_submap(self, initialization: _Initialization) -> None:
-        """A stretch begins if the first picture and the last one show a motion."""
+        """Start a sub-map if the relative pose of the first and the last image can be estimated."""
         config, (_, _, first, all_tracks), (_, _, last, tracks) = (
             self._config,
             initialization.frames[0],
@@ -192,7 +196,7 @@ class MonocularOdometry:
         tracks: Tracks,
         known: Int[np.ndarray, " n"],
     ) -> None:
-        """Where a frame of the beginning was, now that its points are known."""
+        """Estimate the pose of a frame before the start, from the triangulated points."""
         first = self._recent_keyframes[0]
         if frame_idx == first.frame_idx:
             pose = Rigid3.identity()
@@ -212,7 +216,7 @@ class MonocularOdometry:
         )
 
     def _track_frame(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> bool:
-        """Where the frame is, by its step from the last one."""
+        """Track the points into the frame and add its pose. Return False if it fails."""
         step = self._estimate_step(frame, measured)
         if step is None or self._last_frame is None or self._reference is None:
             return False
@@ -278,8 +282,11 @@ class MonocularOdometry:
     def _add_keyframe(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, step: Step
     ) -> None:
-        """Make the frame a key frame: what has shown its depth becomes a landmark, new corners wait
-        for theirs, the window is adjusted."""
+        """Add the frame as a key frame.
+
+        Triangulated points become landmarks, new corners are added as untriangulated points, and
+        the window is adjusted.
+        """
         config, tracks, untriangulated = self._config.odometry, self._tracks, self._untriangulated
         occupied = np.concatenate([tracks.points_img, untriangulated.points_img])
         corners = find_corners(measured.view.grey, occupied, config.tracking)
@@ -314,8 +321,10 @@ class MonocularOdometry:
     def _triangulate_tracks(
         self, ids: Int[np.ndarray, " n"], min_rays: int
     ) -> Int[np.ndarray, " k"]:
-        """Those of the points with these ids (ascending) that have shown their depth, and are
-        landmarks now. One whose rays do not meet is no point: it has no place any more."""
+        """Triangulate the points with these ids (ascending), and return the ids of new landmarks.
+
+        The positions of points whose rays do not meet are set to NaN.
+        """
         if len(ids) == 0:
             return ids
         config, found = self._config, triangulate_points(self._recent_keyframes, ids)
@@ -338,8 +347,10 @@ class MonocularOdometry:
     def _predict_positions(
         self, corners: Float32[np.ndarray, "n 2"], measured: MeasuredView, cam_from_world: Rigid3
     ) -> Float[np.ndarray, "n 3"]:
-        """Where corners may be, as far away as the landmarks next to them in the picture: good
-        enough to follow them."""
+        """Predict the positions of corners at the depth of nearby landmarks in the image.
+
+        This is accurate enough to track them.
+        """
         nearest = 5
         depths = cam_from_world.apply(self._landmarks.positions[self._tracks.landmark_ids])[:, 2]
         apart = np.linalg.norm(corners[:, None] - self._tracks.points_img[None], axis=2)
@@ -349,7 +360,8 @@ class MonocularOdometry:
         return cam_from_world.inverse().apply(np.column_stack([normalized * z[:, None], z]))
 
     def _make_observations(self, tracks: Tracks, num_active: int) -> Observations:
-        """What a key frame sees; only the first of the points are landmarks yet."""
+        """Return the observations of a key frame. Only the first `num_active` points are landmarks
+        yet."""
         num = len(tracks.landmark_ids)
         weights = np.zeros((num, 3))
         weights[:, :2] = 1.0 / self._compute_sigmas(tracks)[:, None]
@@ -357,7 +369,7 @@ class MonocularOdometry:
         return Observations(tracks.landmark_ids, measured, weights, np.arange(num) < num_active)
 
     def _compute_sigmas(self, tracks: Tracks) -> Float[np.ndarray, " n"]:
-        """Pixels; a point that is followed from here on counts as any other."""
+        """Return the standard deviations (pixels). A newly tracked point has the default."""
         unclear = np.clip(
             (tracks.sigmas_px.astype(np.float64) / self._config.clear_px) ** 2,
             *_SIGMA_SCALE_RANGE,
@@ -401,7 +413,7 @@ class MonocularOdometry:
 
 
 def _make_view(frame: StereoFrame, max_side_px: int) -> MeasuredView:
-    """A single picture as odometry of stereo would look at it. Its unit takes the place of the
+    """Return the view of a single image in the form of stereo odometry. The unit replaces the
     baseline."""
     view = undistort_frame(frame, max_side_px)
     return MeasuredView(

@@ -1,8 +1,8 @@
-"""Where the camera will be if it goes on as it went, and how far from there it may be.
+"""Predict the camera pose from constant velocity, with its uncertainty.
 
-Constant velocity; how wrong that is has been seen at every frame so far, as an acceleration. A
-camera without a picture for a time T is off by the acceleration times T^2 / 2, so that four frames
-lost are bridged where somebody walks steadily, and are not where he starts and stops.
+The error of constant velocity was observed at every frame so far, as an acceleration. A camera
+without an image for a time T is off by the acceleration times T^2 / 2. So four lost frames are
+bridged if a person walks steadily, but not if they start and stop.
 """
 
 from __future__ import annotations
@@ -20,33 +20,34 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True)
 class PredictionConfig:
-    """How far a prediction is trusted."""
+    """Configure the uncertainty and the limits of a prediction."""
 
     gap: Annotated[float, AtLeast(1)] = 1.5
-    """A frame that comes later than so many usual intervals comes after a gap."""
+    """A frame follows a gap if it comes later than this many median intervals."""
     max_intervals: Annotated[float, AtLeast(0)] = 10.0
-    """A motion is carried on over so many intervals at most."""
+    """Maximum number of intervals over which a motion is extrapolated."""
     remembered: Annotated[int, Between(1, 10_000)] = 20
-    """Steps from which the acceleration is known ..."""
+    """Number of recent steps from which the acceleration is estimated."""
     min_remembered: Annotated[int, AtLeast(1)] = 3
-    """... and the fewest that say anything."""
+    """Minimum number of steps for this estimate."""
     way_share: Annotated[float, AtLeast(0)] = 0.1
-    """Sigma of a prediction is at least this share of its way, and of its turn."""
+    """Minimum sigma of a prediction after a gap, as a share of its translation and rotation."""
     stop_share: Annotated[float, AtLeast(0)] = 0.7
-    """From a frame to the very next a camera may stop or turn back: sigma is this share of its way
-    and turn there."""
+    """The same share for the very next frame, because a camera may stop or turn back."""
     max_sigmas: Annotated[float, Above(0)] = 3.0
-    """A step that is further from the prediction than this is not what the motion lets expect,
-    ..."""
+    """Maximum distance of an expected step from the prediction, in sigma."""
     clear_sigmas: Annotated[float, Above(0)] = 3.5
-    """... and where another step is as expected, it must be this much less so: root of the
-    difference of their squares."""
+    """Minimum margin of an expected step over another one: the root of the difference of their
+    squared distances, in sigma."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """cam_from_world, one sigma of its position (metres) and of its direction (radians), infinite
-    where no motion is known."""
+    """Hold a predicted cam_from_world with the sigma of its position (metres) and direction
+    (radians).
+
+    Both are infinite if the motion is unknown.
+    """
 
     cam_from_world: Rigid3
     step: Rigid3
@@ -55,7 +56,7 @@ class Prediction:
     is_gap: bool
 
     def distance(self, cam_from_world: Rigid3) -> float:
-        """How far from the prediction a pose is, in sigma."""
+        """Return the distance of a pose from the prediction, in sigma."""
         away = cam_from_world @ self.cam_from_world.inverse()
         return float(
             max(np.linalg.norm(away.translation) / self.sigma, away.angle() / self.sigma_rad)
@@ -65,8 +66,11 @@ class Prediction:
 def select_expected_pose(
     prediction: Prediction | None, poses: Sequence[Rigid3], config: PredictionConfig
 ) -> Rigid3 | None:
-    """Which of several cam_from_world the motion singles out: near the prediction, and all others
-    far; None where it cannot tell."""
+    """Select the pose (cam_from_world) that the motion supports: it is near the prediction, all
+    others far.
+
+    None if there is no such pose.
+    """
     if len(poses) == 1:
         return poses[0]
     if prediction is None or not poses:
@@ -80,19 +84,19 @@ def select_expected_pose(
 
 
 class MotionHistory:
-    """The velocity of the last step, and the accelerations of those before it."""
+    """Hold the velocity of the last step, and the accelerations before it."""
 
     def __init__(self, config: PredictionConfig) -> None:
         self._config = config
         self._squared_accelerations: deque[tuple[float, float]] = deque(maxlen=config.remembered)
         self._intervals: deque[float] = deque(maxlen=config.remembered)
-        self._velocity: np.ndarray | None = None  # twist, left of cam_from_world, a second
+        self._velocity: np.ndarray | None = None  # twist, left of cam_from_world, per second
         self._t_ns: int | None = None
         self._cam_from_world: Rigid3 | None = None
 
     def add_pose(self, t_ns: int, cam_from_world: Rigid3, motion: Rigid3 | None = None) -> None:
-        """A frame was at `cam_from_world`; `motion` is its motion since the frame before, None
-        where that is not known."""
+        """Add the pose of a frame. `motion` is its motion since the preceding frame, None if
+        unknown."""
         if motion is not None and self._t_ns is not None and t_ns > self._t_ns:
             interval = 1e-9 * (t_ns - self._t_ns)
             velocity = motion.log() / interval
@@ -111,15 +115,15 @@ class MotionHistory:
         self._t_ns, self._cam_from_world = t_ns, cam_from_world
 
     def update_last_pose(self, cam_from_world: Rigid3) -> None:
-        """The last frame's pose has been adjusted."""
+        """Replace the last pose after an adjustment."""
         self._cam_from_world = cam_from_world
 
     def reset(self) -> None:
-        """The camera was lost, and its motion with it."""
+        """Discard the motion after the camera was lost. Accelerations are kept."""
         self._velocity, self._t_ns, self._cam_from_world = None, None, None
 
     def predict(self, t_ns: int) -> Prediction | None:
-        """Where the camera is at a time after the last frame; None where there is none."""
+        """Predict the pose at a time after the last frame. None if there is no last frame."""
         if self._t_ns is None or self._cam_from_world is None:
             return None
         time = max(1e-9 * (t_ns - self._t_ns), 0.0)

@@ -1,5 +1,7 @@
-"""The observations of a bundle adjustment, some landmarks after the other: what is in memory at
-once has an end, however long the walk."""
+"""Iterate over the observations of a bundle adjustment in chunks of landmarks.
+
+This bounds the memory for trajectories of any length.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,10 @@ from topoloc.slam.keyframes import KeyFrame
 
 @dataclass(frozen=True, eq=False)
 class ObservationChunk:
-    """The observations of the landmarks `first` to `last` of a bundle, sorted by landmark.
+    """Hold the observations of the landmarks `first` to `last` of a bundle, sorted by landmark.
 
-    Those of landmark n are `starts[n - first]` to `starts[n - first + 1] - 1`: by which key frame
-    (`keyframe_idx`), in which row of that one's observations (`sources`), and what was measured.
+    Those of landmark n are `starts[n - first]` to `starts[n - first + 1] - 1`. `keyframe_idx` is
+    the key frame of each one, and `sources` the row in that key frame's observations.
     """
 
     first: int
@@ -31,17 +33,18 @@ class ObservationChunk:
 
     @property
     def rows(self) -> Int[np.ndarray, " m"]:
-        """Of each observation, its landmark, counted from `first`."""
+        """Return the landmark of each observation, counted from `first`."""
         return np.repeat(np.arange(self.last - self.first), np.diff(self.starts))
 
 
 class ObservationChunks:
-    """The active observations of landmarks by key frames, part by part; gone through as often as
-    one likes, and made anew each time.
+    """Provide the active observations of landmarks by key frames, chunk by chunk.
+
+    It can be iterated repeatedly. Several chunks are built anew each time, a single one is cached.
 
     Args:
         ids: the landmarks, ascending.
-        max_observations: of a part, about.
+        max_observations: approximate size of a chunk.
     """
 
     def __init__(
@@ -62,6 +65,7 @@ class ObservationChunks:
 
     @property
     def num_observations(self) -> int:
+        """Return the number of observations in all chunks."""
         return sum(map(len, self._observation_orders))
 
     def __iter__(self) -> Iterator[ObservationChunk]:
@@ -112,7 +116,7 @@ class ObservationChunks:
 
 
 def _sort_observations(keyframe: KeyFrame, ids: Int[np.ndarray, " n"]) -> Int32[np.ndarray, " m"]:
-    """The rows of its active observations of these landmarks, by landmark."""
+    """Return the rows of a key frame's active observations of these landmarks, by landmark."""
     seen = keyframe.observations
     if not len(ids):
         return np.zeros(0, np.int32)

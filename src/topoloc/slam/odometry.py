@@ -1,11 +1,13 @@
-"""Visual odometry: where the camera went, frame after frame, and the key frames that remember it.
+"""Visual odometry: the camera pose of each frame, and the key frames.
 
-Read from `Odometry.process`. A frame's points are followed from the frame before, their landmarks
-give its pose (robust PnP), and where too few of them are left, or the view has changed, it becomes
-a key frame: disparities are measured, new corners become landmarks, and the last key frames are
-adjusted together. A camera that is lost is sought in the last places; after a while it starts a
-sub-map of its own, with the frames that were sought in vain. So it does at once where a repeating
-wall admits several steps and the motion does not tell which.
+`Odometry.process` is the entry point. A frame's points are tracked from the preceding frame, and
+their landmarks give its pose (robust PnP). If too few points are left, or the view has changed, the
+frame becomes a key frame. Disparities are then measured, new corners become landmarks, and the last
+key frames are adjusted together.
+
+A lost camera is relocalized in the last places. After a while it starts a new sub-map, with the
+frames that could not be relocalized. It does so at once if a repetitive wall admits several steps
+and the motion does not select one.
 """
 
 from __future__ import annotations
@@ -36,14 +38,15 @@ from topoloc.slam.motion_prediction import MotionHistory, select_expected_pose
 from topoloc.slam.place_matching import extract_place_features, match_places
 from topoloc.slam.step_estimation import LastFrame, OdometryConfig, Step, StepEstimator, Tracks
 
-# of places in memory, about 80: the last few are asked, and comparing two takes ten times as long
-# as reading
+# bytes of about 80 places in memory, because matching two takes ten times as long as reading one
 _MAX_PLACE_BYTES = 16_000_000
 
 
 class Odometry:
-    """The state of one recording's odometry. `keyframes` and `landmarks` are those of all
-    recordings, and are added to."""
+    """Hold the state of one recording's odometry.
+
+    `keyframes` and `landmarks` are shared by all recordings, and this class adds to them.
+    """
 
     def __init__(
         self,
@@ -59,13 +62,11 @@ class Odometry:
         self._reference: KeyFrame | None = None
         self._reference_image: np.ndarray = np.zeros((0, 0), np.float32)
         self._tracks = Tracks.from_points(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
-        self._recent_keyframes: list[
-            KeyFrame
-        ] = []  # the key frames since tracking began or began again
+        self._recent_keyframes: list[KeyFrame] = []  # key frames since tracking last started
         self._num_lost = 0
         self._lost_frames: list[
             tuple[int, StereoFrame]
-        ] = []  # the frames since the camera was lost that may begin a sub-map
+        ] = []  # frames since the camera was lost, which may start a sub-map
         self._history = MotionHistory(config.prediction)
         self._repeated_motions: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
@@ -76,14 +77,17 @@ class Odometry:
     def process(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
     ) -> list[FramePose]:
-        """Where this frame is, and those before it whose place is known only now; nothing where
-        that is not known. `measured` is `measured_view(frame)`."""
+        """Process the next frame.
+
+        Return its pose and those of earlier frames that are known only now. The list is empty if
+        the pose is unknown. `measured` must be `measured_view(frame)`.
+        """
         self._enable_bias_estimation(measured)
         pose = self._track_frame(frame_idx, frame, measured)
         return [pose] if pose is not None else self._handle_lost_frame(frame_idx, frame, measured)
 
     def finish(self) -> list[FramePose]:
-        """The recording is at its end: the frames that were sought in vain until then."""
+        """Finish the recording and return the poses of frames that are still pending."""
         poses = self._restart_submap() if len(self._lost_frames) > 1 else []
         self._place_executor.shutdown()
         return poses
@@ -95,7 +99,7 @@ class Odometry:
     def _track_frame(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
     ) -> FramePose | None:
-        """Where the frame is, by its step from the last one."""
+        """Return the pose of the frame by its step from the last one, None if it fails."""
         step = self._estimate_step(frame, measured)
         if step is None:
             return None
@@ -116,8 +120,10 @@ class Odometry:
         return FramePose(frame_idx, self._reference, cam_from_keyframe, measured.view.view_from_cam)
 
     def _estimate_step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
-        """The step from the last frame to this one; None where there is none, or the motion does
-        not tell which."""
+        """Estimate the step from the last frame.
+
+        None if there is none, or the motion cannot select one of several.
+        """
         prediction = self._history.predict(frame.t_ns)
         if self._last_frame is None or self._reference is None or prediction is None:
             return None
@@ -155,12 +161,12 @@ class Odometry:
             or step is None
             or not step_estimator.is_close(expected, step.cam_from_world)
         ):
-            self._reference = None  # nor is it worth while to seek the camera in the last places
+            self._reference = None  # relocalization in the last places would be ambiguous, too
             return None
         return step
 
     def _collect_repeated_poses(self, cam_from_world: Rigid3) -> list[Rigid3]:
-        """All that the camera may be at where it looks as if it were there."""
+        """Return all poses that look the same in a repetitive place."""
         return [cam_from_world, *(repeat @ cam_from_world for repeat in self._repeated_motions)]
 
     def _update_last_frame(
@@ -192,8 +198,11 @@ class Odometry:
         measured: MeasuredView,
         motion: Motion | None,
     ) -> None:
-        """Make the frame a key frame: measure, add landmarks, adjust the window, and follow its
-        points from here on."""
+        """Add the frame as a key frame.
+
+        Disparities are measured, landmarks are added and the window is adjusted. Tracking then
+        continues from this frame.
+        """
         config = self._config
         points, landmark_ids = self._tracks.points_img, self._tracks.landmark_ids
         corners = find_corners(measured.view.grey, points, self._config.tracking)
@@ -274,8 +283,10 @@ class Odometry:
         return bool(far or motion.angle() > np.deg2rad(self._config.place_angle_deg))
 
     def _submit_place_extraction(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
-        """How a key frame looks is found while the next frames are followed; of one at a time, so
-        that few pictures are held."""
+        """Extract the place features of a key frame in a background thread.
+
+        Only one extraction is pending, so that few images are in memory.
+        """
         if self._pending_keyframe is not None:
             assert self._pending_keyframe.place is not None  # waits
         keyframe.pending_place = self._place_executor.submit(
@@ -284,7 +295,7 @@ class Odometry:
         self._pending_keyframe = keyframe
 
     def _last_places(self, num: int) -> list[KeyFrame]:
-        """The last key frames of this sub-map whose looks are known, newest first."""
+        """Return the last key frames of this sub-map with place features, newest first."""
         if self._reference is None:
             return []
         candidates = (
@@ -297,7 +308,7 @@ class Odometry:
     def _handle_lost_frame(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
     ) -> list[FramePose]:
-        """Seek the camera in the last places; after a while begin again."""
+        """Relocalize the camera in the last places, or start a new sub-map after a while."""
         self._num_lost += 1
         self._lost_frames.append((frame_idx, frame))
         if self._num_lost > self._config.max_lost_tracked:
@@ -311,8 +322,10 @@ class Odometry:
         return self._restart_submap()
 
     def _restart_submap(self) -> list[FramePose]:
-        """A sub-map of the frames that were sought in vain, from the first on which all others
-        follow."""
+        """Start a sub-map from the lost frames.
+
+        It begins at the first frame from which all later ones can be tracked.
+        """
         missed, self._lost_frames, self._reference = self._lost_frames, [], None
         num_keyframes, num_landmarks, num_lost = (
             len(self._keyframes),
@@ -323,7 +336,7 @@ class Odometry:
         for frame_idx, frame in missed:
             measured = measured_view(frame)
             pose = self._track_frame(frame_idx, frame, measured) if poses else None
-            if pose is None:  # what came before it leads nowhere
+            if pose is None:  # the preceding frames cannot be continued
                 poses, self._reference = [], None
                 del self._keyframes[num_keyframes:]
                 self._landmarks.num = num_landmarks
@@ -343,7 +356,7 @@ class Odometry:
         cam_from_world: Rigid3,
         motion: Motion | None,
     ) -> FramePose:
-        """Tracking begins with this frame, as a key frame."""
+        """Start tracking with this frame as a key frame."""
         self._last_frame, self._recent_keyframes = None, []
         self._history.reset()
         self._tracks = self._tracks.select(np.zeros(0, np.int64))
@@ -356,8 +369,10 @@ class Odometry:
     def _relocalize(
         self, frame: StereoFrame, measured: MeasuredView
     ) -> tuple[Rigid3, Motion] | None:
-        """Where the camera is by one of the last places; where the wall repeats itself and the
-        motion does not tell, the search ends."""
+        """Relocalize the camera in one of the last places.
+
+        If the place is repetitive and the motion cannot select a pose, the search ends.
+        """
         here = extract_place_features(measured.view, self._config.places)
         prediction = self._history.predict(frame.t_ns)
         for keyframe in self._last_places(self._config.places_asked):

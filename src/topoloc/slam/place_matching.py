@@ -1,5 +1,7 @@
-"""Do two key frames see the same place, and from where? Local features matched, then robust PnP on
-metric points."""
+"""Verify that two key frames see the same place, and estimate their relative pose.
+
+Local features are matched, and robust PnP on metric points gives the pose.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,12 @@ from topoloc.points.metric_points import MetricPointsConfig, locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.slam.keyframes import PlaceFeatures
 
-_MIN_SEPARATION = 0.05  # of the picture's width, so that a feature is not itself at another scale
+_MIN_SEPARATION = 0.05  # of the image width, to exclude the same feature at another scale
 
 
 @dataclass(frozen=True)
 class PlaceMatchingConfig:
-    """What makes two views the same place."""
+    """Configure the verification of a place."""
 
     features: FeatureConfig = field(default_factory=lambda: FeatureConfig(max_features=500))
     points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
@@ -36,17 +38,17 @@ class PlaceMatchingConfig:
         )
     )
     min_inliers: Annotated[int, AtLeast(4)] = 25
-    """Matches that agree on the relative pose, at least."""
+    """Minimum number of matches that agree on the relative pose."""
     min_inlier_share: Annotated[float, Between(0, 1)] = 0.35
-    """Share of the matches that agree on it, at least."""
+    """Minimum share of the matches that agree on the relative pose."""
     max_sigma: Annotated[float, Above(0)] = 0.5
-    """A relative position that is less certain than this (metres, one sigma) says nothing."""
+    """Maximum sigma of the relative position, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceMatch:
-    """target_from_source with the covariance of its left perturbation, and the rows of the features
-    that agree."""
+    """Hold target_from_source, the covariance of its left perturbation, and the rows of the
+    inliers."""
 
     target_from_source: Rigid3
     covariance: Float[np.ndarray, "6 6"]
@@ -55,7 +57,7 @@ class PlaceMatch:
 
 
 def extract_place_features(view: PreparedFrame, config: PlaceMatchingConfig) -> PlaceFeatures:
-    """The local features of a view, and where they are."""
+    """Extract the local features of a view with their metric points."""
     features = extract_features(view.grey, config.features)
     return PlaceFeatures(features, locate_points(features, view, config.points))
 
@@ -63,8 +65,10 @@ def extract_place_features(view: PreparedFrame, config: PlaceMatchingConfig) -> 
 def match_places(
     source: PlaceFeatures, target: PlaceFeatures, stereo: StereoCamera, config: PlaceMatchingConfig
 ) -> PlaceMatch | None:
-    """Where `source` was taken, seen from `target` (whose camera is `stereo`), or None where they
-    do not agree on it."""
+    """Estimate target_from_source of two views. None if too few matches agree.
+
+    `stereo` is the camera of the target.
+    """
     rows, matching = (
         np.flatnonzero(source.points.valid),
         config.matching.resolved(find_feature_type(config.features.kind).ratio),
@@ -98,11 +102,10 @@ def match_places(
 def count_repeated_features(
     view: PlaceFeatures, stereo: StereoCamera, config: PlaceMatchingConfig
 ) -> int:
-    """How many of a view's features look like others of the same picture, all as from one other
-    place: a wall of equal panels.
+    """Count the features of a view that match others of the same image by one common relative pose.
 
-    Each is matched with the one most like it elsewhere in the picture, and the other way round; so
-    many agree on a pose.
+    The count is high for repetitive structures such as a wall of equal panels. Each feature is
+    matched with the most similar distant one, mutually. The result is the number of PnP inliers.
     """
     points_img, descriptors = view.features.points_img.astype(np.float64), view.features.descriptors
     apart = np.linalg.norm(points_img[:, None] - points_img, axis=2)

@@ -1,11 +1,13 @@
-"""Do the poses of a trajectory fit the pictures? If not, which known convention makes them fit?
+"""Check whether the poses of a trajectory fit the images, and find a convention that makes them
+fit.
 
-Steps between pictures are measured from these alone (`measured_steps.py`), of a single camera but
-for their length; a trajectory of the right convention has nearly the same ones. Where it has not,
-the conventions of `geometry/pose_conventions.py` are tried, then a clock that is shifted, then a
-camera that is mounted on the body whose poses these are: hand-eye calibration, body_step @
-body_from_cam = body_from_cam @ camera_step (Park and Martin, *Robot sensor calibration: solving AX
-= XB on the Euclidean group*, 1994).
+Steps between images are measured from the images alone (`measured_steps.py`), without scale for a
+single camera. A trajectory with the right convention has nearly the same steps. If it does not,
+three kinds of alternatives are tested. The first are the conventions of
+`geometry/pose_conventions.py`, the second a shifted clock. The third is a camera mounted on the
+body that the poses describe. That is hand-eye calibration, body_step @ body_from_cam =
+body_from_cam @ camera_step (Park and Martin, *Robot sensor calibration: solving AX = XB on the
+Euclidean group*, 1994).
 """
 
 from __future__ import annotations
@@ -38,36 +40,39 @@ _MIN_INFORMATIVE_STEPS = 5
 _MIN_ACCEPTED_RATIO, _MIN_CONVENTION_RATIO = (
     0.5,
     0.7,
-)  # of the telling steps, that agree with poses that are believed, with a convention that is named
+)  # share of informative steps that agree: accepted poses, and a reported convention
 _MIN_ROTATION, _ROTATION_TOLERANCE, _TRANSLATION_TOLERANCE, _RELATIVE_TOLERANCE = (
     math.radians(5.0),
     math.radians(1.5),
     0.02,
     0.15,
 )  # rad, rad, m, share of the step
-_DEPTH_TOLERANCE = 0.01  # of the depth of what is seen, by which a measured way may be wrong
+_DEPTH_TOLERANCE = 0.01  # error of a measured translation, as a share of the depth
 _MIN_TRANSLATION_RATIO = 3.0  # times the tolerance
 _UNIT_TOLERANCE = 0.15
-_DIRECTION_TOLERANCE = math.radians(12.0)  # of a way whose length is unknown
-_MAX_COORDINATE = 1e12  # no place in any unit; squares of much more are no numbers
+_DIRECTION_TOLERANCE = math.radians(12.0)  # of a translation without scale
+_MAX_COORDINATE = 1e12  # larger than any place in any unit, and its square is finite
 _MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = (
     0.02,
     3.0,
     60,
     1.0,
-)  # shifts tried to each side
+)  # seconds, seconds, number of shifts in each direction, seconds
 _SUSPICIOUS_ERROR, _MAX_ERROR_RATIO = 0.3, 0.4
 _NUM_MOUNTING_ITERATIONS, _MIN_SINGULAR_RATIO = 5, 0.05
-_BODY_COMPLEXITY = 4.0  # conventions: a mounting has six numbers to fit by
+_BODY_COMPLEXITY = 4.0  # in conventions: a mounting has six parameters
 
 _Poses = Sequence[Rigid3 | None]
 
 
 @dataclass(frozen=True)
 class PoseCheckResult:
-    """`num_informative` steps are long enough to tell, `num_consistent` of them agree with the
-    poses as they are. `conventions`, as `--poses` takes them, make most of them agree; empty where
-    the poses are believed, or nothing known makes them fit."""
+    """Hold the result of the check.
+
+    `num_informative` steps are long enough to compare. `num_consistent` of them agree with the
+    poses as given. `conventions` make most of them agree, in the format of `--poses`. It is empty
+    if the poses are accepted, or no known convention fits.
+    """
 
     num_informative: int
     num_consistent: int
@@ -75,6 +80,7 @@ class PoseCheckResult:
 
     @property
     def is_accepted(self) -> bool:
+        """Return whether the poses are accepted. Too few informative steps also accept them."""
         return not self.conventions and (
             self.num_informative < _MIN_INFORMATIVE_STEPS
             or self.num_consistent >= _MIN_ACCEPTED_RATIO * self.num_informative
@@ -83,8 +89,8 @@ class PoseCheckResult:
 
 @dataclass(frozen=True)
 class _PoseInterpretation:
-    """A way to read the poses; `normalized_errors` are those of the steps, in units of what is
-    tolerated."""
+    """Hold one interpretation of the poses, with the errors of the steps in units of the
+    tolerance."""
 
     conventions: tuple[str, ...]
     normalized_errors: Float[np.ndarray, " n"]
@@ -95,7 +101,7 @@ class _PoseInterpretation:
 
     @property
     def sort_key(self) -> tuple[float, float]:
-        """The plainer one is taken where two fit about as well."""
+        """Return a key that prefers the simpler of two interpretations that fit about as well."""
         complexity = sum(
             _BODY_COMPLEXITY if name.startswith("body") else 1.0 for name in self.conventions
         )
@@ -103,7 +109,11 @@ class _PoseInterpretation:
 
 
 def check_pose_coverage(sequence: StereoSequence) -> None:
-    """Hold that at least half of the frames have a pose. Raises TrajectoryError."""
+    """Check that at least half of the frames have a pose, if any has one.
+
+    Raises:
+        TrajectoryError: fewer have one.
+    """
     num_posed = sum(pose is not None for pose in sequence.poses)
     if 0 < 2 * num_posed < len(sequence):
         raise TrajectoryError(
@@ -113,13 +123,13 @@ def check_pose_coverage(sequence: StereoSequence) -> None:
 
 
 def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = None) -> None:
-    """Hold that the poses of a recording fit its pictures; those of a single camera but for their
-    unit.
+    """Check that the poses of a recording fit its images. For a single camera the scale is not
+    checked.
 
     Raises:
-        TrajectoryError: they do not; names the convention that makes them fit, as `--poses` takes
-            it, where one does.
-        RecordingError, CalibrationError, UnreadableImageError: from reading the recording.
+        TrajectoryError: they do not fit. The message contains the convention that makes them fit,
+            in the format of `--poses`, if one does.
+        RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
     """
     posed = [k for k, pose in enumerate(sequence.poses) if pose is not None]
     if len(posed) < _MIN_INFORMATIVE_STEPS:
@@ -152,7 +162,7 @@ def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = N
 def evaluate_poses(
     steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]
 ) -> PoseCheckResult:
-    """Hold the poses (world_from_cam in metres, one a frame) against the measured steps."""
+    """Compare the poses (world_from_cam in metres, one for each frame) with the measured steps."""
     informative_steps = [step for step in steps if _is_informative(step)]
     informative_steps = [
         step
@@ -173,9 +183,7 @@ def evaluate_poses(
         *_test_conventions(informative_steps, poses),
         *_find_time_shift(informative_steps, poses, t_ns),
     ]
-    if (
-        verdict.is_accepted
-    ):  # of a way that is nearly straight and level, wrong poses may be nearly right
+    if verdict.is_accepted:  # wrong poses may be nearly right on a straight and level trajectory
         better = [
             one
             for one in readings
@@ -208,7 +216,7 @@ def _is_informative(step: MeasuredStep) -> bool:
 
 
 def _steps_from_poses(informative_steps: Sequence[MeasuredStep], poses: _Poses) -> list[Rigid3]:
-    """first_from_last as the poses have it."""
+    """Return first_from_last of the poses."""
     pairs = ((poses[step.first], poses[step.last]) for step in informative_steps)
     return [
         first.inverse() @ last for first, last in pairs if first is not None and last is not None
@@ -218,7 +226,7 @@ def _steps_from_poses(informative_steps: Sequence[MeasuredStep], poses: _Poses) 
 def _compute_step_errors(
     informative_steps: Sequence[MeasuredStep], steps: Sequence[Rigid3]
 ) -> Float[np.ndarray, " n"]:
-    """By how much each step is not the measured one: 1 is what is tolerated."""
+    """Return the error of each step relative to the measured one, in units of the tolerance."""
     normalized_errors = []
     for measured, step in zip(informative_steps, steps, strict=True):
         apart, tolerated_turn = (
@@ -232,8 +240,10 @@ def _compute_step_errors(
 
 
 def _compute_translation_error(measured: MeasuredStep, step: Rigid3) -> float:
-    """By how much the way is another one, in units of what is tolerated; of a single camera by its
-    direction alone."""
+    """Return the translation error in units of the tolerance.
+
+    For a single camera only the direction is compared.
+    """
     ours, theirs = measured.first_from_last.translation, step.translation
     if not measured.has_scale:
         length = float(np.linalg.norm(theirs))
@@ -247,7 +257,7 @@ def _compute_translation_error(measured: MeasuredStep, step: Rigid3) -> float:
         + _DEPTH_TOLERANCE * measured.median_depth
         + _RELATIVE_TOLERANCE * float(np.linalg.norm(ours))
     )
-    # seen in the first camera; in the last one the difference is as long
+    # in the first camera frame. The length is the same in the last one.
     return float(np.linalg.norm(ours - theirs)) / tolerated
 
 
@@ -266,7 +276,7 @@ def _test_conventions(
 
 
 def _combine_conventions(*tables: dict[str, PoseConversion]) -> list[tuple[str, ...]]:
-    """One or no convention of each table."""
+    """Return all combinations of at most one convention from each table."""
     choices = [[(), *((name,) for name in table)] for table in tables]
     return [tuple(itertools.chain(*parts)) for parts in itertools.product(*choices)]
 
@@ -274,7 +284,7 @@ def _combine_conventions(*tables: dict[str, PoseConversion]) -> list[tuple[str, 
 def _apply_conventions(
     informative_steps: Sequence[MeasuredStep], poses: _Poses, conventions: tuple[str, ...]
 ) -> list[Rigid3 | None]:
-    """The poses that the steps need, with these conventions undone."""
+    """Return the poses that the steps need, with these conventions undone."""
     needed = {step.first for step in informative_steps} | {step.last for step in informative_steps}
     return [
         undo_pose_conventions(pose, conventions) if pose is not None and k in needed else None
@@ -285,7 +295,10 @@ def _apply_conventions(
 def _estimate_unit(
     informative_steps: Sequence[MeasuredStep], steps: Sequence[Rigid3]
 ) -> tuple[tuple[str, ...], float]:
-    """The unit that gives the steps their measured lengths, as a convention, and its metres."""
+    """Estimate the unit that gives the steps their measured lengths.
+
+    Return it as a convention, with its length in metres.
+    """
     if not all(step.has_scale for step in informative_steps):
         return (), 1.0
     measured = np.array(
@@ -305,8 +318,10 @@ def _estimate_unit(
 def _find_time_shift(
     informative_steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]
 ) -> list[_PoseInterpretation]:
-    """The poses at other times than those of the pictures, by the shift that fits best; none where
-    the recording is too short for any."""
+    """Find the time shift between poses and images with the smallest error.
+
+    The list is empty if the recording is too short.
+    """
     posed = [k for k, pose in enumerate(poses) if pose is not None]
     trajectory = Trajectory([pose for pose in poses if pose is not None], [t_ns[k] for k in posed])
     largest = min(_MAX_SHIFT_S, 0.4e-9 * (t_ns[posed[-1]] - t_ns[posed[0]]))
@@ -328,7 +343,7 @@ def _test_time_shift(
     t_ns: Sequence[int],
     seconds: float,
 ) -> _PoseInterpretation | None:
-    """None where too few steps have poses then."""
+    """Test one time shift. None if too few steps have poses at the shifted times."""
     normalized_errors = []
     for step in informative_steps:
         times = [t_ns[k] + round(1e9 * seconds) for k in (step.first, step.last)]
@@ -341,27 +356,29 @@ def _test_time_shift(
         return None
     normalized_errors += [float(np.median(normalized_errors))] * (
         len(informative_steps) - len(normalized_errors)
-    )  # those beyond an end are taken to be as the others
+    )  # steps beyond an end get the median error
     return _PoseInterpretation((f"shift={seconds:.3g}",), np.array(normalized_errors))
 
 
 def _has_lower_error(other: _PoseInterpretation, as_is: _PoseInterpretation) -> bool:
-    """Does another reading explain most of what the steps miss by?"""
+    """Return whether another interpretation explains most of the error."""
     return _is_suspicious(as_is) and float(
         np.median(other.normalized_errors)
     ) < _MAX_ERROR_RATIO * float(np.median(as_is.normalized_errors))
 
 
 def _is_suspicious(as_is: _PoseInterpretation) -> bool:
-    """Do the steps miss by enough for another reading to be far better?"""
+    """Return whether the error is large enough for another interpretation to be much better."""
     return float(np.median(as_is.normalized_errors)) > _SUSPICIOUS_ERROR
 
 
 def _test_body_poses(
     informative_steps: Sequence[MeasuredStep], poses: _Poses
 ) -> Iterator[_PoseInterpretation]:
-    """The poses as those of a body, by the mounting of the camera that fits best; none by steps
-    that know no metre."""
+    """Test the poses as those of a body with the best-fitting camera mounting.
+
+    Nothing is tested if the steps have no scale.
+    """
     if not all(step.has_scale for step in informative_steps):
         return
     for conventions in _combine_conventions(ROTATIONS, DIRECTIONS):
@@ -372,7 +389,7 @@ def _test_body_poses(
         mounting, normalized_errors = Rigid3.identity(), np.zeros(len(pairs))
         for _ in range(
             _NUM_MOUNTING_ITERATIONS
-        ):  # what the first mountings leave far off may be measured wrongly
+        ):  # repeated without outliers, which may be measured wrongly
             mounting = _estimate_mounting(kept)
             normalized_errors = _compute_step_errors(
                 informative_steps, [mounting.inverse() @ step @ mounting for step in steps]
@@ -388,10 +405,11 @@ def _test_body_poses(
 
 
 def _estimate_mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
-    """body_from_cam of least squares, by turns: its rotation by the steps' axes and ways, its
-    translation by what is left of the ways.
+    """Estimate body_from_cam by least squares, alternating between rotation and translation.
 
-    Along an axis that all steps turn about, the translation cannot be seen, and is left at 0.
+    The rotation comes from the axes and translations of the steps, the translation from the
+    residual translations. The translation along an axis common to all rotations is not observable
+    and stays 0.
     """
     rotation, translation = np.eye(3), np.zeros(3)
     of_axes = sum(

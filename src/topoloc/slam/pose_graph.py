@@ -1,8 +1,7 @@
-"""The pose graph: key frames as nodes, motions and loops as edges, brought to agree (Gauss-Newton,
-Cauchy's loss on the loops).
+"""Optimise a pose graph: key frames are nodes, motions and loops are edges.
 
-An edge (i, j) measures Z = j_from_i. Its residual is ``log(X_j X_i^-1 Z^-1)`` with X =
-cam_from_world, moved by left perturbations.
+It uses Gauss-Newton with Cauchy's loss on the loops. An edge (i, j) measures Z = j_from_i. Its
+residual is ``log(X_j X_i^-1 Z^-1)`` with X = cam_from_world, updated by left perturbations.
 """
 
 from __future__ import annotations
@@ -21,22 +20,24 @@ from topoloc.slam.block_system import BlockPattern, solve_blocks
 
 @dataclass(frozen=True)
 class PoseGraphConfig:
-    """How the edges are weighed and how long is optimised."""
+    """Configure the weights of the edges and the length of the optimisation."""
 
     max_steps: Annotated[int, Between(0, 1000)] = 15
-    """Steps of the optimisation, at most."""
+    """Maximum number of steps."""
     min_step: Annotated[float, AtLeast(0)] = 1e-5
-    """Metres or radians: smaller steps end it."""
+    """The optimisation ends at a step smaller than this, metres and radians."""
     cauchy_scale: Annotated[float, Above(0)] = 3.0
-    """Of loops: residuals (in sigma) beyond this count less and less."""
+    """Scale of Cauchy's loss on loops, in sigma. Larger residuals have less and less weight."""
     max_residual: Annotated[float, Above(0)] = 8.0
-    """A loop that misses by more than this many sigma after all is dropped."""
+    """Maximum residual of a loop after the optimisation, in sigma. Loops beyond it are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """second_from_first with the covariance of its left perturbation; a loop may be wrong, a motion
-    may not."""
+    """Hold second_from_first and the covariance of its left perturbation.
+
+    A loop may be wrong and has a robust loss. A motion is always right.
+    """
 
     first: int
     second: int
@@ -48,7 +49,7 @@ class Edge:
 def optimize_pose_graph(
     cam_from_worlds: Sequence[Rigid3], edges: Sequence[Edge], config: PoseGraphConfig
 ) -> list[Rigid3]:
-    """The poses, the first one unmoved."""
+    """Return the optimised poses. The first one stays fixed."""
     poses = list(cam_from_worlds)
     informations = [np.linalg.inv(edge.covariance) for edge in edges]
     pattern = BlockPattern.from_pairs(len(poses), [(edge.first, edge.second) for edge in edges])
@@ -84,7 +85,7 @@ def optimize_pose_graph(
 def compute_normalized_residuals(
     poses: Sequence[Rigid3], edges: Sequence[Edge]
 ) -> Float[np.ndarray, " e"]:
-    """Length of each edge's residual, in standard deviations."""
+    """Return the length of each edge's residual, in standard deviations."""
     lengths = np.empty(len(edges))
     for k, edge in enumerate(edges):
         residual = (

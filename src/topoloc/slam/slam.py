@@ -1,10 +1,10 @@
-"""Stereo visual SLAM, read from the top: recordings in, the pose of each of their frames out, in
-one world.
+"""Stereo visual SLAM: estimate the poses of all frames of several recordings in one world.
 
-Odometry turns each recording into chains of key frames (sub-maps); loops join them where the same
-place is seen again, within a recording or between two, and what many weaker pairs say together
-where no loop does; a pose graph and a bundle adjustment of the whole make them agree. Of sub-maps
-that stay apart, those that hold most frames are kept. The world is the camera of their first frame.
+Odometry turns each recording into chains of key frames (sub-maps). Loops join them at places that
+are seen again, within a recording or between two. If no loop does, the consensus of many weaker
+pairs joins them. A pose graph and a global bundle adjustment make all poses consistent. Of sub-maps
+that stay apart, the group with the most frames is kept. The world is the camera frame of its first
+frame.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from topoloc.slam.step_estimation import OdometryConfig
 from topoloc.slam.submap_joins import JoinConfig, find_joins, group_submaps
 
 Progress = Callable[[str, int, int], None]
-"""Called with a stage's name, steps done and steps in all."""
+"""Called with a stage's name, the steps done and the total steps."""
 
 
 @dataclass(frozen=True)
 class SlamConfig:
-    """All steps' settings."""
+    """Configure all steps of SLAM."""
 
     checks: InputCheckConfig = field(default_factory=InputCheckConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
@@ -55,13 +55,18 @@ class SlamConfig:
 
 @dataclass(frozen=True, eq=False)
 class SlamResult:
-    """`poses[r][i]` is world_from_cam of frame i of recording r, None where it is not known.
+    """Hold the poses of all frames and statistics.
 
-    `num_submaps` counts the stretches in which tracking was never lost for good; of these
-    `num_joined` share one world, the largest by frames of the first recording, and the frames of
-    the others have no pose. Theirs are `apart[r]`, one list as `poses[r]` for each sub-map, in its
-    own world, as odometry left them. `right_residuals_px` are distances between where landmarks are
-    found in the right pictures and where they should be.
+    Attributes:
+        poses: `poses[r][i]` is world_from_cam of frame i of recording r, None if unknown.
+        apart: `apart[r]` holds the poses of each sub-map outside the common world, in its own world
+            and as odometry estimated them. Each list is as `poses[r]`.
+        num_submaps: number of sub-maps.
+        num_joined: number of sub-maps in the common world, the largest by frames of the first
+            recording.
+        num_lost: number of frames without tracking.
+        disparity_bias_px: disparity bias of the first recording.
+        right_residuals_px: distances between measured and predicted landmarks in the right images.
     """
 
     poses: list[list[Rigid3 | None]]
@@ -80,17 +85,17 @@ def run_slam(
     config: SlamConfig | None = None,
     progress: Progress | None = None,
 ) -> SlamResult:
-    """Track one or several recordings of one place; those after the first are joined to it where
-    they see the same.
+    """Run SLAM on one or several recordings of one place.
 
-    The same recordings give the same poses, byte for byte.
+    Recordings after the first are joined to it at common places. The same recordings give
+    byte-identical poses.
 
     Raises:
-        ConfigError: a value of `config` is out of its bounds.
-        RecordingError: no frame could be tracked; left and right are swapped, or are no pairs;
-            single pictures only.
-        CalibrationError: no calibration, or a baseline that cannot be in metres.
-        UnreadableImageError: from reading the recordings.
+        ConfigError: a value of `config` is out of bounds.
+        RecordingError: no frame could be tracked, left and right are swapped or no pairs, or there
+            are only single images.
+        CalibrationError: there is no calibration, or the baseline cannot be in metres.
+        UnreadableImageError: an image cannot be read.
     """
     config = config or SlamConfig()
     check_bounds(config)
@@ -135,10 +140,11 @@ def estimate_slam_poses(
     config: SlamConfig | None = None,
     progress: Progress | None = None,
 ) -> list[StereoSequence]:
-    """The recordings with the poses that `run_slam` finds.
+    """Return the recordings with the poses of `run_slam`.
 
     Raises:
-        RecordingError: one of them shares no place with the others; and as `run_slam`.
+        RecordingError: a recording has no place in common with the others, or an error of
+            `run_slam`.
     """
     return apply_slam_poses(sequences, run_slam(sequences, config, progress))
 
@@ -146,11 +152,10 @@ def estimate_slam_poses(
 def apply_slam_poses(
     sequences: Sequence[StereoSequence], result: SlamResult
 ) -> list[StereoSequence]:
-    """The recordings with the poses that `run_slam` has found in them, and those of stretches that
-    stayed apart.
+    """Return the recordings with the poses of a SLAM result, including sub-maps that stayed apart.
 
     Raises:
-        RecordingError: one of them shares no place with the others.
+        RecordingError: a recording has no place in common with the others.
     """
     for sequence, poses in zip(sequences, result.poses, strict=True):
         if not any(poses):
@@ -186,8 +191,8 @@ def _track_recording(
 def _prefetch_frames(
     sequence: StereoSequence, checks: InputChecks
 ) -> Iterator[tuple[StereoFrame, MeasuredView]]:
-    """The frames, each read and made ready for measuring while the one before is being worked
-    on."""
+    """Iterate over the frames. Each one is read and prepared while the preceding one is
+    processed."""
 
     def read(index: int) -> tuple[StereoFrame, MeasuredView]:
         frame = sequence[index]
@@ -206,7 +211,7 @@ def _prefetch_frames(
 def _find_largest_submap(
     keyframes: list[KeyFrame], links: list[Link], tracked: list[FramePose | None]
 ) -> int:
-    """The first of the sub-maps that, joined, hold most frames of the first recording."""
+    """Return the first sub-map of the group with the most frames of the first recording."""
     groups = group_submaps(keyframes, links)
     return Counter(
         groups[pose.keyframe.submap] for pose in tracked if pose is not None
@@ -216,7 +221,7 @@ def _find_largest_submap(
 def _read_place_features(
     keyframe: KeyFrame, sequences: Sequence[StereoSequence], config: SlamConfig
 ) -> PlaceFeatures:
-    """What a key frame looks like that was no place of its own: its picture is read once more."""
+    """Extract the place features of a key frame without them, by reading its image again."""
     return extract_place_features(
         prepare_frame(sequences[keyframe.recording][keyframe.frame_idx]), config.odometry.places
     )
@@ -230,7 +235,7 @@ def _optimize_map(
     config: SlamConfig,
     progress: Progress,
 ) -> list:
-    """Make the joined key frames agree; the links that do."""
+    """Optimise the joined key frames, and return the links that agree with the result."""
     chosen = [i for i, keyframe in enumerate(keyframes) if keyframe.submap in joined]
     row = {i: k for k, i in enumerate(chosen)}
     of_joined = [
@@ -250,7 +255,7 @@ def _optimize_map(
 def _to_world_poses(
     tracked: list[list[FramePose | None]], joined: list[int]
 ) -> list[list[Rigid3 | None]]:
-    """World_from_cam of every frame, the world being the camera of the first of them."""
+    """Return world_from_cam of every frame. The world is the camera frame of the first one."""
     poses = [
         [p.world_from_cam() if p is not None and p.keyframe.submap in joined else None for p in one]
         for one in tracked
@@ -262,8 +267,7 @@ def _to_world_poses(
 def _collect_separate_poses(
     tracked: list[FramePose | None], joined: list[int]
 ) -> list[list[Rigid3 | None]]:
-    """Of each sub-map that is not among the joined ones, world_from_cam of its frames in its own
-    world."""
+    """Return the poses of each sub-map that is not joined, in its own world."""
     submaps = sorted({pose.keyframe.submap for pose in tracked if pose is not None} - set(joined))
     return [
         [

@@ -1,8 +1,7 @@
-"""One step of the camera, from the last frame to the next: points followed, robust PnP. And which
-other steps would do as well.
+"""Estimate one step of the camera to the next frame, by point tracking and robust PnP.
 
-Where a wall repeats itself, the points of one panel are found on the next one just as well. That is
-not seen in the step that was found: it is seen by seeking from other places too.
+On a repetitive wall, points of one panel are also found on the next one. The estimated step does
+not show this. So the estimation is repeated from other start poses to find alternative steps.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from topoloc.slam.place_matching import PlaceMatchingConfig
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """When a frame is tracked, and when it becomes a key frame."""
+    """Configure the tracking of frames and the selection of key frames."""
 
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     prediction: PredictionConfig = field(default_factory=PredictionConfig)
@@ -41,61 +40,63 @@ class OdometryConfig:
     bundle: BundleConfig = field(default_factory=BundleConfig)
     places: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
     sigma_px: Annotated[float, Above(0)] = 0.3
-    """Standard deviation of a tracked point."""
+    """Standard deviation of a tracked point, pixels."""
     sigma_bias_px: Annotated[float, Above(0)] = 1.0
-    """How wrong all disparities together may be before the recording has shown by how much."""
+    """Prior standard deviation of the common disparity bias of a recording, pixels."""
     min_disparity_px: Annotated[float, Above(0)] = 0.5
-    """What seems further away than this becomes no landmark."""
+    """Minimum disparity of a new landmark, pixels."""
     sigma_landmark_px: Annotated[float, Above(0)] = 0.25
-    """Uncertainty of a landmark's depth, as a disparity."""
+    """Depth uncertainty of a landmark, as a disparity in pixels."""
     window: Annotated[int, Between(1, 1000)] = 8
-    """Key frames that are adjusted together."""
+    """Number of key frames that are adjusted together."""
     held: Annotated[int, Between(0, 1000)] = 5
-    """Key frames before these that hold them in place."""
+    """Number of fixed key frames before the window."""
     min_tracked: Annotated[int, AtLeast(4)] = 25
-    """Points that agree on a pose; a frame with fewer is lost."""
+    """Minimum number of points that agree on a pose. A frame with fewer is lost."""
     min_tracked_share: Annotated[float, Between(0, 1)] = 0.35
-    """Share of the points followed that must agree; a frame with fewer is lost."""
+    """Minimum share of the tracked points that agree on a pose. A frame with fewer is lost."""
     keyframe_share: Annotated[float, Between(0, 1)] = 0.7
-    """A key frame is due when so few of the last one's points are left."""
+    """A frame becomes a key frame if fewer than this share of the last key frame's points are
+    left."""
     keyframe_motion: Annotated[float, Above(0)] = 0.03
-    """... or when they have moved in the picture by this share of its width (median)."""
+    """A frame also becomes a key frame if the points moved by this share of the image width
+    (median)."""
     min_gap_share: Annotated[float, Between(0, 1)] = 0.5
-    """After a gap, a step that the motion does not let expect is believed where this share of the
-    points is found again."""
+    """Minimum share of the points found again for an unexpected step after a gap."""
     start_spacing_px: Annotated[float, Above(0)] = 25.0
-    """Whether the last picture looks alike from elsewhere is tried from places this far apart
-    (median over the points) ..."""
+    """Spacing of the start poses in the search for repetitions, pixels (median over the points)."""
     max_starts: Annotated[int, Between(0, 1000)] = 16
-    """... so many to either side along the motion at most, ..."""
+    """Maximum number of start poses in each direction along the motion."""
     repeat_depth: Annotated[float, AtLeast(0)] = 1.0
-    """... and as far as this share of the median depth, as the way since the last frame, or as the
-    prediction is uncertain."""
+    """Extent of the start poses, as a share of the median depth. It is at least the predicted step
+    and the uncertainty of the prediction."""
     repeat_share: Annotated[float, Between(0, 1)] = 0.3
-    """It does where this share of the points that should be in the picture agree."""
+    """Minimum share of the visible points that agree at a repetition."""
     max_repeats: Annotated[int, Between(0, 1000)] = 8
-    """A step may then be off by so many of these repeats."""
+    """Maximum number of repetition periods by which a step may be off."""
     same_step: Annotated[float, Above(0)] = 0.04
-    """Steps that differ by less than this share of the median depth, and radians, are the same."""
+    """Two steps are the same if they differ by less than this share of the median depth, and this
+    many radians."""
     max_lost_tracked: Annotated[int, AtLeast(0)] = 3
-    """The points of the last frame that was tracked are sought in so many more."""
+    """Number of frames after a loss into which the last tracked points are still tracked."""
     max_lost_frames: Annotated[int, AtLeast(0)] = 10
-    """A camera that is lost for longer starts a new sub-map, from the first of these frames on that
+    """Number of lost frames after which a new sub-map starts. It begins at the first of them that
     the others follow."""
     places_asked: Annotated[int, Between(0, 1000)] = 6
-    """The last places in which a camera that is lost is sought."""
+    """Number of last places in which a lost camera is relocalized."""
     place_distance: Annotated[float, AtLeast(0)] = 0.1
-    """A key frame keeps what it looks like (for loops) when it is this share of the median depth
-    from the last that did ..."""
+    """Minimum distance between key frames with place features (for loops), as a share of the median
+    depth."""
     place_angle_deg: Annotated[float, AtLeast(0)] = 8.0
-    """... or turned by this angle."""
+    """The rotation (degrees) after which a key frame also gets place features."""
 
 
 @dataclass(eq=False)
 class Tracks:
-    """The points being followed: where they are in the last frame, where in the last key frame,
-    their landmarks, and by how much the first are uncertain, by what does not look alike
-    (pixels)."""
+    """Hold the tracked points: pixels in the last frame and the last key frame, and landmark ids.
+
+    `sigmas_px` is the uncertainty of the former, from the appearance difference (pixels).
+    """
 
     landmark_ids: Int[np.ndarray, " n"]
     points_img: Float32[np.ndarray, "n 2"]
@@ -106,10 +107,11 @@ class Tracks:
     def from_points(
         cls, landmark_ids: Int[np.ndarray, " n"], points_img: Float32[np.ndarray, "n 2"]
     ) -> Tracks:
-        """Points that are followed from here on."""
+        """Start tracks at these points."""
         return cls(landmark_ids, points_img, points_img, np.zeros(len(points_img), np.float32))
 
     def select(self, rows: np.ndarray) -> Tracks:
+        """Return the given rows."""
         return Tracks(
             self.landmark_ids[rows],
             self.points_img[rows],
@@ -120,7 +122,7 @@ class Tracks:
 
 @dataclass(eq=False)
 class LastFrame:
-    """The frame before."""
+    """Hold the preceding frame."""
 
     measured: MeasuredView
     cam_from_world: Rigid3
@@ -128,8 +130,10 @@ class LastFrame:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A pose that enough points agree on. `inlier_ratio` is that of the points that should be in
-    the picture."""
+    """Hold a pose that enough points agree on.
+
+    `inlier_ratio` is the share of inliers among the points that should be visible.
+    """
 
     cam_from_world: Rigid3
     covariance: Float[np.ndarray, "6 6"]
@@ -139,7 +143,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class StepEstimator:
-    """What is followed from the last frame into the next one, `measured`."""
+    """Estimate the step from the last frame to the next one, `measured`."""
 
     last: LastFrame
     reference: KeyFrame
@@ -150,7 +154,7 @@ class StepEstimator:
     config: OdometryConfig
 
     def estimate_step(self, predicted: Rigid3) -> Step | None:
-        """The step that is found from a predicted cam_from_world."""
+        """Estimate the step from a predicted cam_from_world. None if too few points agree."""
         tracks = self.track_points(predicted)
         pose = self.estimate_pose(tracks)
         if pose is None:
@@ -160,8 +164,10 @@ class StepEstimator:
         return Step(pose.cam_from_world, pose.covariance, tracks.select(pose.inliers), inlier_ratio)
 
     def find_repeated_motions(self, prediction: Prediction) -> list[Rigid3]:
-        """What moves a camera to where the last picture would look the same; nothing where nothing
-        repeats itself."""
+        """Return the motions after which the last image would look the same.
+
+        The list is empty if the scene is not repetitive.
+        """
         itself, last = replace(self, measured=self.last.measured), self.last.cam_from_world
         steps = parallel_map(itself.estimate_step, self._sample_start_poses(last, prediction))
         shifts = [
@@ -180,7 +186,8 @@ class StepEstimator:
         ]
 
     def _sample_start_poses(self, centre: Rigid3, prediction: Prediction) -> list[Rigid3]:
-        """Places around one along the predicted motion, as far apart as points are found again."""
+        """Return start poses around one along the predicted motion, as far apart as tracking
+        converges."""
         config = self.config
         direction = prediction.step.log()
         way = float(np.linalg.norm(direction[:3]))
@@ -199,7 +206,7 @@ class StepEstimator:
     def _compute_start_spacing(
         self, cam_from_world: Rigid3, direction: Float[np.ndarray, "6"]
     ) -> float:
-        """How far along a direction the points move by what one step of tracking covers."""
+        """Return the distance along a direction that moves the points by `start_spacing_px`."""
         points = self.landmarks.positions[self.tracks.landmark_ids]
         little = 0.01 * self._median_depth()
         poses = (cam_from_world, Rigid3.exp(little * direction) @ cam_from_world)
@@ -210,12 +217,12 @@ class StepEstimator:
         return little * self.config.start_spacing_px / max(pixels, 1e-3)
 
     def _median_depth(self) -> float:
-        """Median depth of the points in the last frame."""
+        """Return the median depth of the points in the last frame."""
         points = self.last.cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids])
         return float(np.median(points[:, 2])) if len(points) else 1.0
 
     def is_close(self, a: Rigid3, b: Rigid3) -> bool:
-        """Whether two cam_from_world are one place."""
+        """Return whether two cam_from_world are the same within `same_step`."""
         away = a @ b.inverse()
         return bool(
             np.linalg.norm(away.translation) < self.config.same_step * self._median_depth()
@@ -234,8 +241,8 @@ class StepEstimator:
             )
 
     def track_points(self, predicted: Rigid3) -> Tracks:
-        """The points found again from a predicted cam_from_world, where they look as in the last
-        key frame."""
+        """Track the points from a predicted cam_from_world and align them with the last key
+        frame."""
         config, tracks, measured = self.config.tracking, self.tracks, self.measured
         points_world = self.landmarks.positions[tracks.landmark_ids]
         before, after = (
@@ -266,8 +273,8 @@ class StepEstimator:
     def _patch_scales(
         self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3
     ) -> Float32[np.ndarray, " n"]:
-        """How much larger each landmark's surroundings look than in the last key frame: what is
-        approached grows."""
+        """Return the scale of each landmark's patch relative to the last key frame, from the
+        depths."""
         points_world = self.landmarks.positions[landmark_ids]
         before, now = (
             pose.apply(points_world)[:, 2] for pose in (self.reference.cam_from_world, predicted)
@@ -275,7 +282,7 @@ class StepEstimator:
         return np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32)
 
     def estimate_pose(self, tracks: Tracks) -> AbsolutePose | None:
-        """The pose that enough of the points agree on."""
+        """Estimate the pose that enough points agree on. None if there is none."""
         config, stereo = self.config, self.measured.stereo
         if len(tracks.landmark_ids) < config.min_tracked:
             return None
@@ -296,7 +303,7 @@ class StepEstimator:
     def _landmark_covariances(
         self, points_world: Float[np.ndarray, "n 3"], stereo: StereoCamera
     ) -> Float[np.ndarray, "n 3 3"]:
-        """In the world's axes, as the last key frame measured them."""
+        """Return the landmark covariances in world axes, as measured by the last key frame."""
         rotation = self.reference.cam_from_world.rotation
         points_cam = self.reference.cam_from_world.apply(points_world)
         sigma_z = self.config.sigma_landmark_px * points_cam[:, 2] ** 2 / stereo.bf

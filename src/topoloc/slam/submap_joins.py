@@ -1,12 +1,13 @@
-"""Sub-maps that no loop has joined, joined by what many of their pictures say together.
+"""Join sub-maps without a common loop by the consensus of many weak image pairs.
 
-Across a gap two sub-maps share little: a few pictures at their ends, seen from elsewhere, with too
-few matches for any of them to be believed alone. So pairs that match weakly are gathered, both
-ways, with those of the key frames around them; each says where one sub-map lies in the other, and
-what enough of them agree on, from pictures of which none counts twice, joins the two
-(`transform_consensus`). Two floors of one building agree, too, on what they share. So key frames
-that then are nearest to each other are looked at: what both must see alike has to be found again,
-and of another place hardly any of it is. Pictures of a wall of equal panels say nothing here.
+Across a gap two sub-maps share little: a few images at their ends, from other viewpoints. Each pair
+has too few matches to be accepted alone. So weakly matching pairs are collected in both directions,
+together with those of neighbouring key frames. Each pair estimates the transform between the
+sub-maps. The two are joined if enough independent pairs agree (`geometry/transform_consensus.py`).
+
+Two floors of one building may also agree on what they have in common. So the nearest key frames
+after the join are compared. Points that both must see from similar viewpoints have to match. In a
+different place hardly any do. Images of repetitive structures are not used.
 """
 
 from __future__ import annotations
@@ -33,63 +34,61 @@ from topoloc.slam.keyframes import KeyFrame, PlaceFeatures
 from topoloc.slam.loop_closure import Link, LoopConfig, is_reachable, rank_places
 from topoloc.slam.place_matching import PlaceMatchingConfig, count_repeated_features, match_places
 
-_MIN_LOOSE_INLIERS = 6  # matches that agree on a pose which is known already
-_MIN_ROTATION_TRACE = 1.0  # of a turn by 90 degrees: beyond it hardly anything is in both pictures
-_CANDIDATE_FACTOR = (
-    10  # times as many pairs as are checked, the nearest, are asked how much they must see alike
-)
+_MIN_LOOSE_INLIERS = 6  # matches that agree on a known pose
+_MIN_ROTATION_TRACE = 1.0  # of a rotation by 90 degrees, beyond which images hardly overlap
+_CANDIDATE_FACTOR = 10  # candidate pairs per checked pair
 
 PlaceExtractor = Callable[[KeyFrame], PlaceFeatures]
-"""What a key frame looks like, from its recording."""
+"""A function that extracts the place features of a key frame from its recording."""
 
 
 @dataclass(frozen=True)
 class JoinConfig:
-    """Which pictures of two sub-maps are compared, and what joins them."""
+    """Configure the comparison of two sub-maps and the conditions to join them."""
 
     matching: PlaceMatchingConfig = field(
         default_factory=lambda: PlaceMatchingConfig(min_inliers=12, min_inlier_share=0.3)
     )
     consensus: ConsensusConfig = field(default_factory=lambda: ConsensusConfig(min_independent=3))
     num_candidates: Annotated[int, Between(0, 1000)] = 4
-    """Places of the other sub-maps that look most alike, which each one is compared with."""
+    """Number of most similar places in each other sub-map that a place is compared with."""
     num_seeds: Annotated[int, Between(0, 1000)] = 6
-    """Of the pairs that match, around so many of the best ..."""
+    """Number of best matching pairs whose neighbours are compared, too."""
     neighbours: Annotated[int, Between(0, 100)] = 2
-    """... so many key frames before and after either are compared, too."""
+    """Number of key frames before and after each end of these pairs that are compared."""
     sigma: Annotated[float, Above(0)] = 0.03
-    """Metres by which a match may be wrong (one sigma), besides what PnP says ..."""
+    """Sigma of a match, metres, in addition to that of PnP."""
     sigma_deg: Annotated[float, Above(0)] = 1.0
-    """... and degrees."""
+    """Sigma of a match, degrees, in addition to that of PnP."""
     covariance_scale: Annotated[float, Above(0)] = 4.0
-    """Matched features of one view share their errors: more than independent ones would be wrong
-    by."""
+    """Factor of the PnP covariance, because matched features of one view have correlated errors."""
     drift: Annotated[float, AtLeast(0)] = 0.02
-    """Share of the way between two pictures of a sub-map by which they may be wrong (one sigma)
-    ..."""
+    """Drift between two images of a sub-map (one sigma), as a share of their distance."""
     drift_deg: Annotated[float, AtLeast(0)] = 0.3
-    """... and degrees a metre."""
+    """Rotation drift between two images of a sub-map (one sigma), degrees per metre."""
     num_checked: Annotated[int, Between(0, 1000)] = 20
-    """Once joined, so many pairs of pictures that must be most alike are looked at."""
+    """Number of most similar views that are compared to verify a join."""
     alike_deg: Annotated[float, Between(0, 90)] = 15.0
-    """A point is seen alike from directions that differ by less than this ..."""
+    """Maximum angle between two directions from which a point looks the same, degrees."""
     alike_ratio: Annotated[float, AtLeast(1)] = 1.3
-    """... and from distances that differ by less than this factor."""
+    """Maximum ratio of two distances from which a point looks the same."""
     min_seen_points: Annotated[int, AtLeast(1)] = 100
-    """Points that must be seen alike at least, all those pairs together, ..."""
+    """Minimum number of points that must look the same, over all compared views."""
     min_seen_again: Annotated[float, Between(0, 1)] = 0.08
-    """... the share of them that must be matched as the join has it, ..."""
+    """Minimum share of these points that are matched consistently with the join."""
     min_covered: Annotated[float, Between(0, 1)] = 0.55
-    """... and the share of them that lie in parts of a picture where any is: a board may hang in
+    """Minimum share of these points in image cells with a match, because the same board may hang in
     two rooms."""
     cells: Annotated[int, Between(1, 100)] = 4
-    """Such parts, across a picture and down."""
+    """Number of such cells across and down an image."""
 
 
 @dataclass(frozen=True, eq=False)
 class _KeyFramePair:
-    """The two key frames that match best, of the earlier and of the later sub-map: what is said of
-    the two is said at these."""
+    """Hold the best matching key frames of the earlier and the later sub-map.
+
+    Estimates of the transform between the sub-maps refer to these two.
+    """
 
     first: KeyFrame
     second: KeyFrame
@@ -102,8 +101,10 @@ def find_joins(
     config: JoinConfig,
     loops: LoopConfig,
 ) -> list[Link]:
-    """Links that join sub-maps which `links` leave apart; key frames that are compared get their
-    place."""
+    """Return links that join sub-maps which `links` leaves apart.
+
+    Compared key frames get place features.
+    """
     groups = group_submaps(keyframes, links)
     places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
     if len(set(groups.values())) < 2 or len(places) < 2:
@@ -129,8 +130,10 @@ def find_joins(
 def _is_distinct(
     link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, int], config: JoinConfig
 ) -> bool:
-    """Whether neither picture looks nearly as much like itself, from elsewhere, as like the other;
-    `repeated` remembers what did."""
+    """Return whether a match exceeds the repetitions within each of the two images.
+
+    `repeated` caches the counts by key frame.
+    """
     for end in (link.source, link.target):
         place = keyframes[end].place
         if end not in repeated and place is not None:
@@ -144,8 +147,10 @@ def _is_distinct(
 def _select_consistent(
     links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig
 ) -> list[Link]:
-    """Those of the links between two sub-maps that say the same, where enough do and what they say
-    is true of other pictures."""
+    """Return the agreeing links between two sub-maps.
+
+    The list is empty if too few agree, or other images contradict them.
+    """
     if not links:
         return []
     best = max(links, key=lambda link: len(link.match.source_rows))
@@ -159,7 +164,7 @@ def _select_consistent(
 
 
 def group_submaps(keyframes: Sequence[KeyFrame], links: Sequence[Link]) -> dict[int, int]:
-    """Of each sub-map, the first one that links join it with."""
+    """Return the first sub-map of the linked group of each sub-map."""
     groups = {keyframe.submap: keyframe.submap for keyframe in keyframes}
     for link in links:
         one, other = (groups[keyframes[end].submap] for end in (link.source, link.target))
@@ -177,8 +182,7 @@ def _find_similar_places(
     config: JoinConfig,
     loops: LoopConfig,
 ) -> dict[tuple[int, int], list[tuple[int, int]]]:
-    """For each two sub-maps that are apart, the pairs (of the earlier, of the later) that look
-    alike."""
+    """Return the similar pairs (earlier, later) of each two sub-maps that are apart."""
     pairs: dict[tuple[int, int], set[tuple[int, int]]] = {}
     for number, ranked in enumerate(rank_places([keyframes[i] for i in places], loops.vlad)):
         own = keyframes[places[number]].submap
@@ -199,7 +203,7 @@ def _find_similar_places(
 def _find_neighbour_pairs(
     links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig
 ) -> set[tuple[int, int]]:
-    """Pairs of key frames around those of the links: of the earlier sub-map, of the later."""
+    """Return the pairs (earlier, later) of key frames around those of the links."""
     pairs: set[tuple[int, int]] = set()
     for link in links:
         one, other = (
@@ -211,7 +215,7 @@ def _find_neighbour_pairs(
 
 
 def _find_neighbours(row: int, keyframes: Sequence[KeyFrame], num: int) -> list[int]:
-    """Rows of the key frames of one sub-map around one of them, itself among them."""
+    """Return the rows of the key frames of one sub-map around one of them, including itself."""
     own = [i for i, keyframe in enumerate(keyframes) if keyframe.submap == keyframes[row].submap]
     at = own.index(row)
     return own[max(at - num, 0) : at + num + 1]
@@ -223,7 +227,10 @@ def _match_pairs(
     config: JoinConfig,
     loops: LoopConfig,
 ) -> list[Link]:
-    """Both ways of each pair, where it matches and the camera can have gone so."""
+    """Match each pair in both directions.
+
+    Links within a recording that exceed the camera's maximum speed are skipped.
+    """
     links = []
     for source, target in (ends for pair in pairs for ends in (pair, pair[::-1])):
         a, b = keyframes[source].place, keyframes[target].place
@@ -242,15 +249,17 @@ def _match_pairs(
 
 
 def _order_ends(link: Link, keyframes: Sequence[KeyFrame]) -> list[int]:
-    """Its end in the earlier sub-map, and that in the later."""
+    """Return the link's end in the earlier sub-map, and that in the later one."""
     return sorted((link.source, link.target), key=lambda i: keyframes[i].submap)
 
 
 def _compute_estimates(
     links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _KeyFramePair, config: JoinConfig
 ) -> tuple[list[Rigid3], Float[np.ndarray, "n 6 6"]]:
-    """first_from_second as each link says, and the covariances; the further along the sub-maps it
-    is, the less exactly."""
+    """Return first_from_second of each link, and the covariances.
+
+    The covariance grows with the distance along the sub-maps.
+    """
     estimates, covariances, along = [], [], DriftConfig(config.drift, config.drift_deg)
     for link in links:
         a, b = _order_ends(link, keyframes)
@@ -276,8 +285,10 @@ def _is_join_verified(
     ends: _KeyFramePair,
     config: JoinConfig,
 ) -> bool:
-    """Whether enough of what key frames of both sub-maps must see alike is matched, and not on one
-    thing alone."""
+    """Return whether enough of the points that must look the same are matched.
+
+    The matches must also be spread over the images.
+    """
     loosely = replace(config.matching, min_inliers=_MIN_LOOSE_INLIERS, min_inlier_share=0.0)
     num_seen, num_found, num_covered = 0, 0, 0
     for source, target, rows in _find_overlapping_views(
@@ -311,7 +322,7 @@ def _is_join_verified(
 def _compute_cells(
     place: PlaceFeatures, keyframe: KeyFrame, config: JoinConfig
 ) -> Int[np.ndarray, " n"]:
-    """In which cell of a grid over its picture each feature lies."""
+    """Return the grid cell of each feature in its image."""
     camera = keyframe.stereo.camera
     columns_rows = np.floor(
         config.cells * place.features.points_img / [camera.width, camera.height]
@@ -338,8 +349,8 @@ def _find_overlapping_views(
     ends: _KeyFramePair,
     config: JoinConfig,
 ) -> list[tuple[int, int, Int[np.ndarray, " n"]]]:
-    """Source, target and the source's features that are seen alike, of the pairs of places that
-    have most of these; both ways."""
+    """Return source, target and covisible features of the most overlapping pairs, in both
+    directions."""
     ones, others = (
         [i for i, k in enumerate(keyframes) if k.submap == end.submap and k.has_place]
         for end in (ends.first, ends.second)
@@ -380,8 +391,7 @@ def _find_overlapping_views(
 def _find_covisible_features(
     source: KeyFrame, target: KeyFrame, target_from_source: Rigid3, config: JoinConfig
 ) -> Int[np.ndarray, " n"]:
-    """Which features of `source` lie within the picture of `target`, and are seen from about the
-    same side and as far away."""
+    """Return the features of `source` in view of `target` from a similar direction and distance."""
     place = source.place
     assert place is not None
     valid = np.flatnonzero(place.points.valid)

@@ -1,5 +1,4 @@
-"""Points seen by several key frames, put where their rays meet: what a single camera knows of
-depth."""
+"""Triangulate points from the rays of several key frames of a single camera."""
 
 from __future__ import annotations
 
@@ -14,9 +13,13 @@ from topoloc.slam.keyframes import KeyFrame
 
 @dataclass(frozen=True, eq=False)
 class TriangulatedPoints:
-    """Of each point: where its rays come nearest to each other (world), how many there are, the
-    widest angle between the first of them and another (radians), and the largest distance (pixels)
-    from where a key frame sees it; infinite behind one. NaN where one ray is all."""
+    """Hold triangulated points.
+
+    `points` are nearest to all rays (world). `num_rays` is their number. `parallax` is the largest
+    angle between the first ray and another (radians). `max_reprojection_px` is the largest
+    reprojection error, infinite behind a camera. `points` and `max_reprojection_px` are NaN if the
+    point cannot be triangulated.
+    """
 
     points: Float[np.ndarray, "n 3"]
     num_rays: Int[np.ndarray, " n"]
@@ -26,8 +29,10 @@ class TriangulatedPoints:
 
 @dataclass(frozen=True, eq=False)
 class _RayObservations:
-    """All observations of the points sought: row of the point, key frame, pixel, centre and unit
-    direction of the ray in the world."""
+    """Hold all observations of the points.
+
+    They are the point row, key frame, pixel, and the centre and unit direction of the ray (world).
+    """
 
     rows: Int[np.ndarray, " m"]
     frames: Int[np.ndarray, " m"]
@@ -39,8 +44,7 @@ class _RayObservations:
 def triangulate_points(
     keyframes: Sequence[KeyFrame], ids: Int[np.ndarray, " n"]
 ) -> TriangulatedPoints:
-    """The points with these ids (in ascending order) by all that the key frames observe of them,
-    active or not."""
+    """Triangulate the points with these ids (ascending) from all observations, active or not."""
     ray_observations, num = _collect_observations(keyframes, ids), len(ids)
     across = (
         np.eye(3)
@@ -106,7 +110,7 @@ def _compute_reprojection_errors(
 def is_well_triangulated(
     found: TriangulatedPoints, min_rays: int, min_parallax: float, max_px: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which points are known well enough to be believed."""
+    """Return a mask of the points that are triangulated accurately enough."""
     with np.errstate(invalid="ignore"):
         return (
             (found.num_rays >= min_rays)

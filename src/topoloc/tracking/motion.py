@@ -1,10 +1,9 @@
-"""How a camera moves: a filter over pose and velocity on SE(3), which predicts the next pose and
-says how surprising another is.
+"""Filter the camera's pose and velocity on SE(3), predict the next pose and test measured poses.
 
-An extended Kalman filter whose error state is the right perturbation of `world_from_cam` (the
-camera's own axes, in which position and turn are hardly correlated) and the velocity in these axes:
-Sola et al., *A micro Lie theory*, 2018, section V. Between two pictures the velocity is constant
-but for an unknown acceleration.
+It is an extended Kalman filter. Its error state is the right perturbation of `world_from_cam` and
+the velocity, both in the camera's axes. In these axes position and rotation are hardly correlated.
+See Sola et al., *A micro Lie theory*, 2018, section V. The velocity between two images is constant
+except for an unknown acceleration.
 """
 
 from __future__ import annotations
@@ -21,29 +20,32 @@ from topoloc.geometry.rigid import Rigid3
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """What cameras do: in a hand, on a robot, on a car."""
+    """Configure the motion model for a handheld camera, a robot or a car."""
 
     sigma_acceleration: Annotated[float, Above(0)] = 3.0
-    """Of an unknown acceleration, m/s^2."""
+    """Standard deviation of the unknown acceleration, m/s^2."""
     sigma_angular_acceleration: Annotated[float, Above(0)] = 12.0
-    """rad/s^2."""
+    """Standard deviation of the unknown angular acceleration, rad/s^2."""
     sigma_velocity: Annotated[float, Above(0)] = 8.0
-    """Of the velocity of a camera seen once, m/s: it may be on a car."""
+    """Standard deviation of the initial velocity, m/s. The camera may be on a car."""
     sigma_angular_velocity: Annotated[float, Above(0)] = 2.0
-    """rad/s."""
+    """Standard deviation of the initial angular velocity, rad/s."""
     max_step: Annotated[float, Above(0)] = 1.0
-    """Seconds: the velocity says nothing of what comes later, so that the predicted camera stands
-    still from there on."""
+    """Seconds for which the velocity is extrapolated. The predicted camera stands still after
+    that."""
     odometry_share: Annotated[float, AtLeast(0)] = 0.05
-    """Standard deviation of external odometry, as a share of the way and of the turn ..."""
+    """Standard deviation of external odometry, as a share of the translation and the rotation."""
     odometry_sigma: Annotated[float, Above(0)] = 0.002
-    """... and beside it, metres and radians."""
+    """Standard deviation of external odometry that is added to this share, metres and radians."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionState:
-    """Pose and velocity at a time. `covariance` is that of (translation, rotation, velocity,
-    angular velocity) in the camera's axes."""
+    """Hold the pose and velocity at a time.
+
+    `covariance` is that of (translation, rotation, velocity, angular velocity) in the camera's
+    axes.
+    """
 
     t_ns: int
     world_from_cam: Rigid3
@@ -52,16 +54,20 @@ class MotionState:
 
     @property
     def pose_covariance(self) -> Float[np.ndarray, "6 6"]:
-        """Of the right perturbation of `world_from_cam`, equally of the left one of
-        `cam_from_world` (m, rad)."""
+        """Return the covariance of the right perturbation of `world_from_cam` (m, rad).
+
+        It equals that of the left perturbation of `cam_from_world`.
+        """
         return self.covariance[:6, :6]
 
 
 def start_motion(
     t_ns: int, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"], config: MotionConfig
 ) -> MotionState:
-    """A camera seen once, of unknown velocity. `covariance` is of the right perturbation of the
-    pose."""
+    """Return the state of a camera measured once, with unknown velocity.
+
+    `covariance` is that of the right perturbation of the pose.
+    """
     variances = np.repeat([config.sigma_velocity**2, config.sigma_angular_velocity**2], 3)
     both = np.zeros((12, 12))
     both[:6, :6], both[6:, 6:] = covariance, np.diag(variances)
@@ -71,8 +77,11 @@ def start_motion(
 def predict_motion(
     state: MotionState, t_ns: int, config: MotionConfig, before_from_cam: Rigid3 | None = None
 ) -> MotionState:
-    """The state at a later time; with external odometry (`before_from_cam`: the motion since the
-    state) it replaces the velocity."""
+    """Predict the state at a later time.
+
+    External odometry replaces the velocity if it is given. `before_from_cam` is its motion since
+    the state.
+    """
     seconds = (t_ns - state.t_ns) / 1e9
     step = (
         Rigid3.exp(min(seconds, config.max_step) * state.velocity)
@@ -84,10 +93,9 @@ def predict_motion(
     acceleration = np.diag(
         np.repeat([config.sigma_acceleration**2, config.sigma_angular_acceleration**2], 3)
     )
-    # A white acceleration, which leads as far in a step as one that is constant throughout.
-    # Constant it must not be: pose and velocity would be tied so firmly that an error of the
-    # velocity turned its sign with each exact pose and
-    # never faded.
+    # The acceleration is white and moves as far in a step as a constant one. A constant
+    # acceleration would tie pose and velocity so firmly that a velocity error changes its sign with
+    # each exact pose and never fades.
     noise = np.zeros((12, 12))
     noise[6:, 6:] = 0.75 * seconds**2 * acceleration
     if before_from_cam is None:
@@ -110,8 +118,11 @@ def predict_motion(
 def squared_mahalanobis(
     predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> float:
-    """Squared Mahalanobis distance of a measured pose (its covariance of the right perturbation)
-    from the predicted one; chi^2 with 6."""
+    """Return the squared Mahalanobis distance between a measured and the predicted pose.
+
+    `covariance` is that of the right perturbation of the measured pose. The distance follows chi^2
+    with 6 degrees of freedom.
+    """
     error = (predicted.world_from_cam.inverse() @ world_from_cam).log()
     return float(error @ np.linalg.solve(predicted.pose_covariance + covariance, error))
 
@@ -119,7 +130,7 @@ def squared_mahalanobis(
 def update_motion(
     predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> MotionState:
-    """The predicted state, corrected by a measured pose."""
+    """Return the predicted state, corrected by a measured pose."""
     error = (predicted.world_from_cam.inverse() @ world_from_cam).log()
     gain = np.linalg.solve(predicted.pose_covariance + covariance, predicted.covariance[:6]).T
     correction = gain @ error

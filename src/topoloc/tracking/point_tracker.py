@@ -1,11 +1,10 @@
-"""Points of the map followed from picture to picture, between two pictures that were localized in
-full.
+"""Track map points from image to image, between two full localizations.
 
-The points that a full localization stands on are sought again by Lucas and Kanade's method and
-aligned with their patch in that picture (`slam/tracking.py`). The pose is that of the localized
-picture, moved by what the points say of the motion since. For this the points are put where that
-picture, at its pose, shows them, at the depth that the map gives: what the map is wrong by is the
-same before and after the motion, and only wrong depths are left to disturb it.
+The inliers of a full localization are tracked with the Lucas-Kanade method and aligned with their
+patches in that image (`points/point_tracking.py`). The pose is that of the localized image, moved
+by the motion of the points. For this, each point is placed on the ray of its pixel in that image,
+at the depth from the map. Errors of the map are then the same before and after the motion. Only
+wrong depths affect the motion.
 """
 
 from __future__ import annotations
@@ -24,21 +23,20 @@ from topoloc.geometry.stereo import ray_covariances
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.points.point_tracking import TrackingConfig, align_with_reference, track_points
 
-# Where a point lies beside its ray: the pixel defines the ray, so this only keeps the covariance
-# regular.
+# Position noise across the ray. The pixel defines the ray, so this only regularises the covariance.
 _RAY_SIGMA_PX = 0.1
 
 
 @dataclass(frozen=True)
 class PointTrackerConfig:
-    """Which points are followed, and when they are too few."""
+    """Configure the selection of tracked points and the conditions to stop."""
 
     max_points: Annotated[int, Between(4, 100_000)] = 320
-    """Points followed, spread over the picture: more cost time and add little."""
+    """Maximum number of tracked points, spread over the image. More cost time and add little."""
     min_points: Annotated[int, AtLeast(4)] = 20
-    """Points that agree on a pose; with fewer it is not believed."""
+    """Minimum number of points that agree on a pose."""
     min_agreeing: Annotated[float, Between(0, 1)] = 0.6
-    """Share of the points found again that must agree."""
+    """Minimum share of the tracked points that agree on a pose."""
     tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=4.0))
     pose: AbsolutePoseConfig = field(
         default_factory=lambda: AbsolutePoseConfig(
@@ -49,21 +47,23 @@ class PointTrackerConfig:
 
 @dataclass(frozen=True, eq=False)
 class TrackedMotion:
-    """Where a picture was taken, relative to the localized one; `covariance` is of the left
-    perturbation of `cam_from_ref` (m, rad)."""
+    """Hold the motion of an image relative to the localized one.
+
+    `covariance` is that of the left perturbation of `cam_from_ref` (m, rad).
+    """
 
     cam_from_ref: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     num_tracked: int
     num_inliers: int
     tracked_ratio: float
-    """Of the points that there were at first, those that agree."""
+    """Share of the initial points that agree on the pose."""
     shift_px: float
-    """How far they have moved in the picture since (median)."""
+    """Median displacement of the points in the image since then, pixels."""
 
 
 class PointTracker:
-    """Holds the localized picture, its points, and where they were last seen."""
+    """Hold the localized image, its points and their last pixels."""
 
     def __init__(
         self,
@@ -88,13 +88,16 @@ class PointTracker:
 
     @property
     def camera(self) -> Camera:
+        """Return the camera of the tracked images."""
         return self._camera
 
     def track_points(
         self, grey: UInt8[np.ndarray, "h w"], predicted_pose: Rigid3
     ) -> TrackedMotion | None:
-        """The motion up to this picture, taken at about `predicted_pose` (cam_from_world); None
-        where the points are lost."""
+        """Track the points into an image taken near `predicted_pose` (cam_from_world).
+
+        Return the motion since the localized image, None if the points are lost.
+        """
         for initial_pose in (predicted_pose, self._last_from_world):
             rows, points_img = self._find_points(grey, initial_pose)
             pose = self._estimate_pose(points_img, rows)
@@ -127,7 +130,7 @@ class PointTracker:
     def _find_points(
         self, grey: UInt8[np.ndarray, "h w"], initial_pose: Rigid3
     ) -> tuple[np.ndarray, Float32[np.ndarray, "n 2"]]:
-        """Rows of the points found again, and where."""
+        """Return the rows of the points found again, and their pixels."""
         points_world = self._inlier_points.points_world[self._rows]
         before, after = (
             self._camera.img_from_cam(pose.apply(points_world))
@@ -160,8 +163,10 @@ class PointTracker:
     def _estimate_pose(
         self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray
     ) -> AbsolutePose | None:
-        """The pose that enough of the points agree on, found anew: from a prediction that is off
-        the refinement may not get there."""
+        """Estimate the pose that enough points agree on, by RANSAC without a start.
+
+        A refinement may not converge from an inaccurate prediction.
+        """
         config = self._config
         if len(rows) < config.min_points:
             return None
@@ -177,7 +182,7 @@ class PointTracker:
 def _move_onto_rays(
     inlier_points: PointObservations, cam_from_world: Rigid3, camera: Camera
 ) -> PointObservations:
-    """The points moved onto the rays of their pixels; their covariance is that of the depth."""
+    """Move the points onto the rays of their pixels. Their covariance is that of the depth."""
     depths = cam_from_world.apply(inlier_points.points_world)[:, 2]
     rays = np.column_stack(
         [
@@ -204,7 +209,7 @@ def _move_onto_rays(
 def _select_spread_points(
     inlier_points: PointObservations, camera: Camera, max_points: int
 ) -> PointObservations:
-    """At most so many of the points, taken in turn from the cells of a grid."""
+    """Select at most `max_points` points, in turn from the cells of a grid."""
     if len(inlier_points) <= max_points:
         return inlier_points
     cells = np.floor(inlier_points.points_img / [camera.width / 8.0, camera.height / 6.0]).astype(

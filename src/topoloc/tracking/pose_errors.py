@@ -1,13 +1,12 @@
-"""What a localization is wrong by, in two parts: what differs from picture to picture, and what
-lasts.
+"""Split the error of a localization into independent noise and a correlated part.
 
-The noise of a picture's matches is another one in the next picture. What the map's points have in
-common (`correlated_errors.py`) is not: a picture taken close by stands on the same points and is
-wrong by the same, so no number of pictures averages it away. Where the camera moves on, other
-points take over, and the lasting part changes by and by, the sooner the nearer the points are. It
-is taken for a Gauss-Markov process of first order (Gelb, *Applied Optimal Estimation*, 1974,
-section 3.8) in s = way / depth + turn: two pictures have the share exp(-s / reach) of it in common,
-and differ by 2 (1 - exp(-s / reach)) of its covariance.
+The noise of the matches is independent from image to image. The common error of the map's points
+(`correlated_errors.py`) is not. An image taken nearby uses the same points and has the same error,
+so averaging over images does not reduce it. When the camera moves on, other points take over and
+this part changes slowly, faster for nearer points. It is modelled as a first-order Gauss-Markov
+process (Gelb, *Applied Optimal Estimation*, 1974, section 3.8) in s = distance / depth + rotation.
+Two images have the share exp(-s / reach) of it in common. They differ by 2 (1 - exp(-s / reach)) of
+its covariance.
 """
 
 from __future__ import annotations
@@ -23,8 +22,10 @@ from topoloc.localization.result import Localization
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Covariances of the left perturbation of cam_from_world, in the camera's axes (m, rad);
-    `depth` of the points, metres."""
+    """Hold both covariances of the left perturbation of cam_from_world, in camera axes (m, rad).
+
+    `depth` is the median depth of the points, metres.
+    """
 
     noise: Float[np.ndarray, "6 6"]
     correlated: Float[np.ndarray, "6 6"]
@@ -32,11 +33,12 @@ class PoseErrors:
 
     @property
     def total(self) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of the whole error."""
         return self.noise + self.correlated
 
 
 def compute_pose_errors(found: Localization, depth: float, floor_share: float) -> PoseErrors:
-    """The two parts, of points at this depth (metres); the noise is not below `noise_floor`."""
+    """Return both parts for points at this depth (metres). `noise_floor` is added to the noise."""
     noise = found.noise_share * found.camera_covariance
     return PoseErrors(
         noise + noise_floor(depth, floor_share), found.camera_covariance - noise, depth
@@ -44,16 +46,20 @@ def compute_pose_errors(found: Localization, depth: float, floor_share: float) -
 
 
 def noise_floor(depth: float, share: float) -> Float[np.ndarray, "6 6"]:
-    """What is left however many points there are: sigma is `share` of their depth (metres), and as
-    many radians."""
+    """Return the noise that remains with any number of points.
+
+    Its sigma is `share` of their depth (metres), and `share` radians.
+    """
     return np.diag(np.repeat([(share * depth) ** 2, share**2], 3))
 
 
 def compute_correlated_change(
     errors: PoseErrors, cam_from_before: Rigid3, reach: float
 ) -> Float[np.ndarray, "6 6"]:
-    """The covariance by which the lasting part differs from that of another picture,
-    `cam_from_before` away."""
+    """Return the covariance of the change of the correlated part between two images.
+
+    `cam_from_before` is the motion between them.
+    """
     moved = (
         float(np.linalg.norm(cam_from_before.translation)) / errors.depth + cam_from_before.angle()
     )

@@ -1,16 +1,15 @@
-"""What is believed of where a stream's camera is: several hypotheses, each with its motion and its
-weight.
+"""Maintain weighted hypotheses about a stream's camera pose, each with its motion.
 
-A picture of a place that repeats itself may have been taken at any of several poses, and now and
-then a picture is placed wrongly. So a stream believes not one pose but a set of them (a
-multi-hypothesis filter: Reid, *An algorithm for tracking multiple targets*, 1979). Each hypothesis
-predicts the next pose. Where the next picture's answer has a pose that follows, it gains by the
-probability of that pose and by how little this surprises; where it has none, the probability of an
-answer that misses the true pose is left. Poses that follow from nothing begin hypotheses at the
-weight of "elsewhere". Alternatives of two pictures taken close together err alike: what they say
-counts by the share of it that is new. So a camera that was carried, a stream that was placed
-wrongly to begin with, and walls of equal panels are decided alike. What followed points show of the
-motion is true of all hypotheses, and moves them together.
+An image of a repetitive place may fit several poses, and an image is sometimes localized wrongly.
+So a stream holds a set of hypotheses instead of one pose (multi-hypothesis filter: Reid, *An
+algorithm for tracking multiple targets*, 1979).
+
+Each hypothesis predicts the next pose. If the next result contains a consistent pose, the weight is
+multiplied by its probability and likelihood. Otherwise it is multiplied by the probability that the
+result misses the true pose. Poses consistent with no hypothesis start new ones, with the weight of
+"elsewhere". Alternatives of two images taken close together have the same errors. They count only
+by their share of new evidence. The same rule thus handles a camera that was carried, a wrong first
+localization, and walls of equal panels. The motion of tracked points applies to all hypotheses.
 """
 
 from __future__ import annotations
@@ -39,50 +38,50 @@ from topoloc.tracking.motion import (
 
 @dataclass(frozen=True)
 class HypothesesConfig:
-    """What follows from what, what is believed, and how far a prediction reaches."""
+    """Configure the gating, the weights and the extent of predictions."""
 
     motion: MotionConfig = field(default_factory=MotionConfig)
     max_surprise: Annotated[float, Above(0)] = 33.0
-    """Squared Mahalanobis distance from the prediction (chi^2 with 6 degrees of freedom: 1 in
-    100,000), beyond which no pose follows."""
+    """Maximum squared Mahalanobis distance of a consistent pose from the prediction (chi^2 with 6
+    degrees of freedom: 1 in 100,000)."""
     prediction_scale: Annotated[float, Above(0)] = 2.5
-    """By how much the prediction may be more wrong than its sigma says: hands jerk, wheels meet
-    kerbs."""
+    """Factor on the sigma of the prediction, because hands jerk and wheels hit kerbs."""
     min_probability: Annotated[float, Between(0.5, 1)] = 0.9
-    """A hypothesis that has so much of all weight is the pose; while none has, the answer is
+    """Minimum weight of a hypothesis to be reported as the pose. Otherwise the result is
     `ambiguous`."""
     miss: Annotated[float, Between(1e-6, 0.5)] = 0.01
-    """Probability that a localization is wrong ..."""
+    """Probability that a localization is wrong."""
     miss_ambiguous: Annotated[float, Between(1e-6, 0.5)] = 0.1
-    """... and that the true pose is not among alternatives, at least."""
+    """Minimum probability that the true pose is not among the alternatives."""
     renewal: Annotated[float, Above(0)] = 1.0
-    """Motion (way in depths of the points, plus radians) after which what alternatives say is new
-    (but for 1/e) ..."""
+    """Motion after which the evidence of alternatives is new except for 1/e. It is the distance in
+    depths of the points, plus the rotation in radians."""
     renewal_alone: Annotated[float, Above(0)] = 0.1
-    """... and what a single pose says that is less sure than a localization can be."""
+    """The same motion for a single pose that is less certain than a localization can be."""
     refused: Annotated[float, Between(0.01, 1)] = 0.6
-    """Share of its weight that a hypothesis keeps, beside "elsewhere", with a picture that gets no
-    pose: it should have had one there."""
+    """Share of its weight that a hypothesis keeps, relative to "elsewhere", after an image without
+    a pose."""
     elsewhere: Annotated[float, Between(1e-9, 0.5)] = 0.0005
-    """Probability that the camera is at none of the hypotheses, at least: it was carried, or all of
-    them are wrong."""
+    """Minimum probability that the camera is at none of the hypotheses, because it was carried or
+    all are wrong."""
     max_number: Annotated[int, Between(1, 1000)] = 24
-    """The heaviest hypotheses are kept, so many ..."""
+    """Maximum number of hypotheses, those with the highest weights."""
     min_weight: Annotated[float, Between(0, 0.1)] = 0.002
-    """... of at least this share of all weight."""
+    """Minimum weight of a hypothesis."""
     max_asked: Annotated[int, AtLeast(0)] = 8
-    """Around so many of them, the heaviest, a picture is sought where the answer leaves them
-    out."""
+    """Number of hypotheses around which an image is localized again if its result omits them."""
     max_predicted: Annotated[float, AtLeast(0)] = 1.0
-    """Seconds without a measured pose after which a hypothesis is given up ..."""
+    """Seconds without a measured pose after which a hypothesis is dropped."""
     max_predicted_with_odometry: Annotated[float, AtLeast(0)] = 20.0
-    """... or with external odometry."""
+    """The same with external odometry, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose that the picture at hand may have. `covariance` is here, as everywhere below, of the
-    right perturbation."""
+    """Hold a possible pose of the current image.
+
+    `covariance` is that of the right perturbation, as everywhere below.
+    """
 
     world_from_cam: Rigid3
     covariance: Float[np.ndarray, "6 6"]
@@ -92,12 +91,12 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """`state` is of the pose measured last, `odom_from_cam` of that moment, `now` the state at the
-    picture at hand.
+    """Hold one hypothesis.
 
-    `from_best` takes poses of the best hypothesis into those of this one, whatever the motion since
-    they were compared. `candidate_idx` is the number of the candidate that it took of this
-    picture's, None where none.
+    `state` and `odom_from_cam` belong to the last measured pose, `current` to the current image.
+    `from_best` transforms poses of the best hypothesis into those of this one, and stays valid
+    under common motion. `candidate_idx` is the index of the candidate used for this image, None if
+    none was.
     """
 
     state: MotionState
@@ -110,9 +109,10 @@ class _Hypothesis:
 
 
 class PoseHypotheses:
-    """The hypotheses, the heaviest first, and the weight of "elsewhere"; all weights sum to one.
+    """Hold the hypotheses, highest weight first, and the weight of "elsewhere". All weights sum to
+    one.
 
-    `is_track_continued`: the heaviest one is the one that was so before this picture, or follows
+    `is_track_continued` is True if the best hypothesis was the best before this image, or follows
     from it.
     """
 
@@ -121,28 +121,30 @@ class PoseHypotheses:
         self.clear()
 
     def clear(self) -> None:
-        """Nothing is known."""
+        """Remove all hypotheses."""
         self._ranked: list[_Hypothesis] = []
         self._null_weight, self.is_track_continued = 1.0, False
 
     @property
     def best(self) -> MotionState | None:
-        """The heaviest hypothesis at the picture at hand; None where the camera is lost."""
+        """Return the best hypothesis at the current image, None if the camera is lost."""
         return self._ranked[0].current if self._ranked else None
 
     @property
     def candidate_idx(self) -> int | None:
-        """The number of the candidate that the heaviest hypothesis took."""
+        """Return the index of the candidate that the best hypothesis used."""
         return self._ranked[0].candidate_idx if self._ranked else None
 
     @property
     def is_unambiguous(self) -> bool:
-        """Whether one pose leads clearly, or there is none at all."""
+        """Return whether one pose has enough weight, or there is no hypothesis."""
         return not self._ranked or self.alternatives()[0].probability >= self.config.min_probability
 
     def alternatives(self) -> tuple[Alternative, ...]:
-        """The poses at the picture at hand, the likeliest first; hypotheses of one pose that differ
-        in their velocity are one."""
+        """Return the poses at the current image, likeliest first.
+
+        Hypotheses with the same pose and different velocities are merged.
+        """
         found: list[Alternative] = []
         for one in self._ranked:
             pose = one.current.world_from_cam
@@ -159,12 +161,14 @@ class PoseHypotheses:
         return tuple(sorted(found, key=lambda one: -one.probability))
 
     def seconds_since(self, t_ns: int) -> float:
-        """Seconds from the pose measured last to this time; infinite where there is none."""
+        """Return the seconds since the last measured pose, infinite if there is none."""
         return (t_ns - self._ranked[0].state.t_ns) / 1e9 if self._ranked else float("inf")
 
     def predict(self, t_ns: int, odom_from_cam: Rigid3 | None = None) -> MotionState | None:
-        """Where the best hypothesis has the camera at this time; those not measured for too long
-        are given up."""
+        """Predict all hypotheses at this time and return the best.
+
+        Those without a measurement for too long are dropped.
+        """
         config, before, alive = self.config, self._ranked, list[_Hypothesis]()
         for one in before:
             before_from_cam = _relative_odometry(one.odom_from_cam, odom_from_cam)
@@ -185,13 +189,13 @@ class PoseHypotheses:
         left = sum(one.weight for one in alive)
         self._prune(
             alive if self.is_track_continued or left > 0.5 else [], 1.0 - left
-        )  # who was given up is elsewhere: what is left beside it is no belief
+        )  # dropped weight counts as "elsewhere"
         return self.best
 
     def is_consistent(
         self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
     ) -> bool:
-        """Whether this pose can follow from a prediction."""
+        """Return whether this pose is consistent with a prediction."""
         return (
             self._compute_gated_distance(predicted, world_from_cam, covariance)
             <= self.config.max_surprise
@@ -209,8 +213,10 @@ class PoseHypotheses:
         covariance: Float[np.ndarray, "6 6"],
         odom_from_cam: Rigid3 | None,
     ) -> None:
-        """Followed points show the best hypothesis at this pose, and so each other one where the
-        same motion takes it."""
+        """Update all hypotheses with tracked points.
+
+        The points measure the best hypothesis at this pose. The others move by the same motion.
+        """
         for k, one in enumerate(self._ranked):
             current = update_motion(one.current, one.from_best @ world_from_cam, covariance)
             self._ranked[k] = replace(
@@ -224,10 +230,13 @@ class PoseHypotheses:
         odom_from_cam: Rigid3 | None = None,
         new_evidence_ratio: float = 1.0,
     ) -> None:
-        """What the picture's answer makes of the hypotheses, if this share of what it says is new.
+        """Update the hypotheses with the result of the image.
 
-        The candidates exclude each other; where there are none, a place that is not in the map is a
+        The candidates exclude each other. Without candidates, a place outside the map becomes a
         little likelier.
+
+        Args:
+            new_evidence_ratio: share of the evidence that is new since the preceding images.
         """
         if not candidates:
             self._prune(
@@ -249,7 +258,7 @@ class PoseHypotheses:
             if new and self.is_consistent(
                 one.current, candidates[0].world_from_cam, candidates[0].covariance
             ):
-                continue  # it is that one
+                continue  # already merged
             updated = [
                 self._update_with_candidate(one, number, candidate, odom_from_cam)
                 for number, candidate in enumerate(candidates)
@@ -293,8 +302,8 @@ class PoseHypotheses:
         self._update_relative_poses()
 
     def set_best_state(self, state: MotionState, odom_from_cam: Rigid3 | None) -> None:
-        """The heaviest hypothesis is in this state: its pose is known better than from the
-        candidate that it took."""
+        """Replace the state of the best hypothesis by a more accurate one than its candidate
+        gives."""
         self._ranked[0] = replace(
             self._ranked[0], state=state, current=state, odom_from_cam=odom_from_cam
         )
@@ -303,8 +312,10 @@ class PoseHypotheses:
     def _merge_consistent(
         self, candidate: Candidate, odom_from_cam: Rigid3 | None, new_evidence_ratio: float
     ) -> list[_Hypothesis]:
-        """The hypotheses that a sure pose follows from, as one: there they all are. The motion is
-        that of the likeliest of them."""
+        """Merge the hypotheses consistent with a single pose into one.
+
+        The motion is that of the likeliest of them.
+        """
         pose, covariance = candidate.world_from_cam, candidate.covariance
         weight, likeliest = 0.0, (-math.inf, None)
         for one in self._ranked:
@@ -325,8 +336,10 @@ class PoseHypotheses:
     def _update_with_candidate(
         self, one: _Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
     ) -> _Hypothesis | None:
-        """The hypothesis that the picture was taken there, less likely the more that surprises;
-        None where it does not follow."""
+        """Return the hypothesis updated by a candidate, weighted by its likelihood.
+
+        None if the candidate is not consistent with it.
+        """
         pose, covariance = candidate.world_from_cam, candidate.covariance
         if not self.is_consistent(one.current, pose, covariance):
             return None
@@ -345,7 +358,7 @@ class PoseHypotheses:
         )
 
     def _prune(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:
-        """The heaviest of these."""
+        """Keep the hypotheses with the highest weights and normalise the weights."""
         config = self.config
         whole = sum(one.weight for one in hypotheses) + elsewhere
         heaviest = sorted(hypotheses, key=lambda one: -one.weight)[: config.max_number]
@@ -355,7 +368,7 @@ class PoseHypotheses:
         self._ranked = [replace(one, weight=share * one.weight) for one in kept]
 
     def _update_relative_poses(self) -> None:
-        """From where the best hypothesis is to where each is."""
+        """Compute the transforms from the best hypothesis to each one."""
         best_from_world = self._ranked[0].current.world_from_cam.inverse()
         self._ranked = [
             replace(one, from_best=one.current.world_from_cam @ best_from_world)
@@ -364,8 +377,7 @@ class PoseHypotheses:
 
 
 def _merge_duplicates(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
-    """Those that agree in pose and velocity become one, of what was measured now where there is a
-    choice."""
+    """Merge hypotheses with the same pose and velocity, and prefer those measured now."""
     kept: list[_Hypothesis] = []
     least = 1e-4 * max(one.weight for one in hypotheses)
     for one in sorted(
@@ -383,8 +395,10 @@ def _merge_duplicates(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
 
 
 def _is_same_motion(a: MotionState, b: MotionState) -> bool:
-    """Nearer in pose and velocity than what is left open of both would have them by chance every
-    other time."""
+    """Return whether two states differ by less than their covariances allow.
+
+    The limit on the squared Mahalanobis distance (12 degrees of freedom) is 6.
+    """
     error = np.concatenate(
         [(a.world_from_cam.inverse() @ b.world_from_cam).log(), b.velocity - a.velocity]
     )
@@ -392,14 +406,14 @@ def _is_same_motion(a: MotionState, b: MotionState) -> bool:
 
 
 def is_same_pose(a: Rigid3, b: Rigid3) -> bool:
-    """As near as two right answers can be (`Localization.probability`)."""
+    """Return whether two poses are within 0.25 m and 5 degrees."""
     return translation_error(a, b) < 0.25 and (a.inverse() @ b).angle() < math.radians(5.0)
 
 
 def _relative_odometry(
     odom_from_before: Rigid3 | None, odom_from_cam: Rigid3 | None
 ) -> Rigid3 | None:
-    """The motion that external odometry saw, where it was there both times."""
+    """Return the motion of external odometry, None if it is missing at one of the two times."""
     if odom_from_before is None or odom_from_cam is None:
         return None
     return odom_from_before.inverse() @ odom_from_cam

@@ -1,9 +1,8 @@
-"""The last localized pictures adjusted together: each knows where it is in the map, and how the
-camera moved from one to the next.
+"""Smooth the last localized images together.
 
-Localizing has a centimetre of noise, following points a tenth of it. A pose graph over the last few
-localized pictures (`slam/pose_graph.py`; node 0 is the world) takes from each what it knows best,
-with a loss under which a wrong localization loses its say.
+Localization has about a centimetre of noise, point tracking a tenth of that. A pose graph over the
+last few localized images (`slam/pose_graph.py`) combines the two. Its node 0 is the world. A robust
+loss limits the influence of a wrong localization.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimize_pose_graph
 
 @dataclass(frozen=True)
 class PoseWindowConfig:
-    """How many localized pictures, and how they are weighed."""
+    """Configure the size and the weights of the window."""
 
     size: Annotated[int, Between(1, 1000)] = 10
-    """Localized pictures that are adjusted together."""
+    """Number of localized images that are adjusted together."""
     graph: PoseGraphConfig = field(
         default_factory=lambda: PoseGraphConfig(max_steps=5, min_step=1e-4)
     )
@@ -33,7 +32,10 @@ class PoseWindowConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Entry:
-    """Covariances of left perturbations; of the first entry of a window the motion says nothing."""
+    """Hold one localized image. The covariances are those of left perturbations.
+
+    The motion of the first entry is not used.
+    """
 
     cam_from_world: Rigid3
     covariance: Float[np.ndarray, "6 6"]
@@ -42,7 +44,7 @@ class _Entry:
 
 
 class PoseWindow:
-    """The last few localized pictures."""
+    """Hold the last few localized images."""
 
     def __init__(self, config: PoseWindowConfig) -> None:
         self._config = config
@@ -51,6 +53,7 @@ class PoseWindow:
         self._covariance = np.zeros((6, 6))  # of the last one of these
 
     def clear(self) -> None:
+        """Remove all images."""
         self._entries.clear()
         self._smoothed.clear()
 
@@ -61,14 +64,20 @@ class PoseWindow:
         cam_from_before: Rigid3,
         motion_covariance: Float[np.ndarray, "6 6"],
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-        """The smoothed cam_from_world of a picture that was localized at `cam_from_world`,
-        `cam_from_before` after the last one added, and the covariance of its left perturbation.
+        """Add an image and return its smoothed cam_from_world with the covariance of the left
+        perturbation.
+
+        Args:
+            cam_from_world: pose at which the image was localized.
+            covariance: covariance of its left perturbation.
+            cam_from_before: motion since the last added image.
+            motion_covariance: covariance of the left perturbation of the motion.
         """
         if self._smoothed:
             adjoint = cam_from_before.adjoint()
             before = adjoint @ self._covariance @ adjoint.T + motion_covariance
             both = before @ np.linalg.solve(before + covariance, covariance)
-            self._covariance = (both + both.T) / 2.0  # symmetric but for rounding
+            self._covariance = (both + both.T) / 2.0  # symmetric up to rounding
         else:
             self._covariance = covariance
         self._smoothed.append(

@@ -1,5 +1,4 @@
-"""Where a picture of a stream was taken, in full: the localizer's answer, weighed against what is
-believed so far."""
+"""Localize an image of a stream in full, and weigh the result against the pose hypotheses."""
 
 from __future__ import annotations
 
@@ -21,12 +20,13 @@ from topoloc.tracking.tracker_state import StreamFrame
 
 @dataclass(frozen=True, eq=False)
 class ExpectedPose:
-    """About where the picture was taken, and what that is wrong by beside what the filter knows of
-    (covariance, left, of cam_from_world).
+    """Hold the expected pose of an image.
 
-    Who asks around there alone finds only what is there; `is_unique` where nothing else is likely.
-    `is_from_virtual_views`: nodes around do not look this way, so that they know nothing of the
-    picture.
+    `pose_covariance` is the error that the filter does not include (left perturbation of
+    cam_from_world). A search around the expected pose finds only that place. `is_unique` is True if
+    no other place is likely. `is_tracked` is True if the pose comes from tracked points.
+    `is_from_virtual_views` is True if nearby nodes have another viewing direction, so they cannot
+    confirm or reject the image.
     """
 
     world_from_cam: Rigid3
@@ -38,8 +38,7 @@ class ExpectedPose:
 
 @dataclass(frozen=True, eq=False)
 class LocalizedPose:
-    """A pose that the picture may have, with its probability, the points that it stands on, and
-    what it is wrong by."""
+    """Hold a possible pose of the image with its inliers, errors and probability."""
 
     result: Localization
     inlier_points: PointObservations
@@ -48,21 +47,21 @@ class LocalizedPose:
 
 
 class StreamLocalizer:
-    """Asks the localizer and weighs what it answers."""
+    """Run the localizer and update the hypotheses with its result."""
 
     def __init__(
         self, localizer: Localizer, hypotheses: PoseHypotheses, floor_share: float
     ) -> None:
         self._localizer, self._hypotheses, self._floor_share = localizer, hypotheses, floor_share
-        self._last_ambiguous_pose: Rigid3 | None = (
-            None  # where the last ambiguous picture was taken
-        )
+        self._last_ambiguous_pose: Rigid3 | None = None  # pose of the last ambiguous image
 
     def localize(
         self, frame: StreamFrame, expected: ExpectedPose | None
     ) -> LocalizedPose | NotLocalized:
-        """What is believed of this picture, or why nothing is: around what is expected, then in all
-        of the map."""
+        """Localize an image around the expected pose first, then in the whole map.
+
+        Return the pose of the best hypothesis, or the reason if there is none.
+        """
         pose_covariance = np.zeros((6, 6)) if expected is None else expected.pose_covariance
         refusal, found = None, list[LocalizedPose]()
         if expected is not None and expected.is_unique:
@@ -90,8 +89,7 @@ class StreamLocalizer:
         return refusal or reject_jump(found[0].result)
 
     def _compute_new_evidence(self, found: list[LocalizedPose]) -> float:
-        """How much of what a picture says that is not sure is new since the one before that was
-        not."""
+        """Return the share of new evidence in an uncertain result since the last uncertain one."""
         best, before, config = (
             self._hypotheses.best,
             self._last_ambiguous_pose,
@@ -110,9 +108,11 @@ class StreamLocalizer:
     def _localize_globally(
         self, frame: StreamFrame
     ) -> tuple[NotLocalized | None, list[LocalizedPose]]:
-        """As `_query_localizer` in all of the map. Where that does not settle it, also around each
-        hypothesis that the answer leaves out: of many poses that look alike a search finds some.
-        What it left out is at most as likely as the others are in the mean.
+        """Localize an image in the whole map.
+
+        If the result is not unique, the image is also localized around each hypothesis missing from
+        it. A search returns only some of many similar poses. A missing pose is at most as likely as
+        the average of the others.
         """
         refusal, found = self._query_localizer(frame, None)
         if refusal is None:
@@ -143,8 +143,8 @@ class StreamLocalizer:
     def _query_localizer(
         self, frame: StreamFrame, near: Rigid3 | None
     ) -> tuple[NotLocalized | None, list[LocalizedPose]]:
-        """The poses that the picture may have: one, the alternatives of an ambiguous one, or none
-        and why."""
+        """Return the possible poses of the image: one, the alternatives, or none with the
+        reason."""
         result, named = self._localizer.localize_with_inliers(frame.image, frame.camera, near)
         if isinstance(result, NotLocalized):
             return result, [
@@ -173,8 +173,10 @@ class StreamLocalizer:
 
 
 def _place_probability(found: Localization) -> float:
-    """The probability of the place: that of the answer is also that of being precise, which says
-    nothing of other places."""
+    """Return the probability of the place.
+
+    The result's probability also includes the precision, which does not affect other places.
+    """
     return (
         found.probability
         if found.evidence is None
@@ -187,7 +189,7 @@ def _is_known_pose(world_from_cam: Rigid3, found: list[LocalizedPose]) -> bool:
 
 
 def reject_jump(found: Localization) -> NotLocalized:
-    """A pose that the motion does not allow for."""
+    """Return the result for a pose that the motion does not allow."""
     return NotLocalized(
         "jump",
         found.candidates,

@@ -1,5 +1,4 @@
-"""What a stream answers to each of its pictures: the picture's own pose, the smoothed one, and how
-it was come by."""
+"""Result of one image of a stream: its own pose, the smoothed pose and their source."""
 
 from __future__ import annotations
 
@@ -17,17 +16,26 @@ State = Literal["localized", "tracked", "predicted", "ambiguous", "lost"]
 
 @dataclass(frozen=True, eq=False)
 class StreamedPose:
-    """The answer to one picture of a stream.
+    """Hold the result of one image of a stream.
 
-    `state` says what stands behind it: "localized", the picture was matched with the map;
-    "tracked", points of the map were followed into it from the picture before; "predicted",
-    neither, and `smoothed` is what the motion so far lets expect (by the paper's rule: a copy of
-    the pose before); "ambiguous", the pictures so far leave open which of several poses it is, or
-    say too little for one, and `result.alternatives` names them; "lost", no pose at all. In the
-    first two states alone `result` is a `Localization`, the raw pose, and else it says why there is
-    none. `smoothed` is world_from_cam as the whole stream up to this picture shows it;
-    `smoothed_covariance` (6, 6) is of its left perturbation, order (translation, rotation), metres
-    and radians. `is_repeated`: the same picture as the one before, whose answer this is.
+    Attributes:
+        t_ns: capture time, nanoseconds.
+        state: source of the pose, see below.
+        result: the raw pose, a `Localization` in the states "localized" and "tracked". Otherwise
+            the reason for none.
+        smoothed: smoothed world_from_cam, from the whole stream up to this image.
+        smoothed_covariance: covariance (6, 6) of its left perturbation, order (translation,
+            rotation), metres and radians.
+        is_repeated: True if the image equals the preceding one and has the same result.
+
+    The states are:
+
+    - "localized": the image was matched with the map.
+    - "tracked": map points were tracked from the preceding image.
+    - "predicted": neither. `smoothed` is extrapolated from the motion, or copied in mode "paper".
+    - "ambiguous": several poses remain, or one with too little weight. `result.alternatives` holds
+      them.
+    - "lost": no pose.
     """
 
     t_ns: int
@@ -38,7 +46,7 @@ class StreamedPose:
     is_repeated: bool = False
 
     def to_json(self, query: str) -> dict[str, Any]:
-        """One line of the result file, see docs/cli.md."""
+        """Return one line of the result file, see docs/cli.md."""
         smoothed = None if self.smoothed is None else pose_to_json(self.smoothed)
         covariance = None if self.smoothed_covariance is None else self.smoothed_covariance.tolist()
         streamed = {

@@ -1,8 +1,8 @@
-"""A stream through the tiles of an atlas: read from `TileTracker.process`.
+"""Track a stream through the tiles of an atlas.
 
-The atlas is asked until it names the tile that a picture shows. From there the stream is followed
-in that tile's map, as in any map (`tracker.py`). Where that has known nothing for a while, the
-atlas is asked again: the camera may have gone on into another tile.
+`TileTracker.process` is the entry point. The atlas is queried until it finds the tile of an image.
+The stream is then tracked in that tile's map, as in any map (`tracker.py`). If it finds no pose for
+a while, the atlas is queried again, because the camera may have moved to another tile.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 _QUERY_INTERVAL_NS = 1_000_000_000
-"""The atlas is asked again where nothing was known for so long: a refusal costs as much as a dozen
-tracked pictures or more."""
+"""Time without a pose after which the atlas is queried again, nanoseconds. A failed query takes as
+long as a dozen tracked images or more."""
 _LOCALIZED_STATES = ("localized", "tracked")
 
 
 class TileTracker:
-    """The state of one stream; its answers name their tile, in whose world their poses are.
+    """Hold the state of one stream. Each result holds its tile, in whose world the pose is.
 
     Args:
-        localizer: the atlas. The tile that is followed stays open; `close` lets go of it.
+        localizer: the atlas. The tracked tile stays open until `close`.
     """
 
     def __init__(self, localizer: AtlasLocalizer, config: TrackerConfig | None = None) -> None:
@@ -40,15 +40,15 @@ class TileTracker:
         self._last_query_ns = self._last_localized_ns = -_QUERY_INTERVAL_NS
 
     def process(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
-        """Where was this picture, the next of the stream, taken?
+        """Localize the next image of the stream.
 
         Args:
-            t_ns: its time, nanoseconds, later than that of the picture before.
+            t_ns: capture time, nanoseconds, not before the preceding image.
 
         Raises:
-            QueryError: as of `Tracker.process`.
+            QueryError: see `Tracker.process`.
             AtlasError: no tile can be read.
-            StoreError: the object store does not answer.
+            ObjectStoreError: the object store does not respond.
         """
         check_image_size(image, camera)
         self._check_time(t_ns)
@@ -75,15 +75,18 @@ class TileTracker:
         return self._start_tile(result.provenance.tile, image, camera, t_ns)
 
     def process_missing(self, t_ns: int, result: NotLocalized) -> StreamedPose:
-        """The answer to a picture that could not be read. Raises QueryError as of
-        `Tracker.process_missing`."""
+        """Return the result for an image that could not be read.
+
+        Raises:
+            QueryError: see `Tracker.process_missing`.
+        """
         self._check_time(t_ns)
         if self._tile is None:
             return StreamedPose(t_ns, "lost", self.localizer.with_provenance(result, t_ns))
         return self._add_tile(self._tile[2].process_missing(t_ns, result))
 
     def close(self) -> None:
-        """Forget the stream; the tile that was followed may be closed."""
+        """Stop the stream and release the tracked tile."""
         if self._tile is not None:
             self.localizer.release_map(self._tile[1])
         self._tile = None
@@ -99,7 +102,7 @@ class TileTracker:
         self._t_ns = t_ns
 
     def _start_tile(self, tile_id: str, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
-        """The stream followed anew, in this tile."""
+        """Restart the stream in this tile."""
         self.close()
         opened = self.localizer.acquire_map(tile_id)
         self._tile = tile_id, opened, Tracker(opened.localizer, self.config)

@@ -1,18 +1,19 @@
-"""Localizing a stream of pictures: read from `Tracker.process`.
+"""Localize a stream of images. `Tracker.process` is the entry point.
 
-Where a picture was taken is predicted from the motion so far, or from external odometry. Points of
-the map that the last localized picture showed are followed into it; that alone gives its pose, in a
-few milliseconds. Every so often, and whenever too few points are left, it is localized in full,
-around the predicted pose instead of by the coarse search. What that answers is weighed against what
-is believed so far (`pose_hypotheses.py`): a pose that the motion does not allow for is refused
-(reason `jump`), until several agree that the camera is elsewhere indeed, and between the
-alternatives of ambiguous pictures the motion decides. While several are left, the answer is
-`ambiguous`. Localized pictures are adjusted together in a sliding window; what comes out of it is
-the smoothed pose.
+The pose of an image is predicted from the motion so far, or from external odometry. The map points
+of the last localized image are tracked into it, which gives its pose in a few milliseconds. At
+intervals, and if too few points are left, the image is localized in full. The search then runs
+around the predicted pose instead of coarse retrieval.
 
-`mode="paper"` is the rule of section III-B instead: each picture is localized alone, and where its
-pose lies further than `max_jump` from the one before, that one is copied. Here the copy is said to
-be one.
+The result updates the pose hypotheses (`pose_hypotheses.py`). A pose that the motion does not allow
+is rejected (reason `jump`), until several agree that the camera is elsewhere. The motion also
+selects between the alternatives of ambiguous images. While several remain, the result is
+`ambiguous`. Localized images are adjusted together in a sliding window, which gives the smoothed
+pose.
+
+`mode="paper"` applies the rule of section III-B instead. Each image is localized alone. If its pose
+is farther than `max_jump` from the preceding one, that one is copied. The copy has the state
+"predicted".
 """
 
 from __future__ import annotations
@@ -57,46 +58,51 @@ from topoloc.tracking.tracker_state import (
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """When a picture is localized in full, and what is believed."""
+    """Configure the schedule of full localizations, the tracking and the smoothing."""
 
     mode: Literal["motion", "paper"] = "motion"
-    """`paper`: each picture is localized alone, and a pose too far from the one before is refused,
-    which is copied."""
+    """`motion`: predict, track and filter. `paper`: localize each image alone, and copy the
+    preceding pose if the new one is too far from it."""
     max_jump: Annotated[float, Above(0)] = 1.0
-    """mode "paper": metres from one pose to the next beyond which the new one is refused (the
-    paper: 1 to 5, by the size of the place)."""
+    """Mode "paper": maximum distance between two consecutive poses, metres (the paper: 1 to 5, by
+    the size of the place)."""
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
     following: PointTrackerConfig = field(default_factory=PointTrackerConfig)
     window: PoseWindowConfig = field(default_factory=PoseWindowConfig)
     max_side_px: Annotated[int, Between(64, 16_384)] = 800
-    """Points are followed in pictures reduced to this width or height."""
+    """Images are reduced to this width or height for point tracking."""
     localize_every: Annotated[float, AtLeast(0)] = 0.25
-    """Seconds after which a picture that could be tracked is localized in full all the same ..."""
+    """Interval of full localizations, seconds."""
     min_share_left: Annotated[float, Between(0, 1)] = 0.6
-    """... as it is where fewer of the followed points are left ..."""
+    """An image is also localized in full if the share of points still tracked is below this."""
     max_shift: Annotated[float, Above(0)] = 0.04
-    """... or where these have moved by this share of the picture's width."""
+    """An image is also localized in full if the points moved by more than this share of the image
+    width."""
     retry_after: Annotated[float, AtLeast(0)] = 0.1
-    """Seconds to the next attempt where that failed and the points are still there."""
+    """Minimum seconds between two full localizations while the points are tracked."""
     max_doubt: Annotated[float, Above(0)] = 0.3
-    """Where the prediction leaves open by more than this where points are seen (three sigma,
-    radians), the coarse search is asked."""
+    """Maximum direction uncertainty of the prediction (three sigma, radians). Above it, coarse
+    retrieval is used."""
     floor_share: Annotated[float, AtLeast(0)] = 0.001
-    """Sigma of a localization's noise is at least this share of the points' depth, and so many
+    """Sigma added to the noise of a localization, as a share of the points' depth and in
     radians."""
     reach: Annotated[float, Above(0)] = 2.0
-    """How far (way in depths of the points, plus radians) what the map is wrong by lasts (to
-    1/e)."""
+    """Motion over which map errors are correlated (to 1/e). It is the distance in depths of the
+    points, plus the rotation in radians."""
     blend_time: Annotated[float, Above(0)] = 0.2
-    """Seconds (to 1/e) in which what a new localization corrects is worked into the smoothed pose,
-    so that it does not jump."""
+    """Time constant (to 1/e, seconds) of the correction of the smoothed pose by a new localization.
+    It prevents jumps."""
     followed_share: Annotated[float, AtLeast(0)] = 0.05
-    """Sigma of a followed motion, as a share of its way and turn, beside what the points say."""
+    """Sigma of a tracked motion, as a share of its translation and rotation, in addition to the
+    noise of the points."""
 
 
 class Tracker:
-    """The state of one stream; `reset` begins another. Raises ConfigError where a value of `config`
-    is out of its bounds."""
+    """Hold the state of one stream. `reset` starts another one.
+
+    Raises:
+        ConfigError: a value of `config` is out of bounds.
+    """
 
     def __init__(self, localizer: Localizer, config: TrackerConfig | None = None) -> None:
         self.localizer, self.config = localizer, config or TrackerConfig()
@@ -111,7 +117,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Discard the stream."""
         self._t_ns: int | None = None
         self._image: np.ndarray | None = None
         self._answer: StreamedPose | None = None
@@ -123,17 +129,17 @@ class Tracker:
     def process(
         self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None = None
     ) -> StreamedPose:
-        """Where was this picture, the next of the stream, taken?
+        """Localize the next image of the stream.
 
         Args:
-            t_ns: its time, later than that of the picture before; equal only where it is the same
-                picture again.
-            odom_from_cam: its pose by external odometry, in any frame that does not move; only its
-                change from picture to picture counts.
+            t_ns: capture time, nanoseconds, after the preceding image. It may be equal only for the
+                same image.
+            odom_from_cam: pose from external odometry, in any fixed frame. Only its change from
+                image to image is used.
 
         Raises:
-            QueryError: the clock goes backwards, stands still or is not in integer nanoseconds; the
-                image is no picture of 8 bits; the camera is of another image size.
+            QueryError: the clock goes backwards, stands still or is not in integer nanoseconds. Or
+                the image is not an 8-bit image, or its size differs from the camera's.
         """
         check_image_size(image, camera)
         is_same = self._image is not None and np.array_equal(self._image, image)
@@ -145,7 +151,7 @@ class Tracker:
                 result=with_time(self._answer.result, t_ns),
                 is_repeated=True,
             )
-        self._image = image.copy()  # who reads a camera may read into the same memory again
+        self._image = image.copy()  # the caller may reuse the buffer
         if self.config.mode == "paper":
             answer = self._process_paper_mode(image, camera, t_ns)
         else:
@@ -159,7 +165,7 @@ class Tracker:
     def process_missing(
         self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None = None
     ) -> StreamedPose:
-        """The answer to a picture that could not be read: predicted, where the motion is known.
+        """Return the result for an image that could not be read: predicted, if the motion is known.
 
         Raises:
             QueryError: the clock goes backwards or stands still.
@@ -193,8 +199,8 @@ class Tracker:
         self._t_ns = t_ns
 
     def _process_paper_mode(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
-        """Section III-B: "when such a jump is found, we copy the previous pose from the
-        trajectory"."""
+        """Localize one image by section III-B: "when such a jump is found, we copy the previous
+        pose from the trajectory"."""
         result = self.localizer.localize(image, camera)
         if not isinstance(result, Localization):
             return self._copy_previous_pose(result, t_ns)
@@ -239,13 +245,13 @@ class Tracker:
         return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked_motion, clock))
 
     def _drop_stale_reference(self) -> None:
-        """Only while its hypothesis is the heaviest."""
+        """Drop the reference image unless its hypothesis is still the best."""
         if not self._hypotheses.is_track_continued:
             self._reference = None
             self._window.clear()
 
     def _mark_if_ambiguous(self, answer: StreamedPose) -> StreamedPose:
-        """The answer where one hypothesis leads; else that it may be any of them."""
+        """Return the result unchanged if one hypothesis leads, and an ambiguous one otherwise."""
         if self._hypotheses.is_unambiguous:
             return answer
         alternatives = self._hypotheses.alternatives()
@@ -269,8 +275,10 @@ class Tracker:
     def _track_points(
         self, frame: StreamFrame, predicted: MotionState | None
     ) -> TrackedMotion | None:
-        """The points followed into this picture; None where they are lost or lead where the camera
-        cannot be."""
+        """Track the points into this image.
+
+        None if they are lost or give a pose that the motion does not allow.
+        """
         reference = self._reference
         if reference is None or predicted is None or reference.follower.camera != frame.grey_camera:
             return None
@@ -290,7 +298,7 @@ class Tracker:
         )
 
     def _is_localization_due(self, tracked_motion: TrackedMotion, frame: StreamFrame) -> bool:
-        """Whether it is time to localize in full."""
+        """Return whether the image must be localized in full."""
         config, reference = self.config, self._reference
         assert reference is not None
         if not self._hypotheses.is_unambiguous:
@@ -307,8 +315,10 @@ class Tracker:
     def _predict_pose(
         self, predicted: MotionState | None, tracked_motion: TrackedMotion | None
     ) -> ExpectedPose | None:
-        """About where the picture was taken; a followed pose is wrong by its reference's errors and
-        by wrong depths, too."""
+        """Return the expected pose of the image, None if there is no prediction.
+
+        The error of a tracked pose includes those of its reference image and of wrong depths.
+        """
         reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
         if reference is None or predicted is None:
             return None
@@ -343,7 +353,7 @@ class Tracker:
         tracked_motion: TrackedMotion | None,
         seconds: float,
     ) -> StreamedPose:
-        """The answer that a full localization gives, `seconds` after the pose measured before."""
+        """Return the result of a full localization, `seconds` after the last measured pose."""
         cam_from_world, errors = found.result.world_from_cam.inverse(), found.errors
         t_ns, offset = frame.t_ns, Rigid3.identity()
         if predicted is None or self._reference is None:
@@ -361,7 +371,7 @@ class Tracker:
                 else None
             )
             if tracked_motion is None and np.trace(motion_covariance) >= np.trace(errors.noise):
-                self._window.clear()  # a guess from the poses before says nothing new of this one
+                self._window.clear()  # the prediction adds no information
             smoothed, pose_covariance = self._window.add(
                 cam_from_world, errors.noise, motion, motion_covariance
             )
@@ -397,7 +407,7 @@ class Tracker:
         )
 
     def _compute_smoothed_pose(self, tracked_motion: TrackedMotion, t_ns: int) -> Rigid3:
-        """The smoothed cam_from_world of a followed picture."""
+        """Return the smoothed cam_from_world of a tracked image."""
         reference = self._reference
         assert reference is not None
         return (
@@ -412,7 +422,7 @@ class Tracker:
     def _compute_motion(
         self, predicted: MotionState, tracked_motion: TrackedMotion | None
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-        """cam_from_before, from the picture localized last, with the covariance of its left
+        """Return cam_from_before since the last localized image, with the covariance of its left
         perturbation."""
         assert self._reference is not None
         if tracked_motion is not None:
@@ -458,7 +468,7 @@ class Tracker:
         )
 
     def _make_predicted_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
-        """Predicted for a while, then lost."""
+        """Return the predicted pose, or "lost" if there is no hypothesis."""
         predicted = self._hypotheses.best
         if predicted is None:
             return StreamedPose(t_ns, "lost", result)

@@ -1,4 +1,4 @@
-"""What the tracker remembers: the picture at hand, and the one that was localized last."""
+"""Hold the state of the tracker: the current image and the last localized one."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from topoloc.tracking.pose_errors import PoseErrors
 
 @dataclass(frozen=True, eq=False)
 class StreamFrame:
-    """The picture at hand, its time and external odometry; in grey, and reduced, with the camera of
-    that."""
+    """Hold the current image, its time and external odometry.
+
+    `grey` is the image in grey, reduced, and `grey_camera` its camera.
+    """
 
     image: Image
     camera: Camera
@@ -32,11 +34,11 @@ class StreamFrame:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceImage:
-    """The picture that was localized last: its pose raw and smoothed, what these are wrong by, and
-    its points.
+    """Hold the last localized image: its raw and smoothed pose, their errors and its points.
 
-    `covariance` is of the left perturbation of `smoothed`, what the map is wrong by included.
-    `offset` (left of `smoothed`) is what the smoothed poses before it were off by; it fades.
+    `covariance` is that of the left perturbation of `smoothed`, including the errors of the map.
+    `offset` (left of `smoothed`) is the difference to the smoothed poses before this image. It
+    fades over time.
     """
 
     t_ns: int
@@ -50,7 +52,7 @@ class ReferenceImage:
 
 
 def compute_direction_uncertainty(predicted: MotionState, depth: float) -> float:
-    """Three sigma (radians) of the direction in which points at this depth (metres) are seen."""
+    """Return three sigma (radians) of the direction to points at this depth (metres)."""
     sigmas = np.sqrt(np.diag(predicted.pose_covariance))
     return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
 
@@ -58,8 +60,8 @@ def compute_direction_uncertainty(predicted: MotionState, depth: float) -> float
 def compute_motion_covariance(
     tracked_motion: TrackedMotion, share: float
 ) -> Float[np.ndarray, "6 6"]:
-    """Of a followed motion: what the points say, and what wrong depths make of it, this share of
-    the motion."""
+    """Return the covariance of a tracked motion: the noise of the points, and `share` of the motion
+    for wrong depths."""
     way, turn = (
         float(np.linalg.norm(tracked_motion.cam_from_ref.translation)),
         tracked_motion.cam_from_ref.angle(),
@@ -70,8 +72,10 @@ def compute_motion_covariance(
 def compute_smoothed_covariance(
     reference: ReferenceImage | None, since: MotionState | None = None
 ) -> Float[np.ndarray, "6 6"]:
-    """Of the left perturbation of world_from_cam: what the picture localized last is wrong by, and
-    the motion since."""
+    """Return the covariance of the left perturbation of the smoothed world_from_cam.
+
+    It adds the error of the last localized image and of the motion since.
+    """
     covariance = np.zeros((6, 6))
     if reference is not None:
         adjoint = reference.smoothed.inverse().adjoint()
@@ -85,7 +89,7 @@ def compute_smoothed_covariance(
 def downscale_image(
     grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int
 ) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
-    """The picture with its camera, smaller where a side is longer than `max_side_px`."""
+    """Return the image and its camera, reduced if a side is longer than `max_side_px`."""
     scale = max_side_px / max(grey.shape)
     if scale >= 1.0:
         return grey, camera

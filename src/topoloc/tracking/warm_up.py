@@ -1,8 +1,7 @@
-"""Everything that a query needs, compiled before the first one comes: a made-up place is mapped,
-asked about and walked through.
+"""Compile everything that a query needs before the first one.
 
-The machine code is kept (see `compiled.py`): with it this takes a second or two, without it half a
-minute.
+A synthetic place is mapped, localized in and tracked through. The machine code is cached (see
+`compiled.py`). With the cache this takes a second or two, without it half a minute.
 """
 
 from __future__ import annotations
@@ -39,20 +38,20 @@ _WALL_Z, _WALL_SLOPE = 2.0, 0.4  # the wall: z = 2 m + 0.4 x
 
 
 def is_warm() -> bool:
-    """Whether the machine code of what answers is kept: of kernels with which a search begins and
-    ends, and of the last in streams."""
+    """Return whether the machine code for queries is cached.
+
+    It checks kernels at the start and end of a search, and the last one of a stream.
+    """
     return all(map(is_cached, (integral_image, match_projections, solve_factored)))
 
 
 def warm_up(progress: Progress | None = None) -> None:
-    """Compile, or load, all that localizing an image or a stream calls, so that the first query
-    takes no longer than the later ones.
+    """Compile or load all kernels for images and streams, so that the first query is not slower.
 
-    Also fills the cache of machine code where there is none: in a container's image, while it is
-    built.
+    It also fills the cache of machine code, for example while a container image is built.
 
     Args:
-        progress: called with ("compiling", steps done, steps in all).
+        progress: called with ("compiling", steps done, total steps).
     """
     wall = _make_texture(seed=0)
     pictures = [_render_wall(wall, place)[0] for place in (0.0, 0.1, 0.2)]
@@ -95,7 +94,7 @@ def warm_up(progress: Progress | None = None) -> None:
 
 
 class _SyntheticRecording:
-    """An RGB-D recording of two frames along the wall."""
+    """Provide an RGB-D recording of two frames along the wall."""
 
     name = "wall"
 
@@ -123,7 +122,7 @@ class _SyntheticRecording:
 
 
 def _make_texture(seed: int) -> Float32[np.ndarray, "h w"]:
-    """Noise of several sizes, of which no two places look alike."""
+    """Return noise at several scales, in which no two places look alike."""
     rng = np.random.default_rng(seed)
     total = np.zeros((480, 640), np.float32)
     for sigma in (1.5, 3.0, 6.0, 12.0):
@@ -135,7 +134,7 @@ def _make_texture(seed: int) -> Float32[np.ndarray, "h w"]:
 def _render_wall(
     wall: Float32[np.ndarray, "h w"], place: float
 ) -> tuple[UInt8[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """The wall's picture and depth (metres) from `place` metres along x."""
+    """Return the image and depth (metres) of the wall from `place` metres along x."""
     camera = _CAMERA
     wall_from_texel = (
         np.array([[1.0, 0.0, -320.0], [0.0, 1.0, -240.0], [0.0, 0.0, _TEXELS_PER_METRE]])

@@ -93,7 +93,7 @@ def test_without_matplotlib_all_but_the_report_is_done(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setattr(
         demo,
-        "_map_the_lab",
+        "_build_lab_map",
         lambda *_: TopoMetricMap.load(shutil.copy(room_map, tmp_path / "lab.topo")),
     )
     monkeypatch.setattr(demo, "ROLES", {"day": "queries", "night": "queries"})

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.apps.cluster.tiles import TileJob, build_tile, derive_tile_ids, read_manifest
+from topoloc.apps.cluster.tiles import TileJob, build_tile, derive_tile_ids
 from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.editing import read_manifest
 from topoloc.errors import AtlasError, RecordingError
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -134,10 +135,9 @@ def test_nothing_stays_in_the_folder_for_temporary_files(
     job: TileJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    (scratch / ".topoloc-tile.topo.0123456789abcdef.part").write_bytes(
-        b"of a worker that was killed"
-    )
+    left = scratch / "topoloc-tile-0123abcd"
+    left.mkdir(parents=True)
+    (left / "tile.topo").write_bytes(b"of a worker that was killed")
     monkeypatch.setattr("tempfile.tempdir", str(scratch))
     assert build_tile(job, str(tmp_path / "campus"), False, _nothing).state == "built"
     assert list(scratch.iterdir()) == []

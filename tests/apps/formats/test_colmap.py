@@ -22,7 +22,8 @@ from tiny_recordings import (
     tum_line,
     write,
 )
-from topoloc.apps.formats.colmap import align_to_trajectory, open_colmap
+from topoloc import align_to_trajectory
+from topoloc.apps.formats.colmap import open_colmap
 from topoloc.errors import (
     CalibrationError,
     MissingExtraError,

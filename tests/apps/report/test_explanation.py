@@ -31,7 +31,7 @@ def test_an_answer_is_among_what_was_tried(localizer: Localizer, queries: Path):
     best = explanation.best
     assert best is not None
     assert best.verdict == "the answer"
-    assert explanation.num_features["surf"] == len(best.fit.features)
+    assert explanation.num_features["surf"] == len(best.tried.fit.features)
 
 
 def test_first_poses_that_lead_nowhere_new_are_told_so(localizer: Localizer):

@@ -15,6 +15,7 @@ from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.node_matching import NodeMatcher
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.image_io import encode_jpeg
@@ -48,7 +49,10 @@ def test_matches_of_a_localized_query_are_those_that_its_pose_explains(topomap: 
     assert isinstance(result, Localization)
     config = topomap.config.features
     matches = match_with_node(
-        EvaluatedQuery("q", result, truth), picture, CAMERA, topomap.nodes[result.node_id], config
+        EvaluatedQuery("q", result, truth),
+        picture,
+        CAMERA,
+        NodeMatcher(topomap.nodes[result.node_id], config),
     )
     assert len(matches.is_inlier) > 60
     assert matches.is_inlier.all()
@@ -57,16 +61,21 @@ def test_matches_of_a_localized_query_are_those_that_its_pose_explains(topomap: 
 
 def test_without_a_pose_the_truth_tells_right_from_wrong(topomap: TopoMetricMap):
     picture, truth = unseen_views()[2]
-    node = topomap.nodes[2]
-    config = topomap.config.features
+    matcher = NodeMatcher(topomap.nodes[2], topomap.config.features)
     known = match_with_node(
-        EvaluatedQuery("q", NotLocalized("not_in_map"), truth), picture, CAMERA, node, config
+        EvaluatedQuery("q", NotLocalized("not_in_map"), truth),
+        picture,
+        CAMERA,
+        matcher,
     )
     off = _seen_in_node(topomap, 2, known, truth)
     assert known.is_inlier.any()
     np.testing.assert_array_equal(known.is_inlier, off <= 4.0)  # 8 px in a picture of 640
     unknown = match_with_node(
-        EvaluatedQuery("q", NotLocalized("not_in_map"), None), picture, CAMERA, node, config
+        EvaluatedQuery("q", NotLocalized("not_in_map"), None),
+        picture,
+        CAMERA,
+        matcher,
     )
     assert len(unknown.is_inlier) == len(known.is_inlier)
     assert not unknown.is_inlier.any()
@@ -79,8 +88,7 @@ def test_a_picture_without_features_has_no_matches(topomap: TopoMetricMap):
         EvaluatedQuery("q", NotLocalized("too_few_matches"), None),
         black,
         CAMERA,
-        topomap.nodes[0],
-        config,
+        NodeMatcher(topomap.nodes[0], config),
     )
     assert len(matches.is_inlier) == 0
 

@@ -77,13 +77,13 @@ def test_what_nobody_names_is_removed_from_s3_after_its_time(
     where = f"{s3_bucket}/campus"
     create_atlas(where, new_tiles([str(room_map)]))
     store = ObjectStore(where)
-    assert all(-60.0 < age < 60.0 for age in store.ages().values())
+    assert all(-60.0 < age < 60.0 for age in store.ages("tiles").values())
     remove_tiles(where, ["room"])
-    assert len(store.ages()) == 2
+    assert len(store.ages("tiles")) == 2
     add_tiles(
         where, new_tiles([str(other_map)]), grace_s=-60.0
     )  # the clock of the server may be another
-    assert {name.partition("-")[0] for name in store.ages()} == {"tiles/other"}
+    assert {name.partition("-")[0] for name in store.ages("tiles")} == {"tiles/other"}
 
 
 def test_of_manifests_of_one_number_the_first_counts(s3_bucket: str):

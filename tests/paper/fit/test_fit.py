@@ -152,7 +152,7 @@ def test_every_family_is_judged_by_a_fit_without_it():
 
 def test_few_poses_stay_with_the_prior_and_the_strength_follows_what_was_not_fitted_to():
     poses = _drawn(90)
-    assert fit_evidence(poses, TRUE, 1e4).parallel_map == pytest.approx(TRUE.parallel_map, abs=0.01)
+    assert fit_evidence(poses, TRUE, 1e4).as_vector == pytest.approx(TRUE.as_vector, abs=0.01)
     assert best_strength(poses, TRUE) > best_strength(
         _drawn(3000), replace(PRIOR, even_share=0.2, bias=-2.0)
     )

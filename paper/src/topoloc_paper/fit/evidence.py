@@ -81,7 +81,7 @@ def _logistic_regression(
     signs, given = 2.0 * is_right - 1.0, prior.doubt * x[:, -1]
     x, start = (
         np.column_stack([x[:, :-1], np.ones(len(x))]),
-        np.array([*prior.parallel_map[:-1], prior.bias]),
+        np.array([*prior.as_vector[:-1], prior.bias]),
     )
 
     def loss(weights: np.ndarray) -> float:

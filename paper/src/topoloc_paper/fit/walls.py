@@ -55,7 +55,7 @@ def fit_walls(poses: list[TriedPose], before: VirtualViewWeights) -> tuple[Virtu
     signs, given = 2.0 * is_right - 1.0, before.doubt * x[:, -1]
     x, start = (
         np.column_stack([x[:, :-1], np.ones(len(x))]),
-        np.array([*before.parallel_map[:-1], before.bias]),
+        np.array([*before.as_vector[:-1], before.bias]),
     )
 
     def loss(weights: np.ndarray) -> float:

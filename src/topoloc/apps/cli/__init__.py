@@ -103,6 +103,7 @@ PLUGIN_PACKAGES = {
     "train": "topoloc-training",
     "benchmark": "topoloc-paper",
 }
+_BROKEN_PLUGINS: set[str] = set()
 _DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _HELP_ORDER = (
     "demo",
@@ -173,14 +174,27 @@ def all_commands() -> dict[str, tuple[str, str]]:
 
 
 def load_plugins(group: str) -> dict[str, Any]:
-    """What other distributions bring by entry points of a group, all in one dictionary."""
+    """Return the entries of all other distributions' entry points of a group, in one dictionary.
+
+    A distribution whose entry point cannot be loaded is left out, with one warning on stderr.
+    """
     from importlib.metadata import entry_points
 
-    return {
-        name: value
-        for entry_point in entry_points(group=group)
-        for name, value in entry_point.load().items()
-    }
+    found: dict[str, Any] = {}
+    for entry_point in entry_points(group=group):
+        try:
+            found |= dict(entry_point.load())
+        except Exception as error:  # any fault of another distribution: our commands go on
+            _warn_broken_plugin(entry_point.value.partition(":")[0], error)
+    return found
+
+
+def _warn_broken_plugin(module: str, error: Exception) -> None:
+    """Print one line; nothing if it was printed already in this process."""
+    if module not in _BROKEN_PLUGINS:
+        _BROKEN_PLUGINS.add(module)
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        _print_line(f"warning: the plug-in {module} cannot be loaded and is left out ({reason})")
 
 
 def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
@@ -234,8 +248,12 @@ def _check_address_space() -> None:
 
 
 def _print_error(text: str) -> None:
+    _print_line("error: " + " ".join(text.split()))
+
+
+def _print_line(line: str) -> None:
     try:
-        print("error: " + " ".join(text.split()), file=sys.stderr)
+        print(line, file=sys.stderr)
     except OSError:  # the exit status says it
         _discard_output(sys.stderr)
 

@@ -14,8 +14,8 @@ from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
+from topoloc import align_to_trajectory
 from topoloc.apps.cli.output import UsageError, open_recording
-from topoloc.apps.formats.colmap import align_to_trajectory
 from topoloc.apps.formats.metric_scale import estimate_metric_scale
 from topoloc.errors import RecordingError
 from topoloc.geometry.pose_conventions import PoseConventions

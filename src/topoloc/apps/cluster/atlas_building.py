@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from topoloc import read_manifest
 from topoloc.apps.cluster.config import ClusterConfig
+from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import OnJobState, run_on_ray
-from topoloc.apps.cluster.tiles import Outcome, TileJob, build_tile, read_manifest
-from topoloc.atlas.atlas import absolute_address
-from topoloc.mapping.build import Progress
+from topoloc.apps.cluster.tiles import Outcome, TileJob, build_tile
+from topoloc.plugin import absolute_address
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from topoloc.bounds import AtLeast, Between
+from topoloc.plugin import AtLeast, Between
 
 
 @dataclass(frozen=True)

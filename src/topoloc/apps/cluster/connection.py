@@ -18,8 +18,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from topoloc.errors import ClusterError, MissingExtraError
-from topoloc.recordings.atomic import temporary_folder
+from topoloc import ClusterError, MissingExtraError
+from topoloc.plugin import temporary_folder
 
 LOCAL, AUTO = "local", "auto"
 _CONNECT_TIMEOUT_S = 5.0

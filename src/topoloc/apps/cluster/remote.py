@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from topoloc.errors import ClusterError
+from topoloc import ClusterError
 
 if TYPE_CHECKING:
     from topoloc.apps.cluster.tasks import Job
@@ -68,7 +68,7 @@ def run_task(packed: bytes, terms: TaskRequirements, board: Any, number: int) ->
     os.environ.pop("SOURCE_DATE_EPOCH", None)
     if work.epoch is not None:
         os.environ["SOURCE_DATE_EPOCH"] = work.epoch
-    from topoloc.compiled import set_num_threads
+    from topoloc import set_num_threads
 
     set_num_threads(terms.num_threads)
     return pickle.dumps(work.job.run(_create_reporter(board, number)))

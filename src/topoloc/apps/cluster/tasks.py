@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from topoloc import TopolocError
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.connection import connect_to_cluster
 from topoloc.apps.cluster.remote import (
@@ -29,7 +30,6 @@ from topoloc.apps.cluster.remote import (
     run_task,
     throttle_progress,
 )
-from topoloc.errors import TopolocError
 
 _POLL_INTERVAL_S = 0.5
 T = TypeVar("T")

@@ -12,7 +12,6 @@ import contextlib
 import io
 import platform
 import re
-import tempfile
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -21,15 +20,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from topoloc.atlas.atlas import store_at
-from topoloc.atlas.editing import NewTile, add_tiles
-from topoloc.atlas.manifest import Manifest, Tile, check_tile_id
-from topoloc.atlas.store import MANIFEST
-from topoloc.errors import AtlasError, TopolocError
-from topoloc.mapping.build import Progress
-from topoloc.mapping.map_writing import write_map
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.atomic import temporary_file
+from topoloc import AtlasError, NewTile, Tile, TopolocError, TopoMetricMap, add_tiles, read_manifest
+from topoloc.apps.cluster.remote import Progress
+from topoloc.plugin import check_tile_id, temporary_folder
 
 State = Literal["built", "recognised", "updated", "there", "failed"]
 
@@ -155,19 +148,13 @@ def _build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) ->
             " replaces it"
         )
     topomap, _ = job.maker.make(progress)
-    with temporary_file(Path(tempfile.gettempdir()) / "topoloc-tile.topo") as path:
-        write_map(topomap, path)
+    with temporary_folder("topoloc-tile-") as folder:
+        path = folder / "tile.topo"
+        topomap.save(path)
         after = add_tiles(
             atlas, [NewTile(job.tile_id, path, job.world, recipe)], replaces, creates=True
         )
     return "built", after.by_id[job.tile_id]
-
-
-def read_manifest(atlas: str) -> Manifest:
-    """As it is now; an empty one where there is no atlas yet. Raises AtlasError."""
-    store = store_at(atlas)
-    data = store.manifest()
-    return Manifest() if data is None else Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
 
 
 def derive_tile_ids(recordings: Sequence[str]) -> list[str]:

@@ -9,9 +9,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from topoloc import Rigid3, TopolocError
 from topoloc.apps.viewer.scene import Scene, View
-from topoloc.errors import TopolocError
-from topoloc.geometry.rigid import Rigid3
 
 _HALF_PIXEL = 0.5  # the centre of COLMAP's top-left pixel
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from topoloc import TopolocError
 from topoloc.apps.export.colmap import to_colmap_model
 from topoloc.apps.export.foxglove import to_mcap
 from topoloc.apps.export.nerfstudio import to_nerfstudio
 from topoloc.apps.export.text_formats import to_geojson, to_kitti, to_ply, to_tum
 from topoloc.apps.viewer.scene import Scene
-from topoloc.errors import TopolocError
-from topoloc.recordings.atomic import write_bytes, write_folder
+from topoloc.plugin import write_bytes, write_folder
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from topoloc import MissingExtraError, Rigid3
 from topoloc.apps.viewer.scene import Scene, View
-from topoloc.errors import MissingExtraError
-from topoloc.geometry.rigid import Rigid3
 
 MAP_FRAME, CAMERA_FRAME = "map", "camera"
 _CHANNELS = ("red", "green", "blue", "alpha")

@@ -12,11 +12,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from topoloc import GeoreferenceError, Rigid3, TopolocError, TopoMetricMap
 from topoloc.apps.export.text_formats import geojson_feature
-from topoloc.errors import GeoreferenceError, TopolocError
-from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.atomic import write_bytes
+from topoloc.plugin import write_bytes
 
 _TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
 

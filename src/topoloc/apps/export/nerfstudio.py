@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from topoloc import Camera, TopolocError
 from topoloc.apps.export.text_formats import to_ply
 from topoloc.apps.viewer.scene import Scene, View
-from topoloc.errors import TopolocError
-from topoloc.geometry.camera import Camera
 
 _CAM_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _POINTS_FILE = "sparse_pc.ply"

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from topoloc import GeoreferenceError, Trajectory, TrajectoryError
 from topoloc.apps.viewer.scene import Scene, View
-from topoloc.errors import GeoreferenceError, TrajectoryError
-from topoloc.recordings.trajectory import Trajectory, kitti_text, tum_text
+from topoloc.plugin import tum_text
 
 _CAMERA_RGB = (255, 0, 0)
 
@@ -43,7 +43,8 @@ def to_tum(scene: Scene) -> bytes:
 def to_kitti(scene: Scene) -> bytes:
     """The upper 3x4 of world_from_cam, a line a pose; of a map all mapping pictures, not its nodes
     alone."""
-    return kitti_text(Trajectory(scene.trajectory)).encode()
+    rows = (pose.matrix()[:3].ravel().tolist() for pose in scene.trajectory)
+    return "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows).encode()
 
 
 def to_ply(scene: Scene) -> bytes:

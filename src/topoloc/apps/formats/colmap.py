@@ -4,7 +4,7 @@ they stood, in the model's own unit.
 Read by pycolmap (the extra `colmap`), which knows all versions of the files. Pictures come in the
 order of their names. A name that is a number is the picture's time in seconds (nanoseconds above
 1e12), so that a trajectory fits by time; else pictures are 1 s apart. A model made of pictures
-alone knows no metre (`Recording.has_scale`): `scaled` and `align_to_trajectory` give it one.
+alone has no metric scale (`Recording.has_scale`); `align_to_trajectory` gives it one.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.errors import CalibrationError, MissingExtraError, RecordingError, TrajectoryError
-from topoloc.geometry.alignment import align_scaled_poses
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.json_file import parse_relative_path
-from topoloc.recordings.recording import Recording, SequenceView, natural_key
-from topoloc.recordings.text_files import NANOSECONDS_PER_SECOND
-from topoloc.recordings.trajectory import match_frame_poses, read_trajectory
+from topoloc import (
+    CalibrationError,
+    Camera,
+    MissingExtraError,
+    RecordingError,
+    Rigid3,
+    TrajectoryError,
+)
+from topoloc.plugin import Recording, RecordingFormat, natural_key, parse_relative_path
 
 EXPECTED_FILES = "cameras and images (.bin or .txt) of COLMAP"
 _FILES = ("cameras", "images", "points3D")
@@ -86,34 +85,6 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
         cameras=of_frames[1],
         has_scale=False,
     )
-
-
-def align_to_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
-    """A model's recording in the world and the metres of a trajectory file: its own poses, moved
-    and scaled to fit best.
-
-    Raises:
-        TrajectoryError: the file is malformed, fits no frame, or its positions fix no scale.
-    """
-    theirs = match_frame_poses(read_trajectory(path), sequence.t_ns, path)
-    pairs = [
-        (ours, other)
-        for ours, other in zip(sequence.poses, theirs, strict=True)
-        if ours is not None and other is not None
-    ]
-    if not pairs:
-        raise TrajectoryError(f"{path}: no frame has a pose in it and in {sequence.name}")
-    try:
-        scale, world_from_model = align_scaled_poses(
-            [other for _, other in pairs], [ours for ours, _ in pairs]
-        )
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
-    poses = [
-        None if p is None else world_from_model @ Rigid3(p.rotation, scale * p.translation)
-        for p in sequence.poses
-    ]
-    return SequenceView(sequence, list(range(len(sequence))), poses)
 
 
 def _find_model(path: Path) -> Path | None:
@@ -265,14 +236,12 @@ def times_from_names(names: list[str]) -> list[int]:
         whole = [stem.partition(".") for stem in stems]
         is_ns = max(int(seconds or 0) for seconds, _, _ in whole) > _MAX_SECONDS
         t_ns = [
-            int(seconds or 0)
-            if is_ns
-            else int(seconds or 0) * NANOSECONDS_PER_SECOND + int(f"{part:0<9.9}")
+            int(seconds or 0) if is_ns else int(seconds or 0) * 1_000_000_000 + int(f"{part:0<9.9}")
             for seconds, _, part in whole
         ]
         if all(after > before for before, after in pairwise(t_ns)):
             return t_ns
-    return [number * NANOSECONDS_PER_SECOND for number in range(len(names))]
+    return [number * 1_000_000_000 for number in range(len(names))]
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_colmap, ("images",))

@@ -12,13 +12,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from topoloc import CalibrationError, Camera, RecordingError, Rigid3
 from topoloc.apps.formats import colmap
-from topoloc.errors import CalibrationError, RecordingError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.json_file import parse_relative_path
-from topoloc.recordings.recording import Recording, natural_key
+from topoloc.plugin import Recording, RecordingFormat, natural_key, parse_relative_path
 
 EXPECTED_FILES = "database.db of COLMAP"
 _NAME = "database.db"

@@ -18,9 +18,8 @@ from typing import Any
 
 import cv2
 
-from topoloc.errors import RecordingError
-from topoloc.recordings.frame import Image
-from topoloc.recordings.video import silence_opencv
+from topoloc import Image, RecordingError
+from topoloc.plugin import silence_opencv
 
 _URL = re.compile(r"(rtsps?|rtmp|https?|udp|tcp)://\S+", re.IGNORECASE)
 _DEVICE = re.compile(r"\d{1,3}|/dev/video\d{1,3}")

@@ -10,9 +10,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from topoloc.errors import TrajectoryError
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import StereoSequence
+from topoloc import Rigid3, StereoSequence, TrajectoryError
 
 _DISTANCE = re.compile(r"(?P<one>[^,=]+),(?P<other>[^,=]+)=\s*(?P<metres>[0-9.eE+-]+)\s*m?")
 _SCALE_TOLERANCE = 0.05  # of the scale; more than that is no error of a measuring tape

@@ -17,12 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.json_file import json_number, json_rigid, parse_relative_path, read_json
-from topoloc.recordings.recording import DepthImages, Recording, natural_key, times_from_rate
+from topoloc import CalibrationError, Camera, RecordingError, Rigid3, TrajectoryError
+from topoloc.plugin import (
+    DepthImages,
+    Recording,
+    RecordingFormat,
+    json_number,
+    json_rigid,
+    natural_key,
+    parse_relative_path,
+    read_json,
+    times_from_rate,
+)
 
 FILE_NAME = "transforms.json"
 EXPECTED_FILES = "transforms.json of nerfstudio"

@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from topoloc import CalibrationError, Camera, RecordingError, Rigid3, TrajectoryError
 from topoloc.apps.formats.nerfstudio import rigid_from_gl
-from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3, matrix_from_quat_wxyz
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.image_io import image_size
-from topoloc.recordings.json_file import json_number, json_numbers, read_json
-from topoloc.recordings.recording import (
+from topoloc.plugin import (
     DepthImages,
     Recording,
+    RecordingFormat,
+    image_size,
+    json_number,
+    json_numbers,
     list_images,
     natural_key,
+    read_json,
     times_from_rate,
 )
 
@@ -96,7 +96,7 @@ def _pose(row: Any, where: str) -> Rigid3:
     if not 0.99 < length < 1.01:
         raise TrajectoryError(f"{where}: qx qy qz qw is no rotation")
     x, y, z, w = numbers[:4] / length
-    return rigid_from_gl(Rigid3(matrix_from_quat_wxyz(np.array([w, x, y, z])), numbers[4:]))
+    return rigid_from_gl(Rigid3.from_quat_wxyz(np.array([w, x, y, z]), numbers[4:]))
 
 
 def _cameras(data: dict[str, Any], images: list[Path], file: Path) -> list[Camera]:

@@ -9,12 +9,17 @@ from typing import Any
 
 import cv2
 
-from topoloc.errors import MissingExtraError, RecordingError, UnreadableImageError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import StereoRig
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import Image, StereoFrame
-from topoloc.recordings.trajectory import read_ground_truth
+from topoloc import (
+    Camera,
+    Image,
+    MissingExtraError,
+    RecordingError,
+    Rigid3,
+    StereoFrame,
+    StereoRig,
+    UnreadableImageError,
+)
+from topoloc.plugin import read_ground_truth
 
 SVO_SUFFIXES = frozenset({".svo", ".svo2"})
 

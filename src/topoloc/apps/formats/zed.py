@@ -16,16 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
+from topoloc import (
+    CalibrationError,
+    Camera,
+    RecordingError,
+    Rigid3,
+    StereoFrame,
+    StereoRig,
+    StereoSequence,
+)
 from topoloc.apps.formats.svo import SVO_SUFFIXES, open_svo
-from topoloc.errors import CalibrationError, RecordingError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import StereoRig
-from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.text_files import read_text
-from topoloc.recordings.video import VIDEO_SUFFIXES, Video, open_uncalibrated_video, read_frame_size
+from topoloc.plugin import RecordingFormat, Video, read_camera_json, read_text
 
 EXPECTED_FILES = "a video of left and right side by side with SN*.conf beside it, or .svo"
 # Stereolabs' names of the sizes of one picture.
@@ -48,10 +49,10 @@ def can_open(path: Path) -> bool:
         return False
     if path.suffix.lower() in SVO_SUFFIXES:
         return True
-    if path.suffix.lower() not in VIDEO_SUFFIXES or not _list_conf_files(path.parent):
+    if not Video.can_open(path) or not _list_conf_files(path.parent):
         return False
     try:
-        (width, height), _ = read_frame_size(path)
+        width, height = Video.read_size(path)
     except RecordingError:
         return False
     return width >= _MIN_ASPECT_RATIO * height
@@ -114,7 +115,7 @@ def open_zed(path: Path, calibration: str | Path | None = None) -> StereoSequenc
     """
     if path.suffix.lower() in SVO_SUFFIXES:
         return open_svo(path)
-    video = open_uncalibrated_video(path)
+    video = Video.open(path)
     width, height = video.size
     if not is_side_by_side(width, height):
         raise RecordingError(f"{path}: {width}x{height} pixels are not two pictures side by side")
@@ -188,7 +189,8 @@ def read_conf(path: Path, size: tuple[int, int]) -> StereoRig:
     if not baseline > 0.0:
         raise CalibrationError(f"{path}: STEREO baseline of {baseline:g} mm")
     translation = -np.array([baseline, *across]) / 1000.0
-    return StereoRig(left, right, Rigid3(exp_so3(np.array(turn)), translation))
+    rotation = Rigid3.exp(np.array([0.0, 0.0, 0.0, *turn])).rotation
+    return StereoRig(left, right, Rigid3(rotation, translation))
 
 
 def _camera(
@@ -242,12 +244,12 @@ def _find_calibration_file(path: Path) -> Path:
             f"{path}: several calibrations beside it ({', '.join(conf.name for conf in confs)});"
             " --camera names one"
         )
-    if not confs and not (path.parent / FILE_NAME).is_file():
+    if not confs and not (path.parent / "camera.json").is_file():
         raise CalibrationError(
             f"{path}: no SN*.conf beside it; Stereolabs has that of each camera by its serial"
             " number, --camera names it"
         )
-    return confs[0] if confs else path.parent / FILE_NAME
+    return confs[0] if confs else path.parent / "camera.json"
 
 
 def _list_conf_files(folder: Path) -> list[Path]:

@@ -10,15 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.localizer import Localizer
-from topoloc.localization.pose_fit import PoseFit
-from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Trace, TriedProposal
-from topoloc.mapping.sessions import Illumination, measure_illumination
-from topoloc.recordings.frame import Image
+from topoloc import (
+    Camera,
+    Illumination,
+    Localization,
+    Localizer,
+    NotLocalized,
+    Rigid3,
+    Trace,
+    TriedProposal,
+    UncalibratedCamera,
+)
+from topoloc.plugin import Image
 
 _MIN_FEATURES, _MIN_PROBABILITY = 150, 0.5
 _DARKER, _BRIGHTER = 0.6, 1.7  # times the light of the nearest session
@@ -31,11 +34,10 @@ _SAME_POSITION_M, _SAME_ROTATION = 0.3, math.radians(3.0)
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedPose:
-    """One first pose and what became of it; `fit` is the last one of it. `probability` is that of
-    it against "nowhere" alone."""
+    """One first pose and what became of it. `probability` is that of it against "nowhere"
+    alone."""
 
     tried: TriedProposal
-    fit: PoseFit
     probability: float | None
     verdict: str
 
@@ -56,13 +58,13 @@ class Explanation:
     def best(self) -> EvaluatedPose | None:
         """What has most for it."""
         likely = [pose for pose in self.poses if pose.probability is not None]
-        found = [pose for pose in self.poses if pose.fit.pose is not None]
+        found = [pose for pose in self.poses if pose.tried.fit.pose is not None]
         by_odds = max(
             likely,
             key=lambda pose: pose.tried.hypothesis.log_odds if pose.tried.hypothesis else -math.inf,
             default=None,
         )
-        return by_odds or max(found, key=lambda pose: pose.fit.num_inliers, default=None)
+        return by_odds or max(found, key=lambda pose: pose.tried.fit.num_inliers, default=None)
 
 
 def explain(
@@ -72,13 +74,13 @@ def explain(
     trace = Trace()
     result = localizer.localize(image, camera, trace=trace)
     poses = [_evaluate_pose(tried, result) for tried in trace.tried]
-    num_features = {pose.tried.features: len(pose.fit.features) for pose in poses}
+    num_features = {pose.tried.features: len(pose.tried.fit.features) for pose in poses}
     lights = {
         f"{session.session_id} ({session.name})": session.light
         for session in localizer.topomap.sessions
         if session.light is not None
     }
-    unsaid = Explanation(result, num_features, measure_illumination(image), lights, poses, [])
+    unsaid = Explanation(result, num_features, Illumination.of_image(image), lights, poses, [])
     advice = list(dict.fromkeys(_collect_advice(unsaid, localizer)))
     return Explanation(result, num_features, unsaid.light, lights, poses, advice)
 
@@ -89,7 +91,7 @@ def explanation_to_json(name: str, explanation: Explanation) -> dict[str, Any]:
         {
             "source": pose.tried.source,
             "features": pose.tried.features,
-            "node": pose.fit.node_id if pose.fit.node_id >= 0 else None,
+            "node": pose.tried.fit.node_id if pose.tried.fit.node_id >= 0 else None,
             "num_first_matches": len(pose.tried.first.matches),
             "num_first_inliers": pose.tried.first.num_inliers,
             "probability": pose.probability,
@@ -105,25 +107,18 @@ def explanation_to_json(name: str, explanation: Explanation) -> dict[str, Any]:
 
 
 def _evaluate_pose(tried: TriedProposal, result: Localization | NotLocalized) -> EvaluatedPose:
-    fit = (
-        tried.refined
-        if tried.refined is not None and tried.refined.pose is not None
-        else tried.first
-    )
     if tried.hypothesis is not None:
-        fit, probability = tried.hypothesis.fit, tried.hypothesis.probability
+        probability = tried.hypothesis.probability
         return EvaluatedPose(
-            tried, fit, probability, _verdict(tried.hypothesis.world_from_cam, probability, result)
+            tried, probability, _verdict(tried.hypothesis.world_from_cam, probability, result)
         )
-    if fit.pose is None:
+    if tried.fit.pose is None:
         return EvaluatedPose(
-            tried, fit, None, f"no pose: the {len(fit.matches)} matches agree on none"
+            tried, None, f"no pose: the {len(tried.fit.matches)} matches agree on none"
         )
     if tried.refined is None and tried.source != "walls":
-        return EvaluatedPose(tried, fit, None, "the same as one that was found already")
-    return EvaluatedPose(
-        tried, fit, None, "hopeless: far too little of what must be in view was found"
-    )
+        return EvaluatedPose(tried, None, "the same as one that was found already")
+    return EvaluatedPose(tried, None, "hopeless: far too little of what must be in view was found")
 
 
 def _verdict(
@@ -176,13 +171,14 @@ def _collect_advice(explanation: Explanation, localizer: Localizer) -> Iterator[
                 " there"
             )
             yield (
-                f"The likeliest place is near node {best.fit.node_id}, but only {found} were found."
+                f"The likeliest place is near node {best.tried.fit.node_id}, but only {found}"
+                " were found."
             )
             yield (
                 "It may be elsewhere, changed, or seen from a side or in a light that the map does"
                 " not hold."
             )
-        yield from _advice_on_viewpoint(best.fit.world_from_cam, localizer)
+        yield from _advice_on_viewpoint(best.tried.fit.world_from_cam, localizer)
     elif isinstance(result, NotLocalized):
         yield (
             "No part of the map looks enough like this picture: it may be of somewhere else, or of"

@@ -9,15 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from topoloc import Localization, TopoMetricMap
 from topoloc.apps.report.explanation import EvaluatedPose, Explanation
-from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, draw_pair
+from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, decode_template, draw_pair
 from topoloc.apps.report.page_template import render_page
-from topoloc.localization.result import Localization
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.atomic import write_text
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import encode_jpeg
-from topoloc.retrieval.network_images import decode_stored_image
+from topoloc.plugin import Image, encode_jpeg, write_text
 
 _POSES_TEXT = (
     "Of each first pose: points were sought where the map expects them, and weighed. Found counts"
@@ -86,10 +82,14 @@ def verdict(explanation: Explanation) -> str:
 def _rank_poses(explanation: Explanation) -> list[EvaluatedPose]:
     """The poses that are shown, the likeliest first, each node once."""
     with_pose = [
-        pose for pose in explanation.poses if pose.fit.pose is not None and pose.fit.node_id >= 0
+        pose
+        for pose in explanation.poses
+        if pose.tried.fit.pose is not None and pose.tried.fit.node_id >= 0
     ]
-    with_pose.sort(key=lambda pose: (pose.probability or 0.0, pose.fit.num_inliers), reverse=True)
-    return list({pose.fit.node_id: pose for pose in reversed(with_pose)}.values())[::-1][
+    with_pose.sort(
+        key=lambda pose: (pose.probability or 0.0, pose.tried.fit.num_inliers), reverse=True
+    )
+    return list({pose.tried.fit.node_id: pose for pose in reversed(with_pose)}.values())[::-1][
         :_MAX_SHOWN
     ]
 
@@ -107,7 +107,7 @@ def _render_pairs(image: Image, explanation: Explanation, topomap: TopoMetricMap
     articles = [_render_pose(image, pose, topomap) for pose in _rank_poses(explanation)]
     if not articles and explanation.result.candidates:
         node = topomap.nodes[topomap.row_of(explanation.result.candidates[0].node_id)]
-        pair = draw_pair(image, decode_stored_image(node.template_jpeg))
+        pair = draw_pair(image, decode_template(node))
         articles = [_render_figure(pair, f"left the picture, right node {node.summary.node_id}")]
     return '<div class="queries">' + "".join(articles) + "</div>"
 
@@ -120,12 +120,12 @@ def compared_to_json(
     compared = list[dict[str, Any]]()
     for pose in _rank_poses(explanation):
         node, matches = (
-            topomap.nodes[topomap.row_of(pose.fit.node_id)],
+            topomap.nodes[topomap.row_of(pose.tried.fit.node_id)],
             _find_explained_matches(image, pose, topomap),
         )
         pixels = np.column_stack([matches.points_query, matches.points_node]).round(1)[:MAX_MATCHES]
         facts = {
-            "node": pose.fit.node_id,
+            "node": pose.tried.fit.node_id,
             "node_size": [node.camera.width, node.camera.height],
             "verdict": pose.verdict,
         }
@@ -137,7 +137,7 @@ def _find_explained_matches(
     image: Image, pose: EvaluatedPose, topomap: TopoMetricMap
 ) -> NodeMatches:
     """What the pose explains, as far as its node would see it."""
-    node, fit = topomap.nodes[topomap.row_of(pose.fit.node_id)], pose.fit
+    node, fit = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)], pose.tried.fit
     assert fit.pose is not None
     rows = np.flatnonzero(fit.pose.inliers)
     scale = image.shape[1] / fit.camera.width
@@ -157,14 +157,14 @@ def _find_explained_matches(
 
 
 def _num_inliers(pose: EvaluatedPose) -> int:
-    return 0 if pose.fit.pose is None else int(pose.fit.pose.inliers.sum())
+    return 0 if pose.tried.fit.pose is None else int(pose.tried.fit.pose.inliers.sum())
 
 
 def _render_pose(image: Image, pose: EvaluatedPose, topomap: TopoMetricMap) -> str:
-    node = topomap.nodes[topomap.row_of(pose.fit.node_id)]
+    node = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)]
     pair = draw_pair(
         image,
-        decode_stored_image(node.template_jpeg),
+        decode_template(node),
         _find_explained_matches(image, pose, topomap),
         node.camera,
     )
@@ -201,7 +201,7 @@ def _render_table(explanation: Explanation) -> str:
 def row_of(pose: EvaluatedPose) -> tuple[str, ...]:
     """What `_COLUMNS` name, as text."""
     evidence = pose.tried.hypothesis.evidence if pose.tried.hypothesis is not None else None
-    node = str(pose.fit.node_id) if pose.fit.node_id >= 0 else ""
+    node = str(pose.tried.fit.node_id) if pose.tried.fit.node_id >= 0 else ""
     first = f"{pose.tried.first.num_inliers} of {len(pose.tried.first.matches)}"
     if evidence is None:
         return pose.tried.source, pose.tried.features, node, first, "", "", "", "", pose.verdict

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, PercentFormatter
 
+from topoloc import EvaluatedQuery, NotLocalized
 from topoloc.apps.report.figure_style import (
     BAD,
     GREY,
@@ -27,8 +28,7 @@ from topoloc.apps.report.figure_style import (
     recording_colours,
     svg_text,
 )
-from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording
-from topoloc.localization.result import NotLocalized
+from topoloc.plugin import group_by_recording
 
 STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp")
 

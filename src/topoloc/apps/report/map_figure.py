@@ -12,6 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from topoloc import EvaluatedQuery, Localization, NotLocalized, TopoMetricMap
 from topoloc.apps.report.figure_style import (
     BAD,
     ERROR,
@@ -22,9 +23,7 @@ from topoloc.apps.report.figure_style import (
     recording_colours,
     svg_text,
 )
-from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording
-from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.plugin import group_by_recording
 
 # Height over width of the map.
 MIN_ASPECT, MAX_ASPECT = 0.3, 0.8

@@ -13,17 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from topoloc.evaluation.metrics import EvaluatedQuery
-from topoloc.features.extraction import extract_features
-from topoloc.features.feature_types import FeatureConfig, find_feature_type
-from topoloc.features.matching import MatchingConfig, match_pooled
-from topoloc.geometry.camera import Camera
-from topoloc.localization.guided import GuidedConfig, match_guided
-from topoloc.localization.local_map import LocalMap
-from topoloc.localization.result import Localization
-from topoloc.mapping.topomap import TopoNode
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import to_grey
+from topoloc import Camera, EvaluatedQuery, Localization, MapError, TopoNode
+from topoloc.apps.viewer.map_scene import decode_jpeg
+from topoloc.plugin import Image, NodeMatcher
 
 # Pictures are shown, and matched, no wider than this.
 IMAGE_WIDTH_PX = 480
@@ -53,7 +45,7 @@ class NodeMatches:
 
 
 def match_with_node(
-    answer: EvaluatedQuery, image: Image, camera: Camera, node: TopoNode, features: FeatureConfig
+    answer: EvaluatedQuery, image: Image, camera: Camera, matcher: NodeMatcher
 ) -> NodeMatches:
     """Matches of a query's picture (of `camera`) with one node.
 
@@ -61,28 +53,18 @@ def match_with_node(
     where there is none, all disagree.
     """
     image, scaled, scale = _downscale(image, camera)
-    query = extract_features(to_grey(image), features)
-    local_map, kind = LocalMap.of_node(node), find_feature_type(features.kind)
+    query = matcher.extract_features(image)
     if isinstance(answer.result, Localization):
         cam_from_world = answer.result.world_from_cam.inverse()
-        matches = match_guided(
-            query, local_map, cam_from_world, scaled, GuidedConfig().resolved(kind)
-        )
+        matches = matcher.match_at_pose(query, cam_from_world, scaled)
     else:
         cam_from_world = None if answer.world_from_cam is None else answer.world_from_cam.inverse()
-        matching = MatchingConfig(ratio=kind.ratio)
-        matches = match_pooled(
-            query.descriptors,
-            local_map.descriptors,
-            local_map.points_world,
-            local_map.radii,
-            matching,
-        )
+        matches = matcher.match(query)
     points_query = query.points_img[matches.query_idx].astype(np.float64)
-    points_node = node.features.points_img[matches.train_idx].astype(np.float64)
+    points_node = matcher.node.features.points_img[matches.train_idx].astype(np.float64)
     is_inlier = np.zeros(len(points_query), dtype=bool)
     if cam_from_world is not None and len(is_inlier):
-        seen = scaled.img_from_cam(cam_from_world.apply(local_map.points_world[matches.train_idx]))
+        seen = scaled.img_from_cam(cam_from_world.apply(matcher.points_world[matches.train_idx]))
         is_inlier = (
             np.linalg.norm(seen - points_query, axis=1)
             <= MAX_REPROJECTION_ERROR_PX * scaled.width / 640.0
@@ -94,6 +76,14 @@ def match_with_node(
             is_inlier[is_inlier],
         )
     return NodeMatches(points_query / scale, points_node, is_inlier)
+
+
+def decode_template(node: TopoNode) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the image of a node, RGB. Raises MapError if it is damaged."""
+    image = decode_jpeg(node.template_jpeg)
+    if image is None:
+        raise MapError("the map is damaged: a mapping image is no picture")
+    return image
 
 
 def draw_pair(

@@ -9,20 +9,22 @@ from html import escape
 
 import numpy as np
 
-from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, draw_pair, match_with_node
-from topoloc.errors import UnreadableImageError
-from topoloc.evaluation.metrics import (
-    MAX_ROTATION_DEG,
-    MAX_TRANSLATION,
+from topoloc import (
     EvaluatedQuery,
-    format_length,
-    group_by_recording,
+    Localization,
+    NotLocalized,
+    TopoMetricMap,
+    TopoNode,
+    UnreadableImageError,
 )
-from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import TopoMetricMap, TopoNode
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import encode_jpeg
-from topoloc.retrieval.network_images import decode_stored_image
+from topoloc.apps.report.match_images import (
+    JPEG_QUALITY,
+    NodeMatches,
+    decode_template,
+    draw_pair,
+    match_with_node,
+)
+from topoloc.plugin import Image, NodeMatcher, encode_jpeg, format_length, group_by_recording
 
 NUM_WORST = 6
 
@@ -78,7 +80,8 @@ def _error_rank(answer: EvaluatedQuery) -> tuple[int, float]:
     if isinstance(answer.result, NotLocalized):
         return 1, 0.0
     return 2 * answer.is_false_accept, max(
-        answer.translation_m / MAX_TRANSLATION, answer.rotation_deg / MAX_ROTATION_DEG
+        answer.translation_m / answer.MAX_TRANSLATION,
+        answer.rotation_deg / answer.MAX_ROTATION_DEG,
     )
 
 
@@ -146,7 +149,7 @@ def _render_images(answer: EvaluatedQuery, node: TopoNode | None, topomap: TopoM
     else:
         pair = draw_pair(
             image,
-            decode_stored_image(node.template_jpeg),
+            decode_template(node),
             _find_matches(answer, image, node, topomap),
             node.camera,
         )
@@ -161,7 +164,8 @@ def _find_matches(
     """Matches to draw; None where the node has no points or the camera is not known."""
     if answer.camera is None or node.summary.num_points == 0:
         return None
-    return match_with_node(answer, image, answer.camera, node, topomap.config.features)
+    matcher = NodeMatcher(node, topomap.config.features)
+    return match_with_node(answer, image, answer.camera, matcher)
 
 
 def _load_query_image(answer: EvaluatedQuery) -> Image | None:

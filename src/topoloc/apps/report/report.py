@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from topoloc import EvaluatedQuery, TopoMetricMap
 from topoloc.apps.report.figures import draw_error_curves, draw_errors_along, draw_stage_times
 from topoloc.apps.report.map_figure import draw_map
 from topoloc.apps.report.page_template import render_page
@@ -26,9 +27,7 @@ from topoloc.apps.report.report_tables import (
 )
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
 from topoloc.apps.viewer.page import embedded_head, embedded_scene
-from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.atomic import write_text
+from topoloc.plugin import group_by_recording, write_text
 
 _SCENE_BUDGET = SceneBudget(max_points=60_000, max_image_bytes=1_500_000)
 _SCENE = (

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import Any
 
+from topoloc import EvaluatedQuery
 from topoloc.apps.report.figure_style import recording_colours
-from topoloc.evaluation.metrics import MAX_ROTATION_DEG, MAX_TRANSLATION, format_length
+from topoloc.plugin import format_length
 
 _COLUMNS = ("localized", "median error", "in 5 cm, 5°", "in 25 cm, 2°", "false accepts", "ms")
 
@@ -151,7 +152,7 @@ def explain_shares(evaluation: dict[str, Any]) -> str:
     """One sentence or two on how the shares are to be read."""
     false = (
         "A false accept is a pose for an image from elsewhere, or one off by more than"
-        f" {MAX_TRANSLATION:g} m or {MAX_ROTATION_DEG:g}°."
+        f" {EvaluatedQuery.MAX_TRANSLATION:g} m or {EvaluatedQuery.MAX_ROTATION_DEG:g}°."
     )
     if not evaluation["num_queries"]:
         return false

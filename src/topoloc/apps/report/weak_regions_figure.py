@@ -11,14 +11,13 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from topoloc import NodeQuality, TopoMetricMap, WeakRegions
 from topoloc.apps.report.figure_style import BAD, ERROR, GREY, MAX_MARKS, NODE, STYLE, svg_text
 from topoloc.apps.report.map_figure import compute_plot_limits, find_horizontal_axes
-from topoloc.lifelong.weak_regions import NodeQuality, Reason, WeakRegions
-from topoloc.mapping.topomap import TopoMetricMap
 
 # What a node is drawn as: by the worst that is true of it; a ring instead of a dot where nobody
 # looks back.
-_MARKS: dict[Reason | None, tuple[str, str, float, str]] = {
+_MARKS: dict[str | None, tuple[str, str, float, str]] = {
     None: ("o", "#2f6db5", 5.0, "held by the rest of the map"),
     "single_session": ("o", "#7fa7d6", 5.0, "seen by one session alone"),
     "few_landmarks": ("s", ERROR, 6.0, "few landmarks"),
@@ -127,7 +126,7 @@ def _draw_marks(axes: Axes, weak: WeakRegions, axes_idx: list[int]) -> list[Line
     return handles
 
 
-def _worst_reason(node: NodeQuality, weak: WeakRegions) -> Reason | None:
+def _worst_reason(node: NodeQuality, weak: WeakRegions) -> str | None:
     """Of a map of one session, that only this one saw a node says nothing."""
     shown = [
         reason

@@ -8,11 +8,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from topoloc import NodeQuality, TopoMetricMap, WeakRegion, WeakRegions
 from topoloc.apps.report.page_template import render_page
 from topoloc.apps.report.weak_regions_figure import draw_weak_regions
-from topoloc.lifelong.weak_regions import NodeQuality, WeakRegion, WeakRegions
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.atomic import write_text
+from topoloc.plugin import write_text
 
 REASON_TEXTS = {
     "not_held": "not held by the rest of the map",

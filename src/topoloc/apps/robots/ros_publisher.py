@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import MissingExtraError
-from topoloc.geometry.rigid import Rigid3
+from topoloc import MissingExtraError, Rigid3
 
 POSE_TOPIC, TF_TOPIC = "rt/topoloc/pose", "rt/tf"
 MAP_FRAME, CAMERA_FRAME = "map", "topoloc_camera"

@@ -13,6 +13,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 
 import topoloc
+from topoloc import AtlasConfig, MapCache, TrackerConfig
 from topoloc.apps.service import geopose_routes, map_routes, page_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
@@ -25,9 +26,6 @@ from topoloc.apps.service.served_atlases import ServedAtlases
 from topoloc.apps.service.state import Service
 from topoloc.apps.service.streams import Streams
 from topoloc.apps.service.workers import Workers
-from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.map_cache import MapCache
-from topoloc.tracking.tracker import TrackerConfig
 
 _DESCRIPTION = """Where was this picture taken? Pictures become 6-DoF poses in maps that `topoloc build` made.
 

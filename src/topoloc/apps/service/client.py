@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from topoloc.errors import MissingExtraError, ServiceError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import Localization, NotLocalized, result_from_json
+from topoloc import (
+    Camera,
+    Localization,
+    MissingExtraError,
+    NotLocalized,
+    Rigid3,
+    ServiceError,
+    result_from_json,
+)
 
 if TYPE_CHECKING:
     import httpx

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from typing import Annotated
 
-from topoloc.bounds import Above, AtLeast, Between
+from topoloc.plugin import Above, AtLeast, Between
 
 
 @dataclass(frozen=True)

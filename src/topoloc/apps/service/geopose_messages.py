@@ -18,13 +18,9 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
+from topoloc import AtlasError, GeoPositionPrior, Georeference, Localization
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.atlas.location_prior import GeoPositionPrior
-from topoloc.errors import AtlasError
-from topoloc.geometry.geodesy import Georeference
-from topoloc.localization.result import Localization
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import EncodedImage
+from topoloc.plugin import EncodedImage, Image
 
 R = TypeVar("R", bound=BaseModel)
 MEDIA_TYPE = "application/vnd.oscp+json"

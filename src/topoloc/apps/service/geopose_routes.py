@@ -11,6 +11,14 @@ import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse, Response
 
+from topoloc import (
+    Camera,
+    Georeference,
+    Localization,
+    NotLocalized,
+    TopoMetricMap,
+    UncalibratedCamera,
+)
 from topoloc.apps.service.geopose_messages import (
     EXAMPLE,
     MEDIA_TYPE,
@@ -31,13 +39,7 @@ from topoloc.apps.service.query_handler import decode_image
 from topoloc.apps.service.query_request import read_body
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.geodesy import Georeference
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import EncodedImage
+from topoloc.plugin import EncodedImage, Image
 
 router = APIRouter()
 _MAX_DISAGREEMENT_M = 10.0

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 import topoloc
+from topoloc import Camera, describe_map
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
     error_responses,
@@ -18,8 +19,6 @@ from topoloc.apps.service.openapi_schemas import (
 from topoloc.apps.service.query_handler import combine_results, result_to_line
 from topoloc.apps.service.query_request import QueryParameters, read_query_request
 from topoloc.apps.service.state import get_service
-from topoloc.geometry.camera import MODELS
-from topoloc.mapping.description import describe_map
 
 router = APIRouter()
 MapName = Annotated[
@@ -59,7 +58,7 @@ async def capabilities(request: Request) -> dict[str, Any]:
         "version": topoloc.__version__,
         "services": ["localization", "geopose", "streams"],
         "maps": service.maps.names(),
-        "camera_models": list(MODELS),
+        "camera_models": Camera.model_names(),
         "geopose_protocol": ["1.0", "2.0"],
         "limits": {
             "megabytes": config.max_upload_mb,

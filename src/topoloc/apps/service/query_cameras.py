@@ -11,14 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from topoloc import CalibrationError, Camera, TopoMetricMap, UncalibratedCamera
 from topoloc.apps.service.query_request import parse_json
-from topoloc.errors import CalibrationError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.query_camera import parse_camera_option
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.calibration import parse_intrinsics
-from topoloc.recordings.image_io import EncodedImage, exif_focal_length
+from topoloc.plugin import EncodedImage, exif_focal_length, parse_camera_option
 
 _MAX_PARAMS = 20
 
@@ -42,11 +37,11 @@ def parse_camera_field(
             else UncalibratedCamera.from_focal_guess(width, height, focal)
         )
     if text == "unknown" or (text == "map" and topomap is not None):
-        return parse_camera_option(text, topomap)(width, height)
+        return parse_camera_option(text, topomap, allow_files=False)(width, height)
     if text.startswith("{"):
         return camera_from_json(parse_json(text, "camera"), width, height)
     if "," in text:
-        return parse_intrinsics(text)(width, height).camera
+        return parse_camera_option(text, None, allow_files=False)(width, height)
     raise CalibrationError(
         f"camera {text[:40]!r}: exif, unknown, map, fx,fy,cx,cy or a JSON object is expected"
     )

@@ -9,21 +9,25 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
+from topoloc import (
+    AtlasLocalizer,
+    Camera,
+    Localization,
+    Localizer,
+    MapCache,
+    NotLocalized,
+    QueryError,
+    TopoMetricMap,
+    UncalibratedCamera,
+    read_image,
+)
 from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.apps.report.explanation_page import compared_to_json, explanation_page
 from topoloc.apps.service.query_cameras import parse_camera_field
 from topoloc.apps.service.query_request import QueryRequest
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.served_atlases import ServedAtlases
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
-from topoloc.atlas.map_cache import CachedMap, MapCache
-from topoloc.errors import QueryError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import EncodedImage, image_size, read_image
+from topoloc.plugin import EncodedImage, Image, image_size
 
 T = TypeVar("T")
 
@@ -80,18 +84,18 @@ class QueryHandler:
         """Why the picture got its answer: a page, or JSON."""
 
         def explain_image(
-            opened: CachedMap,
+            localizer: Localizer,
             image: Image,
             camera: Camera | UncalibratedCamera,
             query_request: QueryRequest,
         ) -> str:
             explanation, query = (
-                explain(opened.localizer, image, camera),
+                explain(localizer, image, camera),
                 query_request.picture.name,
             )
             if as_page:
-                return explanation_page(query, image, explanation, opened.localizer.topomap)
-            compared = compared_to_json(image, explanation, opened.localizer.topomap)
+                return explanation_page(query, image, explanation, localizer.topomap)
+            compared = compared_to_json(image, explanation, localizer.topomap)
             return json.dumps(
                 explanation_to_json(query, explanation)
                 | {"picture_size": [image.shape[1], image.shape[0]], "compared": compared}
@@ -112,22 +116,20 @@ class QueryHandler:
         self,
         name: str,
         query_request: QueryRequest,
-        run: Callable[[CachedMap, Image, Camera | UncalibratedCamera, QueryRequest], T],
+        run: Callable[[Localizer, Image, Camera | UncalibratedCamera, QueryRequest], T],
     ) -> T:
         with self.maps.use_map(name) as opened:
             image, camera = self.decode_query(query_request, opened.localizer.topomap)
-            return run(opened, image, camera, query_request)
+            return run(opened.localizer, image, camera, query_request)
 
     def _localize_image(
         self,
-        opened: CachedMap,
+        localizer: Localizer,
         image: Image,
         camera: Camera | UncalibratedCamera,
         query_request: QueryRequest,
     ) -> Localization | NotLocalized:
-        return opened.localizer.localize(
-            image, camera, query_request.prior, self._limit_ms(query_request)
-        )
+        return localizer.localize(image, camera, query_request.prior, self._limit_ms(query_request))
 
     def _limit_ms(self, query_request: QueryRequest) -> float:
         return min(query_request.max_ms or self.max_ms, self.max_ms)

@@ -15,13 +15,10 @@ from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect, Request
 
+from topoloc import AtlasError, GeoPositionPrior, ResultError, Rigid3
 from topoloc.apps.service.openapi_schemas import CAMERA_EXAMPLES, PRIOR_EXAMPLE
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.atlas.location_prior import GeoPositionPrior
-from topoloc.errors import AtlasError, ResultError
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization import checked_json
-from topoloc.recordings.image_io import EncodedImage
+from topoloc.plugin import EncodedImage, pose_from_json
 
 _MAX_FIELDS, _MAX_FIELD_BYTES = 8, 20_000
 _MAX_MS = 600_000.0
@@ -149,7 +146,7 @@ def _parse_prior(fields: Mapping[str, str]) -> Rigid3 | None:
 def parse_prior(value: Any) -> Rigid3:
     """world_from_cam as results write it. Raises Refusal."""
     try:
-        return checked_json.rigid(value, "prior")
+        return pose_from_json(value, "prior")
     except ResultError as error:
         raise RequestError(422, str(error).removeprefix("no result: ")) from None
 

@@ -10,11 +10,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+from topoloc import ClusterError, MissingExtraError
 from topoloc.apps.cluster.config import ReplicasConfig
 from topoloc.apps.cluster.connection import LOCAL, connect_to_cluster
 from topoloc.apps.service.access_middleware import App
 from topoloc.apps.service.logs import log
-from topoloc.errors import ClusterError, MissingExtraError
 
 NAME = "topoloc"
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from topoloc.errors import (
-    EmptyMapError,
+from topoloc import (
     MapError,
     MapNotFoundError,
     MissingExtraError,
@@ -27,7 +26,7 @@ class RequestError(Exception):
 
 
 # Failures of what lies here and not of the request; every other known failure is the request's.
-_SERVER_ERRORS = (MapError, EmptyMapError, WeightsError, MissingExtraError)
+_SERVER_ERRORS = (MapError, WeightsError, MissingExtraError)
 
 
 def to_request_error(error: Exception) -> RequestError:

@@ -9,13 +9,8 @@ from __future__ import annotations
 import logging
 import threading
 
+from topoloc import Atlas, AtlasConfig, AtlasLocalizer, MapCache, TopolocError
 from topoloc.apps.service.logs import log
-from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
-from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.map_cache import MapCache
-from topoloc.atlas.watched_atlas import WatchedAtlas
-from topoloc.errors import TopolocError
 
 POLL_INTERVAL_S = 5.0
 """Seconds between two looks at an object store: one listing each, a reading where a manifest was
@@ -28,48 +23,49 @@ class ServedAtlases:
 
     def __init__(self, maps: MapCache, config: AtlasConfig) -> None:
         self._maps, self._config = maps, config
+        self._watched = {watched.where: watched for watched in maps.atlases}
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._opened: dict[str, tuple[Atlas, AtlasLocalizer]] = {}
 
     def localizers(self) -> list[AtlasLocalizer]:
         """One an atlas, as its manifest is now. Raises AtlasError."""
         with self._lock:
-            return [self._open_localizer(watched) for watched in self._maps.atlases]
+            return [self._open_localizer(where) for where in self._watched]
 
     def watch(self) -> None:
         """Look at those in object stores from now on, until `close`."""
-        for watched in self._maps.atlases:
+        for where, watched in self._watched.items():
             if watched.is_remote:
                 threading.Thread(
-                    target=self._poll_atlas, args=(watched,), name="atlas", daemon=True
+                    target=self._poll_atlas, args=(where,), name="atlas", daemon=True
                 ).start()
 
     def close(self) -> None:
         """No more looks; one that waits for its store is not waited for."""
         self._ended.set()
 
-    def _open_localizer(self, watched: WatchedAtlas) -> AtlasLocalizer:
-        atlas, known = watched.now(), self._opened.get(watched.where)
+    def _open_localizer(self, where: str) -> AtlasLocalizer:
+        atlas, known = self._watched[where].now(), self._opened.get(where)
         if known is None or known[0] is not atlas:
-            self._opened[watched.where] = known = (
+            self._opened[where] = known = (
                 atlas,
                 AtlasLocalizer(atlas, self._maps, self._config, _warn),
             )
         return known[1]
 
-    def _poll_atlas(self, watched: WatchedAtlas) -> None:
-        told = ""
+    def _poll_atlas(self, where: str) -> None:
+        watched, told = self._watched[where], ""
         while not self._ended.wait(POLL_INTERVAL_S):
             try:
                 if watched.look():
-                    log("atlas", where=watched.where, serial=watched.now().manifest.serial)
+                    log("atlas", where=where, serial=watched.now().manifest.serial)
                 told = ""
             except (
                 Exception
             ) as error:  # whatever it is, the next look may succeed; what was opened before answers
                 if str(error) != told:
                     unknown = None if isinstance(error, TopolocError) else error
-                    log("atlas", logging.WARNING, unknown, where=watched.where, detail=str(error))
+                    log("atlas", logging.WARNING, unknown, where=where, detail=str(error))
                 told = str(error)
 
 

@@ -15,10 +15,10 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from topoloc import TopolocError
 from topoloc.apps.service.access_middleware import App
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.logs import log_json
-from topoloc.errors import TopolocError
 
 _MAX_CONNECTIONS = 1000
 _KEEP_ALIVE_S = 75

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 from starlette.requests import HTTPConnection
 
+from topoloc import Localization, MapCache, NotLocalized, TopolocError
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.logs import log
 from topoloc.apps.service.metrics import Metrics
@@ -18,10 +19,7 @@ from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.request_errors import RequestError, to_request_error
 from topoloc.apps.service.streams import Streams
 from topoloc.apps.service.workers import Workers
-from topoloc.atlas.map_cache import MapCache
-from topoloc.atlas.tile_fetcher import TileFetch, TilePending
-from topoloc.errors import TopolocError
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.plugin import TilePending
 
 R = TypeVar("R")
 
@@ -52,14 +50,14 @@ class Service:
                         job, self.config.answer_s, time.monotonic() - start
                     )
                 except TilePending as awaited:
-                    await self._wait_for_fetch(awaited.fetch)
+                    await self._wait_for_fetch(awaited)
         except Exception as error:
             refusal = to_request_error(error)
             if not isinstance(error, TopolocError | RequestError):
                 log("failure", logging.ERROR, error, request_id=request.scope["request_id"])
             raise refusal from error
 
-    async def _wait_for_fetch(self, fetch: TileFetch) -> None:
+    async def _wait_for_fetch(self, awaited: TilePending) -> None:
         """When the tile is here, will not come, or has been waited for long enough. Raises Refusal
         where too many wait already."""
         if self.num_awaiting >= self.workers.number + self.workers.max_queue:
@@ -68,6 +66,7 @@ class Service:
                 f"{self.num_awaiting} requests wait already for tiles that are being fetched",
                 retry_after_s=5,
             )
+        fetch = awaited.fetch
         self.num_awaiting += 1
         try:
             await asyncio.wait(

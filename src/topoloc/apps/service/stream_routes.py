@@ -23,7 +23,7 @@ from topoloc.apps.service.query_request import QueryRequest, parse_json, read_qu
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
 from topoloc.apps.service.streams import Stream
-from topoloc.recordings.image_io import EncodedImage
+from topoloc.plugin import EncodedImage
 
 router = APIRouter()
 PROTOCOL = "topoloc"

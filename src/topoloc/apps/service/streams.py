@@ -5,24 +5,23 @@ from __future__ import annotations
 import threading
 import time
 import uuid
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
+from topoloc import CalibrationError, MapCache, Tracker, TrackerConfig, UncalibratedCamera
 from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.query_request import QueryRequest
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.atlas.map_cache import CachedMap, MapCache
-from topoloc.errors import CalibrationError
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.tracking.tracker import Tracker, TrackerConfig
 
 
 @dataclass(eq=False)
 class Stream:
-    """One stream; its lock is held while a picture of it is looked at."""
+    """One stream; its lock is held while a picture of it is looked at, and `open_map` keeps its
+    map open."""
 
     map_name: str
-    opened: CachedMap
+    open_map: ExitStack
     tracker: Tracker
     camera: str | None
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -63,14 +62,15 @@ class Streams:
             MapError: the map is damaged.
         """
         self.forget_idle()
-        opened = self._maps.acquire_map(map_name)
-        stream = Stream(map_name, opened, Tracker(opened.localizer, self._config), camera)
+        open_map = ExitStack()
+        localizer = open_map.enter_context(self._maps.use_map(map_name)).localizer
+        stream = Stream(map_name, open_map, Tracker(localizer, self._config), camera)
         with self._lock:
             is_full = len(self._streams) >= self._max_streams
             if not is_full:
                 self._streams[stream.id] = stream
         if is_full:
-            self._maps.release_map(opened)
+            open_map.close()
             raise RequestError(
                 429, f"{self._max_streams} streams are followed already", retry_after_s=10
             )
@@ -103,7 +103,7 @@ class Streams:
                 raise RequestError(404, "the stream has ended")
             stream.last_used = time.monotonic()
             named = QueryRequest(query_request.picture, query_request.camera or stream.camera)
-            image, camera = self._answerer.decode_query(named, stream.opened.localizer.topomap)
+            image, camera = self._answerer.decode_query(named, stream.tracker.localizer.topomap)
             if isinstance(camera, UncalibratedCamera):
                 raise CalibrationError(
                     "a stream needs a calibrated camera: `map`, fx,fy,cx,cy or a JSON object"
@@ -120,7 +120,7 @@ class Streams:
                 self._streams.pop(stream.id, None)
             if not stream.is_ended:
                 stream.is_ended = True
-                self._maps.release_map(stream.opened)
+                stream.open_map.close()
 
     def forget_idle(self) -> None:
         """End those that nobody has used for long."""

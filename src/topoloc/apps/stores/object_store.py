@@ -10,6 +10,7 @@ one's tiles.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Hashable, Iterator
@@ -18,11 +19,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from topoloc.atlas.manifest import TILES
-from topoloc.atlas.store import sha256_of
-from topoloc.errors import AtlasError, MissingExtraError, ObjectStoreError
-from topoloc.features.network_files import cache_folder
-from topoloc.recordings.atomic import atomic_write
+from topoloc import AtlasError, MissingExtraError, ObjectStoreError
+from topoloc.plugin import atomic_write, cache_folder
 
 _MANIFESTS, _NUM_KEPT = "manifests", 16
 S3_TRIES, S3_CLIENT = (
@@ -111,7 +109,7 @@ class ObjectStore:
                 self._files.get_file(f"{self._root}/{name}", str(temporary))
             except FileNotFoundError:
                 raise AtlasError(f"{self.where}/{name} is missing") from None
-            if sha256_of(temporary) != sha256:
+            if _sha256(temporary) != sha256:
                 raise AtlasError(
                     f"{self.where}/{name} is not the file that was added: its checksum is another"
                 )
@@ -127,12 +125,12 @@ class ObjectStore:
             return path if path.is_file() else None
         return path
 
-    def ages(self) -> dict[str, float]:
+    def ages(self, folder: str) -> dict[str, float]:
         now = time.time()
         with self._translate_errors():
             return {
-                f"{TILES}/{Path(entry['name']).name}": now - self._modified(entry)
-                for entry in self._entries(TILES)
+                f"{folder}/{Path(entry['name']).name}": now - self._modified(entry)
+                for entry in self._entries(folder)
             }
 
     def remove(self, name: str) -> None:
@@ -183,6 +181,11 @@ class ObjectStore:
             raise ObjectStoreError(
                 f"{self.where} does not answer, or not as a store: {text}"
             ) from error
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _cache_path(name: str, sha256: str) -> Path:

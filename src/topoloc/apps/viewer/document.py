@@ -17,13 +17,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from topoloc import Camera, Rigid3, TopoMetricMap
 from topoloc.apps.viewer.map_scene import sample_colours, unique_image_names
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import pose_to_json
-from topoloc.mapping.contents import get_map_id
-from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.image_io import encode_jpeg
+from topoloc.plugin import encode_jpeg, pose_to_json
 
 GAP_STEPS = 6.0
 """A step so many times the path's median step is a gap, over which no line is drawn."""
@@ -109,7 +105,7 @@ def _describe_map(topomap: TopoMetricMap, num_shown: int) -> dict[str, Any]:
     ]
     num_points = sum(summary.num_points for summary in topomap.summaries)
     facts = {
-        "id": get_map_id(topomap),
+        "id": topomap.id,
         "version": topomap.version,
         "num_nodes": len(topomap.summaries),
         "num_points": num_points,

@@ -9,11 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from topoloc import MapError, TopoMetricMap, TopoNode
 from topoloc.apps.viewer.scene import Points, Scene, View
 from topoloc.apps.viewer.tracks import Tracks, find_tracks
-from topoloc.errors import MapError
-from topoloc.mapping.entries import TopoNode
-from topoloc.mapping.topomap import TopoMetricMap
 
 
 def create_map_scene(
@@ -70,7 +68,7 @@ def create_map_scene(
 def _node_view(topomap: TopoMetricMap, node: TopoNode, name: str) -> View:
     s, georeference = node.summary, topomap.georeference
     geopose = None if georeference is None else georeference.geopose(s.world_from_cam)
-    picture = _decode_jpeg(node.template_jpeg)
+    picture = decode_jpeg(node.template_jpeg)
     jpeg_camera = (
         None if picture is None else node.camera.rescaled(picture.shape[1], picture.shape[0])
     )
@@ -112,7 +110,7 @@ def _to_scene_points(tracks: Tracks, sampled_rgb: Float[np.ndarray, "m 3"]) -> P
 def sample_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
     """What the node's picture shows at pixels of its camera, RGB, 0 to 255; black where it cannot
     be read."""
-    picture = _decode_jpeg(node.template_jpeg)
+    picture = decode_jpeg(node.template_jpeg)
     if picture is None or len(pixels) == 0:
         return np.zeros((len(pixels), 3))
     scale = np.array([picture.shape[1] / node.camera.width, picture.shape[0] / node.camera.height])
@@ -126,6 +124,7 @@ def sample_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np
     )[:, 0].astype(float)
 
 
-def _decode_jpeg(jpeg: bytes) -> UInt8[np.ndarray, "h w 3"] | None:
+def decode_jpeg(jpeg: bytes) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Return a stored image, RGB; None if there is none or it is damaged."""
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     return None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.apps.viewer.document import to_script_json
-from topoloc.recordings.atomic import write_text
+from topoloc.plugin import write_text
 
 MODULES = {
     "three": "three.js",

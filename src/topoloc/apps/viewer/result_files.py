@@ -7,12 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from topoloc import Localization, NotLocalized, ResultError, read_trajectory, result_from_json
 from topoloc.apps.viewer.document import ResultSet
-from topoloc.errors import ResultError
-from topoloc.localization import checked_json as checked
-from topoloc.localization.result import pose_to_json, result_from_json
-from topoloc.recordings.text_files import read_text
-from topoloc.recordings.trajectory import read_trajectory
+from topoloc.plugin import pose_from_json, pose_to_json, read_text
 
 
 def read_results(path: Path) -> list[ResultSet]:
@@ -34,11 +31,27 @@ def read_results(path: Path) -> list[ResultSet]:
         ResultSet(
             path.stem,
             [
-                _parse_result(f"{path}, line {number}", line)
+                _answer_to_json(f"{path}, line {number}", line)
                 for number, line in ([(1, whole)] if whole else lines)
             ],
         )
     ]
+
+
+def parse_result(
+    line: str | Mapping[str, Any],
+) -> tuple[Localization | NotLocalized, Mapping[str, Any]]:
+    """Return the result that a JSON line holds, and all keys of the line. Raises ResultError."""
+    result = result_from_json(line)
+    return result, json.loads(line) if isinstance(line, str) else line
+
+
+def text_of(data: Mapping[str, Any], key: str) -> str:
+    """Return the text of a key, "" if it is missing. Raises ResultError if it is no text."""
+    value = data.get(key, "")
+    if not isinstance(value, str):
+        raise ResultError(f"no result: {key!r} is no text")
+    return value
 
 
 def _parse_single_object(text: str) -> Mapping[str, Any] | None:
@@ -58,24 +71,24 @@ def _read_evaluation(path: Path, evaluation: Mapping[str, Any]) -> list[ResultSe
         )
     sets: dict[str, list[Mapping[str, Any]]] = {}
     for number, one in enumerate(evaluation["answers"]):
-        answer = _parse_result(f"{path}, answer {number}", one)
+        answer = _answer_to_json(f"{path}, answer {number}", one)
         sets.setdefault(str(answer.get("recording") or path.stem), []).append(answer)
     return [ResultSet(name, answers) for name, answers in sets.items()]
 
 
-def _parse_result(where: str, line: Any) -> Mapping[str, Any]:
+def _answer_to_json(where: str, line: Any) -> Mapping[str, Any]:
     """A result as JSON, held to be one: only what was understood goes into a page."""
     try:
-        data = checked.parse_object(line)
-        answer = result_from_json(data).to_json(checked.text(data.get("query", ""), "query"))
+        result, data = parse_result(line)
+        answer = result.to_json(text_of(data, "query"))
         for key in ("smoothed", "true_world_from_cam"):
             if key in data:
                 answer[key] = (
-                    None if data[key] is None else pose_to_json(checked.rigid(data[key], key))
+                    None if data[key] is None else pose_to_json(pose_from_json(data[key], key))
                 )
         for key in ("state", "recording"):
             if key in data:
-                answer[key] = checked.text(data[key], key)
+                answer[key] = text_of(data, key)
     except ResultError as error:
         raise ResultError(f"{where}: {error}") from None
     return answer

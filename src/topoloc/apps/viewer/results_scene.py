@@ -5,11 +5,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from topoloc import Localization, ResultError
+from topoloc.apps.viewer.result_files import parse_result, text_of
 from topoloc.apps.viewer.scene import Points, Scene, View
-from topoloc.errors import ResultError
-from topoloc.localization import checked_json as checked
-from topoloc.localization.result import Localization, result_from_json
-from topoloc.recordings.text_files import read_text
+from topoloc.plugin import read_text
 
 
 def create_results_scene(path: Path) -> Scene:
@@ -26,8 +25,8 @@ def create_results_scene(path: Path) -> Scene:
     ]
     for number, line in lines:
         try:
-            data = checked.parse_object(line)
-            result, query = result_from_json(data), checked.text(data.get("query", ""), "query")
+            result, data = parse_result(line)
+            query = text_of(data, "query")
         except ResultError as error:
             raise ResultError(f"{path}, line {number}: {error}") from None
         if isinstance(result, Localization):

@@ -9,9 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.geodesy import GeoPose, Georeference
-from topoloc.geometry.rigid import Rigid3
+from topoloc import Camera, GeoPose, Georeference, Rigid3
 
 
 @dataclass(frozen=True, eq=False)

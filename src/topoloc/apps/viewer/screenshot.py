@@ -8,8 +8,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from topoloc.errors import TopolocError
-from topoloc.recordings.atomic import write_bytes
+from topoloc import TopolocError
+from topoloc.plugin import write_bytes
 
 BROWSERS = (
     "chromium",

@@ -14,18 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.features.feature_types import find_feature_type
-from topoloc.localization.guided import GuidedConfig, match_guided
-from topoloc.localization.local_map import LocalMap
-from topoloc.mapping.entries import TopoNode
-from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc import TopoMetricMap, TopoNode
+from topoloc.plugin import NodeMatcher
 
 NUM_NEIGHBOURS = 8
 MAX_ERROR_PX = 3.0
 """Of a picture whose longer side is 640 pixels: key points further from where a point must be seen
 do not show it."""
-_GUIDED = GuidedConfig(radius_px=MAX_ERROR_PX)
 _NUM_STEPS = 5
 _MIN_SIGMA = 1e-4  # metres; no map knows its points better
 
@@ -49,23 +44,17 @@ def find_tracks(
     starts = np.concatenate([[0], np.cumsum([len(node.points_cam) for node in nodes])]).astype(
         np.int64
     )
-    maps = [LocalMap.of_node(node) for node in nodes]
+    matchers = [NodeMatcher(node, topomap.config.features) for node in nodes]
     pairs = [np.zeros((0, 3))]
-    poses = NodePoses.of([node.summary.world_from_cam for node in nodes])
-    config = _GUIDED.resolved(find_feature_type(topomap.kind))
-    for a, node in enumerate(nodes):
-        order = np.argsort(
-            node_distances(node.summary.world_from_cam, poses, topomap.config.lambda_rot),
-            kind="stable",
-        )
-        for b in (int(k) for k in order[: NUM_NEIGHBOURS + 1] if k != a):
+    neighbours = topomap.find_neighbours(rows, NUM_NEIGHBOURS)
+    for a, matcher in enumerate(matchers):
+        for b in neighbours[a]:
             other = nodes[b]
-            found = match_guided(
+            found = matcher.match_at_pose(
                 other.features,
-                maps[a],
                 other.summary.world_from_cam.inverse(),
                 other.camera,
-                config,
+                MAX_ERROR_PX,
             )
             pairs.append(
                 np.column_stack(
@@ -75,7 +64,7 @@ def find_tracks(
         if progress:
             progress("tracks", a + 1, len(nodes))
     labels = _merge_points(np.concatenate(pairs), np.repeat(np.arange(len(nodes)), np.diff(starts)))
-    return _triangulate_tracks(labels, nodes, maps)
+    return _triangulate_tracks(labels, matchers)
 
 
 def _merge_points(
@@ -143,21 +132,22 @@ class _KeyPoints:
         return (points_cam[:, :2] / z[:, None] - self.normalized) * self.focals[:, None], points_cam
 
 
-def _triangulate_tracks(
-    labels: Int[np.ndarray, " m"], nodes: list[TopoNode], maps: list[LocalMap]
-) -> Tracks:
+def _triangulate_tracks(labels: Int[np.ndarray, " m"], matchers: list[NodeMatcher]) -> Tracks:
     """Each track's point by least squares: where its nodes have it, by their covariances, and where
     their key points are."""
+    nodes = [matcher.node for matcher in matchers]
     num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.of(nodes, labels)
     prior, pull = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
     information = np.linalg.inv(
-        np.concatenate([part.covariances for part in maps]) + _MIN_SIGMA**2 * np.eye(3)
+        np.concatenate([part.covariances for part in matchers]) + _MIN_SIGMA**2 * np.eye(3)
     )
     np.add.at(prior, labels, information)
     np.add.at(
         pull,
         labels,
-        np.einsum("mij,mj->mi", information, np.concatenate([part.points_world for part in maps])),
+        np.einsum(
+            "mij,mj->mi", information, np.concatenate([part.points_world for part in matchers])
+        ),
     )
     points = first = np.linalg.solve(prior, pull[:, :, None])[:, :, 0]
     for _ in range(_NUM_STEPS):

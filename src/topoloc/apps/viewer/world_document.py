@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from topoloc import Atlas, Rigid3, SharedWorld
 from topoloc.apps.viewer.document import (
     ResultSet,
     SceneBudget,
@@ -17,11 +18,7 @@ from topoloc.apps.viewer.document import (
     path_to_json,
     results_to_json,
 )
-from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.shared_world import SharedWorld, iter_open_tiles
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization import checked_json as checked
-from topoloc.localization.result import pose_to_json
+from topoloc.plugin import pose_from_json, pose_to_json
 
 _POSE_KEYS = ("world_from_cam", "true_world_from_cam", "smoothed")
 Document = dict[str, Any]
@@ -44,7 +41,7 @@ def create_world_document(
         StoreError: the store does not answer.
     """
     budget, parts, first_session = budget or SceneBudget(), list[Document](), 0
-    for placed, topomap in iter_open_tiles(atlas, world.tiles, warn):
+    for placed, topomap in world.open_tiles(atlas, warn):
         share = placed.tile.num_nodes / max(1, world.num_nodes)
         its_budget = SceneBudget(
             int(share * budget.max_points), int(share * budget.max_image_bytes)
@@ -110,7 +107,7 @@ def transform_answers(
 
 
 def _transform_pose(world_from_map: Rigid3, pose: Any) -> dict[str, Any]:
-    return pose_to_json(world_from_map @ checked.rigid(pose, "world_from_cam"))
+    return pose_to_json(world_from_map @ pose_from_json(pose, "world_from_cam"))
 
 
 def _transform_document(document: Document, world_from_map: Rigid3, first_session: int) -> Document:

@@ -8,11 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from topoloc import Atlas, Rigid3, SharedWorld
 from topoloc.apps.viewer.map_scene import create_map_scene
 from topoloc.apps.viewer.scene import Points, Scene, View
-from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.shared_world import SharedWorld, iter_open_tiles
-from topoloc.geometry.rigid import Rigid3
 
 Progress = Callable[[str, int, int], None]
 
@@ -34,7 +32,7 @@ def create_world_scene(
     """
     views, trajectory, points = list[View](), list[Rigid3](), list[Points]()
     first_session = 0
-    for placed, topomap in iter_open_tiles(atlas, world.tiles, warn):
+    for placed, topomap in world.open_tiles(atlas, warn):
         scene = create_map_scene(topomap, name, None, with_points, progress)
         numbers = {
             session.session_id: first_session + k for k, session in enumerate(topomap.sessions)

@@ -1,9 +1,9 @@
-"""Nodes whose recorded poses contradict what their neighbours show.
+"""Find nodes whose recorded poses contradict their neighbours.
 
-Neighbouring nodes see the same things. Each is localized by the points of one neighbour at a time,
-from nothing, and the pose found is compared with the recorded one. Nodes that agree belong
-together; a part of the map that agrees within itself but not with the rest was moved. Which of two
-parts is in its place nothing can tell: the larger one is believed.
+Neighbouring nodes see the same points. Each node is localized with the points of one neighbour at a
+time, without a prior. The result is compared with the recorded pose. Nodes that agree form a group.
+A group that agrees within itself but not with the rest was moved. The data cannot show which of two
+groups is in place, so the larger one is assumed to be.
 """
 
 from __future__ import annotations
@@ -25,22 +25,24 @@ from topoloc.mapping.topomap import TopoMetricMap
 
 @dataclass(frozen=True)
 class ContradictionsConfig:
-    """How nodes are compared with their neighbours."""
+    """Configure the comparison of nodes with their neighbours."""
 
     num_neighbours: int = 4
-    """The nearest nodes by Eq. 1 that each is compared with."""
+    """Number of nearest nodes (Eq. 1) that each node is compared with."""
     min_inliers: int = 30
-    """Fewer points in common say nothing."""
+    """Minimum number of common points for a comparison."""
     max_square: float = 60.0
-    """Squared difference of two poses, in units of their covariance (6 numbers), above which they
-    contradict each other ..."""
+    """Minimum squared pose difference of a contradiction, in units of its covariance (6 degrees of
+    freedom)."""
     min_distance: float = 0.5
-    """... where it is also more than so many D_thresh (Eq. 1): below that no answer is far off."""
+    """Minimum pose difference of a contradiction, in D_thresh (Eq. 1). Both limits must be
+    exceeded."""
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Node `node_id` stands `metres` and `degrees` from where its neighbour `other_id` sees it."""
+    """Report that node `node_id` is `metres` and `degrees` off the pose found with node
+    `other_id`."""
 
     node_id: int
     other_id: int
@@ -58,8 +60,11 @@ class Contradiction:
 def find_contradictions(
     topomap: TopoMetricMap, config: ContradictionsConfig | None = None
 ) -> list[Contradiction]:
-    """One for each node that is not where the larger part of the map sees it. Raises MapError from
-    reading the map."""
+    """Return one contradiction for each node outside the largest consistent part of the map.
+
+    Raises:
+        MapError: the map cannot be read.
+    """
     config = config or ContradictionsConfig()
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     rho = (
@@ -94,8 +99,11 @@ def find_contradictions(
 def _pose_difference(
     node: TopoNode, other: TopoNode, rho: float, config: ContradictionsConfig
 ) -> tuple[float, float, float] | None:
-    """How far the node's pose is from where the points of the other see it: squared, in
-    covariances; metres; radians. None where they have too little in common."""
+    """Compare a node's pose with the one found with the points of another node.
+
+    Return the squared difference in covariances, metres and radians. None if they have too few
+    points in common.
+    """
     points = LocalMap.of_node(other)
     matches = match_features(node.features.descriptors, points.descriptors, MatchingConfig())
     if len(matches) < config.min_inliers:
@@ -121,7 +129,7 @@ def _pose_difference(
 
 
 def _merge_groups(group: list[int], a: int, b: int) -> None:
-    """Both rows, and all that were joined with them, get the smaller number."""
+    """Merge the groups of two rows under the smaller number."""
     low, high = sorted((group[a], group[b]))
     if low != high:
         group[:] = [low if number == high else number for number in group]
@@ -130,8 +138,10 @@ def _merge_groups(group: list[int], a: int, b: int) -> None:
 def _outside_largest_group(
     topomap: TopoMetricMap, group: list[int], found: list[tuple[int, int, float, float]]
 ) -> list[Contradiction]:
-    """The contradictions across groups, each told of the node in the smaller one, and of the nodes
-    that were moved with it."""
+    """Return the contradictions between groups.
+
+    Each is assigned to the node in the smaller group, and to the other nodes of that group.
+    """
     sizes, worst = Counter(group), {}
     for row, other_row, metres, radians in found:
         if group[row] == group[other_row]:
@@ -143,7 +153,7 @@ def _outside_largest_group(
             worst[one] = (other, metres, radians)
     moved = {group[one]: one for one in worst}
     ids = [summary.node_id for summary in topomap.summaries]
-    for row, number in enumerate(group):  # the rest of a part that was moved as one
+    for row, number in enumerate(group):  # the rest of a group that was moved as one
         if row not in worst and number in moved:
             worst[row] = worst[moved[number]]
     return [

@@ -1,16 +1,15 @@
-"""What the errors of a map's points have in common, and what that does to a pose's covariance.
+"""Measure the correlated errors of a map's points and inflate pose covariances accordingly.
 
-PnP's covariance takes the errors of n matches for independent, and shrinks with n. But points of
-one node move together when the node's pose is wrong, when its depth is, or its calibration: a
-thousand matches share that error. With rho the share of a match's variance that is common to all of
-them, the variance of what n matches say together is not v / n but v / n (1 + (n - 1) rho): the
-design effect of samples taken in clusters (Kish, *Survey Sampling*, 1965). So PnP's covariance is
-multiplied by 1 + n rho.
+PnP treats the errors of n matches as independent, so its covariance shrinks with n. But the points
+of one node share the errors of the node's pose, depth and calibration. Let rho be the share of a
+match's variance that is common to all matches, and v the variance. The variance of the mean of n
+matches is then not v / n but v / n (1 + (n - 1) rho). This is the design effect of cluster samples
+(Kish, *Survey Sampling*, 1965). The PnP covariance is therefore multiplied by 1 + n rho.
 
-rho is the map's own, and the map knows it: a node is localized by nodes a few steps away, as if it
-were a query, and its recorded pose is compared with the pose found. That takes a second; a map's
-file keeps what came out, with a digest of what it was measured of and with, and where that is not
-what is asked for, it is measured anew.
+rho is measured from the map itself. A node is localized like a query, with nodes a few steps away,
+and the result is compared with its recorded pose. This takes about a second. The map file stores
+rho with a digest of the nodes and settings. If the digest differs from the requested one, rho is
+measured again.
 """
 
 from __future__ import annotations
@@ -31,31 +30,31 @@ from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distance
 from topoloc.mapping.topomap import CorrelatedErrors, TopoMetricMap, TopoNode
 
 _MEDIAN_CHI_SQUARE_6 = 5.348
-_METHOD = 1  # part of the digest: one more whenever the same settings come to give another rho
+_METHOD = 1  # part of the digest: increase if the same settings give another rho
 
 
 @dataclass(frozen=True)
 class CorrelatedErrorsConfig:
-    """How rho is measured."""
+    """Configure the measurement of rho."""
 
     num_nodes: Annotated[int, Between(0, 1000)] = 20
-    """Nodes that are localized by others, evenly along the map."""
+    """Number of nodes, evenly spaced in the map, that are localized with other nodes."""
     min_distances: Annotated[tuple[float, ...], AtLeast(0)] = (3.0, 1.0)
-    """Neighbours nearer than so many D_thresh (Eq. 1) do not help to localize a node, for their
-    points were refined with its picture. The second number counts where the first leaves too few
-    nodes to compare."""
+    """Minimum distance, in D_thresh (Eq. 1), of nodes used to localize a node. Nearer nodes were
+    refined with its image. The second value is used if the first leaves too few nodes."""
     num_helpers: Annotated[int, Between(1, 100)] = 3
-    """The nearest of the others, whose points do."""
+    """Number of nearest allowed nodes whose points are used."""
     min_inliers: Annotated[int, AtLeast(4)] = 20
-    """Nodes localized with fewer inliers are not compared."""
+    """Minimum number of inliers. Nodes localized with fewer are not compared."""
     min_nodes: Annotated[int, AtLeast(1)] = 5
-    """With fewer nodes compared, rho is taken to be unknown."""
+    """Minimum number of compared nodes. With fewer, rho is set to the value for unknown maps."""
     percentile: Annotated[float, Between(0, 100)] = 75.0
-    """Of the nodes' rho; above the median, since some parts of a map are worse than others."""
+    """Percentile of rho over the nodes. It is above the median, because some parts of a map are
+    worse."""
 
 
 def covariance_inflation(num_inliers: int, rho: float) -> float:
-    """What PnP's covariance from so many inliers is multiplied by."""
+    """Return the factor of the PnP covariance for this number of inliers."""
     return 1.0 + num_inliers * rho
 
 
@@ -66,11 +65,10 @@ def find_correlated_error_share(
     config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> float:
-    """rho as the map tells it, where it was measured of these nodes and with these settings; else
-    measured now.
+    """Return rho of the map, from its file if the digest matches, and measured otherwise.
 
     Args:
-        guided, pose: as queries are matched and localized.
+        guided, pose: settings of query matching and pose estimation.
     """
     known = topomap.shared_errors
     if known is not None and known.digest == _digest(topomap, guided, pose, config, weights):
@@ -85,7 +83,7 @@ def measure_stored_error_share(
     config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> CorrelatedErrors:
-    """rho measured, for the map to keep."""
+    """Measure rho and return it with its digest, to be stored in the map."""
     rho = measure_correlated_error_share(topomap, guided, pose, config, weights)
     return CorrelatedErrors(rho, _digest(topomap, guided, pose, config, weights))
 
@@ -97,7 +95,7 @@ def measure_correlated_error_share(
     config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> float:
-    """rho of the map: see above."""
+    """Measure rho of the map (see the module docstring)."""
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
     node_ids = np.unique(
@@ -129,7 +127,7 @@ def _digest(
     config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> str:
-    """A short name for all that rho follows from."""
+    """Return a digest of all inputs of rho."""
     settings = {
         "guided": asdict(guided),
         "pose": asdict(pose),
@@ -148,8 +146,10 @@ def _error_share_of_node(
     config: AbsolutePoseConfig,
     min_inliers: int,
 ) -> float | None:
-    """rho by which the node's pose differs from what its neighbours (`helpers`) say; None where
-    they do not see what it sees."""
+    """Estimate rho from the pose of one node, localized with the points of `helpers`.
+
+    None if they have too few points in common.
+    """
     if not helpers:
         return None
     cam_from_world = node.summary.world_from_cam.inverse()

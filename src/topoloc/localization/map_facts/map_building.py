@@ -1,5 +1,4 @@
-"""A map that is ready to be asked: as `map/build.py` constructs it, and with what only localizing
-can tell of it."""
+"""Build a map together with the statistics that localization needs."""
 
 from __future__ import annotations
 
@@ -25,8 +24,11 @@ from topoloc.slam.slam import estimate_slam_poses
 
 @dataclass(frozen=True)
 class SkippedChecks:
-    """What is not checked: `poses` against the pictures, and `gaps`, frames without a pose that are
-    more than half of all."""
+    """Select the checks to skip.
+
+    `poses` compares the poses with the images. `gaps` requires that at least half of the frames
+    have a pose.
+    """
 
     poses: bool = False
     gaps: bool = False
@@ -39,25 +41,23 @@ def build_map(
     poses_from: Sequence[str] | None = None,
     skipped_checks: SkippedChecks | None = None,
 ) -> TopoMetricMap:
-    """Build a topo-metric map from one or several recordings of one place whose poses share one
-    world.
+    """Build a topo-metric map from recordings whose poses share one world frame.
 
-    Where a recording has no poses at all, those of all of them are found by SLAM, as `topoloc
-    build` does.
+    If a recording has no poses at all, SLAM estimates those of all recordings, as in `topoloc
+    build`.
 
     Args:
-        poses_from: where the poses of each recording come from (`truth`, `slam`, a file), for the
-            map to remember; given, SLAM is not run.
-        trust: what is taken as it comes; by default poses are held against the pictures, but for
-            those that SLAM found in them.
+        poses_from: source of each recording's poses (`truth`, `slam`, a file), to be stored in the
+            map. If it is given, SLAM is not run.
+        skipped_checks: checks to skip. By default, poses are checked unless SLAM estimated them.
 
     Raises:
-        ConfigError: a value of `config` is out of its bounds.
+        ConfigError: a value of `config` is out of bounds.
         TrajectoryError: fewer than half of a recording's frames have a pose, or the poses do not
-            fit the pictures.
-        EmptyMapError: no picture gave a usable node.
-        FeatureKindError: no features of the kind that `config` names.
-        RecordingError, CalibrationError, UnreadableImageError: from reading the recordings.
+            fit the images.
+        EmptyMapError: no image gave a usable node.
+        FeatureTypeError: `config` names an unknown feature type.
+        RecordingError, CalibrationError, UnreadableImageError: a recording cannot be read.
     """
     config = config or build.BuildConfig()
     for kind in config.kinds:
@@ -83,8 +83,10 @@ def build_map(
 def with_map_statistics(
     topomap: TopoMetricMap, progress: build.Progress | None = None
 ) -> TopoMetricMap:
-    """The map with what localizing needs to know of it as a whole, so that who opens its file need
-    not measure it."""
+    """Return the map with its statistics (correlated errors, repetitions).
+
+    A localizer then reads them instead of measuring them.
+    """
     topomap = replace(topomap, shared_errors=None, other_shared_errors={}, repetitions=None)
     errors = {kind: _measure_error_share(topomap.with_feature_type(kind)) for kind in topomap.kinds}
     topomap = replace(topomap, shared_errors=errors.pop(topomap.kind), other_shared_errors=errors)
@@ -92,8 +94,7 @@ def with_map_statistics(
 
 
 def _measure_error_share(topomap: TopoMetricMap) -> CorrelatedErrors:
-    """rho of a map by its first kind of features, so that who opens its file need not measure
-    it."""
+    """Measure rho of a map for its first feature type."""
     config_of_type = LocalizerConfig().for_feature_type(find_feature_type(topomap.kind))
     return measure_stored_error_share(
         topomap,
@@ -107,7 +108,7 @@ def _measure_error_share(topomap: TopoMetricMap) -> CorrelatedErrors:
 def with_repetitions(
     topomap: TopoMetricMap, progress: build.Progress | None = None
 ) -> TopoMetricMap:
-    """The map, told by which moves its nodes are found elsewhere in it."""
+    """Return the map with the repetition moves of its nodes."""
     opened, moves = OpenMap(topomap), dict[int, Float[np.ndarray, "k 4 4"]]()
     for row, found in enumerate(parallel_map(opened.moves, range(len(opened.node_ids)))):
         if len(found):

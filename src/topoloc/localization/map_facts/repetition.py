@@ -1,18 +1,16 @@
-"""Where a place repeats itself: a wall of equal panels, a row of equal windows, tiles; and the same
-wall on the other side of the house.
+"""Find repetitive places: equal panels, windows or tiles, or the same wall elsewhere.
 
-No picture of such a wall tells one panel from the next. Its features fail the ratio test, since the
-next panel has the same ones, and a pose that is found all the same is one of many. So for each node
-it is looked up once how the place can be moved onto itself:
+An image of such a wall cannot distinguish one panel from the next. Its features fail the ratio
+test, because the next panel has the same ones. A pose that is found anyway is one of many. So the
+transforms that move the place onto itself are computed once for each node:
 
-- by **shifts**: its points that look like other points nearby vote for the shift between the two,
-  and what many points vote for is one;
-- by **moves** in general: it is localized by nodes far from it that look like it. Where it is found
-  among their points, as if it were there, it has a copy there.
+- by **shifts**: pairs of similar points nearby vote for the shift between them, and shifts with
+  many votes are kept
+- by **moves** in general: the node is localized with distant nodes that look like it. If it is
+  found among their points, it has a copy there.
 
-A hypothesis there is not alone: the poses moved so are proposed as well (`propose.py`), and a match
-with any copy of a point speaks for all of them (`refine.py`). What tells them apart is what does
-not repeat itself, if the picture shows any of it.
+The moved poses of a hypothesis become proposals too (`propose.py`). A match with any copy of a
+point supports all of them (`refine.py`). The non-repetitive parts of the image separate them.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from topoloc.mapping.nodes import compute_nodes_digest
 
 NUM_NEIGHBOURS = 9
 MIN_SHIFT = 0.3
-"""Metres: from there on a copy is another place."""
+"""Metres. A copy at this distance or more is another place."""
 _NUM_POINTS = 128
 _MIN_SIMILARITY = 0.9
 _CELL = 0.1  # metres
@@ -41,32 +39,32 @@ _MAX_SHIFTS = 6
 _MIN_COPIED, _MIN_COPIED_SHARE = 20, 0.3
 _NEAREST_NEIGHBOR = MatchingConfig(ratio=0.0, mutual=False)
 _POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=500)
-_METHOD = 1  # part of the digest: one more whenever the same nodes come to have other repetitions
-_MAX_CELL_OFFSET = 1000  # cells to either side: more than any shift is long
+_METHOD = 1  # part of the digest: increase if the same nodes give other repetitions
+_MAX_CELL_OFFSET = 1000  # cells in each direction, larger than any shift
 
 
 def digest_of(summaries: Sequence[NodeSummary]) -> str:
-    """A short name for what repetitions follow from."""
+    """Return a digest of the inputs of repetitions."""
     return compute_nodes_digest(summaries, bytes([_METHOD]))
 
 
 def has_repetitions(node: LocalMap) -> bool:
-    """Is there anything in what a node shows that its own picture shows twice? What repeats itself
-    mostly does."""
+    """Return whether a node's own image shows some part twice, as in most repetitive places."""
     return len(find_repetition_shifts(node, node, _MIN_SELF_SHARE)) > 0
 
 
 def find_repetition_shifts(
     node: LocalMap, neighbours: LocalMap, min_share: float = 0.5
 ) -> Float[np.ndarray, "k 3"]:
-    """The shifts (metres, world) by which what a node shows is there once more, those with most
-    votes first; none in most places.
+    """Find the shifts (metres, world) that move a node's points onto copies, most votes first.
+
+    Most places have none.
 
     Args:
-        around: the points of the nodes nearby that look the same way.
-        min_share: of the node's points must find a copy by the first shift, half as many by each
-            other one: parts of a panel may resemble each other, too, and smooth surfaces any part
-            of themselves.
+        neighbours: points of nearby nodes with a similar viewing direction.
+        min_share: share of the node's points that need a copy by the first shift. Each other shift
+            needs half the votes of the first. Parts of a panel may be similar, and a smooth surface
+            is similar to itself.
     """
     points, descriptors = node.points_world[:_NUM_POINTS], node.descriptors[:_NUM_POINTS]
     rows, columns = find_similar_pairs(descriptors, neighbours.descriptors, _MIN_SIMILARITY)
@@ -77,7 +75,7 @@ def find_repetition_shifts(
     least, left = max(_MIN_VOTES, min_share * len(points)), np.ones(len(shifts), np.bool_)
     grids = [
         _ShiftVotes.of(shifts, rows, offset) for offset in (0.0, 0.5)
-    ]  # that overlap: no shift lies at the borders of both
+    ]  # overlap: no shift is at a border of both
     while left.any() and len(found) < _MAX_SHIFTS:
         _, voters = max((grid.find_densest_cell(left) for grid in grids), key=lambda most: most[0])
         near = left & (
@@ -94,8 +92,10 @@ def find_repetition_shifts(
 
 
 def find_copy_transform(node: TopoNode, others: LocalMap) -> Rigid3 | None:
-    """The move (world) that takes what a node shows onto its copy among these points; None where
-    there is none, or it is itself."""
+    """Return the transform (world) that moves a node onto its copy among these points.
+
+    None if there is no copy, or the copy is the node itself.
+    """
     features = node.features.select(np.arange(min(_NUM_POINTS, len(node.features))))
     matches = match_features(features.descriptors, others.descriptors, _NEAREST_NEIGHBOR)
     alike = 1.0 - matches.distances**2 / 2.0 >= _MIN_SIMILARITY
@@ -120,8 +120,8 @@ def find_copy_transform(node: TopoNode, others: LocalMap) -> Rigid3 | None:
 
 @dataclass(frozen=True, eq=False)
 class _ShiftVotes:
-    """Shifts by the cells of a grid that they lie in: `order` sorts them by cell and point, `cells`
-    and `points` are sorted so."""
+    """Hold shifts by grid cell. `order` sorts them by cell and point, as are `cells` and
+    `points`."""
 
     order: Int[np.ndarray, " n"]
     cells: Int[np.ndarray, " n"]
@@ -137,8 +137,10 @@ class _ShiftVotes:
         return _ShiftVotes(order, *np.divmod(keys[order], _NUM_POINTS))
 
     def find_densest_cell(self, left: Bool[np.ndarray, " n"]) -> tuple[int, Int[np.ndarray, " k"]]:
-        """The most points that vote for one cell, and the shifts that lie in it, of those that are
-        left (some are)."""
+        """Return the largest number of points voting for one cell, and the shifts in that cell.
+
+        Only the shifts in `left` count. At least one must be left.
+        """
         is_left = left[self.order]
         cells, points = self.cells[is_left], self.points[is_left]
         begins = np.append(True, cells[1:] != cells[:-1])
@@ -154,14 +156,16 @@ class _ShiftVotes:
 def fold_repetitions(
     points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """The points with all copies moved onto one: along the shortest shift, by whole shifts, into
-    one period of it."""
+    """Move all copies of a point onto one.
+
+    The points are moved by whole multiples of the shortest shift into one period of it.
+    """
     if len(shifts) == 0:
         return points_world
     shift = shifts[np.argmin(np.linalg.norm(shifts, axis=1))]
     along = points_world @ shift / (shift @ shift)
     fractions = np.sort(along % 1.0)
-    # cut where fewest points are: a copy on either side of the cut would be a period off
+    # cut at the largest gap: copies on two sides of the cut would be a period apart
     gap = int(np.argmax(np.diff(fractions, append=fractions[:1] + 1.0))) if len(fractions) else 0
     cut = fractions[gap] + 1e-6 if len(fractions) else 0.0
     return points_world - np.floor(along - cut)[:, None] * shift
@@ -170,5 +174,5 @@ def fold_repetitions(
 def shifted_copies(
     points_world: Float[np.ndarray, "n 3"], shifts: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "c n 3"]:
-    """The points themselves, and moved by each shift."""
+    """Return the points themselves, and moved by each shift."""
     return np.stack([points_world, *(points_world + shift for shift in shifts)])

@@ -1,9 +1,9 @@
-"""Where along the way might a picture have been taken by somebody who comes back?
+"""Select places along the trajectory where an image in the reverse direction may have been taken.
 
-Who walks back sees to the left what the mapping camera saw to the right, and the other way round.
-So each side node that looks like one of the picture's views names a place, about where its wall
-would be seen as far ahead from the other direction; and where both views name the same place, far
-more speaks for it than for a door that looks like another door.
+In the reverse direction the left side shows what the mapping camera saw on the right. So each
+virtual view similar to one of the image's views gives a candidate place. It is the place from which
+the wall would be seen as far ahead in the other direction. Two views that agree on a place are much
+stronger evidence than one door that resembles another.
 """
 
 from __future__ import annotations
@@ -17,15 +17,18 @@ from topoloc.features.virtual_views import VirtualView
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
 
-_NUM_CANDIDATES = 64  # of the side nodes that a view looks like, those that may name a place first
-# cosine of the angle between the ways in which two cameras look that stand in the same place
+_NUM_CANDIDATES = 64  # most similar virtual views per side that may give a place
+# minimum cosine between the viewing directions of two cameras in the same place
 _MIN_DIRECTION_COSINE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class CandidatePlaces:
-    """The places that one view names, row k by one side node: `rotations` and `centres` are those
-    of the camera (world_from_cam, metres), `likeness` says how alike the two look."""
+    """Hold the candidate places of one view of the image, row k from one virtual view of the map.
+
+    `rotations` and `centres` are camera poses (world_from_cam, metres). `likeness` is the
+    similarity of the two views.
+    """
 
     rotations: Float[np.ndarray, "n 3 3"]
     centres: Float[np.ndarray, "n 3"]
@@ -35,15 +38,16 @@ class CandidatePlaces:
     def of(
         view: VirtualView, index: VirtualViewIndex, likeness: Float32[np.ndarray, " sides"]
     ) -> CandidatePlaces:
-        """By all side nodes of the other hand: one of the same hand was seen by who walked the same
-        way.
+        """Return the places of all virtual views of the opposite side.
+
+        Those of the same side belong to the mapped direction.
 
         Args:
-            likeness: how much each side node looks like the view.
+            likeness: similarity of each virtual view of the map to the view.
         """
         ahead = -view.cam_from_virtual.rotation[
             0, 2
-        ]  # on the left a side camera's x axis points ahead, on the right back
+        ]  # a left camera's x axis points ahead, a right one's back
         along = index.middles[:, 0]
         rows = np.flatnonzero(ahead * along < 0.0)
         centres = index.positions[rows] + 2.0 * along[rows, None] * index.rotations[rows, :, 0]
@@ -52,24 +56,26 @@ class CandidatePlaces:
         )
 
     def near(self, other: CandidatePlaces, apart: float) -> Bool[np.ndarray, "n m"]:
-        """Is each of these the same place as each of the others, `apart` metres from it at most and
-        less than 60 degrees turned?"""
+        """Return whether two places agree, for each pair.
+
+        They do within `apart` metres and 60 degrees.
+        """
         away = np.linalg.norm(self.centres[:, None] - other.centres[None], axis=2)
         return (away < apart) & (
             self.rotations[:, :, 2] @ other.rotations[:, :, 2].T > _MIN_DIRECTION_COSINE
         )
 
     def rows(self, rows: Int[np.ndarray, " m"]) -> CandidatePlaces:
+        """Return the given rows."""
         return CandidatePlaces(self.rotations[rows], self.centres[rows], self.likeness[rows])
 
 
 def select_likeliest_places(
     candidates: list[CandidatePlaces], num_places: int, apart: float
 ) -> list[Rigid3]:
-    """The places (world_from_cam) that all views together name first, `apart` (metres) and more
-    from each other.
+    """Return the likeliest places (world_from_cam) of all views, at least `apart` metres apart.
 
-    Each view counts with the most alike side node by which it names the place.
+    Each view adds the similarity of its best virtual view at the place.
     """
     chosen: list[Rigid3] = []
     if not candidates:

@@ -1,13 +1,13 @@
-"""First poses from the walls along the way: the last resort, for who comes back along a way that
-was mapped in one direction only.
+"""Propose poses from virtual views, for a return along a trajectory mapped in one direction.
 
-The image's views to the left and to the right (`features/side_views.py`) are compared with the side
-nodes that must show the same from the places that both look like (`candidate_places.py`); what the
-matches of both agree on (`upright_pose.py`) is followed up in both together
-(`virtual_view_matching.py`). Walls repeat themselves, doors above all: so it also counts how many
-of the key points found look more like the map's point here than like any that the side nodes show
-elsewhere. Where the map has nodes that look the same way, they would have been recognised, so poses
-there are not considered.
+This is the last source of proposals. The image's views to the left and right
+(`features/virtual_views.py`) are compared with the virtual views of the map. Candidate places come
+from `candidate_places.py`. A pose that matches of both views agree on (`upright_pose.py`) is
+refined in both together (`virtual_view_matching.py`).
+
+Walls repeat, doors above all. So the evidence also counts the key points that match here better
+than anywhere else in the virtual views. Poses near nodes with the same viewing direction are
+skipped, because those nodes would have found them.
 """
 
 from __future__ import annotations
@@ -60,8 +60,7 @@ _NEAREST_NEIGHBOR = MatchingConfig(ratio=0.0, mutual=False)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VirtualViewProposal(Proposal):
-    """A first pose on which `num_agreeing` of the matches of both views with the walls of one place
-    agree."""
+    """Hold a pose proposal on which `num_agreeing` matches of both views with one place agree."""
 
     num_agreeing: int
     cam_from_world: Rigid3
@@ -70,8 +69,8 @@ class VirtualViewProposal(Proposal):
 
 @dataclass(frozen=True, eq=False)
 class VirtualViewSearch:
-    """Both sides of a query image, and the places that both look like (world_from_cam), the
-    likeliest first."""
+    """Hold both side views of a query image and the candidate places (world_from_cam), likeliest
+    first."""
 
     search: Search
     index: VirtualViewIndex
@@ -80,6 +79,7 @@ class VirtualViewSearch:
 
     @staticmethod
     def of(search: Search, index: VirtualViewIndex) -> VirtualViewSearch:
+        """Extract both side views of the query image and select the candidate places."""
         query, seen, named = search.query, list[QueryVirtualView](), list[CandidatePlaces]()
         assert isinstance(query.input_camera, Camera)
         for view in make_virtual_views(query.input_camera, index.view_config):
@@ -102,10 +102,11 @@ class VirtualViewSearch:
 
     @property
     def camera(self) -> Camera:
+        """Return the camera of the query."""
         return self.search.query.camera
 
     def virtual_nodes_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[int]:
-        """The side nodes that show what a side must show from a pose."""
+        """Return the virtual views of the map that show the content of a side view at a pose."""
         return select_nearest_virtual_nodes(
             side.view,
             cam_from_world,
@@ -116,7 +117,7 @@ class VirtualViewSearch:
 
     @cached_property
     def local_map_of_places(self) -> LocalMap:
-        """All that must be seen of the walls from any of the places."""
+        """Return the points visible from any of the candidate places."""
         rows = sorted(
             {
                 row
@@ -131,12 +132,12 @@ class VirtualViewSearch:
 def _extract_view_features(
     config: FeatureConfig, view: VirtualView, picture: UInt8[np.ndarray, "a b"]
 ) -> Features:
-    """Those of what a view shows."""
+    """Extract the features of a view."""
     return view.select_inside(extract_from_normalized(normalize_image(picture, config), config))
 
 
 def propose_virtual_views(search: Search) -> Iterator[Proposal]:
-    """The first poses that most matches of a view agree with, some for each view."""
+    """Generate the proposals with the most agreeing matches."""
     config, best = search.config.walls, search.best
     is_settled = (
         best is not None
@@ -163,7 +164,7 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
 
 
 def _select_best(found: list[VirtualViewProposal]) -> list[VirtualViewProposal]:
-    """Those on which most matches agree, apart from each other."""
+    """Return the proposals with the most agreeing matches, at distinct places."""
     kept: list[VirtualViewProposal] = []
     for proposal in sorted(found, key=lambda one: -one.num_agreeing):
         search = proposal.walls.search
@@ -177,14 +178,16 @@ def _select_best(found: list[VirtualViewProposal]) -> list[VirtualViewProposal]:
 
 
 def _compare_again(proposal: VirtualViewProposal) -> VirtualViewProposal:
-    """Compared with what must be seen from the pose itself, where more agrees then: the place that
-    named it was only near."""
+    """Match again from the proposal's own pose, and keep the result if more matches agree.
+
+    The candidate place was only near the pose.
+    """
     again = _compare_views(proposal.walls, proposal.cam_from_world.inverse())
     return again if again is not None and again.num_agreeing > proposal.num_agreeing else proposal
 
 
 def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewProposal | None:
-    """Both views compared with what they must show from a place."""
+    """Match both views with their predicted content at a place and fit an upright pose."""
     config, cam_from_place = walls.search.config.walls, place.inverse()
     sides = _views_around(walls, cam_from_place)
     matches = [
@@ -216,8 +219,10 @@ def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewPropos
 
 
 def refine_virtual_view_pose(proposal: VirtualViewProposal) -> PoseFit | None:
-    """What both sides show around the first pose, and the pose that follows; None where too little
-    does, or the map's nodes see it."""
+    """Refine a proposal with matches of both views.
+
+    None if too few points agree, or the pose is near the map's nodes.
+    """
     walls, config = proposal.walls, proposal.walls.search.config
     cam_from_world, found, pose = proposal.cam_from_world, None, None
     for radius_px, max_error_px in config.walls.rounds:
@@ -234,7 +239,7 @@ def refine_virtual_view_pose(proposal: VirtualViewProposal) -> PoseFit | None:
 
 
 def score_virtual_view_pose(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis | None:
-    """The hypothesis with its evidence; None where too little was found for any."""
+    """Score the refined pose and return it as a hypothesis. None if too few points were found."""
     walls, search, pose, camera = proposal.walls, proposal.walls.search, final.pose, final.camera
     if pose is None or final.num_inliers < search.config.walls.min_found:
         return None
@@ -283,8 +288,7 @@ def score_virtual_view_pose(proposal: VirtualViewProposal, final: PoseFit) -> Hy
 def _match_views(
     proposal: VirtualViewProposal, cam_from_world: Rigid3, radius_px: float
 ) -> VirtualViewMatches | None:
-    """The matches of the proposal itself, or, with a radius, those of both sides around the
-    pose."""
+    """Return the proposal's own matches if the radius is 0, or guided matches around the pose."""
     if radius_px == 0.0:
         return VirtualViewMatches(
             proposal.fit.features, proposal.fit.local_map, proposal.fit.matches
@@ -303,7 +307,7 @@ def _guided_config(walls: VirtualViewSearch, radius_px: float) -> GuidedConfig:
 def _views_around(
     walls: VirtualViewSearch, cam_from_world: Rigid3
 ) -> list[tuple[QueryVirtualView, LocalMap]]:
-    """Each side with the points of the side nodes that show what it must show."""
+    """Return each side view with the points predicted in it."""
     return [
         (side, local_map)
         for side in walls.seen
@@ -325,8 +329,10 @@ def _local_map_around(
 def _estimate(
     walls: VirtualViewSearch, found: VirtualViewMatches, near: Rigid3, max_error_px: float
 ) -> AbsolutePose | None:
-    """The pose refined, or sought anew where that has more inliers and is near: a wall has a second
-    pose."""
+    """Refine the pose, or estimate it without a start if that gives more inliers nearby.
+
+    A plane admits a second pose.
+    """
     sigma_px = walls.search.weights.walls.sigma_px
     config = AbsolutePoseConfig(
         max_reprojection_error_px=max_error_px, sigma_px=sigma_px, max_iterations=400
@@ -345,8 +351,7 @@ def _estimate(
 
 
 def _num_distinct(walls: VirtualViewSearch, final: PoseFit) -> int:
-    """How many inliers look more like the map's point here than like any point that the side nodes
-    of the other places show elsewhere."""
+    """Count the inliers that match better here than with any distant point of the other places."""
     assert final.pose is not None
     rows, columns = (
         index[final.pose.inliers] for index in (final.matches.query_idx, final.matches.train_idx)
@@ -371,13 +376,13 @@ def _num_distinct(walls: VirtualViewSearch, final: PoseFit) -> int:
 
 
 def _is_seen_by_nodes(search: Search, cam_from_world: Rigid3) -> bool:
-    """Do nodes of the map look this way from here?"""
+    """Return whether nodes of the map have nearly this pose."""
     distances = search.map.distances(cam_from_world.inverse())
     return bool(distances.min() < search.config.walls.min_distance * search.map.d_thresh)
 
 
 def _are_near(search: Search, a_from_world: Rigid3, b_from_world: Rigid3) -> bool:
-    """Are two first poses, neither of them precise, worth looking into but once?"""
+    """Return whether two imprecise proposals are so close that only one is refined."""
     apart = a_from_world @ b_from_world.inverse()
     distance = float(
         np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation)

@@ -1,11 +1,10 @@
-"""First poses from walls seen from the other side: where might a picture have been taken?
+"""Estimate poses from walls seen in the reverse direction.
 
-PnP on matches with a wall does not say from where it was seen: the points lie in one plane, and a
-plane has a second pose that looks nearly the same from the other slant. But people and robots carry
-cameras upright: two cameras that saw the same walls differ by a turn about the vertical and a
-shift, which two matches give (Kukelova, Bujnak and Pajdla, 2010: pose of a camera with known
-vertical direction). The pose that most of the matches agree with is the first one; how level the
-cameras were follows later.
+PnP on matches with one wall is ambiguous. The points are coplanar, and a plane admits a second pose
+that looks nearly the same from the other slant. But people and robots carry cameras upright. Two
+such cameras differ by a rotation about the vertical and a translation, which two matches determine
+(Kukelova, Bujnak and Pajdla, 2010: pose of a camera with known vertical direction). The pose with
+the most agreeing matches is proposed. Its tilt is estimated later.
 """
 
 from __future__ import annotations
@@ -20,26 +19,26 @@ from topoloc.localization.walls.upright_pose_kernels import largest_agreement
 
 _NUM_PAIRS = 1500
 _MAX_YAW = math.radians(35.0)
-# tangents of angles between the two key points of a pair: nearer ones say little of the distance
+# minimum tangent between the two key points of a pair; closer ones do not constrain the distance
 _MIN_SEPARATION = 0.1
-_MIN_DEPTH, _MAX_DEPTH = 0.2, 100.0  # metres of depth that the points of a pair may have
+_MIN_DEPTH, _MAX_DEPTH = 0.2, 100.0  # metres: allowed depth of the points of a pair
 _TOLERANCE, _TOLERANCE_SHARE = (
     0.02,
     0.015,
-)  # in tangents: for a camera that is not quite level, more off the axis
+)  # tangents: allowance for a tilted camera, larger off the axis
 
 
 def estimate_upright_pose(
     seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]
 ) -> tuple[int, Rigid3] | None:
-    """How many matches agree on one upright pose, and that cam_from_upright. None with fewer than
-    three matches that agree.
+    """Return the number of matches that agree on one upright pose, and that cam_from_upright.
+
+    None if fewer than three matches agree.
 
     Args:
-        seen: where the camera sees each matched point, as tangents (x / z, y / z).
-        points: the same points (metres) in the frame of a camera that is held upright as well and
-            looks about the same way: poses turned by more than 35 degrees from it are not
-            considered.
+        seen: position of each matched point in the camera, as tangents (x / z, y / z).
+        points: the same points (metres) in the frame of another upright camera. Poses rotated by
+            more than 35 degrees from it are not considered.
     """
     if len(seen) < 3:
         return None
@@ -61,12 +60,14 @@ def _upright_pose(turn: float, shift: Float[np.ndarray, " 3"]) -> Rigid3:
 def _poses_from_pairs(
     seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
-    """Turns about the vertical and shifts (cam_from_upright) that explain pairs of matches; the
-    pairs are the same at every call.
+    """Compute rotations about the vertical and translations (cam_from_upright) from pairs of
+    matches.
 
-    With depths d of the two points, (u, v) where they are seen and e = d1 - d2 = z' cos - x' sin
-    for the turn, where ' is a difference: v1 d1 - v2 d2 = y' and u1 d1 - u2 d2 = x' cos + z' sin.
-    Without d2 that is a cos + b sin + c = 0.
+    The pairs are the same in every call.
+
+    Let d be the depths of the two points, (u, v) their tangents, and ' a difference of the two.
+    With e = d1 - d2 = z' cos - x' sin: v1 d1 - v2 d2 = y' and u1 d1 - u2 d2 = x' cos + z' sin.
+    Eliminating d2 gives a cos + b sin + c = 0.
     """
     first, second = np.random.default_rng(0).integers(0, len(seen), (2, _NUM_PAIRS))
     apart = seen[first] - seen[second]
@@ -79,7 +80,7 @@ def _poses_from_pairs(
         middle, half = np.arctan2(b, a), np.arccos(-c / size)
     turns, rows = np.concatenate([middle + half, middle - half]), np.tile(np.arange(len(u)), 2)
     turns = np.angle(np.exp(1j * turns))
-    allowed = np.abs(turns) < _MAX_YAW  # NaN is not
+    allowed = np.abs(turns) < _MAX_YAW  # False for NaN
     turns, rows = turns[allowed], rows[allowed]
     cos, sin = np.cos(turns), np.sin(turns)
     e = cos * dz[rows] - sin * dx[rows]

@@ -1,4 +1,4 @@
-"""Numba kernel of `wall_poses`: which of many upright poses do most matches agree with?"""
+"""Numba kernel of `upright_pose.py`: select the upright pose with the most agreeing matches."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from topoloc.compiled import kernel
 
 @kernel()
 def largest_agreement(seen, points, turns, shifts, tolerances, nearest):
-    """Row of the pose that most matches agree with, and how many these are.
+    """Return the row of the pose with the most agreeing matches, and their number.
 
-    Match k sees the point `points[k]` at the tangents `seen[k]`; pose j turns it by `turns[j]`
-    about the vertical (y) and shifts it. The two agree within `tolerances[k]`, where the point is
-    at least `nearest` metres before the camera.
+    Match k sees `points[k]` at the tangents `seen[k]`. Pose j rotates the point by `turns[j]` about
+    the vertical (y) and adds `shifts[j]`. They agree within `tolerances[k]`, if the depth of the
+    point is at least `nearest` metres.
     """
     best, most = 0, 0
     for j in range(len(turns)):

@@ -1,5 +1,4 @@
-"""The walls along a map's way, opened for queries: side nodes, what ranks them, and their points.
-Side nodes go by their rows."""
+"""Open the virtual views of a map for queries. They are identified by their rows."""
 
 from __future__ import annotations
 
@@ -17,13 +16,13 @@ from topoloc.retrieval.vlad import SurfVlad
 
 
 class VirtualViewIndex:
-    """A map's side nodes, opened: what ranks them, where they are, and their points.
+    """Hold the virtual views of a map: their ranking, poses and points.
 
-    Row k: `rotations` and `positions` are the poses (world_from_side, metres), `centres` the middle
-    of what is shown in the world and `middles` the same in the side camera's frame.
+    Row k: `rotations` and `positions` are the poses (world_from_side, metres). `centres` is the
+    middle of the view's content in the world, and `middles` the same in the view's frame.
 
     Raises:
-        MapError: what ranks the side nodes is missing or not of them.
+        MapError: the ranking of the virtual views is missing or belongs to others.
     """
 
     def __init__(self, topomap: TopoMetricMap, sides: VirtualNodes) -> None:
@@ -41,11 +40,11 @@ class VirtualViewIndex:
 
     @property
     def axes(self) -> Float[np.ndarray, "nodes 3"]:
-        """The ways in which the side nodes look."""
+        """Return the viewing directions (world)."""
         return self.rotations[:, :, 2]
 
     def similarity(self, image: Image, features: Features) -> Float32[np.ndarray, " sides"]:
-        """How much each side node looks like a view; 0 where it is not among those compared."""
+        """Return the similarity of each virtual view to a view, 0 for those that are not ranked."""
         scores = np.zeros(len(self.positions), np.float32)
         for node in self.coarse.rank(image, features, len(scores)):
             scores[node.node_id] = node.score
@@ -59,8 +58,7 @@ def _load_local_map(sides: VirtualNodes, row: int) -> LocalMap:
 
 
 def _open_ranking(sides: VirtualNodes) -> tuple[SurfVlad, Float[np.ndarray, "nodes 3"]]:
-    """What names the side nodes that look most like a view, and the middles (metres, world) of what
-    they show."""
+    """Return the ranking of the virtual views, and the middles of their content (metres, world)."""
     models = [
         node_ids_to_rows(model, [summary.node_id for summary in sides.summaries])
         for model in sides.coarse_models.values()

@@ -1,4 +1,4 @@
-"""A picture's views to both sides, matched together with the side nodes around a pose."""
+"""Match both side views of an image with the virtual views of the map around a pose."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from topoloc.localization.guided import (
 from topoloc.localization.local_map import LocalMap
 
 _CELL_PX = 8
-_MAX_COMPARED_POINTS = (
-    512  # of the points in view of a side that are compared with dense descriptors
-)
+_MAX_COMPARED_POINTS = 512  # visible points per side that are compared with dense descriptors
 
 
 @dataclass(frozen=True, eq=False)
 class QueryVirtualView:
-    """One side of a picture: its view, what was found in it, and the same features at the pixels of
-    the picture."""
+    """Hold one side view of an image.
+
+    `features` are at pixels of the view, `to_image_pixels` the same at pixels of the image.
+    """
 
     view: VirtualView
     features: Features
@@ -38,8 +38,7 @@ class QueryVirtualView:
 
 @dataclass(frozen=True, eq=False)
 class VirtualViewMatches:
-    """Features of both sides, at pixels of the picture, matched with points of side nodes around a
-    pose."""
+    """Hold the features of both side views, at image pixels, matched with points around a pose."""
 
     features: Features
     local_map: LocalMap
@@ -48,13 +47,12 @@ class VirtualViewMatches:
 
 @dataclass(frozen=True, eq=False)
 class VirtualViewCounts:
-    """What must be seen of the walls from a pose, and what would be found were it wrong.
+    """Hold the predicted content of the side views at a pose and the chance matches.
 
-    `num_visible` counts cells of 8 pixels in which a point must be seen, since neighbouring side
-    nodes hold the same wall; `num_by_chance` the matches that would be found were the pose wrong.
-    `visible_img` are the pixels of the picture where points must be seen, at most 512 of each side;
-    `agreeing_img` those of them where a network's dense descriptors agree, None of features without
-    such.
+    `num_visible` counts cells of 8 pixels with a predicted point, because neighbouring virtual
+    views hold the same wall. `num_by_chance` is the number of matches that a wrong pose would give.
+    `visible_img` holds image pixels of predicted points, at most 512 of each side. `agreeing_img`
+    holds the pixels at which dense descriptors agree. It is None for feature types without them.
     """
 
     num_visible: int
@@ -66,7 +64,7 @@ class VirtualViewCounts:
 def match_virtual_views(
     sides: list[tuple[QueryVirtualView, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig
 ) -> VirtualViewMatches | None:
-    """Both sides' guided matches, each with the points that it is given. None without any."""
+    """Return the guided matches of both sides, each with its own points. None if there are none."""
     guided = [
         match_guided(
             side.features, m, side.view.virtual_from_world(cam_from_world), side.view.camera, config
@@ -79,7 +77,7 @@ def match_virtual_views(
 def merge_matches(
     sides: list[tuple[QueryVirtualView, LocalMap]], matches: list[Matches]
 ) -> VirtualViewMatches | None:
-    """The matches of each side with the points that it is given, as one. None without any."""
+    """Merge the matches of each side with its own points. None if there are none."""
     if sum(map(len, matches)) == 0:
         return None
     first_features = np.cumsum([0, *(len(side.features) for side, _ in sides)])
@@ -102,7 +100,7 @@ def merge_matches(
 def count_virtual_views(
     sides: list[tuple[QueryVirtualView, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig
 ) -> VirtualViewCounts:
-    """What both sides must show, and what of it agrees."""
+    """Count the predicted and the agreeing points of both sides."""
     num_visible, num_by_chance, visible_img, agreeing_img = (
         0,
         0,
@@ -145,8 +143,10 @@ def count_virtual_views(
 def estimate_pose(
     found: VirtualViewMatches, camera: Camera, config: AbsolutePoseConfig, start: Rigid3 | None
 ) -> AbsolutePose | None:
-    """cam_from_world of the picture from the matches of both sides together; refined from `start`,
-    or sought anew."""
+    """Estimate cam_from_world of the image from the matches of both sides.
+
+    The pose is refined from `start`, or estimated by RANSAC if it is None.
+    """
     rows = found.matches.train_idx
     return estimate_absolute_pose(
         found.features.points_img[found.matches.query_idx].astype(np.float64),
@@ -165,14 +165,14 @@ def select_nearest_virtual_nodes(
     axes: Float[np.ndarray, "nodes 3"],
     num_nodes: int,
 ) -> list[int]:
-    """Side nodes that look the same way at what lies in the view, those in its middle first.
+    """Select virtual views with a similar direction whose content lies in the view, central first.
 
-    Where a side node stands says little: it shows what lies well ahead of it, and who comes the
-    other way sees that from beyond.
+    The position of a virtual view is not compared. It shows points well ahead of it, and a camera
+    in the reverse direction sees them from beyond.
 
     Args:
-        centres: the world points (metres) in the middle of what the side nodes show; axes: the
-            directions in which they look.
+        centres: the middles (metres, world) of the virtual views' content.
+        axes: their viewing directions (world).
     """
     side_from_world = view.virtual_from_world(cam_from_world)
     looks_alike = side_from_world.rotation[2] @ axes.T > 0.7
@@ -187,5 +187,5 @@ def select_nearest_virtual_nodes(
 
 
 def with_node_id(local_map: LocalMap, node_id: int) -> LocalMap:
-    """The same points as those of the ordinary node whose picture shows them."""
+    """Return the same points with the id of the node whose image shows them."""
     return replace(local_map, node_ids=np.full_like(local_map.node_ids, node_id))

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from topoloc import MissingExtraError, RecordingError
 from topoloc.apps.formats.bags.message_file import MessageFile, MessageRef, Topic
-from topoloc.errors import MissingExtraError, RecordingError
-from topoloc.recordings.recording import natural_key
+from topoloc.plugin import natural_key
 
 BAG_SUFFIXES = (".bag", ".bag.active", ".db3")
 MCAP_SUFFIXES = (".mcap",)

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from topoloc import Image, UnreadableImageError, read_depth, read_image
 from topoloc.apps.formats.bags.messages import image_bytes
-from topoloc.errors import UnreadableImageError
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import MAX_PIXELS, EncodedImage, read_depth, read_image
+from topoloc.plugin import MAX_PIXELS, EncodedImage
 
 # The type of a pixel, its channels, and what OpenCV makes RGB of it with (None: it is grey, or
 # RGB).

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from topoloc import RecordingError, Rigid3, TrajectoryError
 from topoloc.apps.formats.bags.bag import Bag
 from topoloc.apps.formats.bags.messages import TRANSFORM_TYPES, StampedTransform, decode_transforms
 from topoloc.apps.formats.bags.topics import TF, Roles
 from topoloc.apps.formats.bags.transform_tree import TransformTree, trajectory_from_transforms
-from topoloc.errors import RecordingError, TrajectoryError
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.trajectory import interpolate_poses, read_ground_truth
+from topoloc.plugin import interpolate_poses, read_ground_truth
 
 
 def read_transform_tree(bag: Bag) -> TransformTree:

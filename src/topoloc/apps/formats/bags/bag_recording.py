@@ -10,6 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from topoloc import (
+    CalibrationError,
+    Camera,
+    DepthImage,
+    Image,
+    RecordingError,
+    Rigid3,
+    StereoFrame,
+    StereoRig,
+    UnreadableImageError,
+)
 from topoloc.apps.formats.bags.bag import (
     MCAP_SUFFIXES,
     Bag,
@@ -30,14 +41,7 @@ from topoloc.apps.formats.bags.topics import (
     select_topics,
 )
 from topoloc.apps.formats.bags.transform_tree import TransformTree
-from topoloc.errors import CalibrationError, RecordingError, UnreadableImageError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import StereoRig
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.frame import DepthImage, Image, StereoFrame
-from topoloc.recordings.recording import find_nearest_idx
+from topoloc.plugin import RecordingFormat, find_nearest_idx, read_camera_json
 
 EXPECTED_FILES = "a ROS bag: .bag, .db3, or a folder with metadata.yaml"
 MCAP_EXPECTED_FILES = "an .mcap file"
@@ -327,7 +331,7 @@ def _depth_camera(
 
 
 def _read_folder_camera(bag: Bag) -> tuple[Camera | None, float | None]:
-    path = (bag.path if bag.path.is_dir() else bag.path.parent) / FILE_NAME
+    path = (bag.path if bag.path.is_dir() else bag.path.parent) / "camera.json"
     if not path.is_file():
         return None, None
     file = read_camera_json(path)

@@ -12,11 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from topoloc import CalibrationError, Camera, Rigid3, StereoRig, TrajectoryError
 from topoloc.apps.formats.bags.messages import frame_id
-from topoloc.errors import CalibrationError, TrajectoryError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import StereoRig
-from topoloc.geometry.rigid import Rigid3
 
 _NO_DISTORTION = ("", "none", "plumb_bob", "rational_polynomial")
 _MAX_BASELINE = (

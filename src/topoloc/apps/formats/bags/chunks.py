@@ -15,8 +15,8 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from topoloc import RecordingError
 from topoloc.apps.formats.bags.message_file import TruncatedFileError
-from topoloc.errors import RecordingError
 
 WHOLE_FILE = -1
 MAX_CHUNK_BYTES = 1 << 29

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from topoloc.errors import RecordingError
+from topoloc import RecordingError
 
 
 @dataclass(frozen=True)

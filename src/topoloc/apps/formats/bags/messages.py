@@ -15,8 +15,8 @@ from functools import cache, lru_cache
 from types import SimpleNamespace
 from typing import Any
 
+from topoloc import RecordingError
 from topoloc.apps.formats.bags.message_file import Topic
-from topoloc.errors import RecordingError
 
 RAW_IMAGE_TYPES = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
 COMPRESSED_IMAGE_TYPES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})

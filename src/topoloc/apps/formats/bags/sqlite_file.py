@@ -11,8 +11,8 @@ import sqlite3
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from topoloc import RecordingError
 from topoloc.apps.formats.bags.message_file import MessageRef, Topic, damaged_message_error
-from topoloc.errors import RecordingError
 
 MAGIC = b"SQLite format 3\0"
 _ROW = -2  # in place of a chunk's number

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from topoloc import RecordingError
 from topoloc.apps.formats.bags.bag import Bag
 from topoloc.apps.formats.bags.messages import (
     CALIBRATION_TYPES,
@@ -15,8 +16,7 @@ from topoloc.apps.formats.bags.messages import (
     POSE_TYPES,
     TRANSFORM_TYPES,
 )
-from topoloc.bounds import suggest_name
-from topoloc.errors import RecordingError
+from topoloc.plugin import suggest_name
 
 ROLES = ("left", "right", "depth", "left_info", "right_info", "depth_info", "pose", "pose_frame")
 _ROLE_ALIASES = {

@@ -9,24 +9,22 @@ from itertools import pairwise
 
 import numpy as np
 
+from topoloc import Rigid3, Trajectory
 from topoloc.apps.formats.bags.messages import StampedTransform
-from topoloc.geometry.lazy_poses import LazyPoses, pose_from_quaternion
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.trajectory import Trajectory, interpolate_poses
+from topoloc.plugin import interpolate_poses
 
 
 def trajectory_from_transforms(transforms: list[StampedTransform]) -> Trajectory:
     """In order of time, of equal times the last."""
     by_time = {its.t_ns: its for its in sorted(transforms, key=lambda its: its.t_ns)}
-    return Trajectory(poses_from_transforms(list(by_time.values())), list(by_time))
+    rows = [(*its.translation, *its.quat_xyzw) for its in by_time.values()]
+    numbers = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    return Trajectory.from_quaternions(numbers, list(by_time))
 
 
-def poses_from_transforms(transforms: Sequence[StampedTransform]) -> Sequence[Rigid3]:
-    """Transforms as poses."""
-    rows = np.array(
-        [(*its.translation, *its.quat_xyzw) for its in transforms], dtype=np.float64
-    ).reshape(-1, 7)
-    return LazyPoses(rows, pose_from_quaternion)
+def _pose_of_transform(its: StampedTransform) -> Rigid3:
+    x, y, z, w = its.quat_xyzw
+    return Rigid3.from_quat_wxyz(np.array([w, x, y, z]), np.array(its.translation))
 
 
 @dataclass(eq=False)
@@ -83,7 +81,7 @@ class TransformTree:
         """last_from_first."""
         pose = Rigid3.identity()
         for child, _ in pairwise(path):
-            pose = poses_from_transforms(self.transforms[child][-1:])[0] @ pose
+            pose = _pose_of_transform(self.transforms[child][-1]) @ pose
         return pose
 
     def _static_edges(self, frame: str) -> Iterator[tuple[str, str]]:
@@ -109,5 +107,5 @@ class TransformTree:
     def _poses_at(self, child: str, t_ns: Sequence[int]) -> Sequence[Rigid3 | None]:
         """parent_from_child at each time."""
         if self._is_static(child):
-            return [poses_from_transforms(self.transforms[child][-1:])[0]] * len(t_ns)
+            return [_pose_of_transform(self.transforms[child][-1])] * len(t_ns)
         return interpolate_poses(trajectory_from_transforms(self.transforms[child]), t_ns)

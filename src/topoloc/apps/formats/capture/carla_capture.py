@@ -20,12 +20,19 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from topoloc.errors import ConfigError, MissingExtraError, RecordingError, TrajectoryError
-from topoloc.geometry.camera import Camera
-from topoloc.geometry.pose_conventions import undo_pose_conventions
-from topoloc.geometry.rig import StereoRig
-from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import DepthImage, Image, StereoFrame
+from topoloc import (
+    Camera,
+    ConfigError,
+    DepthImage,
+    Image,
+    MissingExtraError,
+    PoseConventions,
+    RecordingError,
+    Rigid3,
+    StereoFrame,
+    StereoRig,
+    TrajectoryError,
+)
 
 Weather = Literal["clear", "cloudy", "rain"]
 WEATHERS: dict[Weather, str] = {
@@ -102,9 +109,8 @@ def world_from_carla_transform(transform: Any) -> Rigid3:
     """The pose in our axes of a camera that stands in CARLA as this `carla.Transform`. Raises
     RecordingError: it is no pose."""
     try:
-        return undo_pose_conventions(
-            Rigid3.from_matrix(np.array(transform.get_matrix())), ("unreal",)
-        )
+        pose = Rigid3.from_matrix(np.array(transform.get_matrix()))
+        return PoseConventions(("unreal",)).undo_conventions(pose)
     except TrajectoryError as error:
         raise RecordingError(f"CARLA gave a camera no pose ({error})") from None
 

@@ -18,12 +18,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt16
 
-from topoloc.errors import RecordingError, TopolocError
-from topoloc.geometry.rig import StereoRig
-from topoloc.recordings.atomic import write_bytes, write_text
-from topoloc.recordings.camera_json import FILE_NAME
-from topoloc.recordings.frame import Image, StereoFrame
-from topoloc.recordings.trajectory import TUM_HEADER, tum_line
+from topoloc import (
+    Image,
+    RecordingError,
+    StereoFrame,
+    StereoRig,
+    TopolocError,
+    Trajectory,
+    tum_text,
+)
+from topoloc.plugin import write_bytes, write_text
 
 DEPTH_FACTOR = 256.0
 """Units a metre of depth pictures: 4 mm steps up to 256 m."""
@@ -111,7 +115,8 @@ class RecordingWriter:
         assert self._times is not None
         try:
             if self._truth is not None and frame.world_from_cam is not None:
-                self._truth.write(tum_line(frame.t_ns, frame.world_from_cam) + "\n")
+                trajectory = Trajectory([frame.world_from_cam], [frame.t_ns])
+                self._truth.write(tum_text(trajectory, header=False))
                 self._truth.flush()
             self._times.write(f"{Decimal(frame.t_ns).scaleb(-9):.9f}\n")
             self._times.flush()
@@ -134,12 +139,11 @@ class RecordingWriter:
             for name in self._subfolders.values():
                 (self.folder / name).mkdir()
             if frame.camera is not None:
-                write_text(
-                    self.folder / FILE_NAME, json.dumps(calibration_json(frame), indent=1) + "\n"
-                )
+                calibration = json.dumps(calibration_json(frame), indent=1)
+                write_text(self.folder / "camera.json", calibration + "\n")
             if frame.world_from_cam is not None:
                 self._truth = (self.folder / "truth.tum").open("x", encoding="utf-8")
-                self._truth.write(TUM_HEADER + "\n")
+                self._truth.write(tum_text(Trajectory([], [])))
             self._times = (self.folder / "times.txt").open("x", encoding="utf-8")
         except OSError as error:
             raise TopolocError(f"cannot write {self.folder}: {error.strerror}") from None

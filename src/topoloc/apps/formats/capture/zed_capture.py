@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from topoloc import CalibrationError, RecordingError, StereoFrame, StereoRig
 from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.formats.svo import retrieve_image, rig_from_sdk, sdk
 from topoloc.apps.formats.zed import is_side_by_side, read_rig
-from topoloc.errors import CalibrationError, RecordingError
-from topoloc.geometry.rig import StereoRig
-from topoloc.recordings.frame import StereoFrame
 
 
 def side_by_side_frames(source: LiveSource, calibration: Path) -> Iterator[StereoFrame]:

@@ -1,0 +1,75 @@
+"""Hold the deviation of an image's camera from its calibration: plain data, cheap to import."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+MISMATCH_FOCAL_FIELDS = ("focal_length_px", "focal_sigma_px", "calibrated_focal_length_px")
+"""The first fields of a `CalibrationMismatch`, which are also keys of its JSON."""
+
+
+@dataclass(frozen=True, eq=False)
+class IntrinsicsDeviation:
+    """Hold the deviation of an image's estimated intrinsics from the calibration, independent of
+    the image size.
+
+    Args:
+        deviation: logarithm of the focal length over the calibrated one, and the shift of the
+            principal point in calibrated focal lengths (x, y).
+        covariance: its noise under independent errors of the points.
+        place: node that the image shows. Images of one node share the errors of its points.
+    """
+
+    deviation: Float[np.ndarray, " 3"]
+    covariance: Float[np.ndarray, "3 3"]
+    place: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationMismatch:
+    """Compare the camera estimated from an image with the calibration, in pixels of the original
+    image.
+
+    `shift` is the left perturbation (metres, radians) from the pose under the calibration to the
+    pose under the estimated camera.
+    """
+
+    focal_length_px: float
+    focal_sigma_px: float
+    calibrated_focal_length_px: float
+    principal_point_px: Float[np.ndarray, " 2"]
+    calibrated_principal_point_px: Float[np.ndarray, " 2"]
+    has_focal_mismatch: bool
+    has_principal_point_mismatch: bool
+    shift: Float[np.ndarray, " 6"]
+
+    def __str__(self) -> str:
+        parts = []
+        if self.has_focal_mismatch:
+            measured = f"f = {self.focal_length_px:.0f} +- {max(self.focal_sigma_px, 0.5):.0f} px"
+            parts.append(f"{measured}, the calibration {self.calibrated_focal_length_px:.0f}")
+        if self.has_principal_point_mismatch:
+            (x, y), (cx, cy) = self.principal_point_px, self.calibrated_principal_point_px
+            parts.append(
+                f"the principal point at ({x:.0f}, {y:.0f}), the calibration ({cx:.0f}, {cy:.0f})"
+            )
+        return f"the picture says {'; '.join(parts)}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the mismatch as JSON, with a text for the user as `detail`."""
+        of = {
+            "focal_length": self.has_focal_mismatch,
+            "principal_point": self.has_principal_point_mismatch,
+        }
+        return {
+            **{key: getattr(self, key) for key in MISMATCH_FOCAL_FIELDS},
+            "of": [name for name, is_off in of.items() if is_off],
+            "shift": self.shift.tolist(),
+            "principal_point_px": self.principal_point_px.tolist(),
+            "calibrated_principal_point_px": self.calibrated_principal_point_px.tolist(),
+            "detail": str(self),
+        }
