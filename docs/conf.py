@@ -25,7 +25,7 @@ extensions = [
     "from_program",
     "source_pages",
 ]
-exclude_patterns = ["_build", "_ext"]
+exclude_patterns = ["_build", "_ext", "journal"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"

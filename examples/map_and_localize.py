@@ -1,10 +1,9 @@
-"""A place is mapped from one recording, and pictures of another are asked where they were taken.
+"""Map a place from one recording, then localize images of another one.
 
     python examples/map_and_localize.py [--map-from SEQ] [--ask SEQ] [--out FILE]
 
-Without arguments the pictures are those of the built-in demo: a rendered lab, mapped from one lap
-with a stereo camera, asked with single pictures of another. Any recording of docs/cli.md does as
-well; the one that makes the map needs depth and poses.
+Without arguments it maps the demo's rendered lab from one stereo lap and localizes single images of
+another. Any recording of docs/recordings.md works. The mapped one needs depth and poses.
 """
 
 import argparse

@@ -6,7 +6,6 @@ from __future__ import annotations
 import importlib
 import re
 import sqlite3
-import warnings
 from contextlib import closing
 from pathlib import Path
 from types import ModuleType
@@ -27,9 +26,11 @@ DOORS = (topoloc, topoloc.plugin)
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 CLI = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+RESULTS = (ROOT / "docs" / "results-and-exports.md").read_text(encoding="utf-8")
 MAP_FORMAT = (ROOT / "docs" / "map-format.md").read_text(encoding="utf-8")
 PLAN = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+JOURNAL = sorted((ROOT / "docs" / "journal").glob("*.md"))
 
 LOCALIZED = Localization(
     Rigid3.identity(), np.eye(6), 1.0, 0, [NodeScore(0, 1.0)], 30, 20, {"total": 1.0}
@@ -37,10 +38,10 @@ LOCALIZED = Localization(
 UNREADABLE = NotLocalized("unreadable", detail="which file, and why")
 
 
-def _section(command: str) -> str:
-    """What docs/cli.md says of one command."""
-    match = re.search(rf"^## topoloc {command}$(.*?)(?=^## |\Z)", CLI, re.MULTILINE | re.DOTALL)
-    assert match, f"docs/cli.md has no section '## topoloc {command}'"
+def _section(page: str, title: str) -> str:
+    """The section of a page below a heading of the second level."""
+    match = re.search(rf"^## {title}$(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)
+    assert match, f"no section '## {title}'"
     return match.group(1)
 
 
@@ -59,7 +60,7 @@ def _code_blocks(text: str, language: str) -> list[str]:
 def test_every_command_and_setting_is_in_the_docs(command: str, capsys: pytest.CaptureFixture[str]):
     assert f"topoloc {command}" in README
     settings = _settings(command, capsys)
-    documented = set(re.findall(r"`(--[a-z][\w-]*)", _section(command)))
+    documented = set(re.findall(r"`(--[a-z][\w-]*)", _section(CLI, f"topoloc {command}")))
     assert settings - documented == set()
     assert documented - settings == set(), "documented, but no setting of this command"
 
@@ -88,19 +89,19 @@ def test_commands_in_code_blocks_exist(capsys: pytest.CaptureFixture[str]):
     ["too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"],
 )
 def test_every_reason_is_documented(reason: str):
-    assert f"`{reason}`" in _section("localize")
+    assert f"`{reason}`" in _section(RESULTS, "Results")
 
 
 def test_result_and_evaluation_keys_are_documented():
     for key in {**LOCALIZED.to_json("a.png"), **UNREADABLE.to_json("b.png")}:
-        assert f'"{key}"' in _section("localize")
+        assert f'"{key}"' in _section(RESULTS, "Results")
     answers = [
         EvaluatedQuery("a.png", LOCALIZED, Rigid3.identity(), 0),
         EvaluatedQuery("b.png", UNREADABLE, None),
     ]
     evaluation = summarize(answers)
     for key in (*evaluation, *evaluation["recall"]):
-        assert f'"{key}"' in _section("evaluate")
+        assert f'"{key}"' in _section(RESULTS, "Evaluations")
 
 
 def test_every_table_and_column_of_the_map_is_documented():
@@ -154,29 +155,60 @@ def test_python_examples_compile_and_use_public_names():
         assert set(re.findall(r"(?<!from )\btopoloc\.(\w+)", block)) <= set(topoloc.__all__)
 
 
-def test_the_plan_names_the_files_that_are_there():
-    for package in (
-        "src/topoloc",
-        "worlds/src/topoloc_worlds",
-        "training/src/topoloc_training",
-        "paper/src/topoloc_paper",
-    ):
-        rooms = re.search(rf"^{package}/\n(.*?)^\w", PLAN, re.MULTILINE | re.DOTALL)
-        assert rooms
-        named = set(re.findall(r"\b(\w+\.py)\b", rooms.group(1)))
-        there = {path.name for path in (ROOT / package).rglob("*.py") if path.stat().st_size > 0}
-        assert named - there == set(), package
-        if missing := sorted(
-            name
-            for name in there - named
-            if not name.endswith("_kernels.py") and not name.startswith("__")
-        ):
-            warnings.warn(
-                f"docs/architecture.md, {package}: not named: " + ", ".join(missing), stacklevel=1
-            )
+def test_every_path_that_the_plan_names_exists():
+    """Paths in the plan are relative to the package, or else to the repository."""
+    named = re.findall(r"`([\w./-]+(?:/[\w.-]*|\.(?:py|md|toml)))`", PLAN)
+    assert len(named) > 40
+    places = (ROOT / "src" / "topoloc", ROOT)
+    assert [path for path in named if not any((at / path).exists() for at in places)] == []
+
+
+def test_every_package_is_in_the_table_of_layers():
+    package = ROOT / "src" / "topoloc"
+    table = re.search(r"^## Layers\n(.*?)^## ", PLAN, re.MULTILINE | re.DOTALL)
+    assert table
+    rows = [row for row in table.group(1).splitlines() if row.startswith("| `")]
+    named = {name for row in rows for name in re.findall(r"`(\w+)(?:/|\.py)`", row.split("|")[1])}
+    there = {path.parent.name for path in package.glob("*/__init__.py")}
+    there |= {path.stem for path in package.glob("*.py") if not path.stem.startswith("__")}
+    assert named == there
+    applications = {path.parent.name for path in package.glob("apps/*/__init__.py")}
+    assert set(re.findall(r"`apps/(\w+)`", table.group(1))) == applications
+
+
+def test_every_name_in_the_plan_is_defined_in_the_file_beside_it():
+    rows = re.findall(
+        r"^\| ((?:`\w+`(?:, )?)+) \| ((?:`[\w/]+\.py`(?:, )?)+) \|", PLAN, re.MULTILINE
+    )
+    assert len(rows) > 20
+    for names, paths in rows:
+        text = "".join(
+            (ROOT / "src" / "topoloc" / path).read_text(encoding="utf-8")
+            for path in re.findall(r"`([^`]+)`", paths)
+        )
+        for name in re.findall(r"`(\w+)`", names):
+            assert re.search(rf"^(?:class|def) {name}\b|^{name} = ", text, re.MULTILINE), name
+
+
+def _is_importable(name: str) -> bool:
+    """Whether a dotted name is a module, or an attribute of one."""
+    module, _, attribute = name.rpartition(".")
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError:
+        return bool(module) and hasattr(importlib.import_module(module), attribute)
+    return True
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_dotted_names_that_a_page_mentions_exist(page: Path):
+    """Check names such as `topoloc.lifelong.merge.merge_maps`, but not groups of entry points."""
+    groups = {"topoloc.commands", "topoloc.settings"}
+    named = set(re.findall(r"`(topoloc(?:\.[A-Za-z_]\w*)+)`", page.read_text(encoding="utf-8")))
+    assert [name for name in sorted(named - groups) if not _is_importable(name)] == []
+
+
+@pytest.mark.parametrize("page", [*PAGES, *JOURNAL], ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path):
     links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
     local = [link for link in links if "://" not in link]

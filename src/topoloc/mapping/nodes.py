@@ -25,7 +25,7 @@ from topoloc.mapping.entries import NodeSummary
 DEPTH_SHARE = 0.15
 # By default, a rotation by this angle alone creates a node. Nodes are cheap (100 KB), and a query
 # matches only a few. Nodes with nearly the query's view share the map's errors with it
-# (docs/journal.md).
+# (docs/journal/mapping.md).
 RADIANS_PER_NODE = np.deg2rad(2.0)
 _STEPS = list(product((-1, 0, 1), repeat=3))  # steps to a cube and its neighbours
 

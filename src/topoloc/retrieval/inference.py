@@ -2,7 +2,7 @@
 
 If the processor multiplies bfloat16 in hardware, bfloat16 is used. Otherwise single precision is
 used, and a network for single images is frozen into TorchScript. Its fused calls save a third of a
-small network's time (docs/journal.md).
+small network's time (docs/journal/retrieval.md).
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from topoloc.retrieval.descriptor_kernels import add_residuals, multiply_rows
 _BLOCK = 1024  # vectors whitened at a time
 _MIN_GROUP_SIZE = 8  # minimum number of images for a meaningful mean vector
 # Fraction of the group differences that is removed. Removing all costs more if every group covers
-# the whole place (docs/journal.md).
+# the whole place (docs/journal/retrieval.md).
 _SUPPRESSED_SHARE = 0.5
 
 
