@@ -1,10 +1,12 @@
 """Run the same inputs with an old commit and with this source tree, and compare the answers.
 
-    python benchmarks/equality.py OLD_COMMIT [--quick] [--shared ../shared] [--cache FOLDER] [--only CASE]
+    python benchmarks/equality.py OLD_COMMIT [--quick] [--shared ../shared] [--cache FOLDER]
 
-Both sides run the command line in processes of their own on this machine. Reason, tile and node must be equal; position, angle and
-probability may differ by 1e-6 (metres, radians). The old commit is unpacked into a temporary folder and compiles its kernels there,
-which takes about half a minute. `--cache FOLDER` keeps its answers, by commit. Exit status 1 on a difference.
+Both sides run the command line in processes of their own on this machine. Reason, tile and node
+must be equal; position, angle and probability may differ by 1e-6 (metres, radians). The old commit
+is unpacked into a temporary folder and compiles its kernels there, which takes about half a minute.
+`--cache FOLDER` keeps its answers, by commit. `--only CASE` runs one case and those before it.
+The exit status is 1 on a difference.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The jobs of benchmarks/acceptance.py: each runs commands as a user types them and yields figures."""
+"""Jobs of benchmarks/acceptance.py. Each runs commands as a user types them and yields figures."""

@@ -13,7 +13,7 @@ KEPT = ("query", "localized", "reason", "tile", "node", "probability", "world_fr
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold how many answers were compared, how many differ, and the largest differences (m, rad, 1)."""
+    """Hold how many answers differ, and the largest differences (m, rad, 1)."""
 
     compared: int
     different: int
@@ -31,7 +31,7 @@ def kept(answers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def compare_answers(
     old: Sequence[Mapping[str, Any]], new: Sequence[Mapping[str, Any]], tolerance: float = TOLERANCE
 ) -> Comparison:
-    """Compare reason, tile and node exactly, and position (m), angle (rad) and p within a tolerance."""
+    """Compare reason, tile and node exactly; position (m), angle (rad) and p by a tolerance."""
     position = angle = probability = 0.0
     wrong = [] if len(old) == len(new) else [f"{len(old)} answers, now {len(new)}"]
     for was, now in zip(old, new, strict=False):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,9 @@ Value = int | float | str | None
 class Figure:
     """Hold one measured value.
 
-    The rule is `at least` or `at most` (counts, exact), `equal`, `median` (may rise by 5 %: errors, bytes,
-    memory) or `time` (a ratio to OpenCV's SIFT, may rise by 20 %). A figure with `skipped` has no value.
+    The rule is `at least` or `at most` (counts, exact), `equal`, `median` (errors, bytes, memory:
+    may rise by 5 %) or `time` (a ratio to OpenCV's SIFT: may rise by 20 %). A figure with `skipped`
+    has no value.
     """
 
     name: str
@@ -106,16 +107,15 @@ class Committed:
         """Return the committed figures of one job."""
         return self._of_mode.get(job, {})
 
-    def store(self, job: str, figures: list[Figure]) -> None:
-        """Replace the figures of one job. Skipped figures keep their old values."""
+    def store(self, job: str, figures: list[Figure], whole: bool) -> None:
+        """Replace the figures of one job. Keep skipped ones, and all others unless whole."""
         old = self.of_job(job)
-        self._of_mode[job] = {
-            figure.name: old.get(figure.name)
-            if figure.skipped
-            else {"value": figure.value, "rule": figure.rule}
-            for figure in figures
-            if not figure.skipped or figure.name in old
-        }
+        skipped = {figure.name for figure in figures if figure.skipped}
+        new = {name: entry for name, entry in old.items() if name in skipped or not whole}
+        for figure in figures:
+            if not figure.skipped:
+                new[figure.name] = {"value": figure.value, "rule": figure.rule}
+        self._of_mode[job] = new
 
     def write(self) -> None:
         """Write the file."""
@@ -128,7 +128,7 @@ def rounded(number: float, digits: int = 4) -> float:
 
 
 def errors_cm(summary: Mapping[str, Any], name: str) -> list[Figure]:
-    """Return the figures of an evaluation, or of one recording of it: poses, medians, false poses."""
+    """Return the figures of an evaluation, or of one recording of it."""
     count = f"{name}: localized of {summary['num_queries']}"
     translation, rotation = summary["median_translation_m"], summary["median_rotation_deg"]
     return [
@@ -137,9 +137,6 @@ def errors_cm(summary: Mapping[str, Any], name: str) -> list[Figure]:
         Figure(f"{name}: median error, deg", rounded(rotation), "median"),
         Figure(f"{name}: false poses", summary["false_accepts"], "at most"),
     ]
-
-
-Job = Callable[[Any], Any]
 
 
 def _text(value: Value) -> str:

@@ -23,8 +23,8 @@ FIXTURES = ROOT / "tests" / "fixtures" / "aea690a"
 # The recordings below ../shared/data from which the maps of all jobs are built.
 MAPS = {
     "zed": ("zed_lab/session1", ()),
-    "kitchen": ("seven_scenes/kitchen@0::2", ("--d-thresh", 0.5)),
-    "kitchen60": ("seven_scenes/kitchen@0-59/100", ("--d-thresh", 0.5)),
+    "kitchen": ("seven_scenes/kitchen@0::2", ()),
+    "kitchen60": ("seven_scenes/kitchen@0-59/100", ()),
     "street1": ("kitti/sequences/street1@0::2", ()),
     "street2": ("kitti/sequences/street2@0::2", ()),
 }
