@@ -24,8 +24,7 @@ def digest(path: Path) -> str:
 
 
 def _night_joins(work: Workplace) -> Iterator[Figure]:
-    path, night = work.folder / "lab.topo", work.lab("night")
-    work.topoloc("build", work.lab("map_lap1"), path)
+    path, night = work.own_map("lab"), work.lab("night")
     yield _localized(work, "before the update, night", path, night)
     built = digest(path)
     joined = work.answer("update", path, night)["updates"][0]

@@ -14,8 +14,7 @@ from .workplace import Workplace
 
 def stream(work: Workplace) -> Iterator[Figure]:
     """Follow recordings as streams: the demo's lab, ZED session 2, and one that jumps elsewhere."""
-    work.topoloc("build", work.lab("map_lap1"), work.folder / "lab.topo")
-    yield from _of_stream(work, "demo, lap 2", work.folder / "lab.topo", work.lab("map_lap2"), ())
+    yield from _of_stream(work, "demo, lap 2", work.map("lab"), work.lab("map_lap2"), ())
     fit = ("--map-from-truth", work.data(FIT))
     zed = work.data("zed_lab/session2@0:99")
     yield from _of_stream(work, "zed", work.map("zed"), zed, fit)

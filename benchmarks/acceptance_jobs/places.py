@@ -70,18 +70,14 @@ def elsewhere(work: Workplace) -> Iterator[Figure]:
 
 def unknown_focal_length(work: Workplace) -> Iterator[Figure]:
     """Localize single images without a calibration, and compare them with the truth."""
-    chosen = {
-        "kitchen": work.data("seven_scenes/kitchen@1::12" if work.quick else QUERIES["kitchen"][0])
-    }
-    where = {"kitchen": work.map("kitchen")}
+    chosen = {"lab": str(work.lab("day"))}
     if not work.quick:
-        work.topoloc("build", work.lab("map_lap1"), work.folder / "lab.topo")
-        chosen["demo, day"], where["demo, day"] = str(work.lab("day")), work.folder / "lab.topo"
+        chosen["kitchen"] = work.data(QUERIES["kitchen"][0])
     for name, recording in chosen.items():
-        known = work.answer("evaluate", where[name], recording)["answers"]
+        known = work.answer("evaluate", work.map(name), recording)["answers"]
         truth = {_stem(answer["query"]): answer["true_world_from_cam"] for answer in known}
         options = ("--single", "--camera", "unknown")
-        lines = work.answer("localize", where[name], recording, *options)
+        lines = work.answer("localize", work.map(name), recording, *options)
         yield from _against_truth(name, lines, truth)
 
 

@@ -241,13 +241,20 @@ def _has_ended(one: socket.socket) -> bool:
 
 
 def _images(work: Workplace) -> list[Path]:
-    """Return 70 images of the map and 30 of another place, with names of their own."""
+    """Return 70 images of the map and 30 of another place, all of one size."""
+    import cv2
+
     zed = sorted((Path(work.data("zed_lab/session2")) / "image_0").iterdir())[:70]
     tower = sorted(Path(work.data("ie_tower")).rglob("*.jpg"))[::26][:30]
-    mixed = [
-        path for k in range(10) for path in (*zed[7 * k : 7 * k + 7], *tower[3 * k : 3 * k + 3])
-    ]
     folder = work.folder / "images"
     folder.mkdir()
-    copies = [folder / f"{k:03d}{path.suffix}" for k, path in enumerate(mixed)]
-    return [Path(shutil.copy(path, copy)) for path, copy in zip(mixed, copies, strict=True)]
+    copies = []
+    for k in range(100):
+        group, place = divmod(k, 10)
+        copies.append(folder / f"{k:03d}.jpg")
+        if place < 7:
+            shutil.copy(zed[7 * group + place], copies[-1])
+        else:
+            image = cv2.imread(str(tower[3 * group + place - 7]), cv2.IMREAD_GRAYSCALE)
+            cv2.imwrite(str(copies[-1]), cv2.resize(image, (672, 376)))
+    return copies

@@ -39,7 +39,7 @@ def size(work: Workplace) -> Iterator[Figure]:
     yield Figure("import topoloc over SIFT's time", rounded(imported / sift, 2), "time")
     yield Figure("topoloc --help over SIFT's time", rounded(helped / sift, 2), "time")
     script = Path(__file__).with_name("query_times.py")
-    words = (script, work.map("zed"), work.data("zed_lab/session2@0:20"), 6)
+    words = (script, work.map("zed"), work.data("zed_lab/session2@0:20"), 20)
     memory = json.loads(work.python(*words))["memory_mb"]
     yield Figure("memory of a query process, MB", round(memory), "median")
     yield from _installed(work)

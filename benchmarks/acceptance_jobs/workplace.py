@@ -20,8 +20,9 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("src", "worlds/src", "training/src", "paper/src")
 FIXTURES = ROOT / "tests" / "fixtures" / "aea690a"
 
-# The recordings below ../shared/data from which the maps of all jobs are built.
+# The recordings from which the maps of all jobs are built: below ../shared/data, and of the demo.
 MAPS = {
+    "lab": ("demo:map_lap1", ()),
     "zed": ("zed_lab/session1", ()),
     "kitchen": ("seven_scenes/kitchen@0::2", ()),
     "kitchen60": ("seven_scenes/kitchen@0-59/100", ()),
@@ -152,7 +153,7 @@ class Workplace:
 
     def lab(self, name: str) -> Path:
         """Return a recording of the demo's lab, a copy outside of the package."""
-        copy = self.maps / "lab"
+        copy = self.maps / "demo"
         if not copy.exists():
             found = sorted((ROOT / "src").rglob("map_lap1"))
             if not found:
@@ -165,7 +166,9 @@ class Workplace:
         path = self.maps / f"{name}.topo"
         if not path.exists():
             recording, options = MAPS[name]
-            self.topoloc("build", self.data(recording), path, *options)
+            kind, _, lab = recording.partition(":")
+            source = self.lab(lab) if kind == "demo" else self.data(recording)
+            self.topoloc("build", source, path, *options)
         return path
 
     def own_map(self, name: str) -> Path:
