@@ -2,6 +2,8 @@
 # make install   the program with all its extras and the tests' tools, into .venv, at the versions of constraints.txt
 # make test      all checks: ruff, import contract, types, tests; installs into .venv only what these need
 # make test-slow   the few tests that `make test` leaves out for their time: the paper made again, networks trained
+# make acceptance   the commands as a user types them, on the recordings in ../shared; compares figures with benchmarks/acceptance.json
+# make acceptance-quick   the part of it that takes at most three minutes
 # make lint      the same without the tests
 # make docs      these pages as HTML, in docs/_build/html; a warning is an error
 # make clean     remove what the above made
@@ -15,7 +17,7 @@ CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11 python3
 # Without a look at the network for a newer pyright; its node comes from the package index.
 PYRIGHT := PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
 
-.PHONY: demo install test test-slow lint kernels docs clean
+.PHONY: demo install test test-slow acceptance acceptance-quick lint kernels docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-core
@@ -33,6 +35,12 @@ kernels: $(VENV)/installed-test
 
 test-slow: $(VENV)/installed-test
 	@$(BIN)/pytest -m slow
+
+acceptance: kernels
+	@$(BIN)/python benchmarks/acceptance.py
+
+acceptance-quick: kernels
+	@$(BIN)/python benchmarks/acceptance.py --quick
 
 lint: $(VENV)/installed-test
 	@$(BIN)/ruff check --quiet

@@ -1,0 +1,50 @@
+"""Read the files that commit aea690a wrote, and compare the answers."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+
+from .answers import compare_answers, pose_difference
+from .edits import digest
+from .figures import Figure
+from .workplace import FIXTURES, Workplace, read_lines
+
+
+def old_files(work: Workplace) -> Iterator[Figure]:
+    """Compare the answers of old maps with those that aea690a gave."""
+    old = work.folder / "old"
+    shutil.copytree(FIXTURES, old)
+    expected = json.loads((old / "expected.json").read_text(encoding="utf-8"))
+    for name, answers in expected["answers"].items():
+        found = compare_answers(answers, work.answer("localize", old / name, old / "queries"))
+        yield Figure(f"{name}: other answers of {found.compared}", found.different, "at most")
+    for name in ("schema_1.topo", "schema_2.topo", "schema_3.topo"):
+        text = work.topoloc("info", old / name, "--check", status=None)
+        yield Figure(f"{name}: info --check is ok", int(text.split()[-1:] == ["ok"]), "at least")
+    settings = ("--config", old / "settings.toml")
+    answers = work.answer("localize", old / "schema_3.topo", old / "queries", *settings)
+    found = compare_answers(expected["answers"]["schema_3.topo"], answers)
+    yield Figure(f"settings.toml: other answers of {found.compared}", found.different, "at most")
+    work.topoloc("undo", old / "pruned.topo")
+    same = digest(old / "pruned.topo") == expected["sha256_after_undo"]
+    yield Figure("pruned.topo.undo: the same file", int(same), "at least")
+    yield from _results(work)
+
+
+def _results(work: Workplace) -> Iterator[Figure]:
+    """Export the old results as a trajectory, and compare its poses with them."""
+    results = work.folder / "old" / "results.jsonl"
+    poses = [line["world_from_cam"] for line in read_lines(results) if line["localized"]]
+    work.topoloc("export", results, work.folder / "results.tum")
+    text = (work.folder / "results.tum").read_text(encoding="utf-8")
+    rows = [[float(word) for word in row.split()] for row in text.splitlines() if row[0] != "#"]
+    exported = [{"translation": row[1:4], "quat_wxyz": [row[7], *row[4:7]]} for row in rows]
+    pairs = zip(poses, exported, strict=False)
+    # The file has six to nine digits.
+    right = sum(max(pose_difference(pose, row)) < 1e-5 for pose, row in pairs)
+    yield Figure(f"results.jsonl: poses exported of {len(poses)}", right, "at least")
+    scene = work.folder / "scene.json"
+    work.topoloc("view", work.folder / "old" / "schema_3.topo", results, "--json", scene)
+    yield Figure("results.jsonl: view reads it", int(scene.stat().st_size > 1000), "at least")
