@@ -34,33 +34,33 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 # The figures of `python tools/house.py .` (`--help` has the rule of each). A ceiling only goes
 # down, unless an issue grants an allowance. The goals stand behind the ceilings.
 CEILINGS = {
-    "lines.core": 0,  # goal 30000
-    "lines.apps": 0,  # goal 15500
-    "statements.core": 0,  # goal 13500
-    "statements.apps": 0,  # goal 7500
-    "files_over_300": 0,  # goal 20
-    "functions_over_45": 0,  # goal 15
-    "folders_over_20": 0,  # goal 0
-    "one_importer": 0,  # goal 50
+    "lines.core": 42249,  # goal 30000
+    "lines.apps": 18843,  # goal 15500
+    "statements.core": 18339,  # goal 13500
+    "statements.apps": 8565,  # goal 7500
+    "files_over_300": 37,  # goal 20
+    "functions_over_45": 24,  # goal 15
+    "folders_over_20": 8,  # goal 0
+    "one_importer": 113,  # goal 50
     "apps.deep_names": 0,  # goal 0
-    "apps.public_names": 0,  # goal: at most 120
-    "asserts.sum": 0,  # goal 40
-    "branches.map_or_atlas": 0,  # goal 0
-    "branches.walls": 0,  # goal 0
-    "constants.all": 0,  # goal 474, localization 25
-    "constants.core/localization": 0,
-    "user_docs_bytes": 0,  # goal 150000
-    "readme_lines": 0,  # goal 150
-    "architecture_lines": 0,  # goal 110
+    "apps.public_names": 171,  # goal: at most 120
+    "asserts.sum": 129,  # goal 40
+    "branches.map_or_atlas": 35,  # goal 0
+    "branches.walls": 23,  # goal 0
+    "constants.all": 473,  # goal 474, localization 25
+    "constants.core/localization": 57,
+    "user_docs_bytes": 142629,  # goal 150000
+    "readme_lines": 150,  # goal 150
+    "architecture_lines": 110,  # goal 110
 }
 FLOORS = {"documented %": 90, "typed %": 95}
 # Modules of topoloc, and how many of OpenCV, Numba, torch, FAISS and ONNX Runtime, that are loaded
 # in a fresh process after an import.
 REACH = {
-    "localizer": (98, 3),  # goal 60
-    "result": (26, 2),  # goal 10, 0
-    "map": (59, 3),  # goal 20
-    "client": (27, 2),  # goal 10, 0
+    "localizer": (91, 3),  # goal 60
+    "result": (15, 0),  # goal 10, 0
+    "map": (51, 3),  # goal 20
+    "client": (16, 0),  # goal 10, 0
 }
 
 
