@@ -12,10 +12,11 @@ from .workplace import Workplace
 
 @dataclass(frozen=True)
 class Job:
-    """Hold a job, and whether `--quick` runs it."""
+    """Hold a job, whether `--quick` runs it, and whether it measures times and so runs alone."""
 
     run: Callable[[Workplace], Iterator[Figure]]
     quick: bool = False
+    alone: bool = False
 
 
 JOBS = {
@@ -23,7 +24,7 @@ JOBS = {
     "evaluate": Job(places.evaluate, quick=True),
     "elsewhere": Job(places.elsewhere, quick=True),
     "focal": Job(places.unknown_focal_length, quick=True),
-    "speed": Job(places.speed, quick=True),
+    "speed": Job(places.speed, quick=True, alone=True),
     "stream": Job(motion.stream, quick=True),
     "slam": Job(motion.slam),
     "edits": Job(edits.edits, quick=True),
@@ -32,7 +33,7 @@ JOBS = {
     "export": Job(atlases.export),
     "serve": Job(serving.serve),
     "pages": Job(pages.pages, quick=True),
-    "size": Job(sizes.size, quick=True),
+    "size": Job(sizes.size, quick=True, alone=True),
     "equality": Job(places.equality, quick=True),
     "train": Job(long_jobs.train),
     "paper": Job(long_jobs.paper),

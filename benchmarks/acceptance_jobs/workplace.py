@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -29,6 +30,9 @@ MAPS = {
     "street1": ("kitti/sequences/street1@0::2", ()),
     "street2": ("kitti/sequences/street2@0::2", ()),
 }
+
+# Two jobs that run at the same time may need one map.
+_LOCKS = {name: threading.Lock() for name in (*MAPS, "demo")}
 
 
 class JobError(Exception):
@@ -154,21 +158,23 @@ class Workplace:
     def lab(self, name: str) -> Path:
         """Return a recording of the demo's lab, a copy outside of the package."""
         copy = self.maps / "demo"
-        if not copy.exists():
-            found = sorted((ROOT / "src").rglob("map_lap1"))
-            if not found:
-                raise SkippedError("the recordings of the demo are missing")
-            shutil.copytree(found[0].parent, copy)
+        with _LOCKS["demo"]:
+            if not copy.exists():
+                found = sorted((ROOT / "src").rglob("map_lap1"))
+                if not found:
+                    raise SkippedError("the recordings of the demo are missing")
+                shutil.copytree(found[0].parent, copy)
         return copy / name
 
     def map(self, name: str) -> Path:
         """Return a map that no job changes; build it first if it is not there."""
         path = self.maps / f"{name}.topo"
-        if not path.exists():
-            recording, options = MAPS[name]
-            kind, _, lab = recording.partition(":")
-            source = self.lab(lab) if kind == "demo" else self.data(recording)
-            self.topoloc("build", source, path, *options)
+        with _LOCKS[name]:
+            if not path.exists():
+                recording, options = MAPS[name]
+                kind, _, lab = recording.partition(":")
+                source = self.lab(lab) if kind == "demo" else self.data(recording)
+                self.topoloc("build", source, path, *options)
         return path
 
     def own_map(self, name: str) -> Path:
