@@ -58,10 +58,10 @@ def test_only_so_much_stays_in_memory():
         Frame(str(k), np.zeros(5000)) for k in range(50)
     ]  # what is referred to does not count
     there = DiskList(entries(50, frames), max_bytes=8_000, shared_objects=frames)
-    assert len(there._kept) == 10
+    assert len(there._cache) == 10
     assert there[0].values[0][0] == 0.0
-    assert len(there._kept) == 10
-    assert 0 in there._kept
+    assert len(there._cache) == 10
+    assert 0 in there._cache
 
 
 def test_what_was_put_back_is_kept_and_what_it_refers_to_stays_the_same():
