@@ -10,7 +10,7 @@ import pytest
 
 from tiny_network import write_network
 from topoloc.errors import MissingExtraError, WeightsError
-from topoloc.features.network_files import NETWORKS, check_network_file, find_network
+from topoloc.features.network_files import NETWORKS, NetworkInfo, find_network
 
 
 def test_a_network_is_found_in_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -29,7 +29,7 @@ def test_a_network_is_found_in_the_cache(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_file_says_which_network_it_is(tmp_path: Path):
-    assert check_network_file(write_network(tmp_path / "any.onnx", "xfeat")) == NETWORKS["xfeat"]
+    assert NetworkInfo.of_file(write_network(tmp_path / "any.onnx", "xfeat")) == NETWORKS["xfeat"]
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_a_file_says_which_network_it_is(tmp_path: Path):
 )
 def test_other_networks_are_refused(tmp_path: Path, change: dict, said: str):
     with pytest.raises(WeightsError, match=said):
-        check_network_file(write_network(tmp_path / "other.onnx", **change))
+        NetworkInfo.of_file(write_network(tmp_path / "other.onnx", **change))
 
 
 def test_damaged_files_are_refused(tmp_path: Path):
@@ -55,19 +55,19 @@ def test_damaged_files_are_refused(tmp_path: Path):
         path = tmp_path / f"{name}.onnx"
         path.write_bytes(content)
         with pytest.raises(WeightsError, match=r"empty|cut short, damaged, or not ONNX"):
-            check_network_file(path)
+            NetworkInfo.of_file(path)
     with pytest.raises(WeightsError, match="No such file"):
-        check_network_file(tmp_path / "missing.onnx")
+        NetworkInfo.of_file(tmp_path / "missing.onnx")
 
 
 def test_without_onnx_runtime_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = write_network(tmp_path / "any.onnx")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(MissingExtraError, match=r"topoloc\[learned\]"):
-        check_network_file(path)
+        NetworkInfo.of_file(path)
 
 
 def test_the_network_of_our_own_is_shipped():
     path = find_network("topoloc-net")
-    assert check_network_file(path).name == "topoloc-net"
+    assert NetworkInfo.of_file(path).name == "topoloc-net"
     assert path.stat().st_size <= 1_000_000

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from tiny_world import path_pose, render, room, write_stereo_recording
-from topoloc.features.network_files import check_network_file
+from topoloc.features.network_files import NetworkInfo
 from topoloc.recordings.camera_json import read_camera_json
 from topoloc_training.net import teacher as teaching
 from topoloc_training.net import train as training
@@ -76,7 +76,7 @@ def test_training_goes_on_where_it_was_stopped(
     assert [line["step"] for line in lines] == [2, 4]
     again = [json.loads(line) for line in (parts / "log.jsonl").read_text().splitlines()]
     assert again[-1]["rate"] == pytest.approx(lines[-1]["rate"])
-    assert check_network_file(whole / "topoloc-net.onnx").name == "topoloc-net"
+    assert NetworkInfo.of_file(whole / "topoloc-net.onnx").name == "topoloc-net"
 
 
 def test_the_network_comes_nearer_to_its_teacher(config: TrainNet, tmp_path: Path):

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from topoloc.features.network_files import NETWORKS, check_network_file
+from topoloc.features.network_files import NETWORKS, NetworkInfo
 from topoloc_training.net.network import TopolocNet
 from topoloc_training.networks.edgepoint2 import EdgePoint2
 from topoloc_training.networks.export import build_network, convert, export
@@ -50,7 +50,7 @@ def test_the_exported_network_answers_as_the_original(
     original = of_random_weights(network())
     path = tmp_path / "network.onnx"
     export(original, path, {"topoloc_network": kind})
-    assert check_network_file(path) == NETWORKS[kind]
+    assert NetworkInfo.of_file(path) == NETWORKS[kind]
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     for height, width in ((96, 160), (160, 64)):
         image = picture(height, width)
@@ -152,4 +152,4 @@ def test_published_weights_answer_as_published(shared: Path, tmp_path: Path):
             tmp_path / "out.onnx",
             {"topoloc_network": kind},
         )
-        assert check_network_file(tmp_path / "out.onnx").name == kind
+        assert NetworkInfo.of_file(tmp_path / "out.onnx").name == kind
