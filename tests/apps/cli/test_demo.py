@@ -89,7 +89,7 @@ def test_without_matplotlib_all_but_the_report_is_done(
     monkeypatch: pytest.MonkeyPatch,
 ):
     for name in ("report", "figures", "map_figure", "figure_style"):
-        monkeypatch.delitem(sys.modules, f"topoloc.evaluation.{name}", raising=False)
+        monkeypatch.delitem(sys.modules, f"topoloc.apps.report.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setattr(
         demo,
