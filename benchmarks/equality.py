@@ -72,7 +72,12 @@ def cases(data: Path, quick: bool) -> list[Case]:
         away = localize("outside", "zed.topo", *outside[::4], camera="unknown")
         return [demo, Case("zed", (build_zed,), *few), Case("out of map", (), *away)]
     tiles = ("zed.topo", "kitchen.topo", "street.topo")
-    inside = [*colour[3::14], *spread(zed / "session2", "*.png", 6), outside[0], outside[-1]]
+    inside = [
+        *colour[3::14],
+        *spread(zed / "session2/image_0", "*.jpg", 6),
+        outside[0],
+        outside[-1],
+    ]
     return [
         demo,
         Case("zed", (build_zed,), *localize("zed", "zed.topo", f"{zed}/session2")),
@@ -106,7 +111,9 @@ def answers_of(tree: Path, chosen: list[Case], timeout: float = 600) -> Answers:
                 command = [sys.executable, "-m", "topoloc", *words]
                 code, out, err = run(command, folder, tree, timeout)
                 if code != 0:
-                    raise JobError(f"{case.name}: {last_line(err) or last_line(out)}")
+                    raise JobError(
+                        f"{case.name}: exit status {code}: {last_line(err) or last_line(out)}"
+                    )
             answers[case.name] = kept(read_lines(folder / case.results))
     return answers
 
