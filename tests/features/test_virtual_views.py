@@ -205,9 +205,9 @@ def test_what_the_picture_does_not_hold_is_dropped(camera: Camera):
         everywhere = features_at(np.column_stack([columns.ravel(), rows.ravel()]))
         kept = view.select_inside(everywhere)
         assert 0 < len(kept) < len(everywhere)
-        to_image_pixels = view.to_image_pixels(kept, camera).points_img
-        assert (to_image_pixels >= 0).all()
-        assert (to_image_pixels <= [camera.width - 1, camera.height - 1]).all()
+        points_img = view.to_image_pixels(kept, camera).points_img
+        assert (points_img >= 0).all()
+        assert (points_img <= [camera.width - 1, camera.height - 1]).all()
         # and all that is well within is kept
         points_img = view.to_image_pixels(everywhere, camera).points_img
         with np.errstate(invalid="ignore"):

@@ -110,7 +110,7 @@ def test_matches_of_both_sides_lie_where_the_pose_puts_the_points():
     assert len(set(found.matches.query_idx.tolist())) == len(found.matches)
     first = len(_seen()[0].features)
     np.testing.assert_array_equal(
-        found.features.points_img[first:], _seen()[1].to_image_pixels.points_img
+        found.features.points_img[first:], _seen()[1].features_in_image.points_img
     )
     cosines = np.sum(
         found.features.descriptors[found.matches.query_idx]

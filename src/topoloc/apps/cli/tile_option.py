@@ -91,8 +91,8 @@ def run_for_each_tile(
     told of and leaves the others.
 
     Raises:
-        StoreError: the store does not answer; the other tiles would be waited for as long, one
-            after the other.
+        ObjectStoreError: the store does not answer; the other tiles would be waited for as long,
+            one after the other.
     """
     done = list[dict[str, Any]]()
     for tile_id in tile_ids:

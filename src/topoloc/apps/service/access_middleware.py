@@ -85,7 +85,7 @@ class AccessMiddleware:
             self._log_request(request)
 
     def _check(self, request: _Request) -> None:
-        """Raises Refusal."""
+        """Raises RequestError."""
         host, origin = request.header("host"), request.header("origin")
         if self._limits.loopback_only and _host_name(host) not in LOOPBACK:
             raise RequestError(

@@ -108,7 +108,7 @@ class GeoPoseRequest(BaseModel):
     sensorReadings: SensorReadings | list[SensorReading]
 
     def camera_reading(self) -> CameraReading:
-        """The first camera's reading. Raises Refusal."""
+        """The first camera's reading. Raises RequestError."""
         readings = self.sensorReadings
         if isinstance(readings, SensorReadings):
             found = readings.cameraReadings or []
@@ -195,8 +195,8 @@ class GeoPoseError(BaseModel):
 
 
 def check_version(accept: str) -> None:
-    """Raises Refusal where an Accept header names a version of the protocol that is neither 1.0 nor
-    2.0."""
+    """Raises RequestError where an Accept header names a version of the protocol that is neither
+    1.0 nor 2.0."""
     named = _VERSION.search(accept)
     if named and named.group(1) not in _KNOWN_VERSIONS:
         raise RequestError(
@@ -206,7 +206,7 @@ def check_version(accept: str) -> None:
 
 
 def read_request(body: bytes) -> GeoPoseRequest:
-    """Raises Refusal where it is none."""
+    """Raises RequestError where it is none."""
     try:
         return GeoPoseRequest.model_validate_json(body)
     except ValidationError as error:
@@ -221,7 +221,7 @@ def read_image_bytes(reading: CameraReading) -> EncodedImage | Image:
     else bare pixels.
 
     Raises:
-        Refusal: neither.
+        RequestError: neither.
     """
     if reading.imageOrientation is not None and reading.imageOrientation.mirrored:
         raise RequestError(400, "a mirrored picture; it must be sent as the camera saw the world")

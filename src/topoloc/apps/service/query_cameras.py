@@ -26,7 +26,7 @@ def parse_camera_field(
 
     Raises:
         CalibrationError, QueryError: it is none, or of another picture.
-        Refusal: what looks like JSON is none.
+        RequestError: what looks like JSON is none.
     """
     width, height = size
     text = (text or "exif").strip()

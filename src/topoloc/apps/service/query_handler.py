@@ -44,7 +44,7 @@ class QueryHandler:
     atlases: ServedAtlases
 
     def localize(self, name: str, query_request: QueryRequest) -> Localization | NotLocalized:
-        """Raises Refusal, and TopolocError of the picture, its camera or the map."""
+        """Raises RequestError, and TopolocError of the picture, its camera or the map."""
         return self._run_query(name, query_request, self._localize_image)
 
     def localize_everywhere(
@@ -141,7 +141,7 @@ def decode_image(picture: EncodedImage, max_pixels: int) -> Image:
 
     Raises:
         UnreadableImageError: it is no picture, or a damaged one.
-        Refusal: it is too large.
+        RequestError: it is too large.
     """
     width, height = image_size(picture)
     if width * height > max_pixels:

@@ -70,7 +70,7 @@ async def read_query_request(request: Request, parameters: QueryParameters) -> Q
     in the form, or in the address.
 
     Raises:
-        Refusal: neither, or a field that makes no sense.
+        RequestError: neither, or a field that makes no sense.
     """
     fields = {name: str(value) for name, value in parameters.model_dump(exclude_none=True).items()}
     content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -99,7 +99,7 @@ async def read_query_request(request: Request, parameters: QueryParameters) -> Q
 
 
 async def read_body(request: Request) -> bytes:
-    """All of it. Raises Refusal where the client goes away."""
+    """All of it. Raises RequestError where the client goes away."""
     try:
         return await request.body()
     except ClientDisconnect:
@@ -144,7 +144,7 @@ def _parse_prior(fields: Mapping[str, str]) -> Rigid3 | None:
 
 
 def parse_prior(value: Any) -> Rigid3:
-    """world_from_cam as results write it. Raises Refusal."""
+    """world_from_cam as results write it. Raises RequestError."""
     try:
         return pose_from_json(value, "prior")
     except ResultError as error:
@@ -152,7 +152,7 @@ def parse_prior(value: Any) -> Rigid3:
 
 
 def parse_json(text: str, what: str) -> Any:
-    """What the text says. Raises Refusal where it is not JSON."""
+    """What the text says. Raises RequestError where it is not JSON."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

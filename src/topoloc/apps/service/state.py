@@ -41,7 +41,7 @@ class Service:
     async def run_job(self, request: HTTPConnection, job: Callable[[], R]) -> R:
         """What a worker makes of the job, which may be done again from its beginning: where it
         needs a tile that is not here, the worker is free for others until that has come. Raises
-        Refusal, whatever it raised."""
+        RequestError, whatever it raised."""
         start = time.monotonic()
         try:
             while True:
@@ -58,8 +58,8 @@ class Service:
             raise refusal from error
 
     async def _wait_for_fetch(self, awaited: TilePending) -> None:
-        """When the tile is here, will not come, or has been waited for long enough. Raises Refusal
-        where too many wait already."""
+        """When the tile is here, will not come, or has been waited for long enough. Raises
+        RequestError where too many wait already."""
         if self.num_awaiting >= self.workers.number + self.workers.max_queue:
             raise RequestError(
                 429,

@@ -124,7 +124,7 @@ async def stream_over_websocket(socket: WebSocket, map: str) -> None:
 
 
 async def _serve_websocket(socket: WebSocket, service: Service, stream: Stream) -> None:
-    """Until the client goes away. Raises Refusal where it does not listen, or says nothing."""
+    """Until the client goes away. Raises RequestError where it does not listen, or says nothing."""
     parameters: dict[str, Any] = {}
     number = 0
     while True:
@@ -169,7 +169,7 @@ async def _send_text(socket: WebSocket, text: str, timeout_s: float) -> None:
 
 
 def _parse_message(text: str) -> dict[str, Any]:
-    """What a text message says. Raises Refusal."""
+    """What a text message says. Raises RequestError."""
     data = parse_json(text, "the message")
     if not isinstance(data, dict) or not set(data) <= {"camera", "t_ns"}:
         raise RequestError(422, 'a text message is an object of "camera" and "t_ns"')

@@ -17,11 +17,11 @@ from topoloc.apps.service.request_errors import RequestError
 
 @dataclass(eq=False)
 class Stream:
-    """One stream; its lock is held while a picture of it is looked at, and `open_map` keeps its
+    """One stream; its lock is held while a picture of it is looked at, and `resources` keeps its
     map open."""
 
     map_name: str
-    open_map: ExitStack
+    resources: ExitStack
     tracker: Tracker
     camera: str | None
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -58,26 +58,26 @@ class Streams:
         say it themselves.
 
         Raises:
-            Refusal: there are too many, or there is no such map.
+            RequestError: there are too many, or there is no such map.
             MapError: the map is damaged.
         """
         self.forget_idle()
-        open_map = ExitStack()
-        localizer = open_map.enter_context(self._maps.use_map(map_name)).localizer
-        stream = Stream(map_name, open_map, Tracker(localizer, self._config), camera)
+        resources = ExitStack()
+        localizer = resources.enter_context(self._maps.use_map(map_name)).localizer
+        stream = Stream(map_name, resources, Tracker(localizer, self._config), camera)
         with self._lock:
             is_full = len(self._streams) >= self._max_streams
             if not is_full:
                 self._streams[stream.id] = stream
         if is_full:
-            open_map.close()
+            resources.close()
             raise RequestError(
                 429, f"{self._max_streams} streams are followed already", retry_after_s=10
             )
         return stream
 
     def find(self, map_name: str, stream_id: str) -> Stream:
-        """Raises Refusal."""
+        """Raises RequestError."""
         stream = self._streams.get(stream_id)
         if stream is None or stream.map_name != map_name:
             raise RequestError(
@@ -89,7 +89,7 @@ class Streams:
         """The answer to the stream's next picture, as JSON.
 
         Raises:
-            Refusal: the stream has ended, or looks at another picture still.
+            RequestError: the stream has ended, or looks at another picture still.
             TopolocError: the picture, its camera or its time is none.
         """
         if not stream.lock.acquire(blocking=False):
@@ -120,7 +120,7 @@ class Streams:
                 self._streams.pop(stream.id, None)
             if not stream.is_ended:
                 stream.is_ended = True
-                stream.open_map.close()
+                stream.resources.close()
 
     def forget_idle(self) -> None:
         """End those that nobody has used for long."""

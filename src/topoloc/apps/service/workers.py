@@ -32,8 +32,8 @@ class Workers:
         """What the job returns or raises; of the seconds until it takes too long some may be spent.
 
         Raises:
-            Refusal: too many wait already; or it took too long, in which case a job that had begun
-                is finished for nobody.
+            RequestError: too many wait already; or it took too long, in which case a job that had
+                begun is finished for nobody.
         """
         if self._num_jobs >= self.number + self.max_queue:
             wait_s = max(1, round(self._num_jobs * self._seconds_a_job / self.number))

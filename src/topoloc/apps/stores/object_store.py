@@ -194,7 +194,7 @@ def _cache_path(name: str, sha256: str) -> Path:
 
 @contextmanager
 def _cache_file(path: Path) -> Iterator[Path]:
-    """A file to be, in the cache folder. Raises StoreError where it cannot be written."""
+    """A file to be, in the cache folder. Raises ObjectStoreError where it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary:

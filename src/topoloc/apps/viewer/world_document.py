@@ -38,7 +38,7 @@ def create_world_document(
 
     Raises:
         AtlasError: none of the tiles can be read.
-        StoreError: the store does not answer.
+        ObjectStoreError: the store does not answer.
     """
     budget, parts, first_session = budget or SceneBudget(), list[Document](), 0
     for placed, topomap in world.open_tiles(atlas, warn):

@@ -28,7 +28,7 @@ def create_world_scene(
 
     Raises:
         AtlasError: none of the tiles can be read.
-        StoreError: the store does not answer.
+        ObjectStoreError: the store does not answer.
     """
     views, trajectory, points = list[View](), list[Rigid3](), list[Points]()
     first_session = 0

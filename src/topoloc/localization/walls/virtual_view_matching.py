@@ -28,12 +28,12 @@ _MAX_COMPARED_POINTS = 512  # visible points per side that are compared with den
 class QueryVirtualView:
     """Hold one side view of an image.
 
-    `features` are at pixels of the view, `to_image_pixels` the same at pixels of the image.
+    `features` are at pixels of the view, `features_in_image` the same at pixels of the image.
     """
 
     view: VirtualView
     features: Features
-    to_image_pixels: Features
+    features_in_image: Features
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def merge_matches(
         ).astype(np.int32),
         np.concatenate([one.distances for one in matches]).astype(np.float32),
     )
-    features = Features.concatenate([side.to_image_pixels for side, _ in sides])
+    features = Features.concatenate([side.features_in_image for side, _ in sides])
     return VirtualViewMatches(
         features, LocalMap.concatenate([local_map for _, local_map in sides]), joined
     )

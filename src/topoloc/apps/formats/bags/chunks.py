@@ -84,7 +84,7 @@ class ChunkedBytes:
         )
 
     def read(self, chunk: int, offset: int, length: int) -> bytes:
-        """`length` bytes. Raises CutShortError where there are not so many."""
+        """`length` bytes. Raises TruncatedFileError if the file has fewer."""
         if offset < 0 or length < 0 or offset + length > self.readable_size(chunk):
             raise TruncatedFileError
         if chunk != WHOLE_FILE and self.chunks[chunk].is_compressed:
