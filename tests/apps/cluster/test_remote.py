@@ -42,7 +42,7 @@ def undone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(".")
     for name in ("SOURCE_DATE_EPOCH", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         monkeypatch.setenv(name, os.environ.get(name, "1"))
-    monkeypatch.setattr("topoloc.compiled.set_num_threads", lambda number: None)
+    monkeypatch.setattr("topoloc.set_num_threads", lambda number: None)
 
 
 def _asked(work: TaskPayload) -> str:
