@@ -17,6 +17,7 @@ import topoloc_training
 import topoloc_worlds
 from checked_shapes import check
 from made_once import share_in
+from topoloc import compiled
 
 
 def _modules_with_checked_shapes() -> list[str]:
@@ -49,6 +50,16 @@ def shared() -> Path:
     if not (SHARED / "data").is_dir():
         pytest.skip(f"no recordings at {SHARED} (set TOPOLOC_SHARED)")
     return SHARED
+
+
+@pytest.fixture(autouse=True)
+def threads_of_the_process_are_restored() -> Iterator[None]:
+    """Restore the number of threads. `topoloc serve`, called in this process, sets it to 1."""
+    before = list(compiled._configured)
+    yield
+    if compiled._configured != before:
+        topoloc.set_num_threads(before[0] if before else compiled._DEFAULT_NUM_THREADS)
+        compiled._configured[:] = before
 
 
 @pytest.fixture(scope="session", autouse=True)
