@@ -24,11 +24,9 @@ from typing import Any
 import numpy as np
 
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.map_cache import MapCache
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.node_cache import set_node_cache_size
 from topoloc.mapping.topomap import TopoMetricMap
@@ -41,7 +39,7 @@ RIGHT_METRES = 0.5
 
 
 def asked(
-    localizer: AtlasLocalizer, alone: Localizer, tile_id: str, frame: StereoFrame, alike: set[str]
+    localizer: Localizer, alone: Localizer, tile_id: str, frame: StereoFrame, alike: set[str]
 ) -> dict[str, Any]:
     """One picture asked of the map alone and of the atlas."""
     assert frame.camera is not None
@@ -50,7 +48,7 @@ def asked(
     middle = time.process_time()
     by_atlas = localizer.localize(frame.image, frame.camera)
     end = time.process_time()
-    ranking = [name for name, _ in localizer.rank(QueryImage(frame.image, frame.camera))]
+    ranking = [name for name, _ in localizer.rank_tiles(frame.image, frame.camera)]
     answer = by_atlas.provenance.tile if isinstance(by_atlas, Localization) else None
     outcome = (
         "right"
@@ -80,7 +78,7 @@ def asked(
 
 
 def asked_elsewhere(
-    localizer: AtlasLocalizer, alone: dict[str, Localizer], frame: StereoFrame
+    localizer: Localizer, alone: dict[str, Localizer], frame: StereoFrame
 ) -> dict[str, Any]:
     """One picture of no tile asked of each map alone and of the atlas."""
     assert frame.camera is not None
@@ -140,9 +138,11 @@ def line(name: str, rows: list[dict[str, Any]]) -> str:
     )
 
 
-def ask_elsewhere(localizer: AtlasLocalizer, paths: list[str]) -> dict[str, list[dict[str, Any]]]:
+def ask_elsewhere(
+    atlas: Atlas, localizer: Localizer, paths: list[str]
+) -> dict[str, list[dict[str, Any]]]:
     """The rows of each recording, which are printed."""
-    atlas, rows = localizer.atlas, dict[str, list[dict[str, Any]]]()
+    rows = dict[str, list[dict[str, Any]]]()
     with ExitStack() as opened:
         maps = {
             tile.tile_id: opened.enter_context(TopoMetricMap.load(atlas.map_path(tile)))
@@ -173,7 +173,7 @@ def main() -> None:
     warm_up()
     atlas = Atlas.open(args.atlas)
     set_node_cache_size(args.memory_mb * 500_000)
-    localizer = AtlasLocalizer(atlas, MapCache([args.atlas], Localizer, args.memory_mb * 500_000))
+    localizer = Localizer(atlas, maps=MapCache([], Localizer, args.memory_mb * 500_000))
     rows: dict[str, list[dict[str, Any]]] = {}
     for pair in args.recordings:
         tile_id, path = pair.split("=", 1)
@@ -187,7 +187,7 @@ def main() -> None:
         print(line(f"{tile_id} {Path(path).name}", of_one), flush=True)
     print(line("all", [row for of_one in rows.values() for row in of_one]))
     if args.elsewhere:
-        rows |= ask_elsewhere(localizer, args.elsewhere)
+        rows |= ask_elsewhere(atlas, localizer, args.elsewhere)
     print(f"most memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
     if args.json:
         Path(args.json).write_text(json.dumps(rows, indent=1))

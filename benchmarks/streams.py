@@ -48,8 +48,9 @@ from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import as_monocular
 from topoloc.slam.slam import run_slam
+from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.stream_result import StreamedPose
-from topoloc.tracking.tracker import Tracker, TrackerConfig
+from topoloc.tracking.tracker import Tracker
 
 CHI_SQUARE_6_AT_95 = 12.592
 DEMO = Path(__file__).parents[1] / "src" / "topoloc" / "demo" / "lab"

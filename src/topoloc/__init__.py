@@ -16,10 +16,8 @@ if TYPE_CHECKING:
     from topoloc.apps.service.client import AsyncClient, Client
     from topoloc.apps.viewer.map_page import view
     from topoloc.atlas.atlas import Atlas, is_atlas
-    from topoloc.atlas.atlas_localizer import AtlasLocalizer
     from topoloc.atlas.config import AtlasConfig
     from topoloc.atlas.editing import NewTile, add_tiles, read_manifest
-    from topoloc.atlas.evaluated_tile import EvaluatedTile
     from topoloc.atlas.location_prior import GeoPositionPrior
     from topoloc.atlas.manifest import Tile
     from topoloc.atlas.map_cache import MapCache
@@ -108,9 +106,9 @@ if TYPE_CHECKING:
     )
     from topoloc.recordings.trajectory_alignment import align_to_trajectory
     from topoloc.slam.slam import SlamConfig, SlamResult, run_slam
+    from topoloc.tracking.config import TrackerConfig
     from topoloc.tracking.stream_result import StreamedPose
-    from topoloc.tracking.tile_tracker import TileTracker
-    from topoloc.tracking.tracker import Tracker, TrackerConfig
+    from topoloc.tracking.tracker import Tracker
     from topoloc.tracking.warm_up import warm_up
 
     __version__: str
@@ -121,7 +119,6 @@ __all__ = [
     "Atlas",
     "AtlasConfig",
     "AtlasError",
-    "AtlasLocalizer",
     "BuildConfig",
     "CalibrationError",
     "Camera",
@@ -131,7 +128,6 @@ __all__ = [
     "DepthImage",
     "DuplicateSessionError",
     "EvaluatedQuery",
-    "EvaluatedTile",
     "Evaluation",
     "FeatureTypeError",
     "GeoPoint",
@@ -176,7 +172,6 @@ __all__ = [
     "TileFetcher",
     "TileJoinConfig",
     "TileSelectionConfig",
-    "TileTracker",
     "TopoMetricMap",
     "TopoNode",
     "TopolocError",
@@ -241,7 +236,6 @@ _MODULES = {
     "Atlas": "topoloc.atlas.atlas",
     "AtlasConfig": "topoloc.atlas.config",
     "AtlasError": "topoloc.errors",
-    "AtlasLocalizer": "topoloc.atlas.atlas_localizer",
     "BuildConfig": "topoloc.mapping.build",
     "CalibrationError": "topoloc.errors",
     "Camera": "topoloc.geometry.camera",
@@ -251,7 +245,6 @@ _MODULES = {
     "DepthImage": "topoloc.recordings.frame",
     "DuplicateSessionError": "topoloc.errors",
     "EvaluatedQuery": "topoloc.evaluation.metrics",
-    "EvaluatedTile": "topoloc.atlas.evaluated_tile",
     "Evaluation": "topoloc.evaluation.evaluate",
     "FeatureTypeError": "topoloc.errors",
     "GeoPoint": "topoloc.geometry.geodesy",
@@ -296,13 +289,12 @@ _MODULES = {
     "TileFetcher": "topoloc.atlas.tile_fetcher",
     "TileJoinConfig": "topoloc.lifelong.tile_comparison",
     "TileSelectionConfig": "topoloc.lifelong.tile_selection",
-    "TileTracker": "topoloc.tracking.tile_tracker",
     "TopoMetricMap": "topoloc.mapping.topomap",
     "TopoNode": "topoloc.mapping.entries",
     "TopolocError": "topoloc.errors",
     "Trace": "topoloc.localization.search",
     "Tracker": "topoloc.tracking.tracker",
-    "TrackerConfig": "topoloc.tracking.tracker",
+    "TrackerConfig": "topoloc.tracking.config",
     "Trajectory": "topoloc.recordings.trajectory",
     "TrajectoryError": "topoloc.errors",
     "TriedProposal": "topoloc.localization.search",

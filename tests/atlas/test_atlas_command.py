@@ -161,7 +161,7 @@ def test_a_picture_is_explained_in_its_tile(
 ):
     facts = json.loads(_json(capsys, "explain", atlas, f"{of_both}@2"))
     assert facts["tiles"][0] == "atlas: in tile other"
-    assert facts["tiles"][1].startswith("looks most like: other ")
+    assert facts["tiles"][1].startswith("most similar tiles: other ")
     assert facts["tried"][0]["source"] == "retrieval"
 
 

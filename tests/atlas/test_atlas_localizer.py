@@ -12,7 +12,6 @@ import pytest
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.editing import add_tiles, new_tiles
 from topoloc.atlas.map_cache import MapCache
@@ -33,21 +32,21 @@ def _localizer(
     config: AtlasConfig | None = None,
     warn: list[str] | None = None,
     budget: int = BUDGET,
-) -> AtlasLocalizer:
-    return AtlasLocalizer(
+) -> Localizer:
+    return Localizer(
         Atlas.open(str(where)),
-        MapCache([], Localizer, budget),
-        config,
-        (warn if warn is not None else []).append,
+        tiles=config,
+        maps=MapCache([], Localizer, budget),
+        warn=(warn if warn is not None else []).append,
     )
 
 
 @pytest.fixture(scope="module")
-def asked(atlas: Path) -> AtlasLocalizer:
+def asked(atlas: Path) -> Localizer:
     return _localizer(atlas)
 
 
-def test_the_right_tile_answers_as_it_does_alone(asked: AtlasLocalizer, room_map: Path):
+def test_the_right_tile_answers_as_it_does_alone(asked: Localizer, room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
         alone = Localizer(topomap)
         for image, world_from_cam in unseen_views()[::3]:
@@ -62,21 +61,21 @@ def test_the_right_tile_answers_as_it_does_alone(asked: AtlasLocalizer, room_map
             )
 
 
-def test_the_other_room_is_the_other_tile(asked: AtlasLocalizer):
+def test_the_other_room_is_the_other_tile(asked: Localizer):
     image, _ = unseen_views(seed=1)[1]
     result = asked.localize(image, CAMERA)
     assert isinstance(result, Localization)
     assert result.provenance.tile == "other"
 
 
-def test_a_third_room_is_none(asked: AtlasLocalizer):
+def test_a_third_room_is_none(asked: Localizer):
     for image, _ in unseen_views(seed=2)[:3]:
         result = asked.localize(image, CAMERA)
         assert isinstance(result, NotLocalized)
         assert result.provenance.tile in ("room", "other")
 
 
-def test_a_result_names_its_tile_in_json(asked: AtlasLocalizer):
+def test_a_result_names_its_tile_in_json(asked: Localizer):
     result = asked.localize(unseen_views()[0][0], CAMERA, t_ns=7)
     line = result.to_json("view")
     assert (line["tile"], line["t_ns"]) == ("room", 7)
@@ -225,7 +224,7 @@ def test_no_tile_left_is_a_failure(own_atlas: Path):
         _localizer(own_atlas).localize(unseen_views()[0][0], CAMERA)
 
 
-def test_one_tile_can_be_asked_alone_near_a_pose(asked: AtlasLocalizer):
+def test_one_tile_can_be_asked_alone_near_a_pose(asked: Localizer):
     image, world_from_cam = unseen_views()[0]
     near = asked.localize(image, CAMERA, world_from_cam, tile_id="room")
     assert isinstance(near, Localization)
@@ -238,12 +237,12 @@ def test_one_tile_can_be_asked_alone_near_a_pose(asked: AtlasLocalizer):
 
 def test_tiles_are_closed_where_memory_is_little(atlas: Path):
     maps = MapCache([], Localizer, 1)
-    localizer = AtlasLocalizer(Atlas.open(str(atlas)), maps)
+    localizer = Localizer(Atlas.open(str(atlas)), maps=maps)
     for seed in (0, 1, 0):
         localizer.localize(unseen_views(seed)[1][0], CAMERA)
         assert maps.num_open <= 1
 
 
-def test_time_ends_the_search_but_not_before_a_tile_was_asked(asked: AtlasLocalizer):
+def test_time_ends_the_search_but_not_before_a_tile_was_asked(asked: Localizer):
     result = asked.localize(unseen_views(seed=2)[0][0], CAMERA, max_ms=0.001)
     assert result.provenance.tile is not None

@@ -1,23 +1,31 @@
-"""Several tiles heard together: who answers, when nobody does, and how probable each pose is."""
+"""The results of several tiles as one: the reported pose, the refusals, the probabilities."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from topoloc.atlas.manifest import StoredFile, Tile
-from topoloc.atlas.tile_results import TileResult, merge_tile_results
+from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.config import AtlasConfig
+from topoloc.atlas.manifest import Manifest, StoredFile, Tile
+from topoloc.atlas.map_cache import MapCache
+from topoloc.atlas.store import FolderStore
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import Evidence
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.tiles.atlas_tiles import AtlasTiles
+from topoloc.localization.tiles.tile_results import TileResult, merge_tile_results
 from topoloc.retrieval.coarse import NodeScore
 
 STRONG = Evidence(200, 150, 400, 500, 20, 0.9, 0.05, 0.7)
 FAIR = Evidence(100, 30, 80, 400, 20, 0.5, 0.15, 0.15)
+NO_INLIERS = PointObservations(np.zeros((0, 2), np.float32), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 WEAK = Evidence(60, 8, 20, 400, 15, 0.2, 0.8, 0.02)
 
 
@@ -42,40 +50,46 @@ def _pose(evidence: Evidence, x: float = 0.0, probability: float = 0.95) -> Loca
     )
 
 
-def _heard(
-    tile: Tile, result: Localization | NotLocalized, is_exhaustive: bool = True, **more: Any
-) -> TileResult:
-    return TileResult(
-        tile, result, (result,) if isinstance(result, Localization) else (), is_exhaustive, **more
-    )
+Found = tuple[Tile, Localization | NotLocalized]
+
+
+def _merge(*found: Found, coarse: int = -1) -> Localization | NotLocalized:
+    """Merge the results of exhaustive searches; the one of this number was searched coarse only."""
+    manifest = Manifest(tiles=tuple(tile for tile, _ in found))
+    atlas = Atlas(FolderStore(Path("no-such-folder")), manifest)
+    tiles = AtlasTiles(atlas, MapCache([], Localizer, 1), AtlasConfig(), lambda text: None)
+    results = [
+        TileResult(
+            tile.tile_id,
+            result,
+            [(result, NO_INLIERS)] if isinstance(result, Localization) else [],
+            number != coarse,
+        )
+        for number, (tile, result) in enumerate(found)
+    ]
+    tile_id, result, _ = merge_tile_results(tiles, results)
+    return tiles.with_tile(result, tile_id)
 
 
 def test_the_only_tile_that_vouches_answers():
-    result = merge_tile_results(
-        [_heard(_tile("a"), NotLocalized("not_in_map")), _heard(_tile("b"), _pose(STRONG))]
-    )
+    result = _merge((_tile("a"), NotLocalized("not_in_map")), (_tile("b"), _pose(STRONG)))
     assert isinstance(result, Localization)
     assert result.provenance.tile == "b"
     assert result.probability == pytest.approx(0.95)
 
 
 def test_a_pose_with_far_more_for_it_leads_and_pays_for_its_rival():
-    rivals = [_heard(_tile("a"), _pose(WEAK)), _heard(_tile("b"), _pose(STRONG))]
-    for tile_results in (rivals, rivals[::-1]):
-        result = merge_tile_results(tile_results)
+    rivals = [(_tile("a"), _pose(WEAK)), (_tile("b"), _pose(STRONG))]
+    for found in (rivals, rivals[::-1]):
+        result = _merge(*found)
         assert isinstance(result, Localization)
         assert result.provenance.tile == "b"
         assert 0.5 < result.probability < 0.95
 
 
-@pytest.mark.parametrize("second_is_full", [True, False])
-def test_two_poses_with_as_much_for_them_are_both_named(second_is_full: bool):
-    result = merge_tile_results(
-        [
-            _heard(_tile("a"), _pose(FAIR)),
-            _heard(_tile("b"), _pose(FAIR, x=3.0), is_exhaustive=second_is_full),
-        ]
-    )
+@pytest.mark.parametrize("coarse", [-1, 1])
+def test_two_poses_with_as_much_for_them_are_both_named(coarse: int):
+    result = _merge((_tile("a"), _pose(FAIR)), (_tile("b"), _pose(FAIR, x=3.0)), coarse=coarse)
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
     assert {one.tile for one in result.alternatives} == {"a", "b"}
@@ -85,12 +99,8 @@ def test_two_poses_with_as_much_for_them_are_both_named(second_is_full: bool):
 
 def test_the_same_pose_in_two_tiles_of_one_world_is_one():
     a, b = _tile("a", "house"), _tile("b", "house")
-    assert isinstance(
-        merge_tile_results([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=0.01))]), Localization
-    )
-    assert isinstance(
-        merge_tile_results([_heard(a, _pose(FAIR)), _heard(b, _pose(FAIR, x=5.0))]), NotLocalized
-    )
+    assert isinstance(_merge((a, _pose(FAIR)), (b, _pose(FAIR, x=0.01))), Localization)
+    assert isinstance(_merge((a, _pose(FAIR)), (b, _pose(FAIR, x=5.0))), NotLocalized)
 
 
 def test_tiles_that_lie_in_the_atlas_are_compared_there():
@@ -99,23 +109,20 @@ def test_tiles_that_lie_in_the_atlas_are_compared_there():
         replace(_tile(name), atlas_from_world=pose)
         for name, pose in (("a", Rigid3.identity()), ("b", shift))
     )
-    agreed = merge_tile_results([_heard(a, _pose(FAIR, x=12.0)), _heard(b, _pose(FAIR, x=2.0))])
+    agreed = _merge((a, _pose(FAIR, x=12.0)), (b, _pose(FAIR, x=2.0)))
     assert isinstance(agreed, Localization)
     assert agreed.provenance.atlas_from_cam is not None
     assert np.allclose(agreed.provenance.atlas_from_cam.translation, [12.0, 0.0, 0.0])
-    assert isinstance(
-        merge_tile_results([_heard(a, _pose(FAIR, x=2.0)), _heard(b, _pose(FAIR, x=2.0))]),
-        NotLocalized,
-    )
+    assert isinstance(_merge((a, _pose(FAIR, x=2.0)), (b, _pose(FAIR, x=2.0))), NotLocalized)
 
 
 def test_a_refusal_is_that_of_the_tile_that_knows_most():
     few, more = NotLocalized("too_few_matches"), NotLocalized("not_in_map", num_inliers=9)
-    tile_results = [
-        _heard(_tile("a"), few),
-        _heard(_tile("b"), more),
-        _heard(_tile("c"), replace(more, num_inliers=99), is_exhaustive=False),
-    ]
-    result = merge_tile_results(tile_results)
+    result = _merge(
+        (_tile("a"), few),
+        (_tile("b"), more),
+        (_tile("c"), replace(more, num_inliers=99)),
+        coarse=2,
+    )
     assert isinstance(result, NotLocalized)
     assert (result.reason, result.provenance.tile) == ("not_in_map", "b")

@@ -11,7 +11,6 @@ import pytest
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.location_prior import (
     GeoPositionPrior,
     WorldPositionPrior,
@@ -19,7 +18,6 @@ from topoloc.atlas.location_prior import (
     tiles_in_reach,
 )
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
-from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -134,7 +132,7 @@ def test_what_is_no_place_is_refused():
 
 
 def test_a_picture_is_asked_only_of_tiles_in_reach(atlas: Path):
-    localizer = AtlasLocalizer(Atlas.open(str(atlas)), MapCache([], Localizer, 100_000_000))
+    localizer = Localizer(Atlas.open(str(atlas)))
     image, world_from_cam = unseen_views()[0]
     near = localizer.near(WorldPositionPrior("room", world_from_cam, 5.0)).localize(image, CAMERA)
     assert isinstance(near, Localization)

@@ -15,12 +15,10 @@ import pytest
 from tiny_world import CAMERA, Panel, path_pose, render, room, write_stereo_recording
 from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.editing import add_joins, add_tiles, create_atlas, new_tiles, remove_tiles
 from topoloc.atlas.joins import sigmas_at
 from topoloc.atlas.location_prior import WorldPositionPrior, tiles_in_reach
 from topoloc.atlas.manifest import Manifest
-from topoloc.atlas.map_cache import MapCache
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -173,7 +171,7 @@ def test_answers_agree_through_the_joins_and_say_where_in_the_joint_world(
 ):
     """In the overlap two tiles know the place as well; as islands that is ambiguous."""
     where, _ = joined_atlas
-    localizer = AtlasLocalizer(Atlas.open(str(where)), MapCache([], Localizer, 100_000_000))
+    localizer = Localizer(Atlas.open(str(where)))
     for index in (5.5, 6.5, 8.5, 10.5):
         result = localizer.localize(render(room(), path_pose(index), noise_seed=77)[0], CAMERA)
         assert isinstance(result, Localization)
@@ -222,7 +220,7 @@ def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp
         )
         assert tile.geo_box is not None
         assert abs(tile.geo_box[0] - 50.87) < 1e-3
-    localizer = AtlasLocalizer(Atlas.open(str(own)), MapCache([], Localizer, 100_000_000))
+    localizer = Localizer(Atlas.open(str(own)))
     result = localizer.localize(render(room(), path_pose(1.5), noise_seed=77)[0], CAMERA)
     assert isinstance(result, Localization)
     assert result.provenance.tile == "left"

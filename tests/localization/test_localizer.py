@@ -226,7 +226,11 @@ def test_a_query_s_own_time_comes_before_that_of_the_settings(localizer: Localiz
 def test_the_trace_holds_all_that_was_tried_and_the_answer_follows_from_it(
     picture: np.ndarray, localizer: Localizer
 ):
-    trace, weights, evidence = Trace(), localizer.weights.rivals, localizer.config.evidence
+    trace, weights, evidence = (
+        Trace(),
+        localizer.context.first.weights.rivals,
+        localizer.config.evidence,
+    )
     result = localizer.localize(picture, CAMERA, trace=trace)
     assert trace.tried[0].source == "retrieval"
     assert len(trace.tried[0].first.features) == len(trace.tried[-1].first.features)

@@ -235,7 +235,7 @@ def _no_search(*_: object) -> None:
 
 def test_a_prior_replaces_the_coarse_search(room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch):
     localizer, (picture, truth) = Localizer(room), unseen_views()[2]
-    monkeypatch.setattr(localizer.map.coarse, "rank", _no_search)
+    monkeypatch.setattr(localizer.context.first.map.coarse, "rank", _no_search)
     about = truth @ Rigid3(exp_so3(np.array([0.0, 0.05, 0.0])), np.array([0.1, 0.0, -0.1]))
     trace = Trace()
     result = localizer.localize(picture, CAMERA, prior=about, trace=trace)

@@ -30,7 +30,7 @@ def test_by_all_means_after_a_glance_is_by_all_means(
 ):
     picture = QueryImage(unseen_views()[0][0], CAMERA)
     at_once, named = localizer.localize_query(picture)
-    query_session, num_matched = localizer.query_session(picture), list[int]()
+    query_session, num_matched = localizer.context.query_session(picture), list[int]()
     matcher = propose.Matcher
     monkeypatch.setattr(propose, "Matcher", lambda *args: num_matched.append(1) or matcher(*args))
     glance, _ = query_session.localize_coarse_only()
@@ -47,20 +47,20 @@ def test_by_all_means_after_a_glance_is_by_all_means(
 
 def test_the_best_case_is_no_less_than_what_is_found(localizer: Localizer):
     for image, _ in unseen_views()[::4]:
-        query_session = localizer.query_session(QueryImage(image, CAMERA))
+        query_session = localizer.context.query_session(QueryImage(image, CAMERA))
         best = query_session.compute_best_case_evidence(query_session.min_rival_inliers)
         result, _ = query_session.localize_exhaustive()
         assert isinstance(result, Localization)
         assert best is not None
         assert result.evidence is not None
-        assert compute_log_odds(best, localizer.weights) >= compute_log_odds(
-            result.evidence, localizer.weights
+        assert compute_log_odds(best, localizer.context.first.weights) >= compute_log_odds(
+            result.evidence, localizer.context.first.weights
         )
 
 
 def test_nothing_speaks_for_another_place(localizer: Localizer):
     assert (
-        localizer.query_session(
+        localizer.context.query_session(
             QueryImage(unseen_views(seed=1)[1][0], CAMERA)
         ).compute_best_case_evidence(20.0)
         is None

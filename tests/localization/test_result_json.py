@@ -149,7 +149,7 @@ def test_real_results_fit_the_schema(tiny_recording: Path):
     assert isinstance(found, Localization)
     line = found.to_json("a.png")
     check_result(line)
-    assert line["map"] == localizer.map_id != ""
+    assert line["map"] == localizer.context.map_id != ""
     assert (line["version"], line["t_ns"], line["features"]) == (1, 5, "surf")
     assert line["camera"] == CAMERA.to_json()
     assert 0.0 < line["position_sigma_m"] < 0.1

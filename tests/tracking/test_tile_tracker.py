@@ -10,10 +10,7 @@ import pytest
 
 from tiny_world import write_stereo_recording
 from topoloc.apps.cli import main
-from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.editing import create_atlas, new_tiles
-from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import QueryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer
@@ -22,7 +19,7 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
-from topoloc.tracking.tile_tracker import TileTracker
+from topoloc.tracking.tracker import Tracker
 
 STEP_NS = 100_000_000
 
@@ -50,14 +47,12 @@ def rooms(
 
 
 @pytest.fixture
-def tracker(rooms: tuple[Path, list[StereoFrame]]) -> TileTracker:
-    return TileTracker(
-        AtlasLocalizer(Atlas.open(str(rooms[0])), MapCache([], Localizer, 512_000_000))
-    )
+def tracker(rooms: tuple[Path, list[StereoFrame]]) -> Tracker:
+    return Tracker(Localizer(rooms[0]))
 
 
 def test_a_walk_is_followed_from_tile_to_tile(
-    rooms: tuple[Path, list[StereoFrame]], tracker: TileTracker
+    rooms: tuple[Path, list[StereoFrame]], tracker: Tracker
 ):
     walk = rooms[1]
     nothing = np.random.default_rng(3).integers(0, 255, walk[0].image.shape, dtype=np.uint8)
@@ -80,13 +75,13 @@ def test_a_walk_is_followed_from_tile_to_tile(
 
 
 def test_the_atlas_is_not_asked_again_at_once(
-    rooms: tuple[Path, list[StereoFrame]], tracker: TileTracker, monkeypatch: pytest.MonkeyPatch
+    rooms: tuple[Path, list[StereoFrame]], tracker: Tracker, monkeypatch: pytest.MonkeyPatch
 ):
     """A refusal by an atlas costs far more than a tracked picture."""
     walk, asked = rooms[1], []
-    localize = AtlasLocalizer.localize
+    localize = Localizer.localize
     monkeypatch.setattr(
-        AtlasLocalizer,
+        Localizer,
         "localize",
         lambda *args, **kwargs: asked.append(1) or localize(*args, **kwargs),
     )
@@ -104,11 +99,11 @@ def test_the_atlas_is_not_asked_again_at_once(
     assert len(asked) == 2
 
 
-def test_the_map_is_let_go_of(rooms: tuple[Path, list[StereoFrame]], tracker: TileTracker):
+def test_the_map_is_let_go_of(rooms: tuple[Path, list[StereoFrame]], tracker: Tracker):
     walk = rooms[1]
     tracker.process(walk[0].image, walk[0].camera, 0)
-    assert tracker._tile is not None
-    opened = tracker._tile[1]
+    maps = tracker.localizer._tiles._maps  # pyright: ignore
+    opened = maps._entries["room"].opened
     assert opened.num_users == 1
     tracker.close()
     assert opened.num_users == 0

@@ -19,8 +19,9 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.stream_result import StreamedPose
-from topoloc.tracking.tracker import Tracker, TrackerConfig
+from topoloc.tracking.tracker import Tracker
 
 CAMERA = tiny_world.CAMERA
 NOTHING = np.random.default_rng(3).integers(0, 255, (CAMERA.height, CAMERA.width), dtype=np.uint8)
@@ -98,7 +99,9 @@ def test_no_coarse_search_while_tracked(localizer: Localizer, monkeypatch: pytes
     tracker = Tracker(localizer)
     _stream(tracker, 0, 3)
     monkeypatch.setattr(
-        localizer.map.coarse, "rank", lambda *_: pytest.fail("the coarse localizer was asked")
+        localizer.context.first.map.coarse,
+        "rank",
+        lambda *_: pytest.fail("the coarse localizer was asked"),
     )
     assert {answer.state for answer in _stream(tracker, 3, 25)} == {"localized", "tracked"}
 

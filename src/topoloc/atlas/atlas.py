@@ -125,6 +125,14 @@ class Atlas:
 
         return Atlas(store_at(where), merge_atlases(sources, where))
 
+    def __reduce__(self) -> Any:
+        return Atlas.from_manifest, (self.address, self.manifest.to_bytes())
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Return the feature types of all tiles."""
+        return tuple(sorted({kind for tile in self.manifest.tiles for kind in tile.kinds}))
+
     @property
     def address(self) -> str:
         """Its address from any working directory."""

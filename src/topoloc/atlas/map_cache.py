@@ -18,30 +18,42 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 from topoloc.atlas.atlas import Atlas, is_atlas
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.watched_atlas import WatchedAtlas
 from topoloc.errors import MapError, MapNotFoundError
-from topoloc.localization.localizer import Localizer
 from topoloc.mapping.node_cache import set_node_cache_size
 from topoloc.mapping.topomap import TopoMetricMap
 
 SUFFIX = ".topo"
-OpenLocalizer = Callable[[TopoMetricMap], Localizer]
 TilePath = Callable[[Atlas, Tile], Path]
 """A function that returns the local map file of a tile. It raises AtlasError, or another exception
 if the file is not available yet."""
 
 
+@runtime_checkable
+class OpenedMap(Protocol):
+    """Define the content of the cache: something that holds an open map."""
+
+    @property
+    def topomap(self) -> TopoMetricMap:
+        """Return the map."""
+        ...
+
+
+M = TypeVar("M", bound=OpenedMap)
+
+
 @dataclass(eq=False)
-class CachedMap:
+class CachedMap(Generic[M]):
     """Hold an open map, shared by all its users. `stamp` is the file's stamp when it was opened."""
 
     name: str
     path: Path
     stamp: tuple[int, ...]
-    localizer: Localizer
+    content: M
     num_users: int = 0
     is_retired: bool = False
 
@@ -52,7 +64,7 @@ class CachedMap:
 
 
 @dataclass(eq=False)
-class _CacheEntry:
+class _CacheEntry(Generic[M]):
     """Hold one map of the cache.
 
     Its lock is held while the map is opened, so that it is opened once and other maps are not
@@ -60,7 +72,7 @@ class _CacheEntry:
     """
 
     lock: threading.Lock = field(default_factory=threading.Lock)
-    opened: CachedMap | None = None
+    opened: CachedMap[M] | None = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +83,7 @@ class _MapSource:
     tile: tuple[Atlas, Tile] | None = field(default=None, compare=False)
 
 
-class MapCache:
+class MapCache(Generic[M]):
     """Cache the maps of files, folders and atlases. Atlases may be in object stores.
 
     Args:
@@ -87,13 +99,13 @@ class MapCache:
     def __init__(
         self,
         sources: Sequence[str],
-        open_localizer: OpenLocalizer,
+        open_map: Callable[[TopoMetricMap], M],
         max_bytes: int,
         tile_path: TilePath = Atlas.map_path,
     ) -> None:
-        self._open_localizer, self._max_bytes, self.tile_path = open_localizer, max_bytes, tile_path
+        self._open_map, self._max_bytes, self.tile_path = open_map, max_bytes, tile_path
         self._lock = threading.Lock()
-        self._entries: OrderedDict[str, _CacheEntry] = OrderedDict()  # least recently used first
+        self._entries: OrderedDict[str, _CacheEntry[M]] = OrderedDict()  # least recently used first
         for source in sources:
             if "://" not in source and not os.path.exists(source):
                 raise MapError(f"{source}: no such map")
@@ -106,15 +118,15 @@ class MapCache:
     @staticmethod
     def with_memory(
         sources: Sequence[str],
-        open_localizer: OpenLocalizer,
+        open_map: Callable[[TopoMetricMap], M],
         memory_mb: int,
         tile_path: TilePath = Atlas.map_path,
-    ) -> MapCache:
+    ) -> MapCache[M]:
         """Create a cache that uses half of the memory (megabytes) for nodes, of all maps of this
         process, and half for the rest of the open maps. Raises as the class does."""
         budget = memory_mb * 500_000
         set_node_cache_size(budget)
-        return MapCache(sources, open_localizer, budget, tile_path)
+        return MapCache(sources, open_map, budget, tile_path)
 
     def names(self) -> list[str]:
         """Return the names of all current maps. No object store is queried.
@@ -156,7 +168,7 @@ class MapCache:
             return sum(entry.opened is not None for entry in self._entries.values())
 
     @contextmanager
-    def use_map(self, name: str, path: Path | None = None) -> Iterator[CachedMap]:
+    def use_map(self, name: str, path: Path | None = None) -> Iterator[CachedMap[M]]:
         """Open the map of this name for the context, from the file `path` if it is given.
 
         Raises:
@@ -169,7 +181,7 @@ class MapCache:
         finally:
             self.release_map(opened)
 
-    def acquire_map(self, name: str, path: Path | None = None) -> CachedMap:
+    def acquire_map(self, name: str, path: Path | None = None) -> CachedMap[M]:
         """Open a map as `use_map` does. It stays open until `release_map`."""
         path = path or self._path_of(name)
         with self._lock:
@@ -187,13 +199,13 @@ class MapCache:
         self._close_oldest()
         return opened
 
-    def release_map(self, opened: CachedMap) -> None:
+    def release_map(self, opened: CachedMap[M]) -> None:
         """Release a map from `acquire_map`. A retired map is closed after its last user."""
         with self._lock:
             opened.num_users -= 1
             is_last = opened.is_retired and opened.num_users == 0
         if is_last:
-            opened.localizer.topomap.close()
+            opened.content.topomap.close()
 
     def close(self) -> None:
         """Close all maps. Maps in use are closed when they are released."""
@@ -211,10 +223,10 @@ class MapCache:
             )
         return Path(found.where) if found.tile is None else self.tile_path(*found.tile)
 
-    def _opened(self, path: Path) -> Localizer:
+    def _opened(self, path: Path) -> M:
         topomap = TopoMetricMap.load(path)
         try:
-            return self._open_localizer(topomap)
+            return self._open_map(topomap)
         except BaseException:
             topomap.close()
             raise
@@ -222,7 +234,7 @@ class MapCache:
     def _close_oldest(self) -> None:
         with self._lock:
             total = sum(entry.opened.num_bytes for entry in self._entries.values() if entry.opened)
-            closed = list[CachedMap]()
+            closed = list[CachedMap[M]]()
             for entry in self._entries.values():
                 if total <= self._max_bytes:
                     break
@@ -236,14 +248,14 @@ class MapCache:
         for opened in closed:
             self._close_when_unused(opened)
 
-    def _close_when_unused(self, opened: CachedMap | None) -> None:
+    def _close_when_unused(self, opened: CachedMap[M] | None) -> None:
         if opened is None:
             return
         with self._lock:
             opened.is_retired = True
             is_unused = opened.num_users == 0
         if is_unused:
-            opened.localizer.topomap.close()
+            opened.content.topomap.close()
 
 
 def _file_stamp(path: Path) -> tuple[int, ...]:

@@ -9,13 +9,13 @@ from typing import Any
 
 from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording, summarize
 from topoloc.evaluation.query_localization import (
-    QueriedMap,
     localize_out_of_map,
     localize_queries,
 )
 from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.image_calibration_check import check_camera_calibrations
+from topoloc.localization.localizer import Localizer
 from topoloc.mapping.build import Progress
 from topoloc.recordings.frame import StereoSequence
 
@@ -56,28 +56,31 @@ class Evaluation:
 
 
 def evaluate(
-    localizer: QueriedMap,
+    localizer: Localizer,
     sequences: Sequence[StereoSequence],
     out_of_map: Sequence[StereoSequence] = (),
     map_from_truth: Rigid3 | None = None,
     progress: Progress | None = None,
+    tile_id: str | None = None,
 ) -> Evaluation:
     """Localize recordings with known poses, and recordings of other places.
 
     Args:
-        localizer: of a map, or an atlas evaluated in the world of one tile.
+        localizer: localizes in a map or an atlas.
         sequences: recordings with truth; only their left (or colour) images are queried.
         out_of_map: recordings of other places: every pose given for one is a false accept.
         map_from_truth: transform from the world of the truth into the map's (m), if they differ.
         progress: called with a recording's name, queries done and queries in all.
+        tile_id: the tile in whose world the truth is. It may be None if there is only one.
 
     Raises:
+        AtlasError: there is no such tile.
         TrajectoryError: a recording of `sequences` has no poses.
         CalibrationError: a recording has no camera.
     """
     answers = list[EvaluatedQuery]()
     for sequence in sequences:
-        answers += localize_queries(localizer, sequence, map_from_truth, progress)
+        answers += localize_queries(localizer, sequence, map_from_truth, progress, tile_id=tile_id)
     for sequence in out_of_map:
         answers += localize_out_of_map(localizer, sequence, progress)
     return Evaluation(answers)

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.atlas.evaluated_tile import EvaluatedTile
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.geometry.rigid import Rigid3
@@ -22,35 +21,35 @@ from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 NEIGHBOUR_RADIUS = 1.5
 
 
-QueriedMap = Localizer | EvaluatedTile
-"""A map, or an atlas evaluated in the world of one tile."""
-
-
 def localize_queries(
-    localizer: QueriedMap,
+    localizer: Localizer,
     sequence: StereoSequence,
     map_from_truth: Rigid3 | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     label: str | None = None,
     frames: Sequence[int] | None = None,
+    tile_id: str | None = None,
 ) -> list[EvaluatedQuery]:
     """Localize every frame with a known pose. The localizer receives only the left (or colour)
     image.
 
     Args:
-        localizer: the localizer of the map, or an evaluated tile.
+        localizer: the localizer of the map or atlas.
         sequence: the recording.
         map_from_truth: the transform from the recording's world to the map's, if they differ.
         progress: is called with the label, frames done and all frames.
         label: the name of the recording in the results. Defaults to its own name.
         frames: localize only these frames, in this order. Their poses must be known.
+        tile_id: the tile in whose world the true poses are. It may be None if there is only one.
 
     Raises:
+        AtlasError: there is no such tile.
         TrajectoryError: the recording has no ground truth.
         CalibrationError: the recording has no camera model.
     """
-    nodes = NodePoses.of([summary.world_from_cam for summary in localizer.topomap.summaries])
-    lambda_rot = localizer.topomap.config.lambda_rot
+    with localizer.in_tile(tile_id) as in_tile:
+        topomap, tile_id = in_tile.topomap, in_tile.tile_ids[0]
+        nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     frames = find_frames_with_truth(sequence) if frames is None else frames
     label = label or sequence.name
     answers = []
@@ -58,28 +57,25 @@ def localize_queries(
         frame = sequence[i]
         assert frame.world_from_cam is not None
         world_from_cam = (map_from_truth or Rigid3.identity()) @ frame.world_from_cam
-        distances = node_distances(world_from_cam, nodes, lambda_rot)
-        nearest = localizer.topomap.summaries[int(np.argmin(distances))].node_id
-        near = find_neighbour_ids(localizer.topomap, distances)
-        result = _localize(localizer, frame)
+        distances = node_distances(world_from_cam, nodes, topomap.config.lambda_rot)
         answer = EvaluatedQuery(
             frame.name,
-            result,
+            _localize(localizer, frame),
             world_from_cam,
-            nearest,
+            topomap.summaries[int(np.argmin(distances))].node_id,
             label,
             create_image_reader(sequence, i),
             frame.camera,
-            near,
+            find_neighbour_ids(topomap, distances),
         )
-        answers.append(_to_answered_world(localizer, answer))
+        answers.append(_to_answered_world(localizer, answer, tile_id))
         if progress:
             progress(label, done + 1, len(frames))
     return answers
 
 
 def localize_out_of_map(
-    localizer: QueriedMap,
+    localizer: Localizer,
     sequence: StereoSequence,
     progress: Callable[[str, int, int], None] | None = None,
     label: str | None = None,
@@ -88,7 +84,7 @@ def localize_out_of_map(
     """Localize out-of-map images. Every pose of the results is false.
 
     Args:
-        localizer: the localizer of the map, or an evaluated tile.
+        localizer: the localizer of the map or atlas.
         sequence: the recording.
         progress: is called with the label, frames done and all frames.
         label: the name of the recording in the results. Defaults to its own name.
@@ -143,24 +139,25 @@ def find_neighbour_ids(
     return frozenset(along | {topomap.summaries[int(row)].node_id for row in rows})
 
 
-def _to_answered_world(localizer: QueriedMap, answer: EvaluatedQuery) -> EvaluatedQuery:
+def _to_answered_world(
+    localizer: Localizer, answer: EvaluatedQuery, tile_id: str
+) -> EvaluatedQuery:
     """Transform the ground truth to the world of the tile in the result, if it is another tile of
     an atlas. The nearest node is then not evaluated."""
-    if (
-        isinstance(localizer, Localizer)
-        or answer.world_from_cam is None
-        or answer.result.provenance.tile in (None, localizer.tile_id)
-    ):
+    answered = answer.result.provenance.tile
+    if answered in (None, tile_id) or answer.world_from_cam is None:
         return answer
-    truth = localizer.truth_in_result_world(answer.result, answer.world_from_cam)
-    if truth is None:
-        return replace(
-            answer, is_in_other_world=True, nearest_node_id=None, neighbour_ids=frozenset()
-        )
-    return replace(answer, world_from_cam=truth, nearest_node_id=None, neighbour_ids=frozenset())
+    truth = localizer.to_world_of(tile_id, answered, answer.world_from_cam)
+    return replace(
+        answer,
+        world_from_cam=answer.world_from_cam if truth is None else truth,
+        is_in_other_world=truth is None,
+        nearest_node_id=None,
+        neighbour_ids=frozenset(),
+    )
 
 
-def _localize(localizer: QueriedMap, frame: StereoFrame) -> Localization | NotLocalized:
+def _localize(localizer: Localizer, frame: StereoFrame) -> Localization | NotLocalized:
     if frame.camera is None:
         raise CalibrationError(
             f"{frame.name}: no calibration; put a camera.json into the recording's folder"

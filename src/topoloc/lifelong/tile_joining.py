@@ -183,7 +183,7 @@ def _select_pairs(
 
 
 def _join_pair(
-    atlas: Atlas, maps: MapCache, pair: tuple[Tile, Tile], config: TileJoinConfig
+    atlas: Atlas, maps: MapCache[Localizer], pair: tuple[Tile, Tile], config: TileJoinConfig
 ) -> PairResult:
     """Compare a pair of tiles and return the result. A join is added to the manifest."""
     first, second = pair
@@ -204,7 +204,7 @@ def _join_pair(
 
 
 def _compare_pair(
-    atlas: Atlas, maps: MapCache, first: Tile, second: Tile, config: TileJoinConfig
+    atlas: Atlas, maps: MapCache[Localizer], first: Tile, second: Tile, config: TileJoinConfig
 ) -> TileTransform | NotJoined:
     places = [atlas.places_of(tile) for tile in (first, second)]
     with (
@@ -212,7 +212,7 @@ def _compare_pair(
         maps.use_map(second.tile_id, atlas.map_path(second)) as other,
     ):
         return compare_tiles(
-            OpenTile(one.localizer, places[0]), OpenTile(other.localizer, places[1]), config
+            OpenTile(one.content, places[0]), OpenTile(other.content, places[1]), config
         )
 
 

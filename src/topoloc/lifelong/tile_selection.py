@@ -9,11 +9,12 @@ from typing import Annotated
 
 import numpy as np
 
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
 from topoloc.bounds import Between, check_bounds
 from topoloc.errors import TrajectoryError
 from topoloc.lifelong.session_poses import Progress
+from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
 from topoloc.recordings.frame import StereoSequence
 
@@ -31,7 +32,8 @@ class TileSelectionConfig:
 
 
 def find_tile_of_recording(
-    localizer: AtlasLocalizer,
+    atlas: Atlas,
+    localizer: Localizer,
     sequence: StereoSequence,
     config: TileSelectionConfig,
     progress: Progress,
@@ -41,7 +43,7 @@ def find_tile_of_recording(
     Raises:
         ConfigError: a setting is out of its bounds.
         TrajectoryError: too few images are localized, or they are in tiles of several worlds.
-        UnreadableImageError, QueryError, AtlasError: raised by `AtlasLocalizer.localize`.
+        UnreadableImageError, QueryError, AtlasError: raised by `Localizer.localize`.
     """
     check_bounds(config)
     rows = np.unique(
@@ -56,7 +58,7 @@ def find_tile_of_recording(
         if isinstance(result, Localization):
             answers.append(result)
         progress("which tile", done + 1, len(rows))
-    return select_tile(sequence.name, len(rows), answers, localizer.atlas.manifest.by_id, config)
+    return select_tile(sequence.name, len(rows), answers, atlas.manifest.by_id, config)
 
 
 def select_tile(

@@ -1,4 +1,4 @@
-"""Localize a single image in the topo-metric map (section III-B of the paper).
+"""Localize images in a map, or in an atlas of many maps (section III-B of the paper).
 
 The coarse localizer ranks candidate nodes. The image is patch-normalised and its features are
 matched with those of the nodes. PnP on the matches gives the camera's global pose.
@@ -7,7 +7,10 @@ The paper keeps the first pose without a check. This localizer runs one loop ove
 (`query_session.py`) instead. Pose proposals are generated cheapest and likeliest first
 (`propose.py`). Each one is refined and its evidence counted in the same way (`refine.py`). It then
 enters the belief over hypotheses (`belief.py`), until the result is settled. A pose is reported
-only if its evidence is strong and no other place in the map explains the image as well.
+only if its evidence is strong and no other place explains the image as well.
+
+A map is an atlas of one tile. Of several tiles, the ones that look like the image are searched in
+the same way, and their poses are compared (`tiles/tile_search.py`).
 
 These settings give the paper's own behaviour: `num_candidates=1`, `guided.num_nodes=0`,
 `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_places=0`.
@@ -17,88 +20,190 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterable
-from dataclasses import replace
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING
 
+from topoloc.atlas.config import AtlasConfig
 from topoloc.bounds import check_bounds
-from topoloc.features.feature_types import select_stored_types
+from topoloc.errors import AtlasError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.feature_type_context import FeatureTypeContext, select_feature_types
 from topoloc.localization.fitted_weights import FittedWeights
-from topoloc.localization.provenance import Provenance
-from topoloc.localization.query import Query, QueryImage, reduce_image, unknown_camera
-from topoloc.localization.query_session import QuerySession
-from topoloc.localization.result import Localization, NotLocalized, with_time
+from topoloc.localization.map_context import MapContext
+from topoloc.localization.query import QueryImage, StageClock, unknown_camera
+from topoloc.localization.result import Localization, NotLocalized, R, with_time
 from topoloc.localization.result_decision import ResultWithInliers
-from topoloc.localization.search import Search, Trace
-from topoloc.mapping.contents import get_map_id
+from topoloc.localization.search import Trace
+from topoloc.localization.tiles.tile_search import TileSearch
+from topoloc.localization.tiles.tiles import OneMap, Reach, TileRanking, Tiles
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseLocalizer, Image
 
-__all__ = ["Localizer", "LocalizerConfig"]
+if TYPE_CHECKING:
+    from topoloc.atlas.atlas import Atlas
+    from topoloc.atlas.location_prior import LocationPrior
+    from topoloc.atlas.map_cache import MapCache
 
-R = TypeVar("R", bound=Localization | NotLocalized)
+__all__ = ["Localizer", "LocalizerConfig"]
 
 
 class Localizer:
-    """Hold an open map, its coarse localizer and a cache of recently used nodes.
+    """Localize images in a map, or in a snapshot of an atlas.
 
-    `unavailable_types` maps each feature type of the map that cannot be used to the reason. A type
-    cannot be used if its network or ONNX Runtime is not installed.
+    `source` is the map or the atlas. If tiles cannot be read, the other ones are still searched.
 
     Args:
-        topomap: the map, or the path of its file, which is opened.
+        source: the map or the atlas; or the path of a map file or the address of an atlas, which
+            is opened; or a map that is open for queries already, with its settings.
         features: the map's feature types that are used: `learned`, `both`, or names such as
             `surf,topoloc-net`. By default those of `config.kinds`.
         coarse: ranks the candidate nodes instead of one of the map's own coarse localizers. Any
             object with `CoarseLocalizer.rank` (`topoloc/retrieval/coarse.py`) works, such as
             another retrieval method or an external prior. `config.coarse` is then ignored.
         weights: fitted weights to use instead of those shipped for the map's first feature type.
+        tiles: how the tiles of an atlas are selected.
+        maps: opens the tiles of an atlas and keeps the last ones open, for several localizers. By
+            default each localizer keeps up to 512 MB open.
+        warn: called once for each tile that cannot be searched, and once for each feature type of
+            the map that cannot be used.
 
     Raises:
         ConfigError: a setting is out of bounds.
         FeatureTypeError: the map's feature type is unknown.
         EmptyMapError: the map has no node.
         MapError: the map file cannot be read, or the map has no such coarse localizer.
+        AtlasError: the atlas is damaged, or has no tile.
         MissingExtraError, WeightsError: a feature network is not installed, and the map has no
             other feature type or `config.kinds` names this one.
     """
 
     def __init__(
         self,
-        topomap: TopoMetricMap | str | Path,
+        source: TopoMetricMap | Atlas | MapContext | str | Path,
         config: LocalizerConfig | None = None,
         coarse: CoarseLocalizer | None = None,
         weights: FittedWeights | None = None,
         features: str | None = None,
+        tiles: AtlasConfig | None = None,
+        maps: MapCache[Localizer] | None = None,
+        warn: Callable[[str], None] = warnings.warn,
     ) -> None:
-        if isinstance(topomap, str | Path):
-            topomap = TopoMetricMap.load(topomap)
-        config = config or LocalizerConfig()
-        if features is not None:
-            config = replace(config, kinds=select_stored_types(topomap.kinds, features))
-        check_bounds(config)
-        self.topomap, self.map_id = topomap, get_map_id(topomap)
-        kinds, self.unavailable_types = select_feature_types(topomap, config.kinds)
-        self._kinds = [
-            FeatureTypeContext.of(
-                topomap.with_feature_type(kind),
-                config,
-                coarse,
-                weights if kind == kinds[0] else None,
+        self.tile_config = tiles or AtlasConfig()
+        check_bounds(self.tile_config)
+        self._reach: Reach | None = None
+        self._nothing_in_reach = ""
+        if isinstance(source, MapContext):
+            self.config, self.source = source.config, source.topomap
+            self._tiles: Tiles = OneMap(source)
+            return
+        self.config = config or LocalizerConfig()
+        check_bounds(self.config)
+
+        def open_map(topomap: TopoMetricMap) -> MapContext:
+            opened = MapContext.of(topomap, self.config, coarse, weights, features)
+            for kind, lacking in opened.unavailable_types.items():
+                warn(f"features {kind} of the map are not used: {lacking}")
+            return opened
+
+        if isinstance(source, str | Path):
+            source = open_place(str(source))
+        self.source = source
+        if isinstance(source, TopoMetricMap):
+            self._tiles = OneMap(open_map(source))
+        else:
+            self._tiles = _open_tiles(
+                source,
+                maps,
+                lambda topomap: Localizer(open_map(topomap)),
+                self.tile_config,
+                warn,
             )
-            for kind in kinds
-        ]
-        self.map, self.config, self.weights = (
-            self._kinds[0].map,
-            self._kinds[0].config,
-            self._kinds[0].weights,
+
+    @property
+    def context(self) -> MapContext:
+        """Return the open map. Raises AtlasError: this is an atlas."""
+        if isinstance(self._tiles, OneMap):
+            return self._tiles.opened
+        raise AtlasError("an atlas has many maps: in_tile opens one of them")
+
+    @property
+    def topomap(self) -> TopoMetricMap:
+        """Return the map. Raises AtlasError: this is an atlas."""
+        return self.context.topomap
+
+    @property
+    def unavailable_types(self) -> dict[str, str]:
+        """Return the reason for each feature type of the map that cannot be used, for example
+        because its network or ONNX Runtime is not installed. Raises AtlasError: this is an
+        atlas."""
+        return self.context.unavailable_types
+
+    @property
+    def tile_ids(self) -> list[str]:
+        """Return the ids of the tiles. A map is one tile with the id ""."""
+        return self._tiles.ids
+
+    @property
+    def problems(self) -> dict[str, str]:
+        """Return the reason for each tile, by id, that cannot be searched."""
+        return self._tiles.problems
+
+    @contextmanager
+    def in_tile(self, tile_id: str | None = None) -> Iterator[Localizer]:
+        """Yield a localizer for one tile alone. Its map stays open for the context.
+
+        Args:
+            tile_id: the tile. It may be None if there is only one.
+
+        Raises:
+            AtlasError: there is no such tile, or several and none is named.
+            MapError: its map cannot be read.
+        """
+        tile_id = self._tile_id(tile_id)
+        with self._tiles.use(tile_id) as opened:
+            if isinstance(self._tiles, OneMap):
+                yield self
+                return
+            other = copy.copy(self)
+            other.source, other._reach = opened.topomap, None
+            other._tiles = OneMap(opened, self._tiles, tile_id)
+            yield other
+
+    def near(self, near: LocationPrior | None, georeferenced_only: bool = False) -> Localizer:
+        """Return a localizer that searches only tiles within a location prior
+        (`atlas/location_prior.py`).
+
+        If the prior holds a pose, it is used as the prior pose in these tiles.
+
+        Args:
+            georeferenced_only: use only tiles with a known position on earth.
+
+        Raises:
+            AtlasError: no tile belongs to the prior's world, or this is one map.
+        """
+        other = copy.copy(self)
+        other._reach = self._tiles.in_reach(near, georeferenced_only)
+        other._nothing_in_reach = (
+            f"no tile lies {near}" if near is not None else "no tile knows where on earth it lies"
         )
+        return other
+
+    def without(self, node_ids: Iterable[int]) -> Localizer:
+        """Return a localizer for the same map without these nodes.
+
+        An image recorded at one of them is then localized in the rest of the map. At least one node
+        must remain. Virtual views are not used.
+
+        Raises:
+            AtlasError: this is an atlas.
+            KeyError: the map has no node with such an id.
+        """
+        return Localizer(self.context.without(node_ids))
 
     def localize(
         self,
@@ -108,28 +213,32 @@ class Localizer:
         max_ms: float | None = None,
         trace: Trace | None = None,
         t_ns: int | None = None,
+        tile_id: str | None = None,
     ) -> Localization | NotLocalized:
         """Estimate the pose of an image (grey or RGB, uint8).
 
         If the camera is only approximately known, or unknown (None), the focal length is estimated
-        with the pose. This takes a few times as long and assumes a pinhole camera.
+        with the pose. This takes a few times as long and assumes a pinhole camera. In an atlas the
+        provenance of the result holds the tile, in whose world the pose is.
 
         Args:
             camera: camera model of the image, exact or approximate. None: unknown.
             prior: approximate pose (world_from_cam). The nodes nearest to it replace coarse
                 retrieval. The pose needs the same evidence as any other, from matches that the
-                prior did not guide.
-            max_ms: time limit in milliseconds, instead of `config.max_ms`. No further hypothesis is
-                tested after it.
+                prior did not guide. In an atlas it is in the world of the tile `tile_id`.
+            max_ms: time limit in milliseconds, instead of `config.max_ms`. No further tile or
+                hypothesis is tested after it.
             trace: collects all tried proposals.
             t_ns: capture time in nanoseconds, stored in the result.
+            tile_id: search only this tile.
 
         Raises:
             QueryError: the image is not an 8-bit image, or its size differs from the camera's.
+            AtlasError: there is no such tile, a prior comes without one, or no tile can be read.
+            ObjectStoreError: the object store of a required tile does not respond.
         """
-        result = self.localize_with_inliers(
-            image, camera or unknown_camera(image), prior, max_ms, trace
-        )[0]
+        camera = camera or unknown_camera(image)
+        result = self.localize_with_inliers(image, camera, prior, max_ms, trace, tile_id)[0]
         return result if t_ns is None else with_time(result, t_ns)
 
     def localize_with_inliers(
@@ -139,12 +248,13 @@ class Localizer:
         prior: Rigid3 | None,
         max_ms: float | None = None,
         trace: Trace | None = None,
+        tile_id: str | None = None,
     ) -> ResultWithInliers:
         """Localize as `localize` does, and also return the inliers of each reported pose.
 
         The reported poses are the result's own pose, or its alternatives.
         """
-        return self.localize_query(QueryImage(image, camera), prior, max_ms, trace)
+        return self.localize_query(QueryImage(image, camera), prior, max_ms, trace, tile_id)
 
     def localize_query(
         self,
@@ -152,106 +262,77 @@ class Localizer:
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
         trace: Trace | None = None,
+        tile_id: str | None = None,
     ) -> ResultWithInliers:
         """Localize as `localize_with_inliers` does, with a query image that caches its features.
 
         Several maps can share these features.
         """
-        return self.query_session(query_image, prior, max_ms, trace).localize_exhaustive()
-
-    def query_session(
-        self,
-        query_image: QueryImage,
-        prior: Rigid3 | None = None,
-        max_ms: float | None = None,
-        trace: Trace | None = None,
-    ) -> QuerySession:
-        """Return a session for this query, which can run a coarse pass before the exhaustive
-        one."""
-        searches, camera = (
-            self._searches(self._query(query_image, max_ms), trace),
-            query_image.camera,
+        limit = max_ms if max_ms is not None else self.config.max_ms
+        deadline = float("inf") if limit is None else time.perf_counter() + limit / 1e3
+        search = TileSearch(
+            self._tiles, self.tile_config, query_image, deadline, self._reach, trace
         )
+        if prior is not None or tile_id is not None or len(self.tile_ids) == 1:
+            search.search_tile(self._tile_id(tile_id), prior=prior)
+        elif self._reach is not None and not self._reach:
+            return NotLocalized("not_in_map", detail=self._nothing_in_reach), []
+        else:
+            search.search_all()
+        return search.outcome()
 
-        def with_provenance(outcome: ResultWithInliers) -> ResultWithInliers:
-            return self.with_provenance(outcome[0], camera), [
-                (self.with_provenance(one, camera), seen) for one, seen in outcome[1]
-            ]
+    def rank_tiles(self, image: Image, camera: Camera | UncalibratedCamera) -> TileRanking:
+        """Return the tiles by their similarity to an image, followed by those that cannot be
+        ranked."""
+        *_, ranking = self._tiles.rankings(QueryImage(image, camera), StageClock(), self._reach)
+        return ranking
 
-        return QuerySession(searches, prior, with_provenance)
+    def to_world_of(
+        self, tile_id: str | None, other_id: str | None, world_from_cam: Rigid3
+    ) -> Rigid3 | None:
+        """Return a pose in the world of one tile as a pose in the world of another one.
 
-    def without(self, node_ids: Iterable[int]) -> Localizer:
-        """Return a localizer for the same map without these nodes.
-
-        An image recorded at one of them is then localized in the rest of the map. At least one node
-        must remain. Virtual views are not used.
-
-        Raises:
-            KeyError: the map has no node with such an id.
+        None if the transform between them is unknown. Raises AtlasError: there is no such tile.
         """
-        rows, other = [self.topomap.row_of(node_id) for node_id in node_ids], copy.copy(self)
-        other._kinds = [replace(kind, map=kind.map.without(rows)) for kind in self._kinds]
-        other.map = other._kinds[0].map
-        return other
+        known = self._tiles.other_from_world(self._tile_id(tile_id), self._tile_id(other_id))
+        return None if known is None else known @ world_from_cam
 
     def with_provenance(
         self, result: R, camera: Camera | UncalibratedCamera | None = None, t_ns: int | None = None
     ) -> R:
         """Return the result with the map's identity, its geopose, the camera and the time
-        (nanoseconds)."""
-        if isinstance(camera, UncalibratedCamera):
-            focal = result.focal_length_px if isinstance(result, Localization) else None
-            camera = None if focal is None else camera.with_focal(focal)
-        of_map = Provenance(self.map_id, self.topomap.version, t_ns=t_ns, camera=camera)
-        provenance = replace(of_map, features=result.provenance.features)
-        georeference = self.topomap.georeference
-        if isinstance(result, NotLocalized):
-            alternatives = result.alternatives
-            if georeference:
-                alternatives = tuple(
-                    replace(one, geopose=georeference.geopose(one.world_from_cam))
-                    for one in alternatives
-                )
-            return replace(result, provenance=provenance, alternatives=alternatives)
-        return replace(
-            result,
-            provenance=provenance,
-            geopose=georeference.geopose(result.world_from_cam) if georeference else None,
-        )
+        (nanoseconds). In an atlas only the time is known."""
+        return self._tiles.with_provenance(result, camera, t_ns)
 
-    def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
-        """Return one search for each feature type. Each search links to the previous one."""
-        searches = list[Search]()
-        for kind in self._kinds:
-            of_kind = replace(query, feature_config=kind.map.feature_config)
-            search = Search(
-                of_kind, kind.map, kind.config, kind.weights, kind.correlated_errors, trace
-            )
-            if searches:
-                search.previous, searches[-1].is_last = searches[-1], False
-            searches.append(search)
-        return searches
+    def _tile_id(self, tile_id: str | None) -> str:
+        if tile_id is not None:
+            return tile_id
+        if len(self.tile_ids) > 1:
+            raise AtlasError("the atlas has several tiles: name the one that is meant")
+        return self.tile_ids[0]
 
-    @property
-    def correlated_errors(self) -> float:
-        """Return the correlated error share (rho) of the map for its first feature type.
 
-        It is the share of a match's variance that the map's points have in common.
-        """
-        return self._kinds[0].correlated_errors
+def open_place(where: str) -> TopoMetricMap | Atlas:
+    """Open a map file, or the atlas in a folder or an object store.
 
-    def _query(self, query_image: QueryImage, max_ms: float | None) -> Query:
-        image, camera = query_image.image, query_image.camera
-        start, limit = time.perf_counter(), max_ms if max_ms is not None else self.config.max_ms
-        reduced, reduced_camera = reduce_image(
-            image, camera, self.map.focal, self.config.max_finer, self.config.max_side_px
-        )
-        deadline = float("inf") if limit is None else start + limit / 1e3
-        return Query(
-            reduced,
-            reduced_camera,
-            image.shape[1] / reduced_camera.width,
-            self.map.feature_config,
-            deadline=deadline,
-            shared=query_image.features,
-        )
+    Raises:
+        MapError: there is none, or it cannot be read.
+    """
+    from topoloc.atlas.atlas import Atlas, is_atlas
+
+    return Atlas.open(where) if is_atlas(where) else TopoMetricMap.load(where)
+
+
+def _open_tiles(
+    atlas: Atlas,
+    maps: MapCache[Localizer] | None,
+    open_map: Callable[[TopoMetricMap], Localizer],
+    config: AtlasConfig,
+    warn: Callable[[str], None],
+) -> Tiles:
+    """Return the tiles of an atlas. Their modules are loaded here, because a single map needs
+    none of them."""
+    from topoloc.atlas.map_cache import MapCache
+    from topoloc.localization.tiles.atlas_tiles import AtlasTiles
+
+    return AtlasTiles(atlas, maps or MapCache.with_memory([], open_map, 512), config, warn)

@@ -1,104 +1,41 @@
-"""Localize a stream of images. `Tracker.process` is the entry point.
+"""Localize a stream of images in a map or an atlas. `Tracker.process` is the entry point.
 
-The pose of an image is predicted from the motion so far, or from external odometry. The map points
-of the last localized image are tracked into it, which gives its pose in a few milliseconds. At
-intervals, and if too few points are left, the image is localized in full. The search then runs
-around the predicted pose instead of coarse retrieval.
-
-The result updates the pose hypotheses (`pose_hypotheses.py`). A pose that the motion does not allow
-is rejected (reason `jump`), until several agree that the camera is elsewhere. The motion also
-selects between the alternatives of ambiguous images. While several remain, the result is
-`ambiguous`. Localized images are adjusted together in a sliding window, which gives the smoothed
-pose.
-
-`mode="paper"` applies the rule of section III-B instead. Each image is localized alone. If its pose
-is farther than `max_jump` from the preceding one, that one is copied. The copy has the state
-"predicted".
+The stream is tracked in one tile (`map_stream.py`); a map is one tile. An atlas is searched until
+it names the tile of an image. If the tile gives no pose for a while, the atlas is searched again,
+because the camera may have moved to another tile.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
-from topoloc.bounds import Above, AtLeast, Between, check_bounds
+from topoloc.bounds import check_bounds
 from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import StageClock, check_image_size
+from topoloc.localization.query import check_image_size
 from topoloc.localization.result import Localization, NotLocalized, with_time
 from topoloc.recordings.frame_checks import find_time_problem
-from topoloc.recordings.image_io import to_grey
 from topoloc.retrieval.coarse import Image
-from topoloc.tracking.motion import MotionState, update_motion
-from topoloc.tracking.point_tracker import PointTracker, PointTrackerConfig, TrackedMotion
-from topoloc.tracking.pose_errors import compute_correlated_change, noise_floor
-from topoloc.tracking.pose_hypotheses import HypothesesConfig, PoseHypotheses
-from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
-from topoloc.tracking.stream_localizer import (
-    ExpectedPose,
-    LocalizedPose,
-    StreamLocalizer,
-    reject_jump,
-)
+from topoloc.tracking.config import TrackerConfig
+from topoloc.tracking.map_stream import MapStream
 from topoloc.tracking.stream_result import StreamedPose
-from topoloc.tracking.tracker_state import (
-    ReferenceImage,
-    StreamFrame,
-    compute_direction_uncertainty,
-    compute_motion_covariance,
-    compute_smoothed_covariance,
-    downscale_image,
-)
 
-
-@dataclass(frozen=True)
-class TrackerConfig:
-    """Configure the schedule of full localizations, the tracking and the smoothing."""
-
-    mode: Literal["motion", "paper"] = "motion"
-    """`motion`: predict, track and filter. `paper`: localize each image alone, and copy the
-    preceding pose if the new one is too far from it."""
-    max_jump: Annotated[float, Above(0)] = 1.0
-    """Mode "paper": maximum distance between two consecutive poses, metres (the paper: 1 to 5, by
-    the size of the place)."""
-    hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
-    following: PointTrackerConfig = field(default_factory=PointTrackerConfig)
-    window: PoseWindowConfig = field(default_factory=PoseWindowConfig)
-    max_side_px: Annotated[int, Between(64, 16_384)] = 800
-    """Images are reduced to this width or height for point tracking."""
-    localize_every: Annotated[float, AtLeast(0)] = 0.25
-    """Interval of full localizations, seconds."""
-    min_share_left: Annotated[float, Between(0, 1)] = 0.6
-    """An image is also localized in full if the share of points still tracked is below this."""
-    max_shift: Annotated[float, Above(0)] = 0.04
-    """An image is also localized in full if the points moved by more than this share of the image
-    width."""
-    retry_after: Annotated[float, AtLeast(0)] = 0.1
-    """Minimum seconds between two full localizations while the points are tracked."""
-    max_doubt: Annotated[float, Above(0)] = 0.3
-    """Maximum direction uncertainty of the prediction (three sigma, radians). Above it, coarse
-    retrieval is used."""
-    floor_share: Annotated[float, AtLeast(0)] = 0.001
-    """Sigma added to the noise of a localization, as a share of the points' depth and in
-    radians."""
-    reach: Annotated[float, Above(0)] = 2.0
-    """Motion over which map errors are correlated (to 1/e). It is the distance in depths of the
-    points, plus the rotation in radians."""
-    blend_time: Annotated[float, Above(0)] = 0.2
-    """Time constant (to 1/e, seconds) of the correction of the smoothed pose by a new localization.
-    It prevents jumps."""
-    followed_share: Annotated[float, AtLeast(0)] = 0.05
-    """Sigma of a tracked motion, as a share of its translation and rotation, in addition to the
-    noise of the points."""
+_SEARCH_INTERVAL_NS = 1_000_000_000
+"""Time without a pose after which the other tiles are searched, nanoseconds. A failed search takes
+as long as a dozen tracked images or more."""
+_LOCALIZED_STATES = ("localized", "tracked")
 
 
 class Tracker:
-    """Hold the state of one stream. `reset` starts another one.
+    """Hold the state of one stream. `reset` starts another one, `close` ends it.
+
+    Args:
+        localizer: the map or the atlas. The tracked tile stays open until `close`.
 
     Raises:
         ConfigError: a value of `config` is out of bounds.
@@ -107,29 +44,29 @@ class Tracker:
     def __init__(self, localizer: Localizer, config: TrackerConfig | None = None) -> None:
         self.localizer, self.config = localizer, config or TrackerConfig()
         check_bounds(self.config)
-        self._hypotheses, self._window = (
-            PoseHypotheses(self.config.hypotheses),
-            PoseWindow(self.config.window),
-        )
-        self._stream_localizer = StreamLocalizer(
-            localizer, self._hypotheses, self.config.floor_share
-        )
+        self._tile = ExitStack()
         self.reset()
 
     def reset(self) -> None:
         """Discard the stream."""
+        self.close()
         self._t_ns: int | None = None
         self._image: np.ndarray | None = None
         self._answer: StreamedPose | None = None
-        self._reference: ReferenceImage | None = None
-        self._last_attempt_ns = 0
-        self._hypotheses.clear()
-        self._window.clear()
+        self._last_search_ns = self._last_localized_ns = -_SEARCH_INTERVAL_NS
+        if len(self.localizer.tile_ids) == 1:
+            self._enter_tile(None)
+
+    def close(self) -> None:
+        """Release the tracked tile."""
+        self._tile.close()
+        self._stream: MapStream | None = None
 
     def process(
         self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None = None
     ) -> StreamedPose:
-        """Localize the next image of the stream.
+        """Localize the next image of the stream. In an atlas each result names its tile, in whose
+        world the pose is.
 
         Args:
             t_ns: capture time, nanoseconds, after the preceding image. It may be equal only for the
@@ -140,6 +77,8 @@ class Tracker:
         Raises:
             QueryError: the clock goes backwards, stands still or is not in integer nanoseconds. Or
                 the image is not an 8-bit image, or its size differs from the camera's.
+            AtlasError: no tile can be read.
+            ObjectStoreError: the object store does not respond.
         """
         check_image_size(image, camera)
         is_same = self._image is not None and np.array_equal(self._image, image)
@@ -152,14 +91,7 @@ class Tracker:
                 is_repeated=True,
             )
         self._image = image.copy()  # the caller may reuse the buffer
-        if self.config.mode == "paper":
-            answer = self._process_paper_mode(image, camera, t_ns)
-        else:
-            grey = downscale_image(to_grey(image), camera, self.config.max_side_px)
-            answer = self._process_motion_mode(
-                StreamFrame(image, camera, t_ns, odom_from_cam, *grey)
-            )
-        self._answer = self._complete_result(answer, camera)
+        self._answer = self._process_in_tile(image, camera, t_ns, odom_from_cam)
         return self._answer
 
     def process_missing(
@@ -172,18 +104,41 @@ class Tracker:
         """
         self._check_time(t_ns)
         self._image = None
-        if self.config.mode == "paper":
-            return self._complete_result(self._copy_previous_pose(result, t_ns))
-        self._hypotheses.predict(t_ns, odom_from_cam)
-        self._drop_stale_reference()
-        return self._complete_result(
-            self._mark_if_ambiguous(self._make_predicted_pose(result, t_ns))
-        )
+        if self._stream is None:
+            return StreamedPose(t_ns, "lost", self.localizer.with_provenance(result, None, t_ns))
+        return self._stream.process_missing(t_ns, result, odom_from_cam)
 
-    def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
-        return replace(
-            answer, result=self.localizer.with_provenance(answer.result, camera, answer.t_ns)
-        )
+    def _process_in_tile(
+        self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None
+    ) -> StreamedPose:
+        """Process the image in the tracked tile. If it gives no pose, search the other tiles."""
+        answer = None
+        if self._stream is not None:
+            answer = self._stream.process(image, camera, t_ns, odom_from_cam)
+            if answer.state in _LOCALIZED_STATES:
+                self._last_localized_ns = t_ns
+            if not self._is_search_due(t_ns):
+                return answer
+        self._last_search_ns = t_ns
+        result = self.localizer.localize(image, camera, t_ns=t_ns)
+        if not isinstance(result, Localization):
+            return answer or StreamedPose(
+                t_ns, "ambiguous" if result.reason == "ambiguous" else "lost", result
+            )
+        self._last_localized_ns = t_ns
+        return self._enter_tile(result.provenance.tile).process(image, camera, t_ns, odom_from_cam)
+
+    def _is_search_due(self, t_ns: int) -> bool:
+        """Return whether the stream has had no pose for so long that other tiles are searched."""
+        last = max(self._last_localized_ns, self._last_search_ns)
+        return len(self.localizer.tile_ids) > 1 and t_ns - last >= _SEARCH_INTERVAL_NS
+
+    def _enter_tile(self, tile_id: str | None) -> MapStream:
+        """Start the stream in this tile. Its map stays open."""
+        self.close()
+        in_tile = self._tile.enter_context(self.localizer.in_tile(tile_id))
+        self._stream = MapStream(in_tile, self.config)
+        return self._stream
 
     def _check_time(self, t_ns: int, is_repeat_allowed: bool = False) -> None:
         if problem := find_time_problem(t_ns):
@@ -191,291 +146,9 @@ class Tracker:
         if self._t_ns is not None and (
             t_ns < self._t_ns or (t_ns == self._t_ns and not is_repeat_allowed)
         ):
-            what = "stands still" if t_ns == self._t_ns else "goes backwards"
+            problem = "stands still" if t_ns == self._t_ns else "goes backwards"
             raise QueryError(
-                f"the clock of the stream {what}: {t_ns / 1e9:.6f} s comes after"
+                f"the clock of the stream {problem}: {t_ns / 1e9:.6f} s comes after"
                 f" {self._t_ns / 1e9:.6f} s"
             )
         self._t_ns = t_ns
-
-    def _process_paper_mode(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
-        """Localize one image by section III-B: "when such a jump is found, we copy the previous
-        pose from the trajectory"."""
-        result = self.localizer.localize(image, camera)
-        if not isinstance(result, Localization):
-            return self._copy_previous_pose(result, t_ns)
-        previous = self._answer.smoothed if self._answer is not None else None
-        if (
-            previous is not None
-            and np.linalg.norm(result.world_from_cam.translation - previous.translation)
-            > self.config.max_jump
-        ):
-            return self._copy_previous_pose(reject_jump(result), t_ns)
-        return StreamedPose(t_ns, "localized", result, result.world_from_cam, result.covariance)
-
-    def _copy_previous_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
-        previous = self._answer.smoothed if self._answer is not None else None
-        return StreamedPose(t_ns, "lost" if previous is None else "predicted", result, previous)
-
-    def _process_motion_mode(self, frame: StreamFrame) -> StreamedPose:
-        clock = StageClock()
-        seconds = self._hypotheses.seconds_since(frame.t_ns)
-        predicted = self._hypotheses.predict(frame.t_ns, frame.odom_from_cam)
-        self._drop_stale_reference()
-        with clock.stage("tracking"):
-            tracked_motion = self._track_points(frame, predicted)
-        if tracked_motion is not None:
-            self._hypotheses.apply_motion(
-                self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse(),
-                tracked_motion.covariance,
-                frame.odom_from_cam,
-            )
-        if tracked_motion is None or self._is_localization_due(tracked_motion, frame):
-            self._last_attempt_ns = frame.t_ns
-            found = self._stream_localizer.localize(
-                frame, self._predict_pose(predicted, tracked_motion)
-            )
-            self._drop_stale_reference()
-            if isinstance(found, LocalizedPose):
-                return self._mark_if_ambiguous(
-                    self._update_with_localization(frame, found, predicted, tracked_motion, seconds)
-                )
-            if tracked_motion is None or self._reference is None:
-                return self._mark_if_ambiguous(self._make_predicted_pose(found, frame.t_ns))
-        return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked_motion, clock))
-
-    def _drop_stale_reference(self) -> None:
-        """Drop the reference image unless its hypothesis is still the best."""
-        if not self._hypotheses.is_track_continued:
-            self._reference = None
-            self._window.clear()
-
-    def _mark_if_ambiguous(self, answer: StreamedPose) -> StreamedPose:
-        """Return the result unchanged if one hypothesis leads, and an ambiguous one otherwise."""
-        if self._hypotheses.is_unambiguous:
-            return answer
-        alternatives = self._hypotheses.alternatives()
-        detail = (
-            "the pictures so far leave open which of these"
-            if len(alternatives) > 1
-            else "too little speaks for this pose so far"
-        )
-        result = NotLocalized(
-            "ambiguous",
-            [],
-            0,
-            0,
-            answer.result.times_ms,
-            detail,
-            alternatives,
-            answer.result.provenance,
-        )
-        return StreamedPose(answer.t_ns, "ambiguous", result)
-
-    def _track_points(
-        self, frame: StreamFrame, predicted: MotionState | None
-    ) -> TrackedMotion | None:
-        """Track the points into this image.
-
-        None if they are lost or give a pose that the motion does not allow.
-        """
-        reference = self._reference
-        if reference is None or predicted is None or reference.follower.camera != frame.grey_camera:
-            return None
-        tracked_motion = reference.follower.track_points(
-            frame.grey, predicted.world_from_cam.inverse()
-        )
-        if tracked_motion is None:
-            return None
-        world_from_cam = self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse()
-        floor = noise_floor(reference.errors.depth, self.config.floor_share)
-        return (
-            tracked_motion
-            if self._hypotheses.is_consistent(
-                predicted, world_from_cam, tracked_motion.covariance + floor
-            )
-            else None
-        )
-
-    def _is_localization_due(self, tracked_motion: TrackedMotion, frame: StreamFrame) -> bool:
-        """Return whether the image must be localized in full."""
-        config, reference = self.config, self._reference
-        assert reference is not None
-        if not self._hypotheses.is_unambiguous:
-            return True
-        if frame.t_ns - self._last_attempt_ns < config.retry_after * 1e9:
-            return False
-        is_old = frame.t_ns - reference.t_ns >= config.localize_every * 1e9
-        return (
-            is_old
-            or tracked_motion.tracked_ratio < config.min_share_left
-            or tracked_motion.shift_px > config.max_shift * frame.grey_camera.width
-        )
-
-    def _predict_pose(
-        self, predicted: MotionState | None, tracked_motion: TrackedMotion | None
-    ) -> ExpectedPose | None:
-        """Return the expected pose of the image, None if there is no prediction.
-
-        The error of a tracked pose includes those of its reference image and of wrong depths.
-        """
-        reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
-        if reference is None or predicted is None:
-            return None
-        if tracked_motion is None:
-            is_known = (
-                compute_direction_uncertainty(predicted, reference.errors.depth)
-                <= self.config.max_doubt
-            )
-            return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
-        motion, scale = (
-            tracked_motion.cam_from_ref.adjoint(),
-            self.config.hypotheses.prediction_scale**2,
-        )
-        pose_covariance = (
-            motion @ reference.errors.total @ motion.T
-            + scale * compute_motion_covariance(tracked_motion, self.config.followed_share)
-        )
-        near = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
-        return ExpectedPose(
-            near,
-            pose_covariance,
-            is_alone,
-            is_tracked=True,
-            is_from_virtual_views=reference.found.is_from_virtual_views,
-        )
-
-    def _update_with_localization(
-        self,
-        frame: StreamFrame,
-        found: LocalizedPose,
-        predicted: MotionState | None,
-        tracked_motion: TrackedMotion | None,
-        seconds: float,
-    ) -> StreamedPose:
-        """Return the result of a full localization, `seconds` after the last measured pose."""
-        cam_from_world, errors = found.result.world_from_cam.inverse(), found.errors
-        t_ns, offset = frame.t_ns, Rigid3.identity()
-        if predicted is None or self._reference is None:
-            smoothed, pose_covariance = self._window.add(
-                cam_from_world, errors.noise, Rigid3.identity(), errors.noise
-            )
-        else:
-            motion, motion_covariance = self._compute_motion(predicted, tracked_motion)
-            motion_covariance = motion_covariance + compute_correlated_change(
-                errors, motion, self.config.reach
-            )
-            before = (
-                self._compute_smoothed_pose(tracked_motion, t_ns)
-                if tracked_motion is not None
-                else None
-            )
-            if tracked_motion is None and np.trace(motion_covariance) >= np.trace(errors.noise):
-                self._window.clear()  # the prediction adds no information
-            smoothed, pose_covariance = self._window.add(
-                cam_from_world, errors.noise, motion, motion_covariance
-            )
-            if before is not None:
-                offset = self._fade_offset(before @ smoothed.inverse(), seconds)
-            measured = errors.noise if tracked_motion is None else tracked_motion.covariance
-            self._hypotheses.set_best_state(
-                update_motion(predicted, (offset @ smoothed).inverse(), measured),
-                frame.odom_from_cam,
-            )
-        points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
-        follower = PointTracker(
-            frame.grey, points, cam_from_world, frame.grey_camera, self.config.following
-        )
-        self._reference = ReferenceImage(
-            t_ns,
-            found.result,
-            cam_from_world,
-            errors,
-            smoothed,
-            pose_covariance + errors.correlated,
-            offset,
-            follower,
-        )
-        best = self._hypotheses.best
-        assert best is not None
-        return StreamedPose(
-            t_ns,
-            "localized",
-            found.result,
-            best.world_from_cam,
-            compute_smoothed_covariance(self._reference),
-        )
-
-    def _compute_smoothed_pose(self, tracked_motion: TrackedMotion, t_ns: int) -> Rigid3:
-        """Return the smoothed cam_from_world of a tracked image."""
-        reference = self._reference
-        assert reference is not None
-        return (
-            self._fade_offset(reference.offset, (t_ns - reference.t_ns) / 1e9)
-            @ tracked_motion.cam_from_ref
-            @ reference.smoothed
-        )
-
-    def _fade_offset(self, offset: Rigid3, seconds: float) -> Rigid3:
-        return Rigid3.exp(np.exp(-seconds / self.config.blend_time) * offset.log())
-
-    def _compute_motion(
-        self, predicted: MotionState, tracked_motion: TrackedMotion | None
-    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-        """Return cam_from_before since the last localized image, with the covariance of its left
-        perturbation."""
-        assert self._reference is not None
-        if tracked_motion is not None:
-            return tracked_motion.cam_from_ref, compute_motion_covariance(
-                tracked_motion, self.config.followed_share
-            )
-        return (
-            predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(),
-            predicted.pose_covariance,
-        )
-
-    def _make_tracked_pose(
-        self, frame: StreamFrame, tracked_motion: TrackedMotion, clock: StageClock
-    ) -> StreamedPose:
-        reference, state = self._reference, self._hypotheses.best
-        assert reference is not None
-        assert state is not None
-        world_from_cam = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
-        adjoint, motion = world_from_cam.adjoint(), tracked_motion.cam_from_ref.adjoint()
-        covariance = (
-            adjoint
-            @ (motion @ reference.errors.total @ motion.T + tracked_motion.covariance)
-            @ adjoint.T
-        )
-        found = reference.found
-        result = Localization(
-            world_from_cam=world_from_cam,
-            covariance=covariance,
-            probability=min(found.probability, self._hypotheses.alternatives()[0].probability),
-            node_id=found.node_id,
-            candidates=[],
-            num_matches=tracked_motion.num_tracked,
-            num_inliers=tracked_motion.num_inliers,
-            times_ms=clock.times_ms(),
-            provenance=found.provenance,
-        )
-        return StreamedPose(
-            frame.t_ns,
-            "tracked",
-            result,
-            state.world_from_cam,
-            compute_smoothed_covariance(reference, state),
-        )
-
-    def _make_predicted_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
-        """Return the predicted pose, or "lost" if there is no hypothesis."""
-        predicted = self._hypotheses.best
-        if predicted is None:
-            return StreamedPose(t_ns, "lost", result)
-        return StreamedPose(
-            t_ns,
-            "predicted",
-            result,
-            predicted.world_from_cam,
-            compute_smoothed_covariance(self._reference, predicted),
-        )

@@ -26,7 +26,7 @@ from topoloc.bounds import Above, Between, check_bounds, parse_settings
 from topoloc.errors import ConfigError
 from topoloc.localization.localizer import LocalizerConfig
 from topoloc.mapping.build import BuildConfig
-from topoloc.tracking.tracker import TrackerConfig
+from topoloc.tracking.config import TrackerConfig
 
 FileOf = Callable[[str | bytes], str]
 

@@ -14,9 +14,7 @@ from topoloc.apps.cli import main
 from topoloc.apps.stores import object_store
 from topoloc.apps.stores.object_store import ObjectStore
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.atlas_localizer import AtlasLocalizer
 from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles, remove_tiles
-from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
@@ -64,7 +62,7 @@ def test_pictures_are_localized_in_an_atlas_on_s3(s3_bucket: str, room_map: Path
 
     where = f"{s3_bucket}/deep/campus"
     create_atlas(where, new_tiles([str(room_map), str(other_map)]))
-    localizer = AtlasLocalizer(Atlas.open(where), MapCache([], Localizer, 100_000_000))
+    localizer = Localizer(Atlas.open(where))
     for seed, tile in ((0, "room"), (1, "other")):
         result = localizer.localize(unseen_views(seed)[1][0], CAMERA)
         assert isinstance(result, Localization)

@@ -135,7 +135,7 @@ def test_the_first_query_computes_nothing_of_the_map(
         Localizer(TopoMetricMap.load(room_map)),
         topoloc.open_sequence(tiny_recording)[1],
     )
-    assert localizer.map.focal == frame.camera.fx
+    assert localizer.context.first.map.focal == frame.camera.fx
     Localizer(TopoMetricMap.load(room_map)).localize(
         frame.image, frame.camera
     )  # what Numba compiles is hashed, too
@@ -146,6 +146,6 @@ def test_the_first_query_computes_nothing_of_the_map(
     monkeypatch.setattr("topoloc.mapping.nodes.hashlib.sha256", never)
     monkeypatch.setattr(correlated_errors, "measure_correlated_error_share", never)
     assert localizer.localize(frame.image, frame.camera).localized
-    localizer.map.moves(0)
+    localizer.context.first.map.moves(0)
     with pytest.raises(AssertionError, match="a digest of the nodes"):
         Localizer(TopoMetricMap.load(room_map))

@@ -368,7 +368,7 @@ def test_walls_that_the_nodes_own_kind_describes_are_asked_still(monkeypatch: py
     assert topomap.sides is not None
     assert topomap.sides.kind == network
     localizer = Localizer(topomap)
-    assert localizer.weights.walls == load_fitted_weights(network).walls
+    assert localizer.context.first.weights.walls == load_fitted_weights(network).walls
     for picture, truth in seen_on_the_way_back()[::2]:
         result = localizer.localize(picture, WIDE)
         assert _is_by_walls(result)

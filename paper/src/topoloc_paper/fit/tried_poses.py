@@ -153,7 +153,7 @@ def _tried(
     """`world_from_cam` is the truth, in the map's world; None for a picture from elsewhere."""
     trace = Trace()
     localizer.localize(image, camera, trace=trace)
-    rho = localizer.correlated_errors
+    rho = localizer.context.first.correlated_errors
     for tried in trace.tried:
         if (
             tried.hypothesis is None or tried.source == "repetition"

@@ -1,8 +1,7 @@
-"""--features: which kinds of local features a map is built of, and which it is asked by."""
+"""--features and --camera: the feature types and the camera of maps and queries."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Annotated
@@ -10,6 +9,8 @@ from typing import Annotated
 import tyro
 
 from topoloc import (
+    Atlas,
+    AtlasConfig,
     BuildConfig,
     FeatureTypeError,
     Localizer,
@@ -18,7 +19,8 @@ from topoloc import (
     TopoMetricMap,
     WeightsError,
 )
-from topoloc.apps.cli.output import UsageError
+from topoloc.apps.cli.output import UsageError, print_warning
+from topoloc.apps.query_camera import CameraOfSize, parse_camera_option
 from topoloc.plugin import check_available, parse_feature_types
 
 BUILD_FEATURES = Annotated[
@@ -57,20 +59,32 @@ def select_build_features(config: BuildConfig, features: str | None) -> BuildCon
     )
 
 
-def create_localizer(
-    topomap: TopoMetricMap, config: LocalizerConfig, features: str | None
+def open_localizer(
+    source: str | TopoMetricMap | Atlas,
+    config: LocalizerConfig,
+    features: str | None,
+    tiles: AtlasConfig | None = None,
 ) -> Localizer:
-    """Asks the map by the kinds of features that the option names; one line on standard error for
-    each of the map's that cannot be asked.
+    """Open a map or an atlas for queries. A line on standard error names each feature type and each
+    tile that cannot be used.
 
     Raises:
-        FeatureTypeError: the map does not hold them.
-        MissingExtraError, WeightsError: what they need is not here.
+        MapError: it cannot be read.
+        FeatureTypeError: the map does not hold these feature types.
+        MissingExtraError, WeightsError: a feature type cannot be used on this machine.
     """
-    localizer = Localizer(topomap, config, features=features)
-    for kind, lacking in localizer.unavailable_types.items():
-        print(f"warning: features {kind} of the map are not asked: {lacking}", file=sys.stderr)
-    return localizer
+    return Localizer(source, config, features=features, tiles=tiles, warn=print_warning)
+
+
+def parse_camera(localizer: Localizer, text: str) -> CameraOfSize:
+    """Parse the value of `--camera`. Raises CalibrationError; UsageError: `map`, and there are
+    several tiles with cameras of their own."""
+    if text != "map":
+        return parse_camera_option(text, None)
+    if len(localizer.tile_ids) > 1:
+        raise UsageError("--camera map: the tiles of an atlas have cameras of their own")
+    with localizer.in_tile() as in_tile:
+        return parse_camera_option(text, in_tile.topomap)
 
 
 def find_available_types(kinds: Iterable[str]) -> frozenset[str]:

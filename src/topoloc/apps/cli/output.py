@@ -206,6 +206,11 @@ def import_report_writer() -> Callable[..., None]:
     return write_report
 
 
+def print_warning(text: str) -> None:
+    """Print a warning to standard error."""
+    print(f"warning: {text}", file=sys.stderr)
+
+
 def print_fields(facts: Sequence[tuple[str, str]]) -> None:
     """Names and values, one pair a line, the values in one column."""
     width = max(len(name) for name, _ in facts)

@@ -44,7 +44,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "AtlasConfig",
         ("localize", "evaluate", "explain", "serve", "follow", "update"),
     ),
-    "track": ("topoloc.tracking.tracker", "TrackerConfig", ("localize", "serve", "follow")),
+    "track": ("topoloc.tracking.config", "TrackerConfig", ("localize", "serve", "follow")),
     "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
     "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
     "tile_choice": ("topoloc.lifelong.tile_selection", "TileSelectionConfig", ("update",)),

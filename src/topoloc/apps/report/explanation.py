@@ -228,7 +228,8 @@ def _advice_on_image(explanation: Explanation) -> Iterator[str]:
 
 def _advice_on_viewpoint(world_from_cam: Rigid3, localizer: Localizer) -> Iterator[str]:
     """How far the pose is from what the map has seen."""
-    nodes, d_thresh = localizer.map.node_poses, localizer.map.d_thresh
+    opened = localizer.context.first.map
+    nodes, d_thresh = opened.node_poses, opened.d_thresh
     ways = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
     cosines = nodes.rotations[:, :, 2] @ world_from_cam.rotation[:, 2]
     near = ways < max(_MAX_NODE_DISTANCE * d_thresh, float(ways.min()) * 1.5)

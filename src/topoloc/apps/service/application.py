@@ -13,7 +13,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 
 import topoloc
-from topoloc import AtlasConfig, MapCache, TrackerConfig
+from topoloc import AtlasConfig, Localizer, MapCache, TrackerConfig
 from topoloc.apps.service import geopose_routes, map_routes, page_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
@@ -42,7 +42,7 @@ class Access:
 
 
 def create_application(
-    maps: MapCache,
+    maps: MapCache[Localizer],
     config: ServiceConfig,
     access: Access,
     tracking: TrackerConfig | None = None,

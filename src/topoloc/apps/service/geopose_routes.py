@@ -120,27 +120,26 @@ def _localize_and_reply(
         if isinstance(picture, EncodedImage)
         else picture
     )
-    localizers = [] if only is not None else service.query_handler.atlases.localizers()
-    tiles = {tile_id for localizer in localizers for tile_id in localizer.atlas.manifest.by_id}
+    atlases = [] if only is not None else service.query_handler.atlases.opened()
+    tiles = {tile_id for _, localizer in atlases for tile_id in localizer.tile_ids}
     results, georeferences = dict[str, Localization | NotLocalized](), dict[str, Georeference]()
     for name in (
         [only] if only is not None else [name for name in service.maps.names() if name not in tiles]
     ):
         with service.maps.use_map(name) as opened:
-            topomap = opened.localizer.topomap
+            topomap = opened.content.topomap
             if topomap.georeference is not None:
                 camera = _select_camera(reading, picture, image, topomap)
-                results[name] = opened.localizer.localize(
+                results[name] = opened.content.localize(
                     image, camera, max_ms=service.query_handler.max_ms
                 )
                 georeferences[name] = topomap.georeference
     near = asked.near(service.config.geolocation_m)
-    for localizer in localizers:
-        manifest = localizer.atlas.manifest
+    for atlas, localizer in atlases:
         known = {
             tile.tile_id: place
-            for tile in manifest.tiles
-            if (place := manifest.georeference_of(tile)) is not None
+            for tile in atlas.manifest.tiles
+            if (place := atlas.manifest.georeference_of(tile)) is not None
         }
         if known:
             camera = _select_camera(reading, picture, image, None)

@@ -81,7 +81,7 @@ async def one_map(request: Request, map: MapName) -> JSONResponse:
 
     def describe() -> dict[str, Any]:
         with service.maps.use_map(map) as opened:
-            topomap = opened.localizer.topomap
+            topomap = opened.content.topomap
             facts = topomap.describe(opened.path) | {"path": opened.path.name, "name": map}
             return facts | {"nodes": [_node_to_json(summary) for summary in topomap.summaries]}
 

@@ -71,7 +71,7 @@ def _build_scene(service: Service, name: str) -> bytes:
         if name in kept and kept[name][0] == opened.stamp:
             return kept[name][1]
         body = json.dumps(
-            create_document(opened.localizer.topomap, name, budget=_BUDGET), separators=(",", ":")
+            create_document(opened.content.topomap, name, budget=_BUDGET), separators=(",", ":")
         ).encode()
         kept.pop(name, None)
         while len(kept) >= _NUM_CACHED_SCENES:

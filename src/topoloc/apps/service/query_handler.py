@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from topoloc import (
-    AtlasLocalizer,
     Camera,
     Image,
     Localization,
@@ -38,7 +37,7 @@ class QueryHandler:
     """Answers from these maps; pictures of more than `max_pixels` are refused, searches end after
     `max_ms`."""
 
-    maps: MapCache
+    maps: MapCache[Localizer]
     max_pixels: int
     max_ms: float
     atlases: ServedAtlases
@@ -53,10 +52,10 @@ class QueryHandler:
         """By every map of the service, and by each atlas, of which the tile answers that knows most
         of the picture; the time that is left is shared by those that are still to be asked."""
         localizers, end = (
-            self.atlases.localizers(),
+            [localizer for _, localizer in self.atlases.opened()],
             time.perf_counter() + self._limit_ms(query_request) / 1e3,
         )
-        tiles = {tile_id for localizer in localizers for tile_id in localizer.atlas.manifest.by_id}
+        tiles = {tile_id for localizer in localizers for tile_id in localizer.tile_ids}
         names = [name for name in self.maps.names() if name not in tiles]
         answers, num_left = dict[str, Localization | NotLocalized](), len(names) + len(localizers)
         for one in [*names, *localizers]:
@@ -70,7 +69,7 @@ class QueryHandler:
         return answers
 
     def _localize_in_atlas(
-        self, localizer: AtlasLocalizer, query_request: QueryRequest
+        self, localizer: Localizer, query_request: QueryRequest
     ) -> Localization | NotLocalized:
         if query_request.prior is not None:
             raise QueryError("a prior is a pose in one map's world: ask that map")
@@ -120,8 +119,8 @@ class QueryHandler:
         run: Callable[[Localizer, Image, Camera | UncalibratedCamera, QueryRequest], T],
     ) -> T:
         with self.maps.use_map(name) as opened:
-            image, camera = self.decode_query(query_request, opened.localizer.topomap)
-            return run(opened.localizer, image, camera, query_request)
+            image, camera = self.decode_query(query_request, opened.content.topomap)
+            return run(opened.content, image, camera, query_request)
 
     def _localize_image(
         self,

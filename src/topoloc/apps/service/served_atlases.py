@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 
-from topoloc import Atlas, AtlasConfig, AtlasLocalizer, MapCache, TopolocError
+from topoloc import Atlas, AtlasConfig, Localizer, MapCache, TopolocError
 from topoloc.apps.service.logs import log
 
 POLL_INTERVAL_S = 5.0
@@ -21,14 +21,14 @@ class ServedAtlases:
     """Localizers of the atlases of these maps, which open their tiles as the maps of the
     service."""
 
-    def __init__(self, maps: MapCache, config: AtlasConfig) -> None:
+    def __init__(self, maps: MapCache[Localizer], config: AtlasConfig) -> None:
         self._maps, self._config = maps, config
         self._watched = {watched.where: watched for watched in maps.atlases}
         self._lock, self._ended = threading.Lock(), threading.Event()
-        self._opened: dict[str, tuple[Atlas, AtlasLocalizer]] = {}
+        self._opened: dict[str, tuple[Atlas, Localizer]] = {}
 
-    def localizers(self) -> list[AtlasLocalizer]:
-        """One an atlas, as its manifest is now. Raises AtlasError."""
+    def opened(self) -> list[tuple[Atlas, Localizer]]:
+        """Return the current version of each atlas with its localizer. Raises AtlasError."""
         with self._lock:
             return [self._open_localizer(where) for where in self._watched]
 
@@ -44,14 +44,14 @@ class ServedAtlases:
         """No more looks; one that waits for its store is not waited for."""
         self._ended.set()
 
-    def _open_localizer(self, where: str) -> AtlasLocalizer:
+    def _open_localizer(self, where: str) -> tuple[Atlas, Localizer]:
         atlas, known = self._watched[where].now(), self._opened.get(where)
         if known is None or known[0] is not atlas:
             self._opened[where] = known = (
                 atlas,
-                AtlasLocalizer(atlas, self._maps, self._config, _warn),
+                Localizer(atlas, tiles=self._config, maps=self._maps, warn=_warn),
             )
-        return known[1]
+        return known
 
     def _poll_atlas(self, where: str) -> None:
         watched, told = self._watched[where], ""

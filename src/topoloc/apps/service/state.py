@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from starlette.requests import HTTPConnection
 
-from topoloc import Localization, MapCache, NotLocalized, TopolocError
+from topoloc import Localization, Localizer, MapCache, NotLocalized, TopolocError
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.logs import log
 from topoloc.apps.service.metrics import Metrics
@@ -29,7 +29,7 @@ class Service:
     """Maps, those who answer from them, and what is counted; `scenes` are the documents of some
     maps with the stamps of their files."""
 
-    maps: MapCache
+    maps: MapCache[Localizer]
     query_handler: QueryHandler
     workers: Workers
     config: ServiceConfig

@@ -9,7 +9,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
-from topoloc import CalibrationError, MapCache, Tracker, TrackerConfig, UncalibratedCamera
+from topoloc import (
+    CalibrationError,
+    Localizer,
+    MapCache,
+    Tracker,
+    TrackerConfig,
+    UncalibratedCamera,
+)
 from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.query_request import QueryRequest
 from topoloc.apps.service.request_errors import RequestError
@@ -39,7 +46,7 @@ class Streams:
 
     def __init__(
         self,
-        maps: MapCache,
+        maps: MapCache[Localizer],
         query_handler: QueryHandler,
         config: TrackerConfig,
         max_streams: int,
@@ -63,7 +70,7 @@ class Streams:
         """
         self.forget_idle()
         resources = ExitStack()
-        localizer = resources.enter_context(self._maps.use_map(map_name)).localizer
+        localizer = resources.enter_context(self._maps.use_map(map_name)).content
         stream = Stream(map_name, resources, Tracker(localizer, self._config), camera)
         with self._lock:
             is_full = len(self._streams) >= self._max_streams

@@ -21,7 +21,7 @@ from topoloc import (
     edit_tile,
     find_tile_of_recording,
 )
-from topoloc.apps.cli.map_or_atlas import open_atlas
+from topoloc.apps.cli.features_option import open_localizer
 from topoloc.apps.cli.mapping.recordings_table import print_notes, recordings_table
 from topoloc.apps.cli.maps.session_update import SessionUpdateOptions
 from topoloc.apps.cli.output import interruptible
@@ -49,9 +49,10 @@ class TileSelectionJob:
         def find_tile() -> tuple[State, Tile]:
             with interruptible():
                 sequence = self.options.open_session().sequence
-                localizer = open_atlas(self.atlas, self.options.localize, None, self.atlas_config)
+                atlas = Atlas.open(self.atlas)
+                localizer = open_localizer(atlas, self.options.localize, None, self.atlas_config)
                 return "recognised", find_tile_of_recording(
-                    localizer, sequence, self.config, progress
+                    atlas, localizer, sequence, self.config, progress
                 )
 
         return run_tile_work(self.options.recording, "", find_tile)

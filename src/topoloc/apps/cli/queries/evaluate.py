@@ -14,7 +14,6 @@ import tyro
 from topoloc import (
     AtlasConfig,
     EvaluatedQuery,
-    EvaluatedTile,
     Evaluation,
     Localizer,
     LocalizerConfig,
@@ -23,8 +22,7 @@ from topoloc import (
     TrajectoryError,
     WorldFit,
 )
-from topoloc.apps.cli.features_option import QUERY_FEATURES
-from topoloc.apps.cli.map_or_atlas import open_localizer
+from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -46,7 +44,7 @@ from topoloc.apps.cli.queries.remote_queries import (
     localize_on_ray,
 )
 from topoloc.apps.cli.queries.self_evaluation import evaluate_map_itself
-from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
+from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.plugin import format_length, read_json
 
@@ -138,23 +136,27 @@ class Command:
         settings = read_settings(self.config)
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         write_report = import_report_writer() if self.report else None
-        judged = self._open_map(settings, config)
-        topomap = judged.topomap
-        info = topomap.describe(topomap.file.path if topomap.file else self.map)
+        localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
+        tile_id = self._select_tile(localizer)
+        with localizer.in_tile(tile_id) as in_tile:
+            topomap = in_tile.topomap
+            info = topomap.describe(topomap.file.path if topomap.file else self.map)
         map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         asked = self._open_recordings(map_from_truth)
         with progress_bar() as progress:
             if self.ray is None:
                 answers = [
-                    answer for queries in asked for answer in queries.answers(judged, progress)
+                    answer
+                    for queries in asked
+                    for answer in queries.answers(localizer, tile_id, progress)
                 ]
             else:
-                sent = RemoteMap.of(judged, config, self.features)
+                sent = RemoteMap.of(localizer, tile_id, self.features)
                 answers = localize_on_ray(
                     sent, asked, self.ray, settings.of(ClusterConfig), progress
                 )
         evaluated = Evaluation(answers)
-        fits = [] if isinstance(judged, EvaluatedTile) else evaluated.world_fits
+        fits = evaluated.world_fits if len(localizer.tile_ids) == 1 else []
         evaluation = evaluated.to_json() | {
             "map": info,
             "world_fits": [fit.to_json() for fit in fits],
@@ -209,23 +211,17 @@ class Command:
         if given:
             raise UsageError(f"--against-itself asks the map alone, without {', '.join(given)}")
 
-    def _open_map(self, settings: Settings, config: LocalizerConfig) -> Localizer | EvaluatedTile:
-        """The map; or the atlas, in the world of the tile that the recordings' truth is given
-        in."""
-        localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
-        if isinstance(localizer, Localizer):
-            if self.tile is not None:
-                raise UsageError(f"--tile is of an atlas, and {self.map} is none")
-            return localizer
-        tiles = list(localizer.atlas.manifest.by_id)
-        tile_id = self.tile or (tiles[0] if len(tiles) == 1 or not self.sequences else None)
-        if tile_id is None:
+    def _select_tile(self, localizer: Localizer) -> str:
+        """Return the tile in whose world the true poses are. Raises UsageError: there are several,
+        and none is named."""
+        ids = localizer.tile_ids
+        if self.tile is None and len(ids) > 1 and self.sequences:
             raise UsageError("--tile: which tile's world is the recordings' truth in?")
-        if self.report or self.fit_map_from_truth:
+        if len(ids) > 1 and (self.report or self.fit_map_from_truth):
             raise UsageError(
                 "--report and --fit-map-from-truth are of a map: give the tile's own file"
             )
-        return EvaluatedTile.of(localizer, tile_id)
+        return self.tile or ids[0]
 
     def _write_fit(self, fits: Sequence[WorldFit]) -> None:
         if self.fit_map_from_truth and not fits:

@@ -10,18 +10,18 @@ import tyro
 
 from topoloc import (
     AtlasConfig,
-    AtlasLocalizer,
+    Camera,
     Localization,
+    Localizer,
     LocalizerConfig,
     StereoFrame,
-    TopoMetricMap,
+    UncalibratedCamera,
     open_sequence,
 )
-from topoloc.apps.cli.features_option import QUERY_FEATURES, create_localizer
-from topoloc.apps.cli.map_or_atlas import is_atlas, open_atlas, parse_camera
+from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.settings_file import read_settings, with_option
-from topoloc.apps.query_camera import parse_camera_option, select_frame_camera
+from topoloc.apps.query_camera import select_frame_camera
 from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
 from topoloc.apps.report.explanation_page import row_of, verdict, write_explanation
 from topoloc.plugin import as_monocular
@@ -63,18 +63,17 @@ class Command:
         )
         settings = read_settings(self.config)
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
-        path, ranking = Path(self.map), list[str]()
-        if is_atlas(self.map):
-            path, ranking = self._select_tile(
-                open_atlas(self.map, config, self.features, settings.of(AtlasConfig))
-            )
-        with TopoMetricMap.load(path) as topomap:
-            of_size = None if self.camera is None else parse_camera_option(self.camera, topomap)
-            localizer = create_localizer(topomap, config, self.features)
-            frame = self._read_frame()
-            explanation = explain(localizer, frame.image, select_frame_camera(frame, of_size))
+        localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
+        frame = self._read_frame()
+        of_size = None if self.camera is None else parse_camera(localizer, self.camera)
+        camera = select_frame_camera(frame, of_size)
+        tile_id, ranking = _select_tile(localizer, frame, camera)
+        with localizer.in_tile(tile_id) as in_tile:
+            explanation = explain(in_tile, frame.image, camera)
             if self.out:
-                write_explanation(Path(self.out), frame.name, frame.image, explanation, topomap)
+                write_explanation(
+                    Path(self.out), frame.name, frame.image, explanation, in_tile.topomap
+                )
         if self.json != "-":
             for line in ranking:
                 print(line)
@@ -94,31 +93,24 @@ class Command:
             )
         return sequence[0]
 
-    def _select_tile(self, localizer: AtlasLocalizer) -> tuple[Path, list[str]]:
-        """The map of the tile that answers for the picture, and in words what the atlas made of
-        it."""
-        frame, of_size = (
-            self._read_frame(),
-            None if self.camera is None else parse_camera(localizer, self.camera),
-        )
-        camera = select_frame_camera(frame, of_size)
-        result = localizer.localize(frame.image, camera)
-        tile_id = result.provenance.tile
-        assert tile_id is not None
-        likest = ", ".join(
-            f"{name} {likeness:.2f}"
-            for name, likeness in localizer.rank_image(frame.image, camera)[:5]
-        )
-        said = f"in tile {tile_id}"
-        if not isinstance(result, Localization):
-            said = (
-                f"not localized ({result.reason}{f', {result.detail}' if result.detail else ''});"
-                f" most of it is known to tile {tile_id}"
-            )
-        return localizer.atlas.map_path(localizer.atlas.tile(tile_id)), [
-            f"atlas: {said}",
-            f"looks most like: {likest}",
-        ]
+
+def _select_tile(
+    localizer: Localizer, frame: StereoFrame, camera: Camera | UncalibratedCamera
+) -> tuple[str, list[str]]:
+    """Return the tile of the result, and lines that explain the choice if there are several."""
+    if len(localizer.tile_ids) == 1:
+        return localizer.tile_ids[0], []
+    result = localizer.localize(frame.image, camera)
+    tile_id = result.provenance.tile or ""
+    most_similar = ", ".join(
+        f"{name} {similarity:.2f}"
+        for name, similarity in localizer.rank_tiles(frame.image, camera)[:5]
+    )
+    choice = f"in tile {tile_id}"
+    if not isinstance(result, Localization):
+        detail = f", {result.detail}" if result.detail else ""
+        choice = f"not localized ({result.reason}{detail}); tile {tile_id} explains most of it"
+    return tile_id, [f"atlas: {choice}", f"most similar tiles: {most_similar}"]
 
 
 def _print(explanation: Explanation, page: str | None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -20,15 +20,12 @@ from topoloc import (
     StereoFrame,
     StereoSequence,
     StreamedPose,
-    TileTracker,
-    TopoMetricMap,
     Tracker,
     TrackerConfig,
     UncalibratedCamera,
     UnreadableImageError,
 )
-from topoloc.apps.cli.features_option import QUERY_FEATURES, create_localizer
-from topoloc.apps.cli.map_or_atlas import is_atlas, open_atlas, parse_camera
+from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
 from topoloc.apps.cli.output import (
     File,
     Flag,
@@ -39,7 +36,7 @@ from topoloc.apps.cli.output import (
     open_recording,
 )
 from topoloc.apps.cli.queries.query_answers import QueryAnswer, format_answer
-from topoloc.apps.cli.settings_file import Settings, read_settings
+from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
 from topoloc.apps.robots.ros_publisher import RosPublisher
@@ -54,8 +51,7 @@ class Command:
     """What `topoloc follow` takes."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; or an atlas: the tile is followed that recognises a picture, until another one
-    does."""
+    """A map file, or an atlas."""
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
     """A webcam's number or device, an address (rtsp://, http://), a video, or a recording."""
     camera: Annotated[
@@ -85,10 +81,14 @@ class Command:
     def run(self) -> int:
         if self.camera == "unknown":
             raise UsageError("a stream needs a calibration: --camera FILE, fx,fy,cx,cy or map")
-        if self.ros is not None and is_atlas(self.map):
-            raise UsageError("--ros is of a map: the tiles of an atlas have worlds of their own")
         settings = read_settings(self.config)
-        with self._tracker(settings) as tracker, catch_stop_signals() as is_ended:
+        localizer = open_localizer(
+            self.map, settings.of(LocalizerConfig), self.features, settings.of(AtlasConfig)
+        )
+        if self.ros is not None and len(localizer.tile_ids) > 1:
+            raise UsageError("--ros publishes poses of one world, and tiles have their own")
+        tracker = Tracker(localizer, settings.of(TrackerConfig))
+        with closing(tracker), catch_stop_signals() as is_ended:
             of_size = None if self.camera is None else parse_camera(tracker.localizer, self.camera)
             robots = None if self.ros is None else RosPublisher(self.ros)
             for name, t_ns, read in self._read_images(is_ended):
@@ -104,21 +104,6 @@ class Command:
                 )
         return 0
 
-    @contextmanager
-    def _tracker(self, settings: Settings) -> Iterator[Tracker | TileTracker]:
-        localizing, tracking = settings.of(LocalizerConfig), settings.of(TrackerConfig)
-        if not is_atlas(self.map):
-            with TopoMetricMap.load(self.map) as topomap:
-                yield Tracker(create_localizer(topomap, localizing, self.features), tracking)
-            return
-        tracker = TileTracker(
-            open_atlas(self.map, localizing, self.features, settings.of(AtlasConfig)), tracking
-        )
-        try:
-            yield tracker
-        finally:
-            tracker.close()
-
     def _read_images(self, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
         if is_live(self.source):
             return _capture_frames(self.source, is_ended)
@@ -128,7 +113,7 @@ class Command:
 
 
 def _track_frame(
-    tracker: Tracker | TileTracker, t_ns: int, read: ReadFrame, of_size: CameraOfSize | None
+    tracker: Tracker, t_ns: int, read: ReadFrame, of_size: CameraOfSize | None
 ) -> StreamedPose:
     """The answer to the next picture. Raises CalibrationError where its camera is not known."""
     try:

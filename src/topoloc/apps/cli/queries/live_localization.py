@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 
-from topoloc import AtlasLocalizer, CalibrationError, Localizer, Tracker, UncalibratedCamera
+from topoloc import CalibrationError, Localizer, Tracker, UncalibratedCamera
 from topoloc.apps.cli.output import UsageError, catch_stop_signals
 from topoloc.apps.cli.queries.query_answers import QueryAnswer
 from topoloc.apps.formats.live import LiveImage, LiveSource, is_live
@@ -27,7 +27,7 @@ def find_live_input(inputs: tuple[str, ...]) -> str | None:
 
 
 def localize_live(
-    localizer: Localizer | AtlasLocalizer,
+    localizer: Localizer,
     tracker: Tracker | None,
     source: str,
     camera_of_size: CameraOfSize,
@@ -49,7 +49,7 @@ def localize_live(
 
 
 def _localize_image(
-    localizer: Localizer | AtlasLocalizer,
+    localizer: Localizer,
     tracker: Tracker | None,
     picture: LiveImage,
     camera_of_size: CameraOfSize,

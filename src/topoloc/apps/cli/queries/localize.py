@@ -14,7 +14,6 @@ import tyro
 from topoloc import (
     AtlasConfig,
     AtlasError,
-    AtlasLocalizer,
     CalibrationError,
     GeoPositionPrior,
     Localizer,
@@ -31,8 +30,7 @@ from topoloc import (
     read_trajectory,
     write_tum,
 )
-from topoloc.apps.cli.features_option import QUERY_FEATURES
-from topoloc.apps.cli.map_or_atlas import is_atlas, open_localizer, parse_camera
+from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
 from topoloc.apps.cli.output import (
     File,
     Flag,
@@ -98,7 +96,7 @@ class Command:
     """What `topoloc localize` takes."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; or an atlas, of which each picture is asked alone."""
+    """A map file, or an atlas."""
     inputs: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(metavar="INPUT ...", help_behavior_hint="(required)"),
@@ -175,11 +173,7 @@ class Command:
         if live:
             if camera is None:
                 raise UsageError(f"{live} has no calibration: --camera says it")
-            tracker = (
-                Tracker(localizer, tracking)
-                if isinstance(localizer, Localizer) and not self.streams.single
-                else None
-            )
+            tracker = None if self.streams.single else Tracker(localizer, tracking)
             coming = localize_live(localizer, tracker, live, camera)
         start = time.perf_counter()
         try:
@@ -206,22 +200,14 @@ class Command:
         report_calibrations(answers)
         return exit_status(answers)
 
-    def _localizer(
-        self, settings: Settings, near: GeoPositionPrior | None
-    ) -> Localizer | AtlasLocalizer:
+    def _localizer(self, settings: Settings, near: GeoPositionPrior | None) -> Localizer:
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
         localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
-        return (
-            localizer.near(near)
-            if isinstance(localizer, AtlasLocalizer) and near is not None
-            else localizer
-        )
+        return localizer if near is None else localizer.near(near)
 
     @property
     def _parse_near(self) -> GeoPositionPrior | None:
-        if self.near is not None and not is_atlas(self.map):
-            raise UsageError("--near is of an atlas: a map is one place")
         try:
             return None if self.near is None else GeoPositionPrior.parse(self.near)
         except AtlasError as error:
@@ -234,21 +220,12 @@ class Command:
             len(self.inputs) > 1 or find_live_input(self.inputs)
         ):
             raise UsageError("--odometry is that of one recorded stream: give one input with it")
-        streams = self.streams
-        if is_atlas(self.map) and (
-            streams.stream or streams.smoothed or streams.odometry or streams.max_jump is not None
-        ):
-            raise UsageError(
-                "an atlas is asked picture by picture: --stream, --smoothed, --odometry and"
-                " --max-jump are for maps"
-            )
 
     def _open_query(self, path: str) -> _Query:
         """Recordings and videos are streams; pictures, and folders of them, are single unless they
         are said not to be."""
-        is_single = self.streams.single or is_atlas(self.map)
         is_stream = self.streams.stream or (
-            not is_single and find_format(path, self.format) != "folder"
+            not self.streams.single and find_format(path, self.format) != "folder"
         )
         sequence = as_monocular(
             open_recording(path, self.format, self._stereo_calibration, self.topics)
@@ -290,17 +267,13 @@ class Command:
 
 
 def _localize_queries(
-    localizer: Localizer | AtlasLocalizer,
+    localizer: Localizer,
     tracking: TrackerConfig,
     queries: list[_Query],
     camera_of_size: CameraOfSize | None,
 ) -> Iterator[QueryAnswer]:
     for query in queries:
-        tracker = (
-            Tracker(localizer, tracking)
-            if query.is_stream and isinstance(localizer, Localizer)
-            else None
-        )
+        tracker = Tracker(localizer, tracking) if query.is_stream else None
         for i, frame_name in enumerate(query.sequence.names):
             name = (
                 frame_name
@@ -334,7 +307,7 @@ def _localize_frame(
     name: str,
     query: _Query,
     index: int,
-    localizer: Localizer | AtlasLocalizer,
+    localizer: Localizer,
     tracker: Tracker | None,
     camera_of_size: CameraOfSize | None,
 ) -> QueryAnswer:

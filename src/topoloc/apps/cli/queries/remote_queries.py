@@ -18,7 +18,6 @@ from topoloc import (
     Atlas,
     AtlasConfig,
     EvaluatedQuery,
-    EvaluatedTile,
     Localizer,
     LocalizerConfig,
     MissingExtraError,
@@ -33,8 +32,7 @@ from topoloc import (
     localize_queries,
     with_pose_conventions,
 )
-from topoloc.apps.cli.features_option import create_localizer, find_available_types
-from topoloc.apps.cli.map_or_atlas import atlas_localizer
+from topoloc.apps.cli.features_option import find_available_types
 from topoloc.apps.cli.output import open_recording
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
@@ -91,77 +89,57 @@ class OpenQueries:
 
     def answers(
         self,
-        queried_map: Localizer | EvaluatedTile,
+        localizer: Localizer,
+        tile_id: str,
         progress: Progress,
         frames: Sequence[int] | None = None,
     ) -> list[EvaluatedQuery]:
-        """As of `localize_queries` and `localize_out_of_map`; of these frames, or of all."""
+        """Localize these frames, or all. See `localize_queries` and `localize_out_of_map`."""
         if self.recording.is_out_of_map:
-            return localize_out_of_map(queried_map, self.sequence, progress, self.label, frames)
+            return localize_out_of_map(localizer, self.sequence, progress, self.label, frames)
         return localize_queries(
-            queried_map, self.sequence, self.map_from_truth, progress, self.label, frames
+            localizer, self.sequence, self.map_from_truth, progress, self.label, frames, tile_id
         )
-
-
-@dataclass(frozen=True)
-class RemoteAtlas:
-    """An atlas by the manifest that the command read, judged in the world of a tile."""
-
-    where: str
-    manifest: bytes
-    tile_id: str
-    settings: AtlasConfig
 
 
 @dataclass(frozen=True, eq=False)
 class RemoteMap:
-    """What is asked, and how. A map is pickled as its path, and is refused where another one lies
-    there by then; `kinds` are the features of map or tiles that can be had where the command
-    runs."""
+    """Hold a map or an atlas and how it is searched, for another process.
 
-    source: TopoMetricMap | RemoteAtlas
+    It is pickled as its path or address, and refused if another one lies there by then. `kinds` are
+    the feature types that the command can use. The truth is in the world of the tile `tile_id`.
+    """
+
+    source: TopoMetricMap | Atlas
+    tile_id: str
     kinds: frozenset[str]
     config: LocalizerConfig
+    tiles: AtlasConfig
     features: str | None
 
     @staticmethod
-    def of(
-        queried_map: Localizer | EvaluatedTile, config: LocalizerConfig, features: str | None
-    ) -> RemoteMap:
-        """That which the command has opened."""
-        if isinstance(queried_map, Localizer):
-            return RemoteMap(
-                queried_map.topomap,
-                find_available_types(queried_map.topomap.kinds),
-                config,
-                features,
-            )
-        atlas, settings = queried_map.localizer.atlas, queried_map.localizer.config
-        sent = RemoteAtlas(
-            atlas.address,
-            atlas.manifest.to_bytes(),
-            queried_map.tile_id,
-            settings,
+    def of(localizer: Localizer, tile_id: str, features: str | None) -> RemoteMap:
+        """Return what another process needs to search as this localizer."""
+        return RemoteMap(
+            localizer.source,
+            tile_id,
+            find_available_types(localizer.source.kinds),
+            localizer.config,
+            localizer.tile_config,
+            features,
         )
-        return RemoteMap(sent, find_available_types(_feature_types_of(atlas)), config, features)
 
-    def open_map(self, notes: list[str]) -> Localizer | EvaluatedTile:
-        """The same here; what is wrong with tiles becomes known by `notes`, while they are asked.
+    def open(self, notes: list[str]) -> Localizer:
+        """Open the same map or atlas here. `notes` receives the problems of its tiles.
 
         Raises:
             MapError: there is no such map, or another one.
-            MissingExtraError: features can be had here and not there, or the other way round:
-                answers would be others.
+            MissingExtraError: another set of feature types can be used here, so results would
+                differ.
         """
-        if isinstance(self.source, TopoMetricMap):
-            self._check_same_features(self.source.kinds)
-            return create_localizer(self.source, self.config, self.features)
-        sent = self.source
-        atlas = Atlas.from_manifest(sent.where, sent.manifest)
-        self._check_same_features(_feature_types_of(atlas))
-        return EvaluatedTile.of(
-            atlas_localizer(atlas, self.config, self.features, sent.settings, notes.append),
-            sent.tile_id,
+        self._check_same_features(self.source.kinds)
+        return Localizer(
+            self.source, self.config, features=self.features, tiles=self.tiles, warn=notes.append
         )
 
     def _check_same_features(self, kinds: Iterable[str]) -> None:
@@ -212,7 +190,8 @@ class Piece:
                 f"{self.recording.path} is another recording on {platform.node()} than where the"
                 " command was called"
             )
-        answers = queries.answers(self.queried_map.open_map(notes), progress, self.frames)
+        localizer = self.queried_map.open(notes)
+        answers = queries.answers(localizer, self.queried_map.tile_id, progress, self.frames)
         return PieceAnswers([replace(answer, read_image=None) for answer in answers], notes)
 
     def failure_outcome(self, reason: str) -> PieceAnswers:
@@ -290,7 +269,3 @@ def _create_progress_callback(
         progress(stage, sum(done[k] for k in same), sum(pieces[k][1] for k in same))
 
     return show
-
-
-def _feature_types_of(atlas: Atlas) -> set[str]:
-    return {kind for tile in atlas.manifest.tiles for kind in tile.kinds}

@@ -8,13 +8,11 @@ from pathlib import Path
 from topoloc import (
     LocalizerConfig,
     MissingExtraError,
-    TopoMetricMap,
     WeakRegions,
     WeakRegionsConfig,
     find_weak_regions,
 )
-from topoloc.apps.cli.features_option import create_localizer
-from topoloc.apps.cli.map_or_atlas import is_atlas
+from topoloc.apps.cli.features_option import open_localizer
 from topoloc.apps.cli.output import (
     UsageError,
     check_outputs,
@@ -39,21 +37,19 @@ def evaluate_map_itself(
         UsageError: the map is an atlas, or an output is in the way.
         TopolocError: from reading the map, asking it, and writing.
     """
-    if is_atlas(path):
-        raise UsageError("--against-itself is of a map: give the tile's own file")
     check_outputs(list(outputs.values()), [one for one in (path, config) if one])
     settings = read_settings(config)
     queried_nodes = with_option(settings.of(LocalizerConfig), "coarse", coarse, "--coarse")
     json, report = outputs["json"], outputs["report"]
     write_page = _import_page_writer() if report else None
-    with TopoMetricMap.load(path) as topomap:
+    localizer = open_localizer(path, queried_nodes, features)
+    if len(localizer.tile_ids) > 1:
+        raise UsageError("--against-itself evaluates one map: name the file of the tile")
+    with localizer.in_tile() as in_tile:
+        topomap = in_tile.topomap
         info = topomap.describe(path)
         with progress_bar() as progress:
-            weak = find_weak_regions(
-                create_localizer(topomap, queried_nodes, features),
-                settings.of(WeakRegionsConfig),
-                progress,
-            )
+            weak = find_weak_regions(in_tile, settings.of(WeakRegionsConfig), progress)
         if json != "-":
             _print(weak)
         write_json(json, {"map": info, "against_itself": weak.to_json()})

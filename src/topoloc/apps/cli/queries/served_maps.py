@@ -8,6 +8,7 @@ from pathlib import Path
 
 from topoloc import (
     AtlasConfig,
+    Localizer,
     LocalizerConfig,
     MapCache,
     TileFetcher,
@@ -16,7 +17,7 @@ from topoloc import (
     set_num_threads,
     warm_up,
 )
-from topoloc.apps.cli.features_option import create_localizer
+from topoloc.apps.cli.features_option import open_localizer
 from topoloc.apps.service.config import ServiceConfig
 
 MIN_TOKEN_LENGTH = 16
@@ -43,7 +44,7 @@ class ServedMaps:
         access = Access(read_token(self.token_file), self.loopback_only)
         return create_application(self._open_maps(), self.service, access, self.tracker, self.atlas)
 
-    def _open_maps(self) -> MapCache:
+    def _open_maps(self) -> MapCache[Localizer]:
         """The maps, with half of the memory for nodes, and half for the rest of those that are
         open."""
         warm_up(
@@ -54,7 +55,7 @@ class ServedMaps:
         fetches = TileFetcher(self.service.fetch_s)
         return MapCache.with_memory(
             self.paths,
-            lambda topomap: create_localizer(topomap, self.localizer, self.features),
+            lambda topomap: open_localizer(topomap, self.localizer, self.features),
             self.service.memory_mb,
             fetches.path,
         )

@@ -1,0 +1,227 @@
+"""Open a map for the localizer: its feature types with their settings and fitted weights."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from topoloc.errors import MissingExtraError, WeightsError
+from topoloc.features.feature_types import check_available, select_stored_types
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
+from topoloc.localization.map_facts.correlated_errors import find_correlated_error_share
+from topoloc.localization.open_map import OpenMap
+from topoloc.localization.provenance import Provenance
+from topoloc.localization.query import Query, QueryImage, reduce_image
+from topoloc.localization.query_session import QuerySession
+from topoloc.localization.result import Localization, NotLocalized, R
+from topoloc.localization.result_decision import ResultWithInliers
+from topoloc.localization.search import Search, Trace
+from topoloc.mapping.contents import get_map_id
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.retrieval.coarse import CoarseLocalizer
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureTypeContext:
+    """Hold a map opened for one feature type.
+
+    `config` has the type's own thresholds filled in. `correlated_errors` is the correlated error
+    share (rho) of the map: the share of a match's variance that its points have in common
+    (`correlated_errors.py`).
+    """
+
+    map: OpenMap
+    config: LocalizerConfig
+    weights: FittedWeights
+    correlated_errors: float
+
+    @staticmethod
+    def of(
+        topomap: TopoMetricMap,
+        config: LocalizerConfig,
+        coarse: CoarseLocalizer | None = None,
+        weights: FittedWeights | None = None,
+    ) -> FeatureTypeContext:
+        """Open a map for its first feature type.
+
+        `weights` replaces the shipped weights. Raises the errors of `OpenMap`.
+        """
+        opened = OpenMap(topomap, coarse or config.coarse)
+        c, weights = config.for_feature_type(opened.kind), weights or _select_weights(opened)
+        rho = find_correlated_error_share(
+            topomap, c.guided, c.pose, c.correlated_errors, weights.shared_errors
+        )
+        return FeatureTypeContext(opened, c, weights, rho)
+
+
+def _select_weights(opened: OpenMap) -> FittedWeights:
+    """Return the shipped weights. Those of virtual views belong to their own feature type."""
+    weights, sides = load_fitted_weights(opened.kind.name), opened.topomap.sides
+    if sides is None or not sides.is_used_with(opened.kind.name):
+        return weights
+    return replace(weights, walls=load_fitted_weights(sides.kind).walls)
+
+
+@dataclass(frozen=True, eq=False)
+class MapContext:
+    """Hold a map that is open for queries.
+
+    `types` holds the feature types in use, in order of their searches. `unavailable_types` maps
+    each feature type of the map that cannot be used to the reason.
+    """
+
+    topomap: TopoMetricMap
+    config: LocalizerConfig
+    types: tuple[FeatureTypeContext, ...]
+    unavailable_types: dict[str, str]
+
+    @staticmethod
+    def of(
+        topomap: TopoMetricMap,
+        config: LocalizerConfig,
+        coarse: CoarseLocalizer | None = None,
+        weights: FittedWeights | None = None,
+        features: str | None = None,
+    ) -> MapContext:
+        """Open a map for queries. The arguments and errors are those of `Localizer`."""
+        requested = config.kinds
+        if features is not None:
+            requested = select_stored_types(topomap.kinds, features)
+        kinds, unavailable_types = select_feature_types(topomap, requested)
+        types = tuple(
+            FeatureTypeContext.of(
+                topomap.with_feature_type(kind),
+                config,
+                coarse,
+                weights if kind == kinds[0] else None,
+            )
+            for kind in kinds
+        )
+        return MapContext(topomap, config, types, unavailable_types)
+
+    @cached_property
+    def map_id(self) -> str:
+        """Return the map's id, 16 hexadecimal digits."""
+        return get_map_id(self.topomap)
+
+    @property
+    def first(self) -> FeatureTypeContext:
+        """Return the feature type of the first search."""
+        return self.types[0]
+
+    def without(self, node_ids: Iterable[int]) -> MapContext:
+        """Return the map without these nodes. See `Localizer.without`."""
+        rows = [self.topomap.row_of(node_id) for node_id in node_ids]
+        types = tuple(replace(one, map=one.map.without(rows)) for one in self.types)
+        return replace(self, types=types)
+
+    def query_session(
+        self,
+        query_image: QueryImage,
+        prior: Rigid3 | None = None,
+        max_ms: float | None = None,
+        trace: Trace | None = None,
+    ) -> QuerySession:
+        """Return a session for this query, which can run a coarse search before the exhaustive
+        one."""
+        camera = query_image.camera
+
+        def with_provenance(outcome: ResultWithInliers) -> ResultWithInliers:
+            return self.with_provenance(outcome[0], camera), [
+                (self.with_provenance(one, camera), seen) for one, seen in outcome[1]
+            ]
+
+        searches = self._searches(self._query(query_image, max_ms), trace)
+        return QuerySession(searches, prior, with_provenance)
+
+    def with_provenance(
+        self, result: R, camera: Camera | UncalibratedCamera | None = None, t_ns: int | None = None
+    ) -> R:
+        """Return the result with the map's identity, its geopose, the camera and the time
+        (nanoseconds)."""
+        if isinstance(camera, UncalibratedCamera):
+            focal = result.focal_length_px if isinstance(result, Localization) else None
+            camera = None if focal is None else camera.with_focal(focal)
+        provenance = Provenance(
+            self.map_id,
+            self.topomap.version,
+            result.provenance.features,
+            t_ns=t_ns,
+            camera=camera,
+        )
+        georeference = self.topomap.georeference
+        if isinstance(result, NotLocalized):
+            alternatives = result.alternatives
+            if georeference:
+                alternatives = tuple(
+                    replace(one, geopose=georeference.geopose(one.world_from_cam))
+                    for one in alternatives
+                )
+            return replace(result, provenance=provenance, alternatives=alternatives)
+        return replace(
+            result,
+            provenance=provenance,
+            geopose=georeference.geopose(result.world_from_cam) if georeference else None,
+        )
+
+    def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
+        """Return one search for each feature type. Each search links to the previous one."""
+        searches = list[Search]()
+        for one in self.types:
+            of_type = replace(query, feature_config=one.map.feature_config)
+            search = Search(of_type, one.map, one.config, one.weights, one.correlated_errors, trace)
+            if searches:
+                search.previous, searches[-1].is_last = searches[-1], False
+            searches.append(search)
+        return searches
+
+    def _query(self, query_image: QueryImage, max_ms: float | None) -> Query:
+        image, opened = query_image.image, self.first.map
+        deadline = float("inf") if max_ms is None else time.perf_counter() + max_ms / 1e3
+        reduced, camera = reduce_image(
+            image,
+            query_image.camera,
+            opened.focal,
+            self.config.max_finer,
+            self.config.max_side_px,
+        )
+        return Query(
+            reduced,
+            camera,
+            image.shape[1] / camera.width,
+            opened.feature_config,
+            deadline=deadline,
+            shared=query_image.features,
+        )
+
+
+def select_feature_types(
+    topomap: TopoMetricMap, requested: tuple[str, ...] | None
+) -> tuple[list[str], dict[str, str]]:
+    """Select the feature types to use, in order: the requested ones, or all available ones.
+
+    Returns:
+        The available types, and the unavailable types of the map with the reason for each.
+
+    Raises:
+        MissingExtraError, WeightsError: a requested type is not available, or no type of the map
+            is.
+    """
+    available, unavailable_types, first = list[str](), dict[str, str](), None
+    for kind in requested or topomap.kinds:
+        try:
+            check_available(kind)
+            available.append(kind)
+        except (MissingExtraError, WeightsError) as error:
+            if requested:
+                raise
+            first, unavailable_types[kind] = first or error, str(error)
+    if first is not None and not available:
+        raise first
+    return available, unavailable_types

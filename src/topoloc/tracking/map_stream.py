@@ -1,0 +1,387 @@
+"""Track a stream in one map. `MapStream.process` is the entry point.
+
+The pose of an image is predicted from the motion so far, or from external odometry. The map points
+of the last localized image are tracked into it, which gives its pose in a few milliseconds. At
+intervals, and if too few points are left, the image is localized in full. The search then runs
+around the predicted pose instead of coarse retrieval.
+
+The result updates the pose hypotheses (`pose_hypotheses.py`). A pose that the motion does not allow
+is rejected (reason `jump`), until several agree that the camera is elsewhere. The motion also
+selects between the alternatives of ambiguous images. While several remain, the result is
+`ambiguous`. Localized images are adjusted together in a sliding window, which gives the smoothed
+pose.
+
+`mode="paper"` applies the rule of section III-B instead. Each image is localized alone. If its pose
+is farther than `max_jump` from the preceding one, that one is copied. The copy has the state
+"predicted".
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.query import StageClock
+from topoloc.localization.result import Localization, NotLocalized
+from topoloc.recordings.image_io import to_grey
+from topoloc.retrieval.coarse import Image
+from topoloc.tracking.config import TrackerConfig
+from topoloc.tracking.motion import MotionState, update_motion
+from topoloc.tracking.point_tracker import PointTracker, TrackedMotion
+from topoloc.tracking.pose_errors import compute_correlated_change, noise_floor
+from topoloc.tracking.pose_hypotheses import PoseHypotheses
+from topoloc.tracking.pose_window import PoseWindow
+from topoloc.tracking.stream_localizer import (
+    ExpectedPose,
+    LocalizedPose,
+    StreamLocalizer,
+    reject_jump,
+)
+from topoloc.tracking.stream_result import StreamedPose
+from topoloc.tracking.tracker_state import (
+    ReferenceImage,
+    StreamFrame,
+    compute_direction_uncertainty,
+    compute_motion_covariance,
+    compute_smoothed_covariance,
+    downscale_image,
+)
+
+
+class MapStream:
+    """Hold the state of one stream in one map.
+
+    Args:
+        localizer: localizes in this map alone.
+    """
+
+    def __init__(self, localizer: Localizer, config: TrackerConfig) -> None:
+        self.localizer, self.config = localizer, config
+        self._hypotheses, self._window = (
+            PoseHypotheses(self.config.hypotheses),
+            PoseWindow(self.config.window),
+        )
+        self._stream_localizer = StreamLocalizer(
+            localizer, self._hypotheses, self.config.floor_share
+        )
+        self._answer: StreamedPose | None = None
+        self._reference: ReferenceImage | None = None
+        self._last_attempt_ns = 0
+
+    def process(
+        self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None
+    ) -> StreamedPose:
+        """Localize the next image of the stream, see `Tracker.process`."""
+        if self.config.mode == "paper":
+            answer = self._process_paper_mode(image, camera, t_ns)
+        else:
+            grey = downscale_image(to_grey(image), camera, self.config.max_side_px)
+            answer = self._process_motion_mode(
+                StreamFrame(image, camera, t_ns, odom_from_cam, *grey)
+            )
+        self._answer = self._complete_result(answer, camera)
+        return self._answer
+
+    def process_missing(
+        self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None
+    ) -> StreamedPose:
+        """Return the result for an image that could not be read, see `Tracker.process_missing`."""
+        if self.config.mode == "paper":
+            return self._complete_result(self._copy_previous_pose(result, t_ns))
+        self._hypotheses.predict(t_ns, odom_from_cam)
+        self._drop_stale_reference()
+        return self._complete_result(
+            self._mark_if_ambiguous(self._make_predicted_pose(result, t_ns))
+        )
+
+    def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
+        return replace(
+            answer, result=self.localizer.with_provenance(answer.result, camera, answer.t_ns)
+        )
+
+    def _process_paper_mode(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
+        """Localize one image by section III-B: "when such a jump is found, we copy the previous
+        pose from the trajectory"."""
+        result = self.localizer.localize(image, camera)
+        if not isinstance(result, Localization):
+            return self._copy_previous_pose(result, t_ns)
+        previous = self._answer.smoothed if self._answer is not None else None
+        if (
+            previous is not None
+            and np.linalg.norm(result.world_from_cam.translation - previous.translation)
+            > self.config.max_jump
+        ):
+            return self._copy_previous_pose(reject_jump(result), t_ns)
+        return StreamedPose(t_ns, "localized", result, result.world_from_cam, result.covariance)
+
+    def _copy_previous_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
+        previous = self._answer.smoothed if self._answer is not None else None
+        return StreamedPose(t_ns, "lost" if previous is None else "predicted", result, previous)
+
+    def _process_motion_mode(self, frame: StreamFrame) -> StreamedPose:
+        clock = StageClock()
+        seconds = self._hypotheses.seconds_since(frame.t_ns)
+        predicted = self._hypotheses.predict(frame.t_ns, frame.odom_from_cam)
+        self._drop_stale_reference()
+        with clock.stage("tracking"):
+            tracked_motion = self._track_points(frame, predicted)
+        if tracked_motion is not None:
+            self._hypotheses.apply_motion(
+                self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse(),
+                tracked_motion.covariance,
+                frame.odom_from_cam,
+            )
+        if tracked_motion is None or self._is_localization_due(tracked_motion, frame):
+            self._last_attempt_ns = frame.t_ns
+            found = self._stream_localizer.localize(
+                frame, self._predict_pose(predicted, tracked_motion)
+            )
+            self._drop_stale_reference()
+            if isinstance(found, LocalizedPose):
+                return self._mark_if_ambiguous(
+                    self._update_with_localization(frame, found, predicted, tracked_motion, seconds)
+                )
+            if tracked_motion is None or self._reference is None:
+                return self._mark_if_ambiguous(self._make_predicted_pose(found, frame.t_ns))
+        return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked_motion, clock))
+
+    def _drop_stale_reference(self) -> None:
+        """Drop the reference image unless its hypothesis is still the best."""
+        if not self._hypotheses.is_track_continued:
+            self._reference = None
+            self._window.clear()
+
+    def _mark_if_ambiguous(self, answer: StreamedPose) -> StreamedPose:
+        """Return the result unchanged if one hypothesis leads, and an ambiguous one otherwise."""
+        if self._hypotheses.is_unambiguous:
+            return answer
+        alternatives = self._hypotheses.alternatives()
+        detail = (
+            "the pictures so far leave open which of these"
+            if len(alternatives) > 1
+            else "too little speaks for this pose so far"
+        )
+        result = NotLocalized(
+            "ambiguous",
+            [],
+            0,
+            0,
+            answer.result.times_ms,
+            detail,
+            alternatives,
+            answer.result.provenance,
+        )
+        return StreamedPose(answer.t_ns, "ambiguous", result)
+
+    def _track_points(
+        self, frame: StreamFrame, predicted: MotionState | None
+    ) -> TrackedMotion | None:
+        """Track the points into this image.
+
+        None if they are lost or give a pose that the motion does not allow.
+        """
+        reference = self._reference
+        if reference is None or predicted is None or reference.follower.camera != frame.grey_camera:
+            return None
+        tracked_motion = reference.follower.track_points(
+            frame.grey, predicted.world_from_cam.inverse()
+        )
+        if tracked_motion is None:
+            return None
+        world_from_cam = self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse()
+        floor = noise_floor(reference.errors.depth, self.config.floor_share)
+        return (
+            tracked_motion
+            if self._hypotheses.is_consistent(
+                predicted, world_from_cam, tracked_motion.covariance + floor
+            )
+            else None
+        )
+
+    def _is_localization_due(self, tracked_motion: TrackedMotion, frame: StreamFrame) -> bool:
+        """Return whether the image must be localized in full."""
+        config, reference = self.config, self._reference
+        assert reference is not None
+        if not self._hypotheses.is_unambiguous:
+            return True
+        if frame.t_ns - self._last_attempt_ns < config.retry_after * 1e9:
+            return False
+        is_old = frame.t_ns - reference.t_ns >= config.localize_every * 1e9
+        return (
+            is_old
+            or tracked_motion.tracked_ratio < config.min_share_left
+            or tracked_motion.shift_px > config.max_shift * frame.grey_camera.width
+        )
+
+    def _predict_pose(
+        self, predicted: MotionState | None, tracked_motion: TrackedMotion | None
+    ) -> ExpectedPose | None:
+        """Return the expected pose of the image, None if there is no prediction.
+
+        The error of a tracked pose includes those of its reference image and of wrong depths.
+        """
+        reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
+        if reference is None or predicted is None:
+            return None
+        if tracked_motion is None:
+            is_known = (
+                compute_direction_uncertainty(predicted, reference.errors.depth)
+                <= self.config.max_doubt
+            )
+            return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
+        motion, scale = (
+            tracked_motion.cam_from_ref.adjoint(),
+            self.config.hypotheses.prediction_scale**2,
+        )
+        pose_covariance = (
+            motion @ reference.errors.total @ motion.T
+            + scale * compute_motion_covariance(tracked_motion, self.config.followed_share)
+        )
+        near = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
+        return ExpectedPose(
+            near,
+            pose_covariance,
+            is_alone,
+            is_tracked=True,
+            is_from_virtual_views=reference.found.is_from_virtual_views,
+        )
+
+    def _update_with_localization(
+        self,
+        frame: StreamFrame,
+        found: LocalizedPose,
+        predicted: MotionState | None,
+        tracked_motion: TrackedMotion | None,
+        seconds: float,
+    ) -> StreamedPose:
+        """Return the result of a full localization, `seconds` after the last measured pose."""
+        cam_from_world, errors = found.result.world_from_cam.inverse(), found.errors
+        t_ns, offset = frame.t_ns, Rigid3.identity()
+        if predicted is None or self._reference is None:
+            smoothed, pose_covariance = self._window.add(
+                cam_from_world, errors.noise, Rigid3.identity(), errors.noise
+            )
+        else:
+            motion, motion_covariance = self._compute_motion(predicted, tracked_motion)
+            motion_covariance = motion_covariance + compute_correlated_change(
+                errors, motion, self.config.reach
+            )
+            before = (
+                self._compute_smoothed_pose(tracked_motion, t_ns)
+                if tracked_motion is not None
+                else None
+            )
+            if tracked_motion is None and np.trace(motion_covariance) >= np.trace(errors.noise):
+                self._window.clear()  # the prediction adds no information
+            smoothed, pose_covariance = self._window.add(
+                cam_from_world, errors.noise, motion, motion_covariance
+            )
+            if before is not None:
+                offset = self._fade_offset(before @ smoothed.inverse(), seconds)
+            measured = errors.noise if tracked_motion is None else tracked_motion.covariance
+            self._hypotheses.set_best_state(
+                update_motion(predicted, (offset @ smoothed).inverse(), measured),
+                frame.odom_from_cam,
+            )
+        points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
+        follower = PointTracker(
+            frame.grey, points, cam_from_world, frame.grey_camera, self.config.following
+        )
+        self._reference = ReferenceImage(
+            t_ns,
+            found.result,
+            cam_from_world,
+            errors,
+            smoothed,
+            pose_covariance + errors.correlated,
+            offset,
+            follower,
+        )
+        best = self._hypotheses.best
+        assert best is not None
+        return StreamedPose(
+            t_ns,
+            "localized",
+            found.result,
+            best.world_from_cam,
+            compute_smoothed_covariance(self._reference),
+        )
+
+    def _compute_smoothed_pose(self, tracked_motion: TrackedMotion, t_ns: int) -> Rigid3:
+        """Return the smoothed cam_from_world of a tracked image."""
+        reference = self._reference
+        assert reference is not None
+        return (
+            self._fade_offset(reference.offset, (t_ns - reference.t_ns) / 1e9)
+            @ tracked_motion.cam_from_ref
+            @ reference.smoothed
+        )
+
+    def _fade_offset(self, offset: Rigid3, seconds: float) -> Rigid3:
+        return Rigid3.exp(np.exp(-seconds / self.config.blend_time) * offset.log())
+
+    def _compute_motion(
+        self, predicted: MotionState, tracked_motion: TrackedMotion | None
+    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+        """Return cam_from_before since the last localized image, with the covariance of its left
+        perturbation."""
+        assert self._reference is not None
+        if tracked_motion is not None:
+            return tracked_motion.cam_from_ref, compute_motion_covariance(
+                tracked_motion, self.config.followed_share
+            )
+        return (
+            predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(),
+            predicted.pose_covariance,
+        )
+
+    def _make_tracked_pose(
+        self, frame: StreamFrame, tracked_motion: TrackedMotion, clock: StageClock
+    ) -> StreamedPose:
+        reference, state = self._reference, self._hypotheses.best
+        assert reference is not None
+        assert state is not None
+        world_from_cam = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
+        adjoint, motion = world_from_cam.adjoint(), tracked_motion.cam_from_ref.adjoint()
+        covariance = (
+            adjoint
+            @ (motion @ reference.errors.total @ motion.T + tracked_motion.covariance)
+            @ adjoint.T
+        )
+        found = reference.found
+        result = Localization(
+            world_from_cam=world_from_cam,
+            covariance=covariance,
+            probability=min(found.probability, self._hypotheses.alternatives()[0].probability),
+            node_id=found.node_id,
+            candidates=[],
+            num_matches=tracked_motion.num_tracked,
+            num_inliers=tracked_motion.num_inliers,
+            times_ms=clock.times_ms(),
+            provenance=found.provenance,
+        )
+        return StreamedPose(
+            frame.t_ns,
+            "tracked",
+            result,
+            state.world_from_cam,
+            compute_smoothed_covariance(reference, state),
+        )
+
+    def _make_predicted_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
+        """Return the predicted pose, or "lost" if there is no hypothesis."""
+        predicted = self._hypotheses.best
+        if predicted is None:
+            return StreamedPose(t_ns, "lost", result)
+        return StreamedPose(
+            t_ns,
+            "predicted",
+            result,
+            predicted.world_from_cam,
+            compute_smoothed_covariance(self._reference, predicted),
+        )
