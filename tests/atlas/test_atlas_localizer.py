@@ -229,7 +229,7 @@ def test_one_tile_can_be_asked_alone_near_a_pose(asked: Localizer):
     near = asked.localize(image, CAMERA, world_from_cam, tile_id="room")
     assert isinstance(near, Localization)
     assert isinstance(asked.localize(image, CAMERA, tile_id="other"), NotLocalized)
-    with pytest.raises(AtlasError, match="name the tile"):
+    with pytest.raises(AtlasError, match="name the one that is meant"):
         asked.localize(image, CAMERA, world_from_cam)
     with pytest.raises(AtlasError, match="has no tile 'attic'"):
         asked.localize(image, CAMERA, tile_id="attic")

@@ -121,7 +121,7 @@ def test_an_undo_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
         (["export", "MAP", "out.ply", "--tile", "room"], "--tile is of an atlas", 2),
         (["export", "ATLAS", "out.ply", "--session", "0"], "--session is of maps", 2),
         (["view", "ATLAS", "--tile", "attic"], "has no tile 'attic'", 1),
-        (["follow", "ATLAS", "0", "--ros", "1"], "--ros is of a map", 2),
+        (["follow", "ATLAS", "0", "--ros", "1"], "--ros publishes poses of one world", 2),
     ],
 )
 def test_what_cannot_be_meant_is_said(

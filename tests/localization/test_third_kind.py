@@ -70,7 +70,7 @@ def test_until_weights_are_fitted_its_answers_say_so(path: Path):
 
 def test_its_own_thresholds_are_used_unless_others_are_set(path: Path):
     topomap = TopoMetricMap.load(path)
-    config = Localizer(topomap).config
+    config = Localizer(topomap).context.first.config
     assert (config.guided.min_similarity, config.viewpoints.matching.min_similarity) == (0.8, 0.85)
     assert (config.matching.ratio, config.pose.sigma_px) == (
         CORNER_PATCHES.ratio,
@@ -80,7 +80,7 @@ def test_its_own_thresholds_are_used_unless_others_are_set(path: Path):
         matching=replace(LocalizerConfig().matching, ratio=0.7),
         guided=replace(LocalizerConfig().guided, max_turn=0.1),
     )
-    config = Localizer(topomap, own).config
+    config = Localizer(topomap, own).context.first.config
     assert config.matching.ratio == 0.7
     assert config.guided.max_turn == np.inf  # it has no angles to look at
 

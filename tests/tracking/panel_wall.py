@@ -8,11 +8,13 @@ import numpy as np
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.localizer import Localizer
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_context import MapContext
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.localization.result_decision import LocalizationWithInliers
 from topoloc.localization.search import Trace
+from topoloc.localization.tiles.tiles import OneMap
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
@@ -35,7 +37,8 @@ class PanelWall(Localizer):
     def __init__(self) -> None:
         self.xs: list[float] = []
         self.num_asked, self.probability = 0, 0.99
-        self.topomap, self.map_id = TopoMetricMap([], [], [], [], {}), ""
+        opened = MapContext(TopoMetricMap([], [], [], [], {}), LocalizerConfig(), (), {})
+        self._tiles = OneMap(opened)
 
     def localize_with_inliers(
         self,
@@ -44,6 +47,7 @@ class PanelWall(Localizer):
         prior: Rigid3 | None,
         max_ms: float | None = None,
         trace: Trace | None = None,
+        tile_id: str | None = None,
     ) -> tuple[Localization | NotLocalized, list[LocalizationWithInliers]]:
         self.num_asked += 1
         xs = self.xs

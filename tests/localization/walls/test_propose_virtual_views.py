@@ -350,7 +350,7 @@ def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
         assert _is_right(result, truth)
         mirrored = np.ascontiguousarray(picture[:, ::-1])
         assert isinstance(localizer.localize(mirrored, WIDE), NotLocalized)
-    assert Localizer(loaded, LocalizerConfig(kinds=("surf",))).map.walls is None
+    assert Localizer(loaded, LocalizerConfig(kinds=("surf",))).context.first.map.walls is None
     with closing(sqlite3.connect(path)) as database:
         database.execute("UPDATE map SET value = '\"sift\"' WHERE key = 'kind_of_sides'")
         database.commit()
