@@ -18,6 +18,8 @@ from topoloc.errors import TopolocError
 T = TypeVar("T")
 
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
+NonNegative = Annotated[float, Meta(ge=0, le=1e300)]
+Positive = Annotated[float, Meta(gt=0, le=1e300)]
 Count = Annotated[int, Meta(ge=0, lt=2**53)]
 """A whole number that every JSON reader represents exactly."""
 Nanoseconds = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -51,5 +53,7 @@ def decode_json(
         return msgspec.convert(parsed, kind)
     except (ValueError, RecursionError, TopolocError) as failure:
         fault, _, path = " ".join(str(failure).split()).partition(" - at `$")
+        if fault.endswith("1e+300"):
+            fault = "a finite number is expected"
         place = f"{path.strip('.`')[:100]}: " if path else ""
         raise error(f"{where}: {place}{fault[:200]}") from None

@@ -24,7 +24,7 @@ from topoloc.atlas.joint_worlds import place_tiles
 from topoloc.errors import AtlasError, GeoreferenceError, TrajectoryError
 from topoloc.geometry.geodesy import GeoPoint, Georeference, GeoreferenceJson
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Count, Finite, Matrix34, decode_json
+from topoloc.json_data import Count, Finite, Matrix34, Positive, decode_json
 
 FORMAT, FORMAT_VERSION = "topoloc-atlas", 1
 TILES = "tiles"
@@ -288,7 +288,7 @@ class _TileJson(Struct, frozen=True):
     kinds: tuple[str, ...]
     num_nodes: Count
     sessions: tuple[str, ...]
-    focal_px: Annotated[float, Meta(gt=0, le=1e300)]
+    focal_px: Positive
     world: TileId
     box_world: tuple[_Point, _Point]
     georeference: GeoreferenceJson | None
@@ -337,7 +337,7 @@ class _ManifestJson(Struct, frozen=True):
     origin: GeoPoint | None
     tiles: Annotated[list[_TileJson], Meta(max_length=1_000_000)]
     retired: dict[FileName, Finite]
-    joins: list[JoinJson] = []
+    joins: tuple[JoinJson, ...] = ()
 
     def manifest(self) -> Manifest:
         """Return the manifest. Raises ValueError, GeoreferenceError or TrajectoryError."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import Meta, Struct
+from msgspec import Struct
 
-from topoloc.json_data import Finite
+from topoloc.json_data import Finite, NonNegative
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,15 +77,12 @@ class CalibrationMismatch:
         }
 
 
-_Pixels = Annotated[float, Meta(ge=0, le=1e300)]
-
-
 class MismatchJson(Struct, frozen=True):
     """Hold the JSON of a `CalibrationMismatch`."""
 
-    focal_length_px: _Pixels
-    focal_sigma_px: _Pixels
-    calibrated_focal_length_px: _Pixels
+    focal_length_px: NonNegative
+    focal_sigma_px: NonNegative
+    calibrated_focal_length_px: NonNegative
     principal_point_px: tuple[Finite, Finite]
     calibrated_principal_point_px: tuple[Finite, Finite]
     of: list[str]

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from topoloc.errors import GeoreferenceError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Finite, Matrix34, decode_json
+from topoloc.json_data import Finite, Matrix34, NonNegative, decode_json
 
 SEMI_MAJOR = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
@@ -205,7 +205,7 @@ class GeoreferenceJson(Struct, frozen=True):
     origin: GeoPoint
     enu_from_world: Matrix34
     source: str
-    rms_m: Annotated[float, Meta(ge=0, le=1e300)] | None
+    rms_m: NonNegative | None
 
     def georeference(self) -> Georeference:
         """Return the georeference. Raises GeoreferenceError if its matrix is not a pose."""

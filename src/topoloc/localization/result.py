@@ -19,7 +19,7 @@ from topoloc.geometry.calibration_mismatch import (
 )
 from topoloc.geometry.geodesy import GeoPose, GeoPoseJson
 from topoloc.geometry.rigid import PoseJson, Rigid3
-from topoloc.json_data import Count, Finite, Matrix66, decode_json
+from topoloc.json_data import Count, Finite, Matrix66, NonNegative, decode_json
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.provenance import EMPTY_PROVENANCE, Provenance, ProvenanceJson
 from topoloc.retrieval.coarse import NodeScore
@@ -279,7 +279,7 @@ class _LocalizedLine(_Line, frozen=True, kw_only=True):
     probability: _Share
     node: Count
     evidence: Evidence | None = None
-    focal_length_px: Annotated[float, Meta(ge=0, le=1e300)] | None = None
+    focal_length_px: NonNegative | None = None
     noise_share: _Share = 1.0
     calibrated: bool = True
     geopose: GeoPoseJson | None = None
@@ -331,7 +331,7 @@ class _AlternativeJson(Struct, frozen=True):
 class _RefusedLine(_Line, frozen=True, kw_only=True):
     reason: Reason
     detail: str = ""
-    alternatives: Annotated[list[_AlternativeJson], Meta(max_length=10_000)] = []
+    alternatives: Annotated[tuple[_AlternativeJson, ...], Meta(max_length=10_000)] = ()
 
     def result(self) -> NotLocalized:
         """Return the result. Raises CalibrationError if its camera is not usable."""
