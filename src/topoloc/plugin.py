@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from topoloc.evaluation.metrics import format_length, group_by_recording
     from topoloc.features.feature_types import check_available, parse_feature_types
     from topoloc.features.network_files import NETWORKS, NetworkInfo, cache_folder, read_bytes
-    from topoloc.localization.checked_json import pose_from_json, pose_to_json
+    from topoloc.json_data import Finite, decode_json
     from topoloc.localization.node_matching import NodeMatcher
     from topoloc.mapping.build import Progress
     from topoloc.mapping.sessions import find_source_path
@@ -50,13 +50,6 @@ if TYPE_CHECKING:
         exif_focal_length,
         image_size,
     )
-    from topoloc.recordings.json_file import (
-        json_number,
-        json_numbers,
-        json_rigid,
-        parse_relative_path,
-        read_json,
-    )
     from topoloc.recordings.open import find_format, split_selection
     from topoloc.recordings.recording import (
         DepthImages,
@@ -70,7 +63,7 @@ if TYPE_CHECKING:
         scale_poses,
         times_from_rate,
     )
-    from topoloc.recordings.text_files import read_text
+    from topoloc.recordings.text_files import parse_relative_path, read_text
     from topoloc.recordings.trajectory import (
         interpolate_poses,
         match_frame_poses,
@@ -86,6 +79,7 @@ __all__ = [
     "Between",
     "DepthImages",
     "EncodedImage",
+    "Finite",
     "NetworkInfo",
     "NodeMatcher",
     "Progress",
@@ -99,6 +93,7 @@ __all__ = [
     "cache_folder",
     "check_available",
     "check_tile_id",
+    "decode_json",
     "describe_range",
     "encode_jpeg",
     "exif_focal_length",
@@ -112,9 +107,6 @@ __all__ = [
     "has_scale",
     "image_size",
     "interpolate_poses",
-    "json_number",
-    "json_numbers",
-    "json_rigid",
     "list_images",
     "match_frame_poses",
     "natural_key",
@@ -123,13 +115,10 @@ __all__ = [
     "parse_intrinsics",
     "parse_relative_path",
     "parse_settings",
-    "pose_from_json",
-    "pose_to_json",
     "quote_key",
     "read_bytes",
     "read_camera_json",
     "read_ground_truth",
-    "read_json",
     "read_text",
     "recording_notes",
     "remove_stale_files",
@@ -150,6 +139,7 @@ _MODULES = {
     "Between": "topoloc.bounds",
     "DepthImages": "topoloc.recordings.recording",
     "EncodedImage": "topoloc.recordings.image_io",
+    "Finite": "topoloc.json_data",
     "MAX_PIXELS": "topoloc.recordings.image_io",
     "NETWORKS": "topoloc.features.network_files",
     "NetworkInfo": "topoloc.features.network_files",
@@ -165,6 +155,7 @@ _MODULES = {
     "cache_folder": "topoloc.features.network_files",
     "check_available": "topoloc.features.feature_types",
     "check_tile_id": "topoloc.atlas.manifest",
+    "decode_json": "topoloc.json_data",
     "describe_range": "topoloc.bounds",
     "encode_jpeg": "topoloc.recordings.image_io",
     "exif_focal_length": "topoloc.recordings.image_io",
@@ -178,24 +169,18 @@ _MODULES = {
     "has_scale": "topoloc.recordings.recording",
     "image_size": "topoloc.recordings.image_io",
     "interpolate_poses": "topoloc.recordings.trajectory",
-    "json_number": "topoloc.recordings.json_file",
-    "json_numbers": "topoloc.recordings.json_file",
-    "json_rigid": "topoloc.recordings.json_file",
     "list_images": "topoloc.recordings.recording",
     "match_frame_poses": "topoloc.recordings.trajectory",
     "natural_key": "topoloc.recordings.recording",
     "parse_calibration": "topoloc.recordings.calibration",
     "parse_feature_types": "topoloc.features.feature_types",
     "parse_intrinsics": "topoloc.recordings.calibration",
-    "parse_relative_path": "topoloc.recordings.json_file",
+    "parse_relative_path": "topoloc.recordings.text_files",
     "parse_settings": "topoloc.bounds",
-    "pose_from_json": "topoloc.localization.checked_json",
-    "pose_to_json": "topoloc.localization.checked_json",
     "quote_key": "topoloc.bounds",
     "read_bytes": "topoloc.features.network_files",
     "read_camera_json": "topoloc.recordings.camera_json",
     "read_ground_truth": "topoloc.recordings.trajectory",
-    "read_json": "topoloc.recordings.json_file",
     "read_text": "topoloc.recordings.text_files",
     "recording_notes": "topoloc.recordings.recording",
     "remove_stale_files": "topoloc.recordings.atomic",

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
 from topoloc.errors import AtlasError
@@ -21,7 +22,7 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 def _tile(name: str, georeference: Georeference | None = None) -> Tile:
     stored = StoredFile(f"tiles/{name}-0123.topo", "ab" * 32, 10)
     box = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.5]])
-    places = replace(stored, name=f"tiles/{name}-0123.places")
+    places = structs.replace(stored, name=f"tiles/{name}-0123.places")
     return Tile(
         name,
         stored,

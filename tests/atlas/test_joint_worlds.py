@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from topoloc.atlas.joins import Join
 from topoloc.atlas.joint_worlds import adjust_joins
@@ -45,7 +45,7 @@ def _tile(
 ) -> Tile:
     stored = StoredFile(f"tiles/{name}-0123.topo", contents * 32, 10)
     box = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 5.5]])
-    places = replace(stored, name=f"tiles/{name}-0123.places")
+    places = structs.replace(stored, name=f"tiles/{name}-0123.places")
     return Tile(
         name,
         stored,

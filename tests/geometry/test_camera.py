@@ -143,16 +143,22 @@ def test_colmap_and_json_round_trips(model):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ({"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320}, "'cy' is missing"),
+        (
+            {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320},
+            "missing required field `cy`",
+        ),
         ({"model": "EYE", "width": 640, "height": 480}, "unknown camera model"),
-        ({"width": 640, "height": 480, "fx": "wide", "fy": 500, "cx": 320, "cy": 240}, "wide"),
+        (
+            {"width": 640, "height": 480, "fx": "wide", "fy": 500, "cx": 320, "cy": 240},
+            "fx: Expected `float`, got `str`",
+        ),
         (
             {"width": float("inf"), "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240},
-            "infinity",
+            "width: a finite number",
         ),
         (
             {"width": 640, "height": 480, "fx": float("nan"), "fy": 500, "cx": 320, "cy": 240},
-            "not finite",
+            "fx: a finite number",
         ),
         ({"width": 640, "height": 480, "fx": -500, "fy": 500, "cx": 320, "cy": 240}, "positive"),
         ({"width": 0, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}, "positive"),

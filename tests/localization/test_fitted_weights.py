@@ -50,28 +50,37 @@ def _changed(change: Callable[[dict[str, Any]], Any]) -> str:
     [
         ("", "Expecting value"),
         ("[" * 100_000, "recursion"),
-        ("[]", "the file is no table"),
-        (_changed(lambda read: read.pop("date")), "the file lacks date"),
-        (_changed(lambda read: read.update(note="x")), "the file has an unknown note"),
-        (_changed(lambda read: read.update(corpus=3)), "corpus is not a text"),
-        (_changed(lambda read: read["weights"].pop("walls")), "weights lacks walls"),
-        (_changed(lambda read: read["weights"].update(rivals=[])), "rivals is no table"),
-        (_changed(lambda read: read["weights"]["evidence"].pop("bias")), "evidence lacks bias"),
+        ("[]", "Expected `object`, got `array`"),
+        (_changed(lambda read: read.pop("date")), "missing required field `date`"),
+        (_changed(lambda read: read.update(note="x")), "unknown field `note`"),
+        (_changed(lambda read: read.update(corpus=3)), "corpus: Expected `str`, got `int`"),
+        (
+            _changed(lambda read: read["weights"].pop("walls")),
+            "weights: Object missing required field `walls`",
+        ),
+        (
+            _changed(lambda read: read["weights"].update(rivals=[])),
+            "weights.rivals: Expected `object`, got `array`",
+        ),
+        (
+            _changed(lambda read: read["weights"]["evidence"].pop("bias")),
+            "weights.evidence: Object missing required field `bias`",
+        ),
         (
             _changed(lambda read: read["weights"]["evidence"].update(bais=1.0)),
-            "evidence has an unknown bais",
+            "weights.evidence: Object contains unknown field `bais`",
         ),
         (
             _changed(lambda read: read["weights"]["evidence"].update(bias="7.6")),
-            "evidence.bias is not a finite number",
+            "weights.evidence.bias: Expected `float`, got `str`",
         ),
         (
             _changed(lambda read: read["weights"]["evidence"].update(bias=float("nan"))),
-            "evidence.bias is not a finite number",
+            "weights.evidence.bias: a finite number is expected",
         ),
         (
             _changed(lambda read: read["weights"]["shared_errors"].update(factor=True)),
-            "shared_errors.factor is not a finite number",
+            "weights.shared_errors.factor: Expected `float`, got `bool`",
         ),
     ],
 )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from built_room import built_room, unseen_views
 from doubled_room import ELSEWHERE, twice
@@ -142,7 +143,7 @@ def _never_clear(room: TopoMetricMap, config: LocalizerConfig | None = None) -> 
     return Localizer(
         room,
         config,
-        weights=replace(weights, evidence=replace(weights.evidence, clear_log_odds=1e9)),
+        weights=replace(weights, evidence=structs.replace(weights.evidence, clear_log_odds=1e9)),
     )
 
 

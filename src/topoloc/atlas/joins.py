@@ -3,15 +3,21 @@ worlds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta, Struct
 
-from topoloc.atlas.manifest_values import ID, count, matching, number, parse_covariance, parse_pose
 from topoloc.geometry.rigid import Rigid3, skew
+from topoloc.json_data import Count, Finite, Matrix34, Matrix66
+
+ID = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}\Z"
+"""Pattern of tile ids and world names."""
+TileId = Annotated[str, Meta(pattern=ID)]
+_MAX_METRES = 1e8
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,23 +47,6 @@ class Join:
             "num_agreeing": self.num_agreeing,
             "residual": self.residual,
         }
-
-    @staticmethod
-    def from_json(row: Mapping[str, Any]) -> Join:
-        """Parse the output of `to_json`.
-
-        Raises:
-            ValueError, TypeError, KeyError, TrajectoryError: a value is invalid.
-        """
-        residual = row["residual"]
-        return Join(
-            first=matching(ID, row["first"], "a join's tile"),
-            second=matching(ID, row["second"], "a join's tile"),
-            first_from_second=parse_pose(row["first_from_second"], "first_from_second"),
-            covariance=parse_covariance(row["covariance"], "a join's covariance", is_definite=True),
-            num_agreeing=count(row["num_agreeing"], "num_agreeing"),
-            residual=None if residual is None else number(residual, "residual"),
-        )
 
     def sigmas_at(self, point_second: Float[np.ndarray, "3"]) -> tuple[float, float]:
         """Return one sigma of the position (m, in the worst direction) of a point of the second
@@ -91,20 +80,63 @@ class JointPose:
             "covariance": self.covariance.tolist(),
         }
 
-    @staticmethod
-    def from_json(row: Mapping[str, Any]) -> JointPose:
-        """Parse the output of `to_json`.
 
-        Raises:
-            ValueError, TypeError, KeyError, TrajectoryError: a value is invalid.
-        """
-        return JointPose(
-            joint=matching(ID, row["world"], "a joint world"),
-            joint_from_world=parse_pose(row["joint_from_world"], "joint_from_world"),
-            covariance=parse_covariance(
-                row["covariance"], "a joint pose's covariance", is_definite=False
-            ),
+class JoinJson(Struct, frozen=True):
+    """Hold the JSON of a `Join`."""
+
+    first: TileId
+    second: TileId
+    first_from_second: Matrix34
+    covariance: Matrix66
+    num_agreeing: Count
+    residual: Finite | None
+
+    def join(self) -> Join:
+        """Return the join. Raises ValueError or TrajectoryError if its matrices are invalid."""
+        return Join(
+            self.first,
+            self.second,
+            _pose(self.first_from_second),
+            _covariance(self.covariance, is_definite=True),
+            self.num_agreeing,
+            self.residual,
         )
+
+
+class JointPoseJson(Struct, frozen=True):
+    """Hold the JSON of a `JointPose`."""
+
+    world: TileId
+    joint_from_world: Matrix34
+    covariance: Matrix66
+
+    def pose(self) -> JointPose:
+        """Return the pose. Raises ValueError or TrajectoryError if its matrices are invalid."""
+        covariance = _covariance(self.covariance, is_definite=False)
+        return JointPose(self.world, _pose(self.joint_from_world), covariance)
+
+
+def _pose(rows: Matrix34) -> Rigid3:
+    pose = Rigid3.from_matrix(rows)
+    if np.abs(pose.translation).max() > _MAX_METRES:
+        raise ValueError("a pose is further away than the earth is wide")
+    return pose
+
+
+def _covariance(rows: Sequence[Sequence[float]], is_definite: bool) -> Float[np.ndarray, "6 6"]:
+    """Return a 6x6 covariance as an exactly symmetric matrix. Raises ValueError if it is none."""
+    matrix = np.array(rows)
+    symmetric = 0.5 * (matrix + matrix.T)
+    values = np.linalg.eigvalsh(symmetric)
+    slack = 1e-9 * max(float(values[-1]), 0.0)
+    if (
+        np.abs(matrix).max() > _MAX_METRES**2
+        or np.abs(matrix - symmetric).max() > slack
+        or values[0] < -slack
+        or (is_definite and values[0] <= 0.0)
+    ):
+        raise ValueError("the covariance of a join is no covariance")
+    return symmetric
 
 
 def sigmas_at(

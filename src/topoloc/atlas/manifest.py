@@ -11,38 +11,34 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta, Struct, to_builtins
 
-from topoloc.atlas.joins import Join, JointPose
+from topoloc.atlas.joins import ID, Join, JoinJson, JointPose, JointPoseJson, TileId
 from topoloc.atlas.joint_worlds import place_tiles
-from topoloc.atlas.manifest_values import ID, count, matching, number, of
 from topoloc.errors import AtlasError, GeoreferenceError, TrajectoryError
-from topoloc.geometry.geodesy import GeoPoint, Georeference
+from topoloc.geometry.geodesy import GeoPoint, Georeference, GeoreferenceJson
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import Count, Finite, Matrix34, Positive, decode_json
 
 FORMAT, FORMAT_VERSION = "topoloc-atlas", 1
 TILES = "tiles"
-MAX_TILES = 1_000_000
-_FILE = re.compile(rf"{TILES}/[A-Za-z0-9][A-Za-z0-9_.-]{{0,199}}")
-_SHA256, _MAP_ID = re.compile(r"[0-9a-f]{64}"), re.compile(r"[0-9a-f]{16}")
+FileName = Annotated[str, Meta(pattern=rf"^{TILES}/[A-Za-z0-9][A-Za-z0-9_.-]{{0,199}}\Z")]
+Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+_Point = tuple[Finite, Finite, Finite]
 
 
-@dataclass(frozen=True)
-class StoredFile:
+class StoredFile(Struct, frozen=True, rename={"name": "file", "num_bytes": "bytes"}):
     """Describe a file of the atlas: its relative name, SHA-256 and size in bytes."""
 
-    name: str
-    sha256: str
-    num_bytes: int
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the file as a JSON object."""
-        return {"file": self.name, "sha256": self.sha256, "bytes": self.num_bytes}
+    name: FileName
+    sha256: Sha256
+    num_bytes: Count
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +111,11 @@ class Tile:
         if self.joint is not None:
             made_of["joint"] = self.joint.to_json()
         if self.undo is not None:
-            made_of["undo"] = self.undo.to_json()
+            made_of["undo"] = to_builtins(self.undo)
         return made_of | {
             "id": self.tile_id,
-            "map": self.map.to_json(),
-            "places": self.places.to_json() | {"vocabularies": dict(self.vocabularies)},
+            "map": to_builtins(self.map),
+            "places": to_builtins(self.places) | {"vocabularies": dict(self.vocabularies)},
             "map_id": self.map_id,
             "map_version": self.map_version,
             "kinds": list(self.kinds),
@@ -234,9 +230,7 @@ class Manifest:
             "format": FORMAT,
             "version": FORMAT_VERSION,
             "serial": self.serial,
-            "origin": (
-                None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h}
-            ),
+            "origin": None if origin is None else asdict(origin),
             "tiles": [tile.to_json() for tile in self.tiles],
             "retired": dict(self.retired),
             **({"joins": [join.to_json() for join in self.joins]} if self.joins else {}),
@@ -250,25 +244,18 @@ class Manifest:
         Raises:
             AtlasError: the bytes are not a valid manifest. The message contains `where`.
         """
-        try:
-            return _parse_manifest(json.loads(data))
-        except (
-            ValueError,
-            TypeError,
-            KeyError,
-            RecursionError,
-            OverflowError,
-            GeoreferenceError,
-            TrajectoryError,
-        ) as error:
-            what = (
-                f"{error.args[0]!r} is missing"
-                if isinstance(error, KeyError)
-                else " ".join(str(error).split())[:200]
-            )
+        fault = f"{where} is no manifest of an atlas, or a damaged one"
+        whole = decode_json(data, dict[str, Any], AtlasError, fault)
+        written = decode_json(whole, _Header, AtlasError, fault).version
+        if written != FORMAT_VERSION:
             raise AtlasError(
-                f"{where} is no manifest of an atlas, or a damaged one: {what}"
-            ) from None
+                f"{fault}: version {written} of the format; this topoloc reads version"
+                f" {FORMAT_VERSION}"
+            )
+        try:
+            return decode_json(whole, _ManifestJson, AtlasError, fault).manifest()
+        except (ValueError, GeoreferenceError, TrajectoryError) as error:
+            raise AtlasError(f"{fault}: {error}") from None
 
 
 def check_tile_id(tile_id: str) -> None:
@@ -277,40 +264,89 @@ def check_tile_id(tile_id: str) -> None:
     Raises:
         AtlasError: the id is invalid.
     """
-    if not ID.fullmatch(tile_id):
+    if not re.match(ID, tile_id):
         raise AtlasError(
             f"no tile can be called {tile_id[:80]!r}: at most 100 letters, digits, `_`, `-` and"
             " `.`, a letter or digit first"
         )
 
 
-def _parse_manifest(data: Any) -> Manifest:
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise ValueError(f"'format' is not {FORMAT!r}")
-    if data.get("version") != FORMAT_VERSION:
-        raise ValueError(
-            f"version {str(data.get('version'))[:20]} of the format; this topoloc reads version"
-            f" {FORMAT_VERSION}"
+class _PlacesJson(StoredFile, frozen=True):
+    """Hold the JSON of the file of the global descriptors."""
+
+    vocabularies: dict[str, str]
+
+
+class _TileJson(Struct, frozen=True):
+    """Hold the JSON of a `Tile`."""
+
+    id: TileId
+    map: StoredFile
+    places: _PlacesJson
+    map_id: Annotated[str, Meta(pattern=r"^[0-9a-f]{16}\Z")]
+    map_version: Count
+    kinds: tuple[str, ...]
+    num_nodes: Count
+    sessions: tuple[str, ...]
+    focal_px: Positive
+    world: TileId
+    box_world: tuple[_Point, _Point]
+    georeference: GeoreferenceJson | None
+    geo_box: tuple[Finite, Finite, Finite, Finite] | None
+    atlas_from_world: Matrix34 | None
+    recipe: Sha256 | None = None
+    joint: JointPoseJson | None = None
+    undo: StoredFile | None = None
+
+    def tile(self) -> Tile:
+        """Return the tile. Raises ValueError, GeoreferenceError or TrajectoryError."""
+        places, pose = self.places, self.atlas_from_world
+        return Tile(
+            tile_id=self.id,
+            map=self.map,
+            places=StoredFile(places.name, places.sha256, places.num_bytes),
+            vocabularies=places.vocabularies,
+            map_id=self.map_id,
+            map_version=self.map_version,
+            kinds=self.kinds,
+            num_nodes=self.num_nodes,
+            sessions=self.sessions,
+            focal_px=self.focal_px,
+            box_world=np.array(self.box_world),
+            world=self.world,
+            georeference=None if self.georeference is None else self.georeference.georeference(),
+            geo_box=self.geo_box,
+            atlas_from_world=None if pose is None else Rigid3.from_matrix(pose),
+            recipe=self.recipe,
+            joint=None if self.joint is None else self.joint.pose(),
+            undo=self.undo,
         )
-    rows = of(list, data["tiles"], "tiles")
-    tiles = [_parse_tile(of(dict, row, "a tile")) for row in rows[: MAX_TILES + 1]]
-    if len(tiles) > MAX_TILES or len({tile.tile_id for tile in tiles}) < len(tiles):
-        raise ValueError("too many tiles, or two of one id")
-    origin, retired = data["origin"], of(dict, data["retired"], "retired")
-    for name in retired:
-        matching(_FILE, name, "a retired file")
-    place = (
-        None
-        if origin is None
-        else GeoPoint(*(number(origin[name], name) for name in ("lat", "lon", "h")))
-    )
-    ordered = tuple(sorted(tiles, key=lambda tile: tile.tile_id))
-    joins = [
-        Join.from_json(of(dict, row, "a join")) for row in of(list, data.get("joins", []), "joins")
-    ]
-    _check_joins(joins, {tile.tile_id for tile in tiles})
-    given_up = {name: number(when, "retired") for name, when in retired.items()}
-    return Manifest(count(data["serial"], "serial"), ordered, place, given_up, tuple(joins))
+
+
+class _Header(Struct, frozen=True):
+    """Hold the format of a manifest, which is checked before its other keys."""
+
+    format: Literal["topoloc-atlas"]
+    version: int
+
+
+class _ManifestJson(Struct, frozen=True):
+    """Hold the JSON of a `Manifest`."""
+
+    serial: Count
+    origin: GeoPoint | None
+    tiles: Annotated[list[_TileJson], Meta(max_length=1_000_000)]
+    retired: dict[FileName, Finite]
+    joins: tuple[JoinJson, ...] = ()
+
+    def manifest(self) -> Manifest:
+        """Return the manifest. Raises ValueError, GeoreferenceError or TrajectoryError."""
+        tiles = sorted((row.tile() for row in self.tiles), key=lambda tile: tile.tile_id)
+        if len({tile.tile_id for tile in tiles}) < len(tiles):
+            raise ValueError("tiles: two of one id")
+        joins = tuple(row.join() for row in self.joins)
+        _check_joins(joins, {tile.tile_id for tile in tiles})
+        return Manifest(self.serial, tuple(tiles), self.origin, self.retired, joins)
 
 
 def _check_joins(joins: Sequence[Join], known: set[str]) -> None:
@@ -323,54 +359,3 @@ def _check_joins(joins: Sequence[Join], known: set[str]) -> None:
             )
     if len({join.pair for join in joins}) < len(joins):
         raise ValueError("two joins of the same tiles")
-
-
-def _parse_tile(row: dict[str, Any]) -> Tile:
-    box = np.array(row["box_world"], np.float64)
-    if box.shape != (2, 3) or not np.isfinite(box).all():
-        raise ValueError("box_world is no two points")
-    geo_box, georeference, pose, recipe = (
-        row["geo_box"],
-        row["georeference"],
-        row["atlas_from_world"],
-        row.get("recipe"),
-    )
-    joint, undo = row.get("joint"), row.get("undo")
-    focal = number(row["focal_px"], "focal_px")
-    if focal <= 0.0:
-        raise ValueError("focal_px is not above 0")
-    vocabularies = of(dict, row["places"]["vocabularies"], "vocabularies")
-    corners = (
-        None
-        if geo_box is None
-        else [number(value, "geo_box") for value in of(list, geo_box, "geo_box")]
-    )
-    if corners is not None and len(corners) != 4:
-        raise ValueError("geo_box is no four degrees")
-    return Tile(
-        tile_id=matching(ID, row["id"], "id"),
-        map=_parse_file(row["map"]),
-        places=_parse_file(row["places"]),
-        vocabularies={
-            kind: of(str, version, "vocabularies") for kind, version in vocabularies.items()
-        },
-        map_id=matching(_MAP_ID, row["map_id"], "map_id"),
-        map_version=count(row["map_version"], "map_version"),
-        kinds=tuple(of(str, kind, "kinds") for kind in of(list, row["kinds"], "kinds")),
-        num_nodes=count(row["num_nodes"], "num_nodes"),
-        sessions=tuple(of(str, name, "sessions") for name in of(list, row["sessions"], "sessions")),
-        focal_px=focal,
-        box_world=box,
-        world=matching(ID, row["world"], "world"),
-        georeference=None if georeference is None else Georeference.from_json(georeference),
-        geo_box=None if corners is None else (corners[0], corners[1], corners[2], corners[3]),
-        atlas_from_world=None if pose is None else Rigid3.from_matrix(np.array(pose, np.float64)),
-        recipe=None if recipe is None else matching(_SHA256, recipe, "recipe"),
-        joint=None if joint is None else JointPose.from_json(of(dict, joint, "joint")),
-        undo=None if undo is None else _parse_file(of(dict, undo, "undo")),
-    )
-
-
-def _parse_file(row: Any) -> StoredFile:
-    name, sha256 = matching(_FILE, row["file"], "file"), matching(_SHA256, row["sha256"], "sha256")
-    return StoredFile(name, sha256, count(row["bytes"], "bytes"))

@@ -11,7 +11,7 @@ import numpy as np
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import Localization, NotLocalized, pose_to_json
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.recordings.frame import Image
 
 # A query is recalled if its pose error is within both (metres, degrees). Recall counts all queries.
@@ -89,7 +89,7 @@ class EvaluatedQuery:
     def to_json(self) -> dict[str, Any]:
         """Return the result's JSON with its recording and its ground truth, which is null for an
         out-of-map image."""
-        truth = None if self.world_from_cam is None else pose_to_json(self.world_from_cam)
+        truth = None if self.world_from_cam is None else self.world_from_cam.to_json()
         return self.result.to_json(self.query) | {
             "recording": self.recording,
             "true_world_from_cam": truth,

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Struct
 
-MISMATCH_FOCAL_FIELDS = ("focal_length_px", "focal_sigma_px", "calibrated_focal_length_px")
-"""The first fields of a `CalibrationMismatch`, which are also keys of its JSON."""
+from topoloc.json_data import Finite, NonNegative
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +66,37 @@ class CalibrationMismatch:
             "principal_point": self.has_principal_point_mismatch,
         }
         return {
-            **{key: getattr(self, key) for key in MISMATCH_FOCAL_FIELDS},
+            "focal_length_px": self.focal_length_px,
+            "focal_sigma_px": self.focal_sigma_px,
+            "calibrated_focal_length_px": self.calibrated_focal_length_px,
             "of": [name for name, is_off in of.items() if is_off],
             "shift": self.shift.tolist(),
             "principal_point_px": self.principal_point_px.tolist(),
             "calibrated_principal_point_px": self.calibrated_principal_point_px.tolist(),
             "detail": str(self),
         }
+
+
+class MismatchJson(Struct, frozen=True):
+    """Hold the JSON of a `CalibrationMismatch`."""
+
+    focal_length_px: NonNegative
+    focal_sigma_px: NonNegative
+    calibrated_focal_length_px: NonNegative
+    principal_point_px: tuple[Finite, Finite]
+    calibrated_principal_point_px: tuple[Finite, Finite]
+    of: list[str]
+    shift: tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+
+    def mismatch(self) -> CalibrationMismatch:
+        """Return the mismatch."""
+        return CalibrationMismatch(
+            self.focal_length_px,
+            self.focal_sigma_px,
+            self.calibrated_focal_length_px,
+            np.array(self.principal_point_px),
+            np.array(self.calibrated_principal_point_px),
+            "focal_length" in self.of,
+            "principal_point" in self.of,
+            np.array(self.shift),
+        )

@@ -7,9 +7,12 @@ and left, is used only when COLMAP's files are read or written.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import defstruct
+from msgspec.structs import astuple
 
 from topoloc.errors import CalibrationError
 from topoloc.geometry.distortion import (
@@ -19,6 +22,7 @@ from topoloc.geometry.distortion import (
     undistort_fisheye,
     undistort_rational,
 )
+from topoloc.json_data import Finite, decode_json
 
 # Parameter names of each model, in COLMAP's order.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -29,6 +33,11 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+# The keys of camera.json by model, without a model only the size.
+_JSON = {
+    model: defstruct("CameraJson", [(key, Finite) for key in ("width", "height", *names)])
+    for model, names in {**MODELS, "": ()}.items()
 }
 _MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = (
     1e-3,
@@ -242,21 +251,18 @@ class Camera:
         return size | dict(zip(MODELS[self.model], self.params, strict=True))
 
     @staticmethod
-    def from_json(data: dict[str, object]) -> Camera:
-        """Read the form of `to_json`. Other keys (baseline, depth_factor) are ignored.
+    def from_json(data: Any, name: str = "camera") -> Camera:
+        """Parse the form of `to_json`, from text or an object. Other keys (baseline, depth_factor)
+        are ignored. `name` is its name in errors.
 
         Raises:
             CalibrationError: a key is missing or not a number, or the camera is not usable.
         """
-        if not isinstance(data, dict):
-            raise CalibrationError(
-                f"camera: an object of named values is expected, not {type(data).__name__}"
-            )
+        values = decode_json(data, dict[str, Any], CalibrationError, name)
+        model = str(values.get("model", "PINHOLE"))
+        kind = _JSON.get(model, _JSON[""])
+        width, height, *params = astuple(decode_json(values, kind, CalibrationError, name))
         try:
-            model = str(data.get("model", "PINHOLE"))
-            params = tuple(float(data[name]) for name in MODELS.get(model, ()))  # type: ignore[arg-type]
-            return Camera(model, int(data["width"]), int(data["height"]), params)  # type: ignore[call-overload]
-        except KeyError as error:
-            raise CalibrationError(f"camera: {error.args[0]!r} is missing") from None
-        except (TypeError, ValueError, OverflowError) as error:
-            raise CalibrationError(f"camera: {error}") from None
+            return Camera(model, int(width), int(height), tuple(params))
+        except CalibrationError as error:
+            raise CalibrationError(f"{name}: {error}") from None

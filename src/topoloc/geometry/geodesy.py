@@ -10,13 +10,16 @@ with x to latitude 0, longitude 0 and z to the north pole. Formulas: Torge and M
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Struct
 
 from topoloc.errors import GeoreferenceError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import Finite, Matrix34, NonNegative, decode_json
 
 SEMI_MAJOR = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
@@ -115,23 +118,35 @@ class GeoPose:
     def to_json(self) -> dict[str, dict[str, float]]:
         """Return the strict form, with exactly the members of the standard."""
         w, x, y, z = self.quat_wxyz.tolist()
-        position = {"lat": self.position.lat, "lon": self.position.lon, "h": self.position.h}
-        return {"position": position, "quaternion": {"x": x, "y": y, "z": z, "w": w}}
+        return {"position": asdict(self.position), "quaternion": {"x": x, "y": y, "z": z, "w": w}}
 
     @staticmethod
-    def from_json(data: object) -> GeoPose:
+    def from_json(data: Any) -> GeoPose:
         """Read the form of `to_json`. Raises GeoreferenceError if the data have another form."""
-        try:
-            position, quaternion = data["position"], data["quaternion"]  # type: ignore[index]
-            lat, lon, h = (float(position[name]) for name in ("lat", "lon", "h"))
-            quat_wxyz = np.array([float(quaternion[name]) for name in ("w", "x", "y", "z")])
-        except (KeyError, TypeError, ValueError, OverflowError):
-            raise GeoreferenceError(
-                "no GeoPose: position (lat, lon, h) and quaternion (x, y, z, w) are needed"
-            ) from None
-        if not abs(float(np.linalg.norm(quat_wxyz)) - 1.0) < 1e-3:  # also true for NaN
-            raise GeoreferenceError("no GeoPose: its quaternion is not of unit length")
-        return GeoPose(GeoPoint(lat, lon, h), quat_wxyz)
+        return decode_json(data, GeoPoseJson, GeoreferenceError, "no GeoPose").geopose()
+
+
+class _Quaternion(Struct, frozen=True):
+    x: Finite
+    y: Finite
+    z: Finite
+    w: Finite
+
+    def __post_init__(self) -> None:
+        if not abs(math.hypot(self.w, self.x, self.y, self.z) - 1.0) < 1e-3:
+            raise ValueError("a quaternion that is not of unit length")
+
+
+class GeoPoseJson(Struct, frozen=True):
+    """Hold the JSON of a `GeoPose`."""
+
+    position: GeoPoint
+    quaternion: _Quaternion
+
+    def geopose(self) -> GeoPose:
+        """Return the GeoPose."""
+        q = self.quaternion
+        return GeoPose(self.position, np.array([q.w, q.x, q.y, q.z]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,37 +165,19 @@ class Georeference:
 
     def to_json(self) -> dict[str, object]:
         """Return the form stored in the map file."""
-        origin = {"lat": self.origin.lat, "lon": self.origin.lon, "h": self.origin.h}
-        matrix = self.enu_from_world.matrix()[:3].tolist()
         return {
-            "origin": origin,
-            "enu_from_world": matrix,
+            "origin": asdict(self.origin),
+            "enu_from_world": self.enu_from_world.matrix()[:3].tolist(),
             "source": self.source,
             "rms_m": self.rms_m,
         }
 
     @staticmethod
-    def from_json(data: object) -> Georeference:
+    def from_json(data: Any) -> Georeference:
         """Read the form of `to_json`. Raises GeoreferenceError if the data have another form."""
-        try:
-            origin, rms_m, source = data["origin"], data["rms_m"], data["source"]  # type: ignore[index]
-            lat, lon, h = (float(origin[name]) for name in ("lat", "lon", "h"))
-            matrix = np.array(data["enu_from_world"], np.float64)  # type: ignore[index]
-            enu_from_world = Rigid3.from_matrix(matrix)
-            if (
-                np.abs(enu_from_world.matrix()[:3] - matrix[:3]).max() < 1e-9
-            ):  # keep the stored values bit by bit
-                enu_from_world = Rigid3(matrix[:3, :3].copy(), matrix[:3, 3].copy())
-            rms_m = None if rms_m is None else float(rms_m)
-        except (KeyError, TypeError, ValueError, OverflowError, TrajectoryError):
-            raise GeoreferenceError(
-                "no georeference: origin, enu_from_world (3x4), source and rms_m are needed"
-            ) from None
-        if not isinstance(source, str) or (rms_m is not None and not 0.0 <= rms_m < math.inf):
-            raise GeoreferenceError(
-                "no georeference: its source is a text, its rms_m no negative number"
-            )
-        return Georeference(GeoPoint(lat, lon, h), enu_from_world, source, rms_m)
+        return decode_json(
+            data, GeoreferenceJson, GeoreferenceError, "no georeference"
+        ).georeference()
 
     def geopoint(self, point_world: Float[np.ndarray, "3"]) -> GeoPoint:
         """Return latitude, longitude and height of a point in the world frame (metres). Raises
@@ -200,3 +197,24 @@ class Georeference:
         """Return the heading of a direction in degrees clockwise from true north, 0 to 360."""
         east, north, _ = self.enu_from_world.rotation @ direction_world
         return math.degrees(math.atan2(east, north)) % 360.0
+
+
+class GeoreferenceJson(Struct, frozen=True):
+    """Hold the JSON of a `Georeference`."""
+
+    origin: GeoPoint
+    enu_from_world: Matrix34
+    source: str
+    rms_m: NonNegative | None
+
+    def georeference(self) -> Georeference:
+        """Return the georeference. Raises GeoreferenceError if its matrix is not a pose."""
+        matrix = np.array(self.enu_from_world)
+        try:
+            enu_from_world = Rigid3.from_matrix(matrix)
+        except TrajectoryError as error:
+            raise GeoreferenceError(f"no georeference: enu_from_world: {error}") from None
+        if np.abs(enu_from_world.matrix()[:3] - matrix).max() < 1e-9:
+            # Keep the stored values bit by bit.
+            enu_from_world = Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
+        return Georeference(self.origin, enu_from_world, self.source, self.rms_m)

@@ -7,12 +7,17 @@ the left: ``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Struct
 
 from topoloc.errors import TrajectoryError
+from topoloc.json_data import Finite, decode_json
 
 _SMALL_ANGLE = 1e-7
 _TOLERANCE = 1e-2
@@ -102,18 +107,23 @@ class Rigid3:
         return Rigid3(np.eye(3), np.zeros(3))
 
     @staticmethod
-    def from_matrix(matrix: np.ndarray) -> Rigid3:
+    def from_matrix(matrix: np.ndarray | Sequence[Any]) -> Rigid3:
         """Return the transform of a 3x4 or 4x4 matrix. Its rotation is made orthonormal.
 
         Raises:
-            TrajectoryError: the shape is wrong, values are not finite, or the 3x3 part is not a
-                rotation within `_TOLERANCE`.
+            TrajectoryError: the shape is wrong, values are not finite, the last row of four is not
+                0 0 0 1, or the 3x3 part is not a rotation within `_TOLERANCE`.
         """
-        m = np.asarray(matrix, dtype=np.float64)
+        try:
+            m = np.asarray(matrix, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            raise TrajectoryError("not a pose: not a 3x4 or 4x4 matrix of numbers") from None
         if m.shape not in ((3, 4), (4, 4)):
             raise TrajectoryError(f"not a pose: a matrix of shape {m.shape}, not 3x4 or 4x4")
         if not np.all(np.isfinite(m)):
             raise TrajectoryError("not a pose: NaN or infinite entries")
+        if len(m) == 4 and not np.allclose(m[3], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
+            raise TrajectoryError("not a pose: its last row is not 0 0 0 1; is it transposed?")
         u, singular, vt = np.linalg.svd(m[:3, :3])
         if np.any(np.abs(singular - 1.0) > _TOLERANCE) or np.linalg.det(u @ vt) < 0:
             raise TrajectoryError("not a pose: its 3x3 part is no rotation")
@@ -130,6 +140,22 @@ class Rigid3:
         if t.shape != (3,) or not np.all(np.isfinite(t)):
             raise TrajectoryError(f"not a translation: {t.tolist()}")
         return Rigid3(matrix_from_quat_wxyz(np.asarray(quat_wxyz, dtype=np.float64)), t)
+
+    def to_json(self) -> dict[str, list[float]]:
+        """Return the form ``{"translation": [x, y, z], "quat_wxyz": [w, x, y, z]}``, in metres."""
+        return {
+            "translation": self.translation.tolist(),
+            "quat_wxyz": self.quat_wxyz().tolist(),
+        }
+
+    @staticmethod
+    def from_json(data: Any, name: str = "pose") -> Rigid3:
+        """Parse the form of `to_json`, from text or an object. `name` is its name in errors.
+
+        Raises:
+            TrajectoryError: it has another form, or the quaternion is not of unit length.
+        """
+        return decode_json(data, PoseJson, TrajectoryError, name).rigid()
 
     @staticmethod
     def exp(xi: Float[np.ndarray, "6"]) -> Rigid3:
@@ -183,6 +209,21 @@ class Rigid3:
         omega = log_so3(other.rotation @ self.rotation.T)
         translation = (1.0 - fraction) * self.translation + fraction * other.translation
         return Rigid3(exp_so3(fraction * omega) @ self.rotation, translation)
+
+
+class PoseJson(Struct, frozen=True):
+    """Hold the JSON of a pose: translation in metres, unit quaternion."""
+
+    translation: tuple[Finite, Finite, Finite]
+    quat_wxyz: tuple[Finite, Finite, Finite, Finite]
+
+    def __post_init__(self) -> None:
+        if not abs(math.hypot(*self.quat_wxyz) - 1.0) < 1e-3:
+            raise ValueError("quat_wxyz is not of unit length")
+
+    def rigid(self) -> Rigid3:
+        """Return the transform."""
+        return Rigid3.from_quat_wxyz(np.array(self.quat_wxyz), np.array(self.translation))
 
 
 def inverse_covariance(

@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast, Between
+from topoloc.json_data import Count, Finite
 from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, RivalWeights
 
 COLUMNS, ROWS = 8, 6
@@ -55,16 +56,16 @@ class Evidence:
         num_lesser_side: number of found points of the side view that has fewer. Virtual views only.
     """
 
-    num_matches: int
-    num_inliers: int
-    num_found: int
-    num_visible: int
-    num_by_chance: int
-    spread: float
-    doubt: float
-    even_share: float
-    num_distinct: int | None = None
-    num_lesser_side: int | None = None
+    num_matches: Count
+    num_inliers: Count
+    num_found: Count
+    num_visible: Count
+    num_by_chance: Count
+    spread: Finite
+    doubt: Finite
+    even_share: Finite
+    num_distinct: Count | None = None
+    num_lesser_side: Count | None = None
 
     @property
     def is_from_virtual_views(self) -> bool:

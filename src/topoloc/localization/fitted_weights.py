@@ -8,39 +8,38 @@ type, and its results are marked as not calibrated.
 
 from __future__ import annotations
 
-import json
-import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
+
+from msgspec import Struct, to_builtins
+from msgspec.structs import astuple
 
 from topoloc.errors import FeatureTypeError
 from topoloc.features.feature_types import FEATURE_TYPES, LEARNED_TYPES
+from topoloc.json_data import Finite, decode_json
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FALLBACK_TYPE, LEARNED_FALLBACK_TYPE = "surf", LEARNED_TYPES[0].name
 """Feature types whose weights are the fallback: for types without a network, and with one."""
 
-_T = TypeVar("_T")
 
-
-@dataclass(frozen=True)
-class EvidenceWeights:
+class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the weights of the evidence for one pose (`evidence.py`), in log-odds.
 
     A pose with more than `clear_log_odds` is clear. Only very similar places of the map are then
     searched.
     """
 
-    even_share: float
-    chance: float
-    inliers: float
-    inlier_share: float
-    spread: float
-    doubt: float
-    bias: float
-    clear_log_odds: float
+    even_share: Finite
+    chance: Finite
+    inliers: Finite
+    inlier_share: Finite
+    spread: Finite
+    doubt: Finite
+    bias: Finite
+    clear_log_odds: Finite
 
     @property
     def as_vector(self) -> tuple[float, ...]:
@@ -55,8 +54,7 @@ class EvidenceWeights:
         )
 
 
-@dataclass(frozen=True)
-class RivalWeights:
+class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the weights that compare two poses of one image (`belief.py`).
 
     They weigh the log-odds, the spatially uniform inlier ratio and the normalized uncertainty, in
@@ -64,14 +62,13 @@ class RivalWeights:
     pose elsewhere.
     """
 
-    odds: float
-    even_share: float
-    doubt: float
-    unclear_lead: float
+    odds: Finite
+    even_share: Finite
+    doubt: Finite
+    unclear_lead: Finite
 
 
-@dataclass(frozen=True)
-class VirtualViewWeights:
+class VirtualViewWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the weights of the evidence for a pose from virtual views (`walls/`), in log-odds.
 
     `sigma_px` is the standard deviation (pixels) of a key point found at a slant. `few_points` over
@@ -79,18 +76,18 @@ class VirtualViewWeights:
     found, guided matching has biased most of them towards the pose.
     """
 
-    found: float
-    chance: float
-    inliers: float
-    inlier_share: float
-    spread: float
-    doubt: float
-    distinct: float
-    lesser_side: float
-    even_share: float
-    bias: float
-    sigma_px: float
-    few_points: float
+    found: Finite
+    chance: Finite
+    inliers: Finite
+    inlier_share: Finite
+    spread: Finite
+    doubt: Finite
+    distinct: Finite
+    lesser_side: Finite
+    even_share: Finite
+    bias: Finite
+    sigma_px: Finite
+    few_points: Finite
 
     @property
     def as_vector(self) -> tuple[float, ...]:
@@ -99,17 +96,16 @@ class VirtualViewWeights:
         return (*shares, self.distinct, self.lesser_side, self.even_share, self.doubt)
 
 
-@dataclass(frozen=True)
-class CorrelatedErrorWeights:
+class CorrelatedErrorWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the conversion from a comparison of neighbouring nodes to rho (`correlated_errors.py`).
 
     `factor` corrects for errors that neighbours share, which a comparison cannot show. `least` is
     the minimum of rho. `unknown` is rho if too few nodes can be compared.
     """
 
-    factor: float
-    least: float
-    unknown: float
+    factor: Finite
+    least: Finite
+    unknown: Finite
 
 
 @dataclass(frozen=True)
@@ -137,18 +133,33 @@ class FittedWeights:
         return self.calibration_error is not None
 
     def to_json(self) -> dict[str, Any]:
-        """Return a JSON object that `parse_fitted_weights` reads."""
-        whole = asdict(self)
-        return {name: whole.pop(name) for name in _SOURCE} | {"weights": whole}
+        """Return the JSON object of a file of weights."""
+        groups = ("evidence", "rivals", "walls", "shared_errors")
+        weights = {name: to_builtins(getattr(self, name)) for name in groups}
+        return {
+            "kind": self.kind,
+            "corpus": self.corpus,
+            "date": self.date,
+            "command": self.command,
+            "calibration_error": self.calibration_error,
+            "weights": weights,
+        }
 
 
-_GROUPS = {
-    "evidence": EvidenceWeights,
-    "rivals": RivalWeights,
-    "walls": VirtualViewWeights,
-    "shared_errors": CorrelatedErrorWeights,
-}
-_SOURCE = ("kind", "corpus", "date", "command", "calibration_error")
+class _Groups(Struct, frozen=True, forbid_unknown_fields=True):
+    evidence: EvidenceWeights
+    rivals: RivalWeights
+    walls: VirtualViewWeights
+    shared_errors: CorrelatedErrorWeights
+
+
+class _WeightsFile(Struct, frozen=True, forbid_unknown_fields=True):
+    kind: str
+    corpus: str
+    date: str
+    command: str
+    calibration_error: Finite
+    weights: _Groups
 
 
 @cache
@@ -180,48 +191,11 @@ def read_weights(path: Path) -> FittedWeights:
     Raises:
         FeatureTypeError: the file cannot be read, or has not the format of `FittedWeights.to_json`.
     """
+    fault = f"cannot read the weights in {path}"
     try:
-        return parse_fitted_weights(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, RecursionError) as error:
-        raise FeatureTypeError(f"cannot read the weights in {path}: {error}") from error
-
-
-def parse_fitted_weights(read: Any) -> FittedWeights:
-    """Parse the object that `FittedWeights.to_json` returns.
-
-    Raises:
-        ValueError: a key is missing, unknown or of the wrong type.
-    """
-    _check_keys(read, {*_SOURCE, "weights"}, "the file")
-    _check_keys(read["weights"], set(_GROUPS), "weights")
-    for name in _SOURCE[:-1]:
-        if not isinstance(read[name], str):
-            raise ValueError(f"{name} is not a text")
-    values: dict[str, Any] = {name: read[name] for name in _SOURCE}
-    values["calibration_error"] = _number(read["calibration_error"], "calibration_error")
-    values |= {
-        name: _parse_weight_group(group, read["weights"][name], name)
-        for name, group in _GROUPS.items()
-    }
-    return FittedWeights(**values)
-
-
-def _parse_weight_group(group: type[_T], read: Any, name: str) -> _T:
-    names = [field.name for field in fields(group)]  # pyright: ignore[reportArgumentType]
-    _check_keys(read, set(names), name)
-    return group(*(_number(read[key], f"{name}.{key}") for key in names))
-
-
-def _check_keys(read: Any, expected: set[str], where: str) -> None:
-    if not isinstance(read, dict):
-        raise ValueError(f"{where} is no table of names and values")
-    if missing := sorted(expected - set(read)):
-        raise ValueError(f"{where} lacks {missing[0]}")
-    if unknown := sorted(set(read) - expected):
-        raise ValueError(f"{where} has an unknown {unknown[0]}")
-
-
-def _number(value: Any, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{name} is not a finite number")
-    return float(value)
+        text = path.read_bytes()
+    except OSError as error:
+        raise FeatureTypeError(f"{fault}: {error.strerror}") from None
+    file = decode_json(text, _WeightsFile, FeatureTypeError, fault)
+    source = (file.kind, file.corpus, file.date, file.command, file.calibration_error)
+    return FittedWeights(*source, *astuple(file.weights))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from topoloc.errors import CalibrationError, ResultError
+from msgspec import Struct
+
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization import checked_json as checked
+from topoloc.geometry.rigid import PoseJson, Rigid3
+from topoloc.json_data import Count, Nanoseconds
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Provenance:
         camera = None if self.camera is None else self.camera.to_json()
         of_atlas: dict[str, Any] = {} if self.tile is None else {"tile": self.tile}
         if self.atlas_from_cam is not None:
-            of_atlas["atlas_from_cam"] = checked.pose_to_json(self.atlas_from_cam)
+            of_atlas["atlas_from_cam"] = self.atlas_from_cam.to_json()
         if self.joint_world is not None:
             of_atlas["joint_world"] = self.joint_world
         if self.joint_from_cam is not None:
-            of_atlas["joint_from_cam"] = checked.pose_to_json(self.joint_from_cam)
+            of_atlas["joint_from_cam"] = self.joint_from_cam.to_json()
         return of_atlas | {
             "map": self.map_id,
             "version": self.map_version,
@@ -56,35 +56,33 @@ class Provenance:
             "features": self.features,
         }
 
-    @staticmethod
-    def from_json(data: Mapping[str, Any]) -> Provenance:
-        """Parse the provenance in a result's JSON. Missing keys give the defaults.
 
-        Raises:
-            ResultError: a value is invalid.
-        """
-        t_ns, camera, tile, pose = (
-            data.get(key) for key in ("t_ns", "camera", "tile", "atlas_from_cam")
+class ProvenanceJson(Struct, frozen=True, kw_only=True):
+    """Hold the keys of a result's JSON that describe its source."""
+
+    map: str = ""
+    version: Count = 0
+    features: str = ""
+    t_ns: Nanoseconds | None = None
+    camera: dict[str, Any] | None = None
+    tile: str | None = None
+    atlas_from_cam: PoseJson | None = None
+    joint_world: str | None = None
+    joint_from_cam: PoseJson | None = None
+
+    def provenance(self) -> Provenance:
+        """Return the provenance. Raises CalibrationError if the camera is not usable."""
+        return Provenance(
+            self.map,
+            self.version,
+            self.features,
+            self.t_ns,
+            None if self.camera is None else Camera.from_json(self.camera),
+            self.tile,
+            None if self.atlas_from_cam is None else self.atlas_from_cam.rigid(),
+            self.joint_world,
+            None if self.joint_from_cam is None else self.joint_from_cam.rigid(),
         )
-        joint, joint_pose = data.get("joint_world"), data.get("joint_from_cam")
-        if camera is not None and not isinstance(camera, dict):
-            raise ResultError("no result: 'camera' is no object")
-        try:
-            return Provenance(
-                checked.text(data.get("map", ""), "map"),
-                checked.integer(data.get("version", 0), "version"),
-                checked.text(data.get("features", ""), "features"),
-                None if t_ns is None else checked.integer(t_ns, "t_ns", -(2**63)),
-                None if camera is None else Camera.from_json(camera),
-                None if tile is None else checked.text(tile, "tile"),
-                None if pose is None else checked.pose_from_json(pose, "atlas_from_cam"),
-                None if joint is None else checked.text(joint, "joint_world"),
-                None
-                if joint_pose is None
-                else checked.pose_from_json(joint_pose, "joint_from_cam"),
-            )
-        except CalibrationError as error:
-            raise ResultError(f"no result: {error}") from None
 
 
 EMPTY_PROVENANCE = Provenance()

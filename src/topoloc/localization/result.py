@@ -4,24 +4,24 @@ exists."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, TypeVar, get_args
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta, Struct
 
-from topoloc.errors import GeoreferenceError, ResultError
+from topoloc.errors import CalibrationError, ResultError
 from topoloc.geometry.calibration_mismatch import (
-    MISMATCH_FOCAL_FIELDS,
     CalibrationMismatch,
     IntrinsicsDeviation,
+    MismatchJson,
 )
-from topoloc.geometry.geodesy import GeoPose
-from topoloc.geometry.rigid import Rigid3
-from topoloc.localization import checked_json as checked
-from topoloc.localization.checked_json import pose_to_json
+from topoloc.geometry.geodesy import GeoPose, GeoPoseJson
+from topoloc.geometry.rigid import PoseJson, Rigid3
+from topoloc.json_data import Count, Finite, Matrix66, NonNegative, decode_json
 from topoloc.localization.evidence import Evidence
-from topoloc.localization.provenance import EMPTY_PROVENANCE, Provenance
+from topoloc.localization.provenance import EMPTY_PROVENANCE, Provenance, ProvenanceJson
 from topoloc.retrieval.coarse import NodeScore
 
 Reason = Literal[
@@ -110,7 +110,7 @@ class Localization:
         return {
             "query": query,
             "localized": True,
-            "world_from_cam": pose_to_json(self.world_from_cam),
+            "world_from_cam": self.world_from_cam.to_json(),
             "covariance": self.covariance.tolist(),
             "position_sigma_m": self.position_sigma_m,
             "rotation_sigma_deg": self.rotation_sigma_deg,
@@ -138,31 +138,13 @@ class Localization:
         Raises:
             ResultError: it is not a result, or the result of an image that was not localized.
         """
-        data = checked.parse_object(line)
-        if checked.require(data, "localized") is not True:
+        result = result_from_json(line)
+        if not isinstance(result, Localization):
             raise ResultError(
                 "the result of an image that was not localized holds no pose"
                 " (NotLocalized.from_json reads it)"
             )
-        focal, evidence, doubt = (
-            data.get(key) for key in ("focal_length_px", "evidence", "calibration_doubt")
-        )
-        return Localization(
-            checked.pose_from_json(checked.require(data, "world_from_cam"), "world_from_cam"),
-            checked.covariance(checked.require(data, "covariance"), "covariance"),
-            checked.number(checked.require(data, "probability"), "probability", 0.0, 1.0),
-            checked.integer(checked.require(data, "node"), "node"),
-            **_parse_evidence_fields(data),
-            evidence=None if evidence is None else _parse_evidence(evidence),
-            focal_length_px=(
-                None if focal is None else checked.number(focal, "focal_length_px", 0.0)
-            ),
-            noise_share=checked.number(data.get("noise_share", 1.0), "noise_share", 0.0, 1.0),
-            calibrated=data.get("calibrated", True) is not False,
-            provenance=Provenance.from_json(data),
-            geopose=_parse_geopose(data),
-            calibration_doubt=None if doubt is None else _parse_calibration_doubt(doubt),
-        )
+        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,29 +164,12 @@ class Alternative:
     def to_json(self) -> dict[str, Any]:
         """Return the alternative as a JSON object."""
         pose = {
-            "world_from_cam": pose_to_json(self.world_from_cam),
+            "world_from_cam": self.world_from_cam.to_json(),
             "probability": self.probability,
             "node": self.node_id,
         }
         pose |= {} if self.tile is None else {"tile": self.tile}
         return pose if self.geopose is None else pose | {"geopose": self.geopose.to_json()}
-
-    @staticmethod
-    def from_json(data: Any) -> Alternative:
-        """Parse the output of `to_json`.
-
-        Raises:
-            ResultError: it is not an alternative.
-        """
-        if not isinstance(data, Mapping):
-            raise ResultError("no result: an alternative is an object")
-        return Alternative(
-            checked.pose_from_json(checked.require(data, "world_from_cam"), "world_from_cam"),
-            checked.number(checked.require(data, "probability"), "probability", 0.0, 1.0),
-            checked.integer(checked.require(data, "node"), "node"),
-            _parse_geopose(data),
-            None if data.get("tile") is None else checked.text(data["tile"], "tile"),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,25 +213,13 @@ class NotLocalized:
         Raises:
             ResultError: it is not a result, or the result of an image that was localized.
         """
-        data = checked.parse_object(line)
-        if checked.require(data, "localized") is not False:
+        result = result_from_json(line)
+        if not isinstance(result, NotLocalized):
             raise ResultError(
                 "the result of an image that was localized is no refusal (Localization.from_json"
                 " reads it)"
             )
-        reason = checked.require(data, "reason")
-        if reason not in get_args(Reason):
-            raise ResultError(f"no result: the reason is none of {', '.join(get_args(Reason))}")
-        return NotLocalized(
-            reason,
-            **_parse_evidence_fields(data),
-            detail=checked.text(data.get("detail", ""), "detail"),
-            alternatives=tuple(
-                Alternative.from_json(one)
-                for one in checked.items(data.get("alternatives", []), "alternatives")
-            ),
-            provenance=Provenance.from_json(data),
-        )
+        return result
 
 
 R = TypeVar("R", bound=Localization | NotLocalized)
@@ -278,12 +231,12 @@ def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | No
     Raises:
         ResultError: it is not a result.
     """
-    data = checked.parse_object(line)
-    return (
-        Localization.from_json(data)
-        if data.get("localized") is True
-        else NotLocalized.from_json(data)
-    )
+    data = decode_json(line, dict[str, Any], ResultError, "no result")
+    kind = _LocalizedLine if data.get("localized") is True else _RefusedLine
+    try:
+        return decode_json(data, kind, ResultError, "no result").result()
+    except CalibrationError as error:
+        raise ResultError(f"no result: {error}") from None
 
 
 def with_time(result: R, t_ns: int) -> R:
@@ -301,68 +254,94 @@ def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
     }
 
 
-def _parse_geopose(data: Mapping[str, Any]) -> GeoPose | None:
-    try:
-        return None if data.get("geopose") is None else GeoPose.from_json(data["geopose"])
-    except GeoreferenceError as error:
-        raise ResultError(f"no result: 'geopose': {error}") from None
+_Share = Annotated[float, Meta(ge=0, le=1)]
+_Candidates = Annotated[list[tuple[Count, Finite]], Meta(max_length=10_000)]
 
 
-def _parse_evidence(value: Any) -> Evidence:
-    data = checked.mapping(value, "evidence")
-    values: dict[str, Any] = {}
-    for one in fields(Evidence):
-        is_missing = one.name in ("num_distinct", "num_lesser_side") and data.get(one.name) is None
-        read = checked.integer if one.name.startswith("num_") else checked.number
-        values[one.name] = (
-            None if is_missing else read(checked.require(data, one.name), f"evidence.{one.name}")
+class _Line(ProvenanceJson, frozen=True, kw_only=True):
+    """Hold the keys that the JSON of each result has. Other keys are ignored."""
+
+    localized: bool
+    candidates: _Candidates
+    num_matches: Count
+    num_inliers: Count
+    times_ms: dict[str, Finite]
+
+    @property
+    def scores(self) -> list[NodeScore]:
+        """Return the candidates."""
+        return [NodeScore(node_id, score) for node_id, score in self.candidates]
+
+
+class _LocalizedLine(_Line, frozen=True, kw_only=True):
+    world_from_cam: PoseJson
+    covariance: Matrix66
+    probability: _Share
+    node: Count
+    evidence: Evidence | None = None
+    focal_length_px: NonNegative | None = None
+    noise_share: _Share = 1.0
+    calibrated: bool = True
+    geopose: GeoPoseJson | None = None
+    calibration_doubt: MismatchJson | None = None
+
+    def __post_init__(self) -> None:
+        matrix = np.array(self.covariance)
+        diagonal = np.diag(matrix)
+        slack = 1e-6 * np.sqrt(np.abs(np.outer(diagonal, diagonal))) + 1e-300
+        if (diagonal < 0.0).any() or (np.abs(matrix - matrix.T) > slack).any():
+            raise ValueError("covariance is not symmetric, or has a negative variance")
+
+    def result(self) -> Localization:
+        """Return the result. Raises CalibrationError if its camera is not usable."""
+        doubt = self.calibration_doubt
+        return Localization(
+            self.world_from_cam.rigid(),
+            np.array(self.covariance),
+            self.probability,
+            self.node,
+            self.scores,
+            self.num_matches,
+            self.num_inliers,
+            self.times_ms,
+            self.evidence,
+            self.focal_length_px,
+            self.noise_share,
+            self.calibrated,
+            self.provenance(),
+            None if self.geopose is None else self.geopose.geopose(),
+            None if doubt is None else doubt.mismatch(),
         )
-    return Evidence(**values)
 
 
-def _parse_calibration_doubt(value: Any) -> CalibrationMismatch:
-    data = checked.mapping(value, "calibration_doubt")
+class _AlternativeJson(Struct, frozen=True):
+    world_from_cam: PoseJson
+    probability: _Share
+    node: Count
+    geopose: GeoPoseJson | None = None
+    tile: str | None = None
 
-    def vector(key: str, length: int) -> np.ndarray:
-        values = [
-            checked.number(one, key) for one in checked.items(checked.require(data, key), key)
-        ]
-        if len(values) != length:
-            raise ResultError(f"no result: {key!r} is no {length} numbers")
-        return np.array(values)
-
-    of = checked.items(checked.require(data, "of"), "of")
-    focal, sigma, calibrated = (
-        checked.number(checked.require(data, key), key, 0.0) for key in MISMATCH_FOCAL_FIELDS
-    )
-    return CalibrationMismatch(
-        focal,
-        sigma,
-        calibrated,
-        vector("principal_point_px", 2),
-        vector("calibrated_principal_point_px", 2),
-        "focal_length" in of,
-        "principal_point" in of,
-        vector("shift", 6),
-    )
+    def alternative(self) -> Alternative:
+        """Return the alternative."""
+        geopose = None if self.geopose is None else self.geopose.geopose()
+        pose = self.world_from_cam.rigid()
+        return Alternative(pose, self.probability, self.node, geopose, self.tile)
 
 
-def _parse_evidence_fields(data: Mapping[str, Any]) -> dict[str, Any]:
-    pairs = [
-        checked.items(pair, "candidates")
-        for pair in checked.items(checked.require(data, "candidates"), "candidates")
-    ]
-    if any(len(pair) != 2 for pair in pairs):
-        raise ResultError("no result: 'candidates' are pairs of a node and its score")
-    times_ms = checked.require(data, "times_ms")
-    if not isinstance(times_ms, Mapping):
-        raise ResultError("no result: 'times_ms' are milliseconds by the names of stages")
-    return {
-        "candidates": [
-            NodeScore(checked.integer(node_id, "candidates"), checked.number(score, "candidates"))
-            for node_id, score in pairs
-        ],
-        "num_matches": checked.integer(checked.require(data, "num_matches"), "num_matches"),
-        "num_inliers": checked.integer(checked.require(data, "num_inliers"), "num_inliers"),
-        "times_ms": {str(stage): checked.number(ms, "times_ms") for stage, ms in times_ms.items()},
-    }
+class _RefusedLine(_Line, frozen=True, kw_only=True):
+    reason: Reason
+    detail: str = ""
+    alternatives: Annotated[tuple[_AlternativeJson, ...], Meta(max_length=10_000)] = ()
+
+    def result(self) -> NotLocalized:
+        """Return the result. Raises CalibrationError if its camera is not usable."""
+        return NotLocalized(
+            self.reason,
+            self.scores,
+            self.num_matches,
+            self.num_inliers,
+            self.times_ms,
+            self.detail,
+            tuple(one.alternative() for one in self.alternatives),
+            self.provenance(),
+        )

@@ -14,9 +14,10 @@ from topoloc.features.feature_types import (
     default_learned_type,
     find_feature_type,
 )
+from topoloc.json_data import decode_json
 from topoloc.mapping.landmarks import LandmarkConfig
 from topoloc.mapping.nodes import NodeConfig
-from topoloc.mapping.validation import parse_json
+from topoloc.mapping.validation import CorruptDataError
 from topoloc.mapping.virtual_nodes import VirtualNodesConfig
 from topoloc.points.metric_points import MetricPointsConfig
 from topoloc.points.motion_triangulation import MotionTriangulationConfig
@@ -111,8 +112,8 @@ def config_to_text(config: MapConfig) -> str:
 def config_from_text(text: str, version: int | None) -> MapConfig:
     """Parse the text of `config_to_text`. Files of schema 1 contain no version. Raises ConfigError
     with the key."""
-    data = parse_json(text)
-    if version is not None and isinstance(data, dict) and data.pop("version", None) != version:
+    data = decode_json(text, dict[str, Any], CorruptDataError, "config")
+    if version is not None and data.pop("version", None) != version:
         raise ConfigError(f"config: of another version than {version}, which is known")
     config = parse_settings(MapConfig, data, "config")
     for name in ("d_thresh", "lambda_rot"):

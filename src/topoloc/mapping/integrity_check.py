@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError
+from topoloc.json_data import decode_json
 from topoloc.mapping.map_file import MapFile
 from topoloc.mapping.map_writing import compute_map_digest
 from topoloc.mapping.schema import SORT_COLUMNS, TABLES
 from topoloc.mapping.topomap import TopoMetricMap, open_map_coarse_localizer
-from topoloc.mapping.validation import CorruptDataError, parse_json
+from topoloc.mapping.validation import CorruptDataError
 from topoloc.retrieval.coarse import open_coarse_localizer
 
 
@@ -40,7 +41,7 @@ def list_coarse_models(path: Path) -> list[dict[str, Any]]:
                 "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
             )
             return [
-                _model_facts(name, parse_json(settings), num_bytes)
+                _model_facts(name, settings, num_bytes)
                 for name, settings, num_bytes in database.execute(query)
             ]
     finally:
@@ -109,10 +110,9 @@ def _try_read(read: Callable[[], Any]) -> tuple[Any, list[str]]:
         return None, [f"node {error} is missing"]
 
 
-def _model_facts(name: str, settings: Any, num_bytes: int) -> dict[str, Any]:
-    if not isinstance(settings, dict):
-        raise CorruptDataError(f"the settings of coarse localizer {name} are none")
-    facts = {"name": name, "bytes": num_bytes}
-    return facts | {
-        key: settings[key] for key in ("backbone", "weights", "trained") if key in settings
+def _model_facts(name: str, text: str, num_bytes: int) -> dict[str, Any]:
+    settings = decode_json(text, dict[str, Any], CorruptDataError, f"coarse localizer {name}")
+    shown = ("backbone", "weights", "trained")
+    return {"name": name, "bytes": num_bytes} | {
+        key: settings[key] for key in shown if key in settings
     }

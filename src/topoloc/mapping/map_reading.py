@@ -12,11 +12,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from topoloc.bounds import parse_settings, parse_value
+from topoloc.bounds import parse_settings
 from topoloc.errors import MapError
 from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
+from topoloc.json_data import decode_json
 from topoloc.mapping.config import CONFIG_VERSION, MapConfig, config_from_text
 from topoloc.mapping.contents import MapContents, NextIds
 from topoloc.mapping.entries import (
@@ -39,7 +40,6 @@ from topoloc.mapping.validation import (
     arrays_from_npz,
     camera_from_text,
     check_count,
-    parse_json,
     pose_from_bytes,
 )
 from topoloc.retrieval.coarse import CoarseModel
@@ -83,7 +83,7 @@ def _read_contents(file: MapFile) -> MapContents:
     sides = None
     if file.count(f"{VIRTUAL_PREFIX}nodes") > 0:
         kind = (
-            parse_value(str, parse_json(facts["kind_of_sides"]), "kind_of_sides")
+            decode_json(facts["kind_of_sides"], str, CorruptDataError, "kind_of_sides")
             if "kind_of_sides" in facts
             else config.features.kind
         )
@@ -105,9 +105,9 @@ def _read_contents(file: MapFile) -> MapContents:
         ),
         coarse_models=_LazyMapping(file, "coarse_models", _model_from_row),
         config=config,
-        length_m=parse_value(float, parse_json(facts["length_m"]), "length_m"),
-        default_coarse=parse_value(
-            str, parse_json(facts.get("default_coarse", '"surf-vlad"')), "default_coarse"
+        length_m=_read_length(facts["length_m"]),
+        default_coarse=decode_json(
+            facts.get("default_coarse", '"surf-vlad"'), str, CorruptDataError, "default_coarse"
         ),
         shared_errors=_read_correlated_errors(facts, "shared_errors"),
         other_shared_errors={
@@ -123,12 +123,12 @@ def _read_contents(file: MapFile) -> MapContents:
         sides=sides,
         sessions=list(_read_sessions(file).values()),
         edits=_read_edits(file),
-        next_ids=parse_settings(NextIds, parse_json(facts.get("next_ids", "{}")), "next_ids"),
+        next_ids=parse_settings(
+            NextIds, _decode_object(facts.get("next_ids", "{}"), "next_ids"), "next_ids"
+        ),
         map_id=_read_map_id(facts),
         georeference=(
-            Georeference.from_json(parse_json(facts["georeference"]))
-            if "georeference" in facts
-            else None
+            Georeference.from_json(facts["georeference"]) if "georeference" in facts else None
         ),
         other_kinds={
             kind: _lazy_nodes(file, kind, is_default=False)
@@ -138,16 +138,26 @@ def _read_contents(file: MapFile) -> MapContents:
     )
 
 
+def _decode_object(text: str, what: str) -> dict[str, Any]:
+    return decode_json(text, dict[str, Any], CorruptDataError, what)
+
+
+def _read_length(text: str) -> float:
+    length = decode_json(text, float, CorruptDataError, "length_m")
+    if not math.isfinite(length):
+        raise CorruptDataError("length_m: a finite number is expected")
+    return length
+
+
 def _read_feature_types(facts: Mapping[str, str], config: MapConfig) -> list[str]:
     """Return the feature types of the map, the first type first."""
-    kinds = parse_json(facts["kinds"]) if "kinds" in facts else [config.features.kind]
-    if (
-        not isinstance(kinds, list)
-        or not all(isinstance(kind, str) for kind in kinds)
-        or len(kinds) > 8
-        or len(set(kinds)) < len(kinds)
-    ):
-        raise CorruptDataError("kinds: a list of names is expected")
+    kinds = (
+        decode_json(facts["kinds"], list[str], CorruptDataError, "kinds")
+        if "kinds" in facts
+        else [config.features.kind]
+    )
+    if len(kinds) > 8 or len(set(kinds)) < len(kinds):
+        raise CorruptDataError("kinds: at most 8 different names are expected")
     if kinds[:1] != [config.features.kind]:
         raise CorruptDataError(f"kinds: {kinds} do not begin with that of the configuration")
     for kind in kinds:
@@ -165,18 +175,16 @@ def _read_map_id(facts: Mapping[str, str]) -> str | None:
 def _read_correlated_errors(facts: Mapping[str, str], key: str) -> CorrelatedErrors | None:
     if key not in facts:
         return None
-    found = parse_settings(CorrelatedErrors, parse_json(facts[key]), key)
+    found = parse_settings(CorrelatedErrors, _decode_object(facts[key], key), key)
     if not 0.0 <= found.rho < math.inf:
         raise CorruptDataError("shared errors that are no share")
     return found
 
 
 def _read_edits(file: MapFile) -> list[Edit]:
-    changes = parse_json(file.facts.get("changes", "{}"))
-    if not isinstance(changes, dict) or not all(
-        isinstance(of_edit, dict) for of_edit in changes.values()
-    ):
-        raise CorruptDataError("changes: what each edit changed is expected")
+    changes = decode_json(
+        file.facts.get("changes", "{}"), dict[str, dict[str, Any]], CorruptDataError, "changes"
+    )
     return [Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")]
 
 
@@ -195,9 +203,7 @@ def _read_session(file: MapFile, session_id: int) -> Session:
 
 
 def _session_from_row(row: Mapping[str, Any]) -> Session:
-    facts = parse_json(row["json"])
-    if not isinstance(facts, dict):
-        raise CorruptDataError("a session that says nothing of itself")
+    facts = _decode_object(row["json"], "session")
     camera = facts.pop("camera", None)
     session = parse_settings(
         Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session"
@@ -345,7 +351,7 @@ class _LazyStatistics:
                 " session_id LIMIT 100000"
             )
             return [
-                parse_value(int, row[0], "landmark_sums.session_id")
+                decode_json(row[0], int, CorruptDataError, "landmark_sums.session_id")
                 for row in database.execute(query, (self._node_id, self._kind))
             ]
 
@@ -421,10 +427,9 @@ class _LazyMapping(Mapping[K, V]):
 
 
 def _model_from_row(row: dict[str, Any]) -> CoarseModel:
-    name, settings = row["name"], parse_json(row["settings"])
-    if not isinstance(settings, dict):
-        raise CorruptDataError(f"the settings of coarse localizer {name} are none")
-    return CoarseModel(name, settings, arrays_from_npz(row["arrays"], f"coarse localizer {name}"))
+    name, what = row["name"], f"coarse localizer {row['name']}"
+    settings = _decode_object(row["settings"], what)
+    return CoarseModel(name, settings, arrays_from_npz(row["arrays"], what))
 
 
 def _moves_from_row(row: dict[str, Any]) -> np.ndarray:

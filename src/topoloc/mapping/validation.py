@@ -4,7 +4,6 @@ before any kernel uses it."""
 from __future__ import annotations
 
 import io
-import json
 import math
 import zipfile
 import zlib
@@ -16,6 +15,7 @@ import numpy as np
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import Count, decode_json
 
 MAX_POINTS = 100_000
 MAX_SIDE_PX = 32_768
@@ -55,7 +55,7 @@ def pose_from_bytes(data: bytes) -> Rigid3:
 
 def camera_from_text(text: str) -> Camera:
     """Parse a camera model of plausible size. Raises CalibrationError, CorruptDataError."""
-    camera = Camera.from_json(parse_json(text))
+    camera = Camera.from_json(text)
     if (
         max(camera.width, camera.height) > MAX_SIDE_PX
         or max(map(abs, camera.params)) > _MAX_MAGNITUDE
@@ -67,16 +67,6 @@ def camera_from_text(text: str) -> Camera:
     return camera
 
 
-def parse_json(text: str) -> Any:
-    """Parse a JSON text. Raises CorruptDataError."""
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CorruptDataError(
-            f"no JSON that can be read ({' '.join(str(error).split())[:100]})"
-        ) from error
-
-
 def check_count(value: int, least: int, most: int, what: str) -> int:
     """Return `value` if it is within `least` and `most`. Raises CorruptDataError otherwise."""
     if not least <= value <= most:
@@ -86,12 +76,8 @@ def check_count(value: int, least: int, most: int, what: str) -> int:
 
 def parse_counts(text: str | None, tables: Iterable[str]) -> dict[str, int]:
     """Return the number of rows of each table from the map's JSON. Raises CorruptDataError."""
-    counts = parse_json(text) if text is not None else None
-    if (
-        not isinstance(counts, dict)
-        or set(counts) != set(tables) - {"map"}
-        or not all(type(n) is int and n >= 0 for n in counts.values())
-    ):
+    counts = decode_json(text, dict[str, Count], CorruptDataError, "the numbers of rows")
+    if set(counts) != set(tables) - {"map"}:
         raise CorruptDataError("the numbers of rows are missing")
     return counts
 

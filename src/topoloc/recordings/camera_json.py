@@ -7,10 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from topoloc.errors import CalibrationError
+from msgspec import Struct
+
+from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
-from topoloc.recordings.json_file import json_number, json_rigid, read_json
+from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import Finite, Positive, decode_json
+from topoloc.recordings.text_files import read_text
 
 FILE_NAME = "camera.json"
 
@@ -36,51 +40,38 @@ def read_camera_json(path: Path) -> CameraCalibration:
         CalibrationError: the file is missing, is not JSON, or a key is missing or out of range.
             Names the file.
     """
-    data = read_json(path, CalibrationError, "no such camera file")
-    if not isinstance(data, dict):
-        raise CalibrationError(f"{path}: not a JSON object")
+    text = read_text(path, CalibrationError, "no such camera file")
+    whole = decode_json(text, dict[str, Any], CalibrationError, str(path))
+    data = decode_json(whole, _CameraFile, CalibrationError, str(path))
     try:
-        depth_factor = _positive_number(data, "depth_factor")
-        if "left" in data or "right" in data:
-            rig = _stereo_rig(data)
-            return CameraCalibration(rig.left, rig, depth_factor)
-        camera, baseline = Camera.from_json(data), _positive_number(data, "baseline")
-        return CameraCalibration(
-            camera,
-            None if baseline is None else StereoRig.rectified(camera, baseline),
-            depth_factor,
-        )
-    except CalibrationError as error:
+        if data.left is None and data.right is None:
+            camera = Camera.from_json(whole)
+            rig = None if data.baseline is None else StereoRig.rectified(camera, data.baseline)
+        else:
+            rig = data.stereo_rig()
+            camera = rig.left
+    except (CalibrationError, TrajectoryError) as error:
         raise CalibrationError(f"{path}: {error}") from None
+    return CameraCalibration(camera, rig, data.depth_factor)
 
 
-def _stereo_rig(data: dict[str, Any]) -> StereoRig:
-    for key in ("left", "right", "right_from_left"):
-        if key not in data:
+class _CameraFile(Struct, frozen=True):
+    """Hold the keys of a camera.json, except those of a single camera."""
+
+    depth_factor: Positive | None = None
+    baseline: Positive | None = None
+    left: dict[str, Any] | None = None
+    right: dict[str, Any] | None = None
+    right_from_left: list[list[Finite]] | None = None
+
+    def stereo_rig(self) -> StereoRig:
+        """Return the stereo pair. Raises CalibrationError or TrajectoryError."""
+        if self.left is None or self.right is None or self.right_from_left is None:
             raise CalibrationError(
-                f'{key!r} is missing; a stereo pair has "left", "right" and "right_from_left" (4x4,'
-                " metres)"
+                'a stereo pair has "left", "right" and "right_from_left" (4x4, metres)'
             )
-    right_from_left = json_rigid(data["right_from_left"], "right_from_left", CalibrationError)
-    return StereoRig(
-        _camera_from_key(data, "left"), _camera_from_key(data, "right"), right_from_left
-    )
-
-
-def _camera_from_key(data: dict[str, Any], key: str) -> Camera:
-    try:
-        return Camera.from_json(data[key])
-    except CalibrationError as error:
-        raise CalibrationError(f"{key}: {error}") from None
-
-
-def _positive_number(data: dict[str, Any], key: str) -> float | None:
-    if data.get(key) is None:
-        return None
-    try:
-        number = json_number(data[key], key, CalibrationError)
-    except CalibrationError:
-        number = -1.0
-    if number <= 0.0:
-        raise CalibrationError(f"{key} must be a positive number, not {str(data[key])[:40]}")
-    return number
+        return StereoRig(
+            Camera.from_json(self.left, "left"),
+            Camera.from_json(self.right, "right"),
+            Rigid3.from_matrix(self.right_from_left),
+        )

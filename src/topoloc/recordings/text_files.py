@@ -159,7 +159,14 @@ def read_file_list(path: Path, error: type[TopolocError]) -> tuple[list[int], li
     for line, columns in rows:
         if len(columns) < 2:
             raise error(f"{path}, line {line}: not a time and a file name")
-        name = PurePath(columns[1])
-        if name.is_absolute() or ".." in name.parts or "\0" in columns[1]:
-            raise error(f"{path}, line {line}: {columns[1][:80]!r} is no picture below this folder")
+        parse_relative_path(columns[1], f"{path}, line {line}", error)
     return parse_times(rows, path, error), [columns[1] for _, columns in rows]
+
+
+def parse_relative_path(name: str, where: str, error: type[TopolocError]) -> str:
+    """Return a file name that stays inside its folder. Raises `error` otherwise, which begins with
+    `where`."""
+    path = PurePath(name)
+    if not path.parts or path.is_absolute() or ".." in path.parts or {"\0", "\\"} & set(name):
+        raise error(f"{where}: {name[:80]!r} is no picture below this folder")
+    return path.as_posix()

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import Localization, NotLocalized, pose_to_json
+from topoloc.localization.result import Localization, NotLocalized
 
 State = Literal["localized", "tracked", "predicted", "ambiguous", "lost"]
 
@@ -47,7 +47,7 @@ class StreamedPose:
 
     def to_json(self, query: str) -> dict[str, Any]:
         """Return one line of the result file, see docs/cli.md."""
-        smoothed = None if self.smoothed is None else pose_to_json(self.smoothed)
+        smoothed = None if self.smoothed is None else self.smoothed.to_json()
         covariance = None if self.smoothed_covariance is None else self.smoothed_covariance.tolist()
         streamed = {
             "t_ns": self.t_ns,

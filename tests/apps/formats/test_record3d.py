@@ -140,9 +140,17 @@ def test_without_the_extra(export: Make, monkeypatch: pytest.MonkeyPatch):
             TrajectoryError,
             "pose 0: qx qy qz qw is no rotation",
         ),
-        ({"poses": [[0, 0, 0, 1, 1, 2]] * 3}, TrajectoryError, "7 finite numbers"),
-        ({"poses": [[0, 0, 0, 1, 1, 2, float("nan")]] * 3}, TrajectoryError, "7 finite numbers"),
-        ({"K": None}, CalibrationError, "K: 9 finite numbers"),
+        (
+            {"poses": [[0, 0, 0, 1, 1, 2]] * 3},
+            RecordingError,
+            r"poses\[0\]: Expected `array` of length 7",
+        ),
+        (
+            {"poses": [[0, 0, 0, 1, 1, 2, float("nan")]] * 3},
+            RecordingError,
+            r"poses\[0\]\[6\]: a finite number",
+        ),
+        ({"K": None}, CalibrationError, "neither K nor"),
         ({"K": [0] * 9}, CalibrationError, "focal length"),
         (
             {"perFrameIntrinsicCoeffs": [[1, 2, 3, 4]]},
@@ -151,7 +159,7 @@ def test_without_the_extra(export: Make, monkeypatch: pytest.MonkeyPatch):
         ),
         ({"w": 100}, CalibrationError, "of 100x24, but 0.jpg is 32x24"),
         ({"frameTimestamps": [1.0, 0.5, 2.0]}, RecordingError, "do not increase"),
-        ({"frameTimestamps": [1.0]}, RecordingError, "3 finite numbers"),
+        ({"frameTimestamps": [1.0]}, RecordingError, "1 frameTimestamps for 3 pictures"),
     ],
 )
 def test_what_is_refused(

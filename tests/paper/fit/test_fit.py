@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from topoloc.localization.evidence import Evidence, compute_log_odds, compute_node_log_odds
 from topoloc.localization.fitted_weights import (
@@ -45,7 +46,7 @@ TRUE = EvidenceWeights(
     bias=7.0,
     clear_log_odds=4.5,
 )
-PRIOR = replace(TRUE, even_share=1.0, inliers=1.0, bias=4.0)
+PRIOR = structs.replace(TRUE, even_share=1.0, inliers=1.0, bias=4.0)
 RIGHT, WRONG, BETWEEN = (0.01, 0.2), (3.0, 5.0), (0.3, 5.0)
 MAPS = ("corridor_map", "demo/map_lap1", "seven_scenes/kitchen@0-59/100")
 
@@ -154,7 +155,7 @@ def test_few_poses_stay_with_the_prior_and_the_strength_follows_what_was_not_fit
     poses = _drawn(90)
     assert fit_evidence(poses, TRUE, 1e4).as_vector == pytest.approx(TRUE.as_vector, abs=0.01)
     assert best_strength(poses, TRUE) > best_strength(
-        _drawn(3000), replace(PRIOR, even_share=0.2, bias=-2.0)
+        _drawn(3000), structs.replace(PRIOR, even_share=0.2, bias=-2.0)
     )
 
 
@@ -265,7 +266,9 @@ def test_the_weights_of_walls_are_found_again_and_left_alone_where_poses_are_few
     before = load_fitted_weights("surf")
     true = replace(
         before,
-        walls=replace(before.walls, spread=2.0, lesser_side=0.7, bias=before.walls.bias - 3.5),
+        walls=structs.replace(
+            before.walls, spread=2.0, lesser_side=0.7, bias=before.walls.bias - 3.5
+        ),
     )
     fitted, num = fit_walls(_on_walls(4000, true), before.walls)
     assert num == 4000

@@ -10,10 +10,11 @@ poses, and a free weight would follow them to zero.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from msgspec.structs import replace
 from scipy.optimize import minimize
 
 from topoloc.localization.evidence import compute_node_log_odds, compute_score_features

@@ -8,10 +8,9 @@ weights are fitted to hard pairs, by logistic regression without a bias.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Bool, Float
+from msgspec import structs
 from scipy.optimize import minimize
 
 from topoloc.localization.evidence import compute_node_log_odds, compute_score_features
@@ -49,7 +48,7 @@ def fit_rivals(
         method="L-BFGS-B",
     ).x
     odds, even_share, doubt = (float(w) for w in np.round(fitted, 2))
-    return replace(before, odds=odds, even_share=even_share, doubt=doubt), num_hard
+    return structs.replace(before, odds=odds, even_share=even_share, doubt=doubt), num_hard
 
 
 def pairs_of(

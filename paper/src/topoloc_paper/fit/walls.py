@@ -8,9 +8,8 @@ place; the weight of the doubt is given.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from msgspec.structs import replace
 from scipy.optimize import minimize
 
 from topoloc.localization.evidence import compute_virtual_view_features

@@ -13,20 +13,21 @@ from __future__ import annotations
 
 import os
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from topoloc import CalibrationError, Camera, RecordingError, Rigid3, TrajectoryError
 from topoloc.plugin import (
     DepthImages,
+    Finite,
     Recording,
     RecordingFormat,
-    json_number,
-    json_rigid,
+    decode_json,
     natural_key,
     parse_relative_path,
-    read_json,
+    read_text,
     times_from_rate,
 )
 
@@ -36,16 +37,6 @@ DEPTH_UNIT = 0.001
 """Metres: nerfstudio's own default of `depth_unit_scale_factor`."""
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
 """Axes of OpenCV (y down, z forward) from those of OpenGL (y up, z back), of one camera."""
-_PERSPECTIVE = (
-    "OPENCV",
-    "PINHOLE",
-    "SIMPLE_PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "FULL_OPENCV",
-    "perspective",
-)
-_FISHEYE = ("OPENCV_FISHEYE", "fisheye")
 
 
 def can_open(path: Path) -> bool:
@@ -64,30 +55,26 @@ def open_nerfstudio(path: Path) -> Recording:
         TrajectoryError: a matrix is no pose.
     """
     file = path if path.is_file() else path / FILE_NAME
-    data = read_json(file, RecordingError)
-    frames = data.get("frames") if isinstance(data, dict) else None
-    if (
-        not isinstance(frames, list)
-        or not frames
-        or not all(isinstance(frame, dict) for frame in frames)
-    ):
-        raise RecordingError(
-            f"{file}: no list of frames, which a transforms.json of nerfstudio has"
-        )
+    data = decode_json(read_text(file, RecordingError), dict[str, Any], RecordingError, str(file))
+    whole = decode_json(data, _File, RecordingError, str(file))
+    read = [
+        decode_json(frame, _Frame, RecordingError, f"{file}, frame {k}")
+        for k, frame in enumerate(whole.frames)
+    ]
     named = [
-        (parse_relative_path(frame.get("file_path"), f"{file}, frame {k}", RecordingError), frame)
-        for k, frame in enumerate(frames)
+        (parse_relative_path(frame.file_path, f"{file}, frame {k}", RecordingError), frame, lens)
+        for k, (frame, lens) in enumerate(zip(read, whole.frames, strict=True))
     ]
     named.sort(key=lambda pair: natural_key(pair[0]))
-    names = [_with_suffix(file.parent, name) for name, _ in named]
+    names = [_with_suffix(file.parent, name) for name, _, _ in named]
     where = [f"{file}, {name}" for name in names]
-    ordered = [frame for _, frame in named]
-    scale = _positive_number(data, "applied_scale", 1.0, str(file))
+    frames = [frame for _, frame, _ in named]
     poses: list[Rigid3 | None] = [
-        _pose(frame, scale, at) for frame, at in zip(ordered, where, strict=True)
+        _pose(frame, whole.applied_scale, at) for frame, at in zip(frames, where, strict=True)
     ]
-    cameras = [_camera(data, frame, at) for frame, at in zip(ordered, where, strict=True)]
-    depth = _depth(data, ordered, file, where)
+    # The values of the file count first, as in nerfstudio.
+    cameras = [_camera(lens | data, at) for (_, _, lens), at in zip(named, where, strict=True)]
+    depth = _depth(frames, whole.depth_unit_scale_factor, file, where)
     name, t_ns = file.parent.resolve().name, times_from_rate(len(names))
     if len(set(cameras)) == 1:
         return Recording(name, file.parent, names, t_ns, poses, cameras[0], depth=depth)
@@ -99,81 +86,89 @@ def rigid_from_gl(world_from_gl: Rigid3) -> Rigid3:
     return Rigid3(world_from_gl.rotation @ CV_FROM_GL, world_from_gl.translation)
 
 
-def _pose(frame: dict[str, Any], scale: float, where: str) -> Rigid3:
-    if "transform_matrix" not in frame:
-        raise TrajectoryError(f"{where}: no transform_matrix")
-    world_from_gl = json_rigid(
-        frame["transform_matrix"], f"{where}: transform_matrix", TrajectoryError
-    )
+_Factor = Annotated[float, Meta(gt=1e-12, lt=1e12)]
+
+
+class _Frame(Struct, frozen=True):
+    file_path: str
+    transform_matrix: list[list[Finite]]
+    depth_file_path: str | None = None
+
+
+class _File(Struct, frozen=True):
+    frames: Annotated[list[dict[str, Any]], Meta(min_length=1)]
+    applied_scale: _Factor = 1.0
+    depth_unit_scale_factor: _Factor = DEPTH_UNIT
+
+
+class _Lens(Struct, frozen=True):
+    w: Finite
+    h: Finite
+    fl_x: Finite
+    cx: Finite
+    cy: Finite
+    fl_y: Finite | None = None
+    k1: Finite = 0.0
+    k2: Finite = 0.0
+    k3: Finite = 0.0
+    k4: Finite = 0.0
+    p1: Finite = 0.0
+    p2: Finite = 0.0
+    camera_model: Literal[
+        "OPENCV",
+        "PINHOLE",
+        "SIMPLE_PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "FULL_OPENCV",
+        "perspective",
+        "OPENCV_FISHEYE",
+        "fisheye",
+    ] = "OPENCV"
+
+
+def _pose(frame: _Frame, scale: float, where: str) -> Rigid3:
+    try:
+        world_from_gl = Rigid3.from_matrix(frame.transform_matrix)
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{where}: transform_matrix: {error}") from None
     return rigid_from_gl(Rigid3(world_from_gl.rotation, world_from_gl.translation / scale))
 
 
-def _camera(data: dict[str, Any], frame: dict[str, Any], where: str) -> Camera:
-    """The camera of a frame; what the file says for all of them counts first, as in nerfstudio."""
-    values = frame | data
-    model = values.get("camera_model", "OPENCV")
-    if model not in _PERSPECTIVE + _FISHEYE:
-        raise CalibrationError(
-            f"{where}: camera_model {str(model)[:40]!r} is not known here; perspective and fisheye"
-            " lenses are"
-        )
-    missing = [key for key in ("fl_x", "cx", "cy", "w", "h") if key not in values]
-    if missing:
-        raise CalibrationError(
-            f"{where}: {', '.join(missing)} is missing, in the file and in this frame"
-        )
-    keys = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
-    defaults = dict.fromkeys(keys, 0.0) | {"fl_y": values["fl_x"]}
-    w, h, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4 = (
-        json_number(values.get(key, defaults[key]), f"{where}: {key}", CalibrationError)
-        for key in keys
-    )
-    params = (fx, fy, cx, cy)
+def _camera(data: dict[str, Any], where: str) -> Camera:
+    lens = decode_json(data, _Lens, CalibrationError, where)
+    w, h, k1, k2, k3, k4 = int(lens.w), int(lens.h), lens.k1, lens.k2, lens.k3, lens.k4
+    p1, p2, fl_y = lens.p1, lens.p2, lens.fl_x if lens.fl_y is None else lens.fl_y
+    params = (lens.fl_x, fl_y, lens.cx, lens.cy)
     try:
-        if model in _FISHEYE:
-            return Camera.from_colmap("OPENCV_FISHEYE", int(w), int(h), (*params, k1, k2, k3, k4))
-        if (
-            k4 != 0.0
-            # nerfstudio's fourth radial coefficient is none of OpenCV's model, whose k4 is a divisor  # noqa: E501
-        ):
+        if lens.camera_model in ("OPENCV_FISHEYE", "fisheye"):
+            return Camera.from_colmap("OPENCV_FISHEYE", w, h, (*params, k1, k2, k3, k4))
+        if k4 != 0.0:  # OpenCV's model has no fourth radial coefficient, its k4 is a divisor
             raise CalibrationError("a fourth radial coefficient is not known here")
         if k3 != 0.0:
-            return Camera.from_colmap(
-                "FULL_OPENCV", int(w), int(h), (*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-            )
+            full = (*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+            return Camera.from_colmap("FULL_OPENCV", w, h, full)
         if (k1, k2, p1, p2) == (0.0, 0.0, 0.0, 0.0):
-            return Camera.from_colmap("PINHOLE", int(w), int(h), params)
-        return Camera.from_colmap("OPENCV", int(w), int(h), (*params, k1, k2, p1, p2))
+            return Camera.from_colmap("PINHOLE", w, h, params)
+        return Camera.from_colmap("OPENCV", w, h, (*params, k1, k2, p1, p2))
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from None
 
 
-def _depth(
-    data: dict[str, Any], frames: list[dict[str, Any]], file: Path, where: list[str]
-) -> DepthImages | None:
-    num_with_depth = sum("depth_file_path" in frame for frame in frames)
-    if num_with_depth == 0:
+def _depth(frames: list[_Frame], unit: float, file: Path, where: list[str]) -> DepthImages | None:
+    names = [frame.depth_file_path for frame in frames if frame.depth_file_path is not None]
+    if not names:
         return None
-    if num_with_depth != len(frames):
+    if len(names) != len(frames):
         raise RecordingError(
-            f"{file}: {len(frames)} frames but {num_with_depth} with a depth_file_path; all of them"
+            f"{file}: {len(frames)} frames but {len(names)} with a depth_file_path; all of them"
             " need one, or none"
         )
-    pairs = zip(frames, where, strict=True)
     paths = [
-        file.parent
-        / parse_relative_path(frame["depth_file_path"], f"{at}: depth_file_path", RecordingError)
-        for frame, at in pairs
+        file.parent / parse_relative_path(name, f"{at}: depth_file_path", RecordingError)
+        for name, at in zip(names, where, strict=True)
     ]
-    unit = _positive_number(data, "depth_unit_scale_factor", DEPTH_UNIT, str(file))
     return DepthImages(paths, 1.0 / unit, None, Rigid3.identity())
-
-
-def _positive_number(data: dict[str, Any], key: str, default: float, where: str) -> float:
-    number = json_number(data.get(key, default), f"{where}: {key}", RecordingError)
-    if not 1e-12 < number < 1e12:
-        raise RecordingError(f"{where}: {key} must be a positive number, not {number:g}")
-    return number
 
 
 def _with_suffix(folder: Path, name: str) -> str:

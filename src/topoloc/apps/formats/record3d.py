@@ -10,23 +10,23 @@ than `w` x `h`, as LiDAR's finer ones are, the calibration is that of `w` x `h` 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from msgspec import Meta, Struct
 
 from topoloc import CalibrationError, Camera, RecordingError, Rigid3, TrajectoryError
 from topoloc.apps.formats.nerfstudio import rigid_from_gl
 from topoloc.plugin import (
     DepthImages,
+    Finite,
     Recording,
     RecordingFormat,
+    decode_json,
     image_size,
-    json_number,
-    json_numbers,
     list_images,
     natural_key,
-    read_json,
+    read_text,
     times_from_rate,
 )
 
@@ -54,16 +54,13 @@ def open_record3d(path: Path) -> Recording:
     if root is None:
         raise RecordingError(f"{path}: not an export of Record3D, which has {EXPECTED_FILES}")
     file = root / FILE_NAME
-    data = read_json(file, RecordingError)
-    if not isinstance(data, dict):
-        raise RecordingError(f"{file}: not a JSON object")
+    data = decode_json(read_text(file, RecordingError), _Metadata, RecordingError, str(file))
     images = list_images(root / "rgb")
-    rows = data.get("poses")
-    if not isinstance(rows, list) or len(rows) != len(images):
-        raise RecordingError(
-            f"{file}: {len(rows) if isinstance(rows, list) else 0} poses for {len(images)} pictures"
-        )
-    poses: list[Rigid3 | None] = [_pose(row, f"{file}, pose {k}") for k, row in enumerate(rows)]
+    if len(data.poses) != len(images):
+        raise RecordingError(f"{file}: {len(data.poses)} poses for {len(images)} pictures")
+    poses: list[Rigid3 | None] = [
+        _pose(row, f"{file}, pose {k}") for k, row in enumerate(data.poses)
+    ]
     cameras = _cameras(data, images, file)
     same = len(set(cameras)) == 1
     return Recording(
@@ -90,8 +87,21 @@ def _find_root(path: Path) -> Path | None:
     )
 
 
-def _pose(row: Any, where: str) -> Rigid3:
-    numbers = json_numbers(row, 7, where, TrajectoryError)
+_Four = tuple[Finite, Finite, Finite, Finite]
+
+
+class _Metadata(Struct, frozen=True):
+    w: Finite
+    h: Finite
+    poses: list[tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite]]
+    perFrameIntrinsicCoeffs: list[_Four] | None = None
+    K: Annotated[list[Finite], Meta(min_length=9, max_length=9)] | None = None
+    frameTimestamps: list[Annotated[float, Meta(ge=-9e9, le=9e9)]] | None = None
+    fps: Finite = _RATE_HZ
+
+
+def _pose(row: tuple[float, ...], where: str) -> Rigid3:
+    numbers = np.array(row)
     length = float(np.linalg.norm(numbers[:4]))
     if not 0.99 < length < 1.01:
         raise TrajectoryError(f"{where}: qx qy qz qw is no rotation")
@@ -99,52 +109,46 @@ def _pose(row: Any, where: str) -> Rigid3:
     return rigid_from_gl(Rigid3.from_quat_wxyz(np.array([w, x, y, z]), numbers[4:]))
 
 
-def _cameras(data: dict[str, Any], images: list[Path], file: Path) -> list[Camera]:
+def _cameras(data: _Metadata, images: list[Path], file: Path) -> list[Camera]:
     """The camera of each picture, of the size that the pictures are of."""
-    w, h = (
-        int(json_number(data.get(key), f"{file}: {key}", CalibrationError)) for key in ("w", "h")
-    )
+    w, h = int(data.w), int(data.h)
     width, height = image_size(images[0])
     if abs(width * h - height * w) > max(w, h, width, height):
         raise CalibrationError(f"{file}: of {w}x{h}, but {images[0].name} is {width}x{height}")
-    per_frame = data.get("perFrameIntrinsicCoeffs")
-    if isinstance(per_frame, list) and per_frame:
-        if len(per_frame) != len(images):
-            raise CalibrationError(
-                f"{file}: {len(per_frame)} perFrameIntrinsicCoeffs for {len(images)} pictures"
-            )
-        numbers = [
-            json_numbers(row, 4, f"{file}, perFrameIntrinsicCoeffs {k}", CalibrationError)
-            for k, row in enumerate(per_frame)
-        ]
-    else:
-        k = json_numbers(data.get("K"), 9, f"{file}: K", CalibrationError)
-        numbers = [k[[0, 4, 6, 7]]] * len(images)
+    numbers = data.perFrameIntrinsicCoeffs
+    if not numbers:
+        if data.K is None:
+            raise CalibrationError(f"{file}: neither K nor perFrameIntrinsicCoeffs")
+        numbers = [(data.K[0], data.K[4], data.K[6], data.K[7])] * len(images)
+    if len(numbers) != len(images):
+        raise CalibrationError(
+            f"{file}: {len(numbers)} perFrameIntrinsicCoeffs for {len(images)} pictures"
+        )
     return [_camera(row, (w, h), (width, height), file) for row in numbers]
 
 
 def _camera(
-    numbers: Float[np.ndarray, "4"],
+    numbers: _Four,
     calibrated_size: tuple[int, int],
     size: tuple[int, int],
     file: Path,
 ) -> Camera:
     try:
-        return Camera.pinhole(*calibrated_size, *numbers.tolist()).rescaled(*size)
+        return Camera.pinhole(*calibrated_size, *numbers).rescaled(*size)
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from None
 
 
-def _times(data: dict[str, Any], count: int, file: Path) -> list[int]:
+def _times(data: _Metadata, count: int, file: Path) -> list[int]:
     """Nanoseconds; by the frame rate where the export has no times."""
-    seconds = data.get("frameTimestamps")
-    if not isinstance(seconds, list) or not seconds:
-        fps = json_number(data.get("fps", _RATE_HZ), f"{file}: fps", RecordingError)
-        return times_from_rate(count, round(fps) if fps >= 1.0 else _RATE_HZ)
-    numbers = json_numbers(seconds, count, f"{file}: frameTimestamps", RecordingError)
-    if np.any(np.diff(numbers) <= 0.0) or np.abs(numbers).max() > 1e9 * 9:
+    seconds = data.frameTimestamps
+    if not seconds:
+        return times_from_rate(count, round(data.fps) if data.fps >= 1.0 else _RATE_HZ)
+    if len(seconds) != count:
+        raise RecordingError(f"{file}: {len(seconds)} frameTimestamps for {count} pictures")
+    if np.any(np.diff(seconds) <= 0.0):
         raise RecordingError(f"{file}: frameTimestamps do not increase from frame to frame")
-    return [round(float(number) * 1e9) for number in numbers]
+    return [round(second * 1e9) for second in seconds]
 
 
 def _depth(root: Path, images: list[Path]) -> DepthImages | None:

@@ -8,15 +8,13 @@ COLMAP's `model` and `params` in its own convention, where the centre of the top
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta, Struct
 
 from topoloc import CalibrationError, Camera, TopoMetricMap, UncalibratedCamera
 from topoloc.apps.query_camera import parse_camera_option
-from topoloc.apps.service.query_request import parse_json
-from topoloc.plugin import EncodedImage, exif_focal_length
-
-_MAX_PARAMS = 20
+from topoloc.plugin import EncodedImage, decode_json, exif_focal_length
 
 
 def parse_camera_field(
@@ -26,7 +24,6 @@ def parse_camera_field(
 
     Raises:
         CalibrationError, QueryError: it is none, or of another picture.
-        RequestError: what looks like JSON is none.
     """
     width, height = size
     text = (text or "exif").strip()
@@ -40,7 +37,7 @@ def parse_camera_field(
     if text == "unknown" or (text == "map" and topomap is not None):
         return parse_camera_option(text, topomap, allow_files=False)(width, height)
     if text.startswith("{"):
-        return camera_from_json(parse_json(text, "camera"), width, height)
+        return camera_from_json(text, width, height)
     if "," in text:
         return parse_camera_option(text, None, allow_files=False)(width, height)
     raise CalibrationError(
@@ -54,23 +51,20 @@ def camera_from_json(data: Any, width: int, height: int) -> Camera:
     Raises:
         CalibrationError: it is no camera.
     """
-    if not isinstance(data, Mapping):
-        raise CalibrationError("camera: a JSON object is expected")
-    sized: dict[str, Any] = {"width": width, "height": height, **data}
+    named = decode_json(data, dict[str, Any], CalibrationError, "camera")
+    sized = {"width": width, "height": height, **named}
     if "params" not in sized:
         return Camera.from_json(sized)
-    params, size = sized["params"], (sized["width"], sized["height"])
-    if (
-        not isinstance(params, list)
-        or len(params) > _MAX_PARAMS
-        or not all(_is_number(value) for value in [*params, *size])
-    ):
-        raise CalibrationError("camera: params must be a list of numbers, width and height numbers")
-    return Camera.from_colmap(
-        str(sized.get("model", "PINHOLE")), int(size[0]), int(size[1]), tuple(map(float, params))
-    )
+    camera = decode_json(sized, _ColmapCamera, CalibrationError, "camera")
+    size = int(camera.width), int(camera.height)
+    return Camera.from_colmap(camera.model, *size, tuple(camera.params))
 
 
-def _is_number(value: Any) -> bool:
-    """One that fits into the bounds of a camera; NaN and the infinite are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
+_Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
+
+
+class _ColmapCamera(Struct, frozen=True):
+    width: _Number
+    height: _Number
+    params: Annotated[list[_Number], Meta(max_length=20)]
+    model: str = "PINHOLE"

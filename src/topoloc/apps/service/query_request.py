@@ -3,22 +3,20 @@ anything."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Any
 
 from pydantic import BaseModel, Field
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect, Request
 
-from topoloc import AtlasError, GeoPositionPrior, ResultError, Rigid3
+from topoloc import AtlasError, GeoPositionPrior, Rigid3, TrajectoryError
 from topoloc.apps.service.openapi_schemas import CAMERA_EXAMPLES, PRIOR_EXAMPLE
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.plugin import EncodedImage, pose_from_json
+from topoloc.plugin import EncodedImage
 
 _MAX_FIELDS, _MAX_FIELD_BYTES = 8, 20_000
 _MAX_MS = 600_000.0
@@ -140,23 +138,10 @@ async def _read_form(request: Request) -> tuple[bytes, str, dict[str, str]]:
 def _parse_prior(fields: Mapping[str, str]) -> Rigid3 | None:
     if "prior" not in fields:
         return None
-    return parse_prior(parse_json(fields["prior"], "prior"))
-
-
-def parse_prior(value: Any) -> Rigid3:
-    """world_from_cam as results write it. Raises RequestError."""
     try:
-        return pose_from_json(value, "prior")
-    except ResultError as error:
-        raise RequestError(422, str(error).removeprefix("no result: ")) from None
-
-
-def parse_json(text: str, what: str) -> Any:
-    """What the text says. Raises RequestError where it is not JSON."""
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        raise RequestError(422, f"{what}: not JSON") from None
+        return Rigid3.from_json(fields["prior"], "prior")
+    except TrajectoryError as error:
+        raise RequestError(422, str(error)) from None
 
 
 def _parse_near(fields: Mapping[str, str]) -> GeoPositionPrior | None:

@@ -6,10 +6,12 @@ import asyncio
 import contextlib
 import json
 import time
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse, Response
+from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 from pydantic import BaseModel
 
 from topoloc.apps.service.map_routes import MapName, UrlParameters
@@ -19,11 +21,11 @@ from topoloc.apps.service.openapi_schemas import (
     result_schema,
     success_response,
 )
-from topoloc.apps.service.query_request import QueryRequest, parse_json, read_query_request
+from topoloc.apps.service.query_request import QueryRequest, read_query_request
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
 from topoloc.apps.service.streams import Stream
-from topoloc.plugin import EncodedImage
+from topoloc.plugin import EncodedImage, decode_json
 
 router = APIRouter()
 PROTOCOL = "topoloc"
@@ -168,17 +170,17 @@ async def _send_text(socket: WebSocket, text: str, timeout_s: float) -> None:
         raise RequestError(408, "the answers are not read") from None
 
 
+class _Message(Struct, frozen=True, forbid_unknown_fields=True):
+    camera: str | dict[str, Any] | UnsetType | None = UNSET
+    t_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)] | UnsetType | None = UNSET
+
+
 def _parse_message(text: str) -> dict[str, Any]:
-    """What a text message says. Raises RequestError."""
-    data = parse_json(text, "the message")
-    if not isinstance(data, dict) or not set(data) <= {"camera", "t_ns"}:
-        raise RequestError(422, 'a text message is an object of "camera" and "t_ns"')
-    t_ns, camera = data.get("t_ns"), data.get("camera")
-    if t_ns is not None and (
-        isinstance(t_ns, bool) or not isinstance(t_ns, int) or not 0 <= t_ns < 2**63
-    ):
-        raise RequestError(422, "t_ns is an integer of nanoseconds")
-    return data if isinstance(camera, str | None) else data | {"camera": json.dumps(camera)}
+    """Return the keys of a text message. Raises RequestError."""
+    message = decode_json(text, _Message, partial(RequestError, 422), "a text message")
+    data = to_builtins(message)
+    camera = data.get("camera")
+    return data | {"camera": json.dumps(camera)} if isinstance(camera, dict) else data
 
 
 async def _close_socket(socket: WebSocket, refusal: RequestError) -> None:

@@ -19,7 +19,7 @@ from jaxtyping import Float, UInt8
 
 from topoloc import Camera, Rigid3, TopoMetricMap
 from topoloc.apps.viewer.map_scene import sample_colours, unique_image_names
-from topoloc.plugin import encode_jpeg, pose_to_json
+from topoloc.plugin import encode_jpeg
 
 GAP_STEPS = 6.0
 """A step so many times the path's median step is a gap, over which no line is drawn."""
@@ -192,7 +192,7 @@ def _nodes_to_json(
             "name": name,
             "session": summary.session_id,
             "num_points": summary.num_points,
-            "world_from_cam": _round_values(pose_to_json(summary.world_from_cam)),
+            "world_from_cam": _round_values(summary.world_from_cam.to_json()),
             "camera": camera.to_json(),
             "picture": picture,
         }

@@ -7,9 +7,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from topoloc import Localization, NotLocalized, ResultError, read_trajectory, result_from_json
+from msgspec import UNSET, Struct, UnsetType, to_builtins
+
+from topoloc import (
+    Localization,
+    NotLocalized,
+    ResultError,
+    Rigid3,
+    TrajectoryError,
+    read_trajectory,
+    result_from_json,
+)
 from topoloc.apps.viewer.document import ResultSet
-from topoloc.plugin import pose_from_json, pose_to_json, read_text
+from topoloc.plugin import decode_json, read_text
 
 
 def read_results(path: Path) -> list[ResultSet]:
@@ -38,20 +48,21 @@ def read_results(path: Path) -> list[ResultSet]:
     ]
 
 
+class ResultExtras(Struct, frozen=True):
+    """Hold the keys of a JSON line that evaluations and streams add to a result."""
+
+    query: str = ""
+    state: str | UnsetType = UNSET
+    recording: str | UnsetType = UNSET
+    smoothed: dict[str, Any] | UnsetType | None = UNSET
+    true_world_from_cam: dict[str, Any] | UnsetType | None = UNSET
+
+
 def parse_result(
     line: str | Mapping[str, Any],
-) -> tuple[Localization | NotLocalized, Mapping[str, Any]]:
-    """Return the result that a JSON line holds, and all keys of the line. Raises ResultError."""
-    result = result_from_json(line)
-    return result, json.loads(line) if isinstance(line, str) else line
-
-
-def text_of(data: Mapping[str, Any], key: str) -> str:
-    """Return the text of a key, "" if it is missing. Raises ResultError if it is no text."""
-    value = data.get(key, "")
-    if not isinstance(value, str):
-        raise ResultError(f"no result: {key!r} is no text")
-    return value
+) -> tuple[Localization | NotLocalized, ResultExtras]:
+    """Return the result that a JSON line holds, and its further keys. Raises ResultError."""
+    return result_from_json(line), decode_json(line, ResultExtras, ResultError, "no result")
 
 
 def _parse_single_object(text: str) -> Mapping[str, Any] | None:
@@ -79,16 +90,11 @@ def _read_evaluation(path: Path, evaluation: Mapping[str, Any]) -> list[ResultSe
 def _answer_to_json(where: str, line: Any) -> Mapping[str, Any]:
     """A result as JSON, held to be one: only what was understood goes into a page."""
     try:
-        result, data = parse_result(line)
-        answer = result.to_json(text_of(data, "query"))
+        result, extras = parse_result(line)
+        answer = result.to_json(extras.query) | to_builtins(extras)
         for key in ("smoothed", "true_world_from_cam"):
-            if key in data:
-                answer[key] = (
-                    None if data[key] is None else pose_to_json(pose_from_json(data[key], key))
-                )
-        for key in ("state", "recording"):
-            if key in data:
-                answer[key] = text_of(data, key)
-    except ResultError as error:
+            if answer.get(key) is not None:
+                answer[key] = Rigid3.from_json(answer[key], key).to_json()
+    except (ResultError, TrajectoryError) as error:
         raise ResultError(f"{where}: {error}") from None
     return answer

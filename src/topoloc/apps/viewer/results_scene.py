@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from topoloc import Localization, ResultError
-from topoloc.apps.viewer.result_files import parse_result, text_of
+from topoloc.apps.viewer.result_files import parse_result
 from topoloc.apps.viewer.scene import Points, Scene, View
 from topoloc.plugin import read_text
 
@@ -25,8 +25,8 @@ def create_results_scene(path: Path) -> Scene:
     ]
     for number, line in lines:
         try:
-            result, data = parse_result(line)
-            query = text_of(data, "query")
+            result, extras = parse_result(line)
+            query = extras.query
         except ResultError as error:
             raise ResultError(f"{path}, line {number}: {error}") from None
         if isinstance(result, Localization):

@@ -18,7 +18,6 @@ from topoloc.apps.viewer.document import (
     path_to_json,
     results_to_json,
 )
-from topoloc.plugin import pose_from_json, pose_to_json
 
 _POSE_KEYS = ("world_from_cam", "true_world_from_cam", "smoothed")
 Document = dict[str, Any]
@@ -107,7 +106,7 @@ def transform_answers(
 
 
 def _transform_pose(world_from_map: Rigid3, pose: Any) -> dict[str, Any]:
-    return pose_to_json(world_from_map @ pose_from_json(pose, "world_from_cam"))
+    return (world_from_map @ Rigid3.from_json(pose)).to_json()
 
 
 def _transform_document(document: Document, world_from_map: Rigid3, first_session: int) -> Document:

@@ -20,6 +20,7 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import to_builtins
 
 from topoloc.bounds import AtLeast, Between
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
@@ -131,7 +132,7 @@ def _digest(
     settings = {
         "guided": asdict(guided),
         "pose": asdict(pose),
-        "config": asdict(config) | asdict(weights),
+        "config": asdict(config) | to_builtins(weights),
         "nodes": asdict(topomap.config.nodes),
     }
     return compute_nodes_digest(

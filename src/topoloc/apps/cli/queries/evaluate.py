@@ -46,7 +46,7 @@ from topoloc.apps.cli.queries.remote_queries import (
 from topoloc.apps.cli.queries.self_evaluation import evaluate_map_itself
 from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.cluster.config import ClusterConfig
-from topoloc.plugin import format_length, read_json
+from topoloc.plugin import decode_json, format_length, read_text
 
 
 @dataclass(frozen=True)
@@ -264,17 +264,13 @@ def _unique_labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) ->
 
 def _read_rigid(path: Path) -> Rigid3:
     """A 4x4 matrix, alone or as the only matrix of a JSON object."""
-    data = read_json(path, TrajectoryError)
-    matrices = (
-        [value for value in data.values() if isinstance(value, list)]
-        if isinstance(data, dict)
-        else [data]
-    )
+    data = decode_json(read_text(path, TrajectoryError), Any, TrajectoryError, str(path))
+    values = data.values() if isinstance(data, dict) else [data]
+    matrices = [value for value in values if isinstance(value, list)]
+    if len(matrices) != 1:
+        raise TrajectoryError(f"{path}: one 4x4 matrix is needed")
     try:
-        (matrix,) = matrices
-        return Rigid3.from_matrix(np.array(matrix, dtype=np.float64))
-    except (ValueError, TypeError, OverflowError):
-        raise TrajectoryError(f"{path}: one 4x4 matrix is needed") from None
+        return Rigid3.from_matrix(matrices[0])
     except TrajectoryError as error:
         raise TrajectoryError(f"{path}: {error}") from None
 
