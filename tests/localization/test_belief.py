@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_fit, made_hypothesis
+from msgspec import structs
 
 from topoloc.localization.belief import (
     MIN_LOG_ODDS_MARGIN,
@@ -263,7 +264,7 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
         [made_hypothesis(log_odds, even_share=0.3), made_hypothesis(log_odds - 3.0, x=9.0)]
     )
     assert isinstance(decide_result(search)[0], Localization)
-    strict = replace(WEIGHTS, rivals=replace(WEIGHTS.rivals, unclear_lead=4.0))
+    strict = structs.replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
     assert (
         isinstance(decide_result(replace(search, weights=strict))[0], Localization) == is_answered
     )
@@ -271,7 +272,7 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
 
 def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
     """Each of their points was held against all other walls."""
-    strict = replace(WEIGHTS, rivals=replace(WEIGHTS.rivals, unclear_lead=4.0))
+    strict = structs.replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
     for walls in (True, False):
         search = believed(
             [

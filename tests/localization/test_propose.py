@@ -173,9 +173,7 @@ def test_poses_that_viewpoints_agree_on_are_looked_into_once_the_one_with_most_i
     assert [fit.num_inliers for fit in fits] == sorted(
         (fit.num_inliers for fit in fits), reverse=True
     )
-    centres = [
-        fit.pose.cam_from_world.inverse().translation for fit in fits if fit.pose is not None
-    ]
+    centres = [fit.world_from_cam.translation for fit in fits if isinstance(fit, PoseFit)]
     assert len(centres) == len(fits)
     assert all(np.linalg.norm(a - b) > 0.05 for k, a in enumerate(centres) for b in centres[:k])
 
@@ -276,8 +274,8 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(
         assert isinstance(Localizer(room).localize(picture, CAMERA), Localization)
         search, proposal = followed[0]
         assert refine.is_already_found(search, proposal)
+        assert isinstance(proposal.fit, PoseFit)
         pose = proposal.fit.pose
-        assert pose is not None
         beside = replace(
             pose, cam_from_world=Rigid3(np.eye(3), np.array([0.3, 0.0, 0.0])) @ pose.cam_from_world
         )

@@ -106,25 +106,14 @@ def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
         return True
     if a.features is not b.features or not a.may_share_points(b):
         return False
-    rows_a, rows_b = (
-        fit.matches.query_idx[fit.pose.inliers] for fit in (a, b) if fit.pose is not None
-    )
+    rows_a, rows_b = a.inlier_query_idx, b.inlier_query_idx
     _, of_a, of_b = np.intersect1d(rows_a, rows_b, return_indices=True)
     if 2 * len(of_a) < min(len(rows_a), len(rows_b)):
         return False
-    points_a, points_b = (
-        a.local_map.points_world[_inlier_point_idx(a)[of_a]],
-        b.local_map.points_world[_inlier_point_idx(b)[of_b]],
-    )
-    radii = np.maximum(
-        a.local_map.radii[_inlier_point_idx(a)[of_a]], b.local_map.radii[_inlier_point_idx(b)[of_b]]
-    )
+    idx_a, idx_b = a.inlier_point_idx[of_a], b.inlier_point_idx[of_b]
+    points_a, points_b = a.local_map.points_world[idx_a], b.local_map.points_world[idx_b]
+    radii = np.maximum(a.local_map.radii[idx_a], b.local_map.radii[idx_b])
     return bool(np.mean(np.linalg.norm(points_a - points_b, axis=1) <= radii) > 0.5)
-
-
-def _inlier_point_idx(fit: PoseFit) -> np.ndarray:
-    assert fit.pose is not None
-    return fit.matches.train_idx[fit.pose.inliers]
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.guided import match_guided
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
-from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
 
@@ -75,14 +75,14 @@ def check_image_calibration(
         The deviation from the calibration, None if it cannot be estimated or there is no
         calibration. And the mismatch, None if the two agree.
     """
-    if isinstance(fit.input_camera, UncalibratedCamera) or fit.pose is None:
+    if isinstance(fit.input_camera, UncalibratedCamera):
         return None, None
     found = _estimate_image_calibration(search, fit)
     if found is None:
         return None, None
     if not any(_is_calibration_off(fit, found, fit.camera, *_SUSPECT_LIMITS)):
         return compute_intrinsics_deviation(fit.camera, fit.camera, found, fit.node_id), None
-    by_calibration, calibrated, first, place = fit, fit.camera, fit.pose.cam_from_world, fit.node_id
+    by_calibration, calibrated, first, place = fit, fit.camera, fit.cam_from_world, fit.node_id
     fit, found = _refine_image_calibration(search, fit, found)
     seen = compute_intrinsics_deviation(calibrated, fit.camera, found, place)
     has_focal_mismatch, has_principal_point_mismatch = _is_calibration_off(
@@ -119,6 +119,8 @@ def _refine_image_calibration(
     """
     for _ in range(_ROUNDS if search.config.guided.num_nodes else 0):
         around = _rematch(search, fit, found)
+        if not isinstance(around, PoseFit):
+            break
         again = _estimate_image_calibration(search, around)
         if again is None:  # no estimate: keep the previous one
             break
@@ -143,11 +145,8 @@ def _gain(before: PoseFit, after: PoseFit) -> float:
 def _count_within_radius(fit: PoseFit, px: float) -> int:
     """Count the points within a radius of their projections, in pixels of a 640-pixel-wide
     image."""
-    assert fit.pose is not None
     seen = fit.inlier_observations(1.0)
-    offsets = (
-        fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world)) - seen.points_img
-    )
+    offsets = fit.camera.img_from_cam(fit.cam_from_world.apply(seen.points_world)) - seen.points_img
     return int(
         np.count_nonzero(
             np.linalg.norm(offsets, axis=1) < px * max(fit.camera.width, fit.camera.height) / 640.0
@@ -156,8 +155,6 @@ def _count_within_radius(fit: PoseFit, px: float) -> int:
 
 
 def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibration | None:
-    if fit.pose is None:
-        return None
     seen = fit.inlier_observations(1.0)
     points_img, sigma_px = seen.points_img.astype(np.float64), search.config.pose.key_point_sigma_px
     return estimate_image_calibration(
@@ -165,12 +162,12 @@ def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibratio
         seen.points_world,
         seen.covariances,
         fit.camera,
-        fit.pose.cam_from_world,
+        fit.cam_from_world,
         sigma_px,
     )
 
 
-def _rematch(search: Search, fit: PoseFit, found: ImageCalibration) -> PoseFit:
+def _rematch(search: Search, fit: PoseFit, found: ImageCalibration) -> PointMatches:
     """Match the points again around the estimated pose and camera."""
     camera, cam_from_world, config = (
         corrected_camera(fit.camera, found),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
@@ -46,11 +46,11 @@ _MIN_MATCHES = 4
 
 
 @dataclass(frozen=True, eq=False)
-class PoseFit:
-    """Hold matches and the pose fitted to them.
+class PointMatches:
+    """Hold matches of an image with map points, on which no pose agrees.
 
     `input_camera` is the given camera. `camera` is the same, or has the estimated focal length if
-    the given camera is approximate. `pose` is None if no pose was found.
+    the given camera is approximate.
     """
 
     features: Features
@@ -58,35 +58,62 @@ class PoseFit:
     camera: Camera
     local_map: LocalMap
     matches: Matches
-    pose: AbsolutePose | None
 
     @property
+    def inlier_query_idx(self) -> Int[np.ndarray, " n"]:
+        """Return the feature of each inlier. Without a pose there are none."""
+        return self.matches.query_idx[:0]
+
+    @property
+    def inlier_point_idx(self) -> Int[np.ndarray, " n"]:
+        """Return the map point of each inlier."""
+        return self.matches.train_idx[:0]
+
+    @cached_property
     def num_inliers(self) -> int:
-        """Return the number of inliers, 0 without a pose."""
-        return int(self.pose.inliers.sum()) if self.pose else 0
+        """Return the number of inliers."""
+        return len(self.inlier_query_idx)
 
     @property
     def node_id(self) -> int:
         """Return the node with the most inliers, -1 if there are no inliers."""
-        if self.num_inliers == 0 or self.pose is None:
-            return -1
         node_ids, counts = np.unique(
-            self.local_map.node_ids[self.matches.train_idx[self.pose.inliers]], return_counts=True
+            self.local_map.node_ids[self.inlier_point_idx], return_counts=True
         )
-        return int(node_ids[counts.argmax()])
+        return int(node_ids[counts.argmax()]) if len(counts) else -1
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit(PointMatches):
+    """Hold matches and the pose fitted to them."""
+
+    pose: AbsolutePose
+
+    @property
+    def cam_from_world(self) -> Rigid3:
+        """Return the pose."""
+        return self.pose.cam_from_world
+
+    @property
+    def inlier_query_idx(self) -> Int[np.ndarray, " n"]:
+        """Return the feature of each inlier."""
+        return self.matches.query_idx[self.pose.inliers]
+
+    @property
+    def inlier_point_idx(self) -> Int[np.ndarray, " n"]:
+        """Return the map point of each inlier."""
+        return self.matches.train_idx[self.pose.inliers]
 
     @cached_property
     def world_from_cam(self) -> Rigid3:
-        """Return the pose. The fit must have one."""
-        assert self.pose is not None
-        return self.pose.cam_from_world.inverse()
+        """Return the pose."""
+        return self.cam_from_world.inverse()
 
     @cached_property
     def _bounding_box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """Return the lower and upper corner (metres, world) of the box around the inliers'
         points."""
-        assert self.pose is not None
-        columns = self.matches.train_idx[self.pose.inliers]
+        columns = self.inlier_point_idx
         points, radii = self.local_map.points_world[columns], self.local_map.radii[columns][:, None]
         return (points - radii).min(axis=0), (points + radii).max(axis=0)
 
@@ -97,21 +124,12 @@ class PoseFit:
         return bool(np.all(low <= other_high) and np.all(other_low <= high))
 
     def inlier_observations(self, scale: float) -> PointObservations:
-        """Return the inliers, in an image `scale` times as wide as that of the features.
-
-        The fit must have a pose.
-        """
-        assert self.pose is not None
-        query_idx, train_idx = (
-            self.matches.query_idx[self.pose.inliers],
-            self.matches.train_idx[self.pose.inliers],
-        )
-        points_world, covariances = (
-            self.local_map.points_world[train_idx],
-            self.local_map.covariances[train_idx],
-        )
+        """Return the inliers, in an image `scale` times as wide as that of the features."""
+        rows = self.inlier_point_idx
         return PointObservations(
-            self.features.points_img[query_idx], points_world, covariances
+            self.features.points_img[self.inlier_query_idx],
+            self.local_map.points_world[rows],
+            self.local_map.covariances[rows],
         ).to_image_scale(scale)
 
 
@@ -122,14 +140,15 @@ def fit_pose(
     matches: Matches,
     config: AbsolutePoseConfig,
     start: tuple[Rigid3, Camera] | None = None,
-) -> PoseFit:
+) -> PointMatches:
     """Fit a pose by robust PnP, or refine `start` (cam_from_world, camera).
 
-    The focal length is estimated too if the camera is approximate.
+    The focal length is estimated too if the camera is approximate. The result is a `PoseFit` if
+    enough matches agree on a pose.
     """
     camera = start[1] if start else nominal_camera(input_camera)
     if len(matches) < _MIN_MATCHES:
-        return PoseFit(features, input_camera, camera, local_map, matches, None)
+        return PointMatches(features, input_camera, camera, local_map, matches)
     points_img = features.points_img[matches.query_idx].astype(np.float64)
     points_world, covariances = (
         local_map.points_world[matches.train_idx],
@@ -155,4 +174,6 @@ def fit_pose(
             point_covariances=covariances,
             start=near,
         )
+    if pose is None:
+        return PointMatches(features, input_camera, camera, local_map, matches)
     return PoseFit(features, input_camera, camera, local_map, matches, pose)

@@ -37,7 +37,7 @@ from topoloc.localization.guided import (
 )
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.repetition import MIN_SHIFT
-from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 from topoloc.mapping.nodes import node_distances
@@ -159,7 +159,7 @@ def _match_and_fit(
     if len(matches) < max(search.config.min_matches, least):
         return Proposal(
             source,
-            PoseFit(query.features, query.input_camera, query.camera, local_map, matches, None),
+            PointMatches(query.features, query.input_camera, query.camera, local_map, matches),
             is_guided=False,
         )
     with query.clock.stage("pnp"):
@@ -205,9 +205,9 @@ def min_rival_inliers(search: Search) -> float:
     It is more than chance and a share of the inliers of the best pose.
     """
     best, config, least = search.best, search.config, float(search.config.num_chance_inliers)
-    if best is None or best.fit.pose is None or best.probability < config.evidence.min_probability:
+    if best is None or best.probability < config.evidence.min_probability:
         return least
-    found = best.fit.matches.query_idx[best.fit.pose.inliers]
+    found = best.fit.inlier_query_idx
     share_of_strongest = np.count_nonzero(found < config.num_first_features) / max(len(found), 1)
     return max(
         least, config.look_alikes.min_inlier_share * best.evidence.num_inliers * share_of_strongest
@@ -248,7 +248,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
         ]
     kept: list[PoseFit] = []
     for fit in sorted(fits, key=lambda fit: -fit.num_inliers):
-        if fit.pose is not None and not any(
+        if isinstance(fit, PoseFit) and not any(
             is_same_pose(fit, other, search.config.evidence) for other in kept
         ):
             kept.append(fit)
@@ -346,4 +346,4 @@ def _fit_around_pose(
         return None
     with query.clock.stage("pnp"):
         fit = fit_pose(query.features, query.input_camera, local_map, matches, config.pose, start)
-    return fit if fit.num_inliers >= least else None
+    return fit if isinstance(fit, PoseFit) and fit.num_inliers >= least else None

@@ -29,7 +29,7 @@ from topoloc.localization.evidence import (
 from topoloc.localization.guided import count_chance_matches, match_guided, select_visible_points
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.map_facts.repetition import fold_repetitions, shifted_copies
-from topoloc.localization.pose_fit import PoseFit, fit_pose
+from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, TriedProposal
 from topoloc.localization.walls.propose_virtual_views import (
     VirtualViewProposal,
@@ -56,7 +56,7 @@ def evaluate_proposal(search: Search, proposal: Proposal) -> Hypothesis | None:
         (None, None) if is_already_found(search, proposal) else _refine_and_score(search, proposal)
     )
     if search.first is None:
-        search.first = proposal.fit if final is None or final.pose is None else final
+        search.first = final if isinstance(final, PoseFit) else proposal.fit
     if search.trace is not None:
         milliseconds = search.query.clock.times_ms()["total"]
         kind = search.query.feature_config.kind
@@ -68,7 +68,7 @@ def evaluate_proposal(search: Search, proposal: Proposal) -> Hypothesis | None:
 
 def _refine_and_score(
     search: Search, proposal: Proposal
-) -> tuple[PoseFit | None, Hypothesis | None]:
+) -> tuple[PointMatches | None, Hypothesis | None]:
     if isinstance(proposal, VirtualViewProposal):
         with search.query.clock.stage("walls"):
             final = refine_virtual_view_pose(proposal)
@@ -84,23 +84,19 @@ def is_already_found(search: Search, proposal: Proposal) -> bool:
     """
     fit, config = proposal.fit, search.config
     if (
-        fit.pose is None
+        not isinstance(fit, PoseFit)
         or proposal.repeats is not None
         or isinstance(proposal, VirtualViewProposal)
     ):
         return False
     radius_px = config.guided.radius_px * max(max(fit.camera.width, fit.camera.height) / 640.0, 0.5)
     for known in search.belief.hypotheses:
-        if (
-            known.is_from_virtual_views
-            or known.probability < config.evidence.min_probability
-            or known.fit.pose is None
-        ):
+        if known.is_from_virtual_views or known.probability < config.evidence.min_probability:
             continue
         seen = known.fit.inlier_observations(1.0)
         with np.errstate(invalid="ignore"):
             apart = np.linalg.norm(
-                fit.camera.img_from_cam(fit.pose.cam_from_world.apply(seen.points_world))
+                fit.camera.img_from_cam(fit.cam_from_world.apply(seen.points_world))
                 - seen.points_img,
                 axis=1,
             )
@@ -109,7 +105,7 @@ def is_already_found(search: Search, proposal: Proposal) -> bool:
     return False
 
 
-def refine(search: Search, proposal: Proposal) -> PoseFit:
+def refine(search: Search, proposal: Proposal) -> PointMatches:
     """Return the pose refitted to guided matches, or the proposal if it has too few inliers."""
     config, first = search.config, proposal.fit
     final = _refit_around(search, first)
@@ -120,15 +116,15 @@ def refine(search: Search, proposal: Proposal) -> PoseFit:
     return final
 
 
-def _refit_around(search: Search, fit: PoseFit) -> PoseFit:
+def _refit_around(search: Search, fit: PointMatches) -> PointMatches:
     config, query = search.config, search.query
     if (
         config.guided.num_nodes == 0
-        or fit.pose is None
+        or not isinstance(fit, PoseFit)
         or fit.num_inliers < config.evidence.min_inliers
     ):
         return fit
-    cam_from_world = fit.pose.cam_from_world
+    cam_from_world = fit.cam_from_world
     with query.clock.stage("matching"):
         local_map = search.map.local_map(
             search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes)
@@ -145,7 +141,7 @@ def _refit_around(search: Search, fit: PoseFit) -> PoseFit:
         )
 
 
-def score_pose(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis | None:
+def score_pose(search: Search, proposal: Proposal, final: PointMatches) -> Hypothesis | None:
     """Score the refined pose and return it as a hypothesis. None if too few points were found.
 
     The evidence comes from unguided matches. The proposal's own matches are enough if they make the
@@ -154,8 +150,8 @@ def score_pose(search: Search, proposal: Proposal, final: PoseFit) -> Hypothesis
     """
     config, first = search.config.evidence, proposal.fit
     if (
-        first.pose is None
-        or final.pose is None
+        not isinstance(first, PoseFit)
+        or not isinstance(final, PoseFit)
         or first.num_inliers < config.min_inliers
         or final.num_inliers < config.min_found
     ):
@@ -176,7 +172,7 @@ def compute_best_case_evidence(search: Search, proposal: Proposal) -> Evidence |
     None if too few points were found.
     """
     final = refine(search, proposal)
-    if final.pose is None or final.num_inliers < search.config.evidence.min_found:
+    if not isinstance(final, PoseFit) or final.num_inliers < search.config.evidence.min_found:
         return None
     with search.query.clock.stage("evidence"):
         counted = _count_found_points(
@@ -200,7 +196,7 @@ def cross_check_hypothesis(
         with these features, None if there is none.
     """
     final = _refit_around(search, hypothesis.fit)
-    if final.num_inliers < search.config.evidence.min_found:
+    if not isinstance(final, PoseFit) or final.num_inliers < search.config.evidence.min_found:
         return 0.0, None
     scored = score_pose(search, Proposal("other features", final, is_guided=True), final)
     num_matches = (
@@ -229,7 +225,6 @@ def _compute_evidence(
             num_matches=unguided[0],
             num_inliers=unguided[1],
         )
-    assert final.pose is not None
     counted, may_be_hopeless = (
         replace(counted, num_by_chance=_count_chance_matches(search, final)),
         True,
@@ -249,14 +244,14 @@ def _compute_evidence(
         of_strongest = _with_unguided(
             search,
             counted,
-            _fit_without_pose(final, matcher.match_first(search.config.num_first_features)),
+            _unguided(final, matcher.match_first(search.config.num_first_features)),
             final,
         )
         if (
             compute_log_odds(of_strongest, search.weights) < 2.0 * _HOPELESS_LOG_ODDS
         ):  # for any matches of the other features
             return None
-    return _with_unguided(search, counted, _fit_without_pose(final, matcher.match_first()), final)
+    return _with_unguided(search, counted, _unguided(final, matcher.match_first()), final)
 
 
 def _count_found_points(
@@ -266,13 +261,10 @@ def _count_found_points(
 
     `covariance` is that of the left perturbation of cam_from_world.
     """
-    pose, camera = final.pose, final.camera
-    assert pose is not None
-    depths = pose.cam_from_world.apply(
-        final.local_map.points_world[final.matches.train_idx[pose.inliers]]
-    )[:, 2]
-    found_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
-    visible, visible_img = select_visible_points(final.local_map, pose.cam_from_world, camera)
+    camera = final.camera
+    depths = final.cam_from_world.apply(final.local_map.points_world[final.inlier_point_idx])[:, 2]
+    found_img = final.features.points_img[final.inlier_query_idx].astype(np.float64)
+    visible, visible_img = select_visible_points(final.local_map, final.cam_from_world, camera)
     return Evidence(
         num_matches=0,
         num_inliers=0,
@@ -309,11 +301,10 @@ def _compute_uniform_inlier_ratio(
 
 
 def _count_chance_matches(search: Search, final: PoseFit) -> int:
-    assert final.pose is not None
     return count_chance_matches(
         final.features,
         final.local_map,
-        final.pose.cam_from_world,
+        final.cam_from_world,
         final.camera,
         search.config.guided,
     )
@@ -325,17 +316,16 @@ def _assume_all_agree(counted: Evidence, final: PoseFit) -> Evidence:
 
 
 def _with_unguided(
-    search: Search, evidence: Evidence, unguided: PoseFit, final: PoseFit
+    search: Search, evidence: Evidence, unguided: PointMatches, final: PoseFit
 ) -> Evidence:
     """Return the evidence with the counts of these unguided matches."""
-    assert final.pose is not None
     # points with correlated errors differ from node to node, so true matches agree less well
     agreement_px = search.config.evidence.agreement_px * math.sqrt(
         1.0 + search.correlated_error_share
     )
     num_agreeing = _count_agreeing_matches(
         unguided,
-        final.pose.cam_from_world,
+        final.cam_from_world,
         final.camera,
         agreement_px,
         _repetition_shifts(search, final),
@@ -357,13 +347,13 @@ def _create_unguided_matcher(search: Search, final: PoseFit) -> Matcher:
     )
 
 
-def _fit_without_pose(final: PoseFit, matches: Matches) -> PoseFit:
-    """Return a fit of unguided matches without a pose."""
-    return replace(final, matches=matches, pose=None)
+def _unguided(final: PoseFit, matches: Matches) -> PointMatches:
+    """Return unguided matches with the points around a pose."""
+    return PointMatches(final.features, final.input_camera, final.camera, final.local_map, matches)
 
 
 def _count_agreeing_matches(
-    unguided: PoseFit,
+    unguided: PointMatches,
     cam_from_world: Rigid3,
     camera: Camera,
     agreement_px: float,

@@ -93,9 +93,8 @@ def _uncertainty_with_covariance(
     search: Search, best: Hypothesis, covariance: Float[np.ndarray, "6 6"]
 ) -> float:
     """Compute `Evidence.doubt` of the hypothesis for another covariance."""
-    assert best.fit.pose is not None
     seen = best.fit.inlier_observations(1.0)
-    depth = float(np.median(best.fit.pose.cam_from_world.apply(seen.points_world)[:, 2]))
+    depth = float(np.median(best.fit.cam_from_world.apply(seen.points_world)[:, 2]))
     return compute_normalized_uncertainty(covariance, depth, search.config.evidence)
 
 
@@ -140,11 +139,10 @@ def _build_localization(
     search: Search, hypothesis: Hypothesis, probability: float
 ) -> LocalizationWithInliers:
     best = _with_clustered_errors(search, hypothesis)
-    assert best.fit.pose is not None
     is_rough = isinstance(best.fit.input_camera, UncalibratedCamera)
     localization = Localization(
         world_from_cam=best.world_from_cam,
-        covariance=inverse_covariance(best.fit.pose.cam_from_world, best.covariance),
+        covariance=inverse_covariance(best.fit.cam_from_world, best.covariance),
         probability=probability,
         node_id=best.fit.node_id,
         candidates=search.named,
@@ -166,13 +164,13 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
     The errors common to the whole image and those common to parts add up. The factor is n rho +
     coherence^2, relative to independent errors. Virtual views have an inflation of their own.
     """
-    if best.is_from_virtual_views or best.fit.pose is None:
+    if best.is_from_virtual_views:
         return best
     seen = best.fit.inlier_observations(1.0)
     parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
     squared = (
         compute_variance_inflation(
-            *parts, best.fit.camera, best.fit.pose.cam_from_world, search.config.pose
+            *parts, best.fit.camera, best.fit.cam_from_world, search.config.pose
         )
         ** 2
     )

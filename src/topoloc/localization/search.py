@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
-from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.pose_fit import PointMatches, PoseFit
 from topoloc.localization.query import Query
 from topoloc.retrieval.coarse import NodeScore
 
@@ -26,18 +27,23 @@ class TriedProposal:
     """
 
     source: str
-    first: PoseFit
-    refined: PoseFit | None
+    first: PointMatches
+    refined: PointMatches | None
     hypothesis: Hypothesis | None
     milliseconds: float
     features: str
 
     @property
-    def fit(self) -> PoseFit:
+    def world_from_cam(self) -> Rigid3 | None:
+        """Return the pose, None if the matches agree on none."""
+        return self.fit.world_from_cam if isinstance(self.fit, PoseFit) else None
+
+    @property
+    def fit(self) -> PointMatches:
         """The last fit of it: that of the hypothesis, else the refined one if it has a pose."""
         if self.hypothesis is not None:
             return self.hypothesis.fit
-        if self.refined is not None and self.refined.pose is not None:
+        if isinstance(self.refined, PoseFit):
             return self.refined
         return self.first
 
@@ -58,13 +64,13 @@ Source = Literal[
 class Proposal:
     """Hold a pose proposal and its source.
 
-    `fit.pose` is None if the matches agree on no pose. `is_guided` is True if a pose guided the
+    `fit` is a `PoseFit` if the matches agree on a pose. `is_guided` is True if a pose guided the
     matches, which are then no evidence for it. `repeats` is the evidence for the pose that this
     proposal repeats elsewhere. The unguided matches support both.
     """
 
     source: Source
-    fit: PoseFit
+    fit: PointMatches
     is_guided: bool
     repeats: Evidence | None = None
 
@@ -89,9 +95,9 @@ class Search:
     """True if no other feature type follows."""
     belief: Belief = field(default_factory=Belief)
     ranked: list[NodeScore] = field(default_factory=list)
-    retrieved: PoseFit | None = None
+    retrieved: PointMatches | None = None
     """The fit to the retrieved candidates."""
-    first: PoseFit | None = None
+    first: PointMatches | None = None
     """The first fit tried. It gives the reason if there is no hypothesis."""
     is_repetitive: bool = False
     """True if the best pose is one of many from which a repetitive place looks the same."""

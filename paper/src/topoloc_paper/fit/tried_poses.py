@@ -160,7 +160,6 @@ def _tried(
         ):  # that counts the matches of another pose
             continue
         final, evidence = tried.hypothesis.fit, tried.hypothesis.evidence
-        assert final.pose is not None
         first_evidence = None
         if tried.source not in ("viewpoints", "walls"):
             first_evidence = replace(
@@ -175,6 +174,6 @@ def _tried(
             )
             xi = error.log()
             square = float(xi @ np.linalg.solve(final.pose.covariance, xi))
-        points_world = final.local_map.points_world[final.matches.train_idx[final.pose.inliers]]
+        points_world = final.local_map.points_world[final.inlier_point_idx]
         depth = float(np.median(cam_from_world.apply(points_world)[:, 2]))
         yield TriedPose(*picture, error_m, error_deg, depth, evidence, first_evidence, square, rho)

@@ -58,7 +58,7 @@ class Explanation:
     def best(self) -> EvaluatedPose | None:
         """What has most for it."""
         likely = [pose for pose in self.poses if pose.probability is not None]
-        found = [pose for pose in self.poses if pose.tried.fit.pose is not None]
+        found = [pose for pose in self.poses if pose.tried.world_from_cam]
         by_odds = max(
             likely,
             key=lambda pose: pose.tried.hypothesis.log_odds if pose.tried.hypothesis else -math.inf,
@@ -112,7 +112,7 @@ def _evaluate_pose(tried: TriedProposal, result: Localization | NotLocalized) ->
         return EvaluatedPose(
             tried, probability, _verdict(tried.hypothesis.world_from_cam, probability, result)
         )
-    if tried.fit.pose is None:
+    if tried.world_from_cam is None:
         return EvaluatedPose(
             tried, None, f"no pose: the {len(tried.fit.matches)} matches agree on none"
         )
@@ -178,7 +178,7 @@ def _collect_advice(explanation: Explanation, localizer: Localizer) -> Iterator[
                 "It may be elsewhere, changed, or seen from a side or in a light that the map does"
                 " not hold."
             )
-        yield from _advice_on_viewpoint(best.tried.fit.world_from_cam, localizer)
+        yield from _advice_on_viewpoint(best.tried.hypothesis.world_from_cam, localizer)
     elif isinstance(result, NotLocalized):
         yield (
             "No part of the map looks enough like this picture: it may be of somewhere else, or of"

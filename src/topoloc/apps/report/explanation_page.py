@@ -81,11 +81,7 @@ def verdict(explanation: Explanation) -> str:
 
 def _rank_poses(explanation: Explanation) -> list[EvaluatedPose]:
     """The poses that are shown, the likeliest first, each node once."""
-    with_pose = [
-        pose
-        for pose in explanation.poses
-        if pose.tried.fit.pose is not None and pose.tried.fit.node_id >= 0
-    ]
+    with_pose = [pose for pose in explanation.poses if pose.tried.fit.node_id >= 0]
     with_pose.sort(
         key=lambda pose: (pose.probability or 0.0, pose.tried.fit.num_inliers), reverse=True
     )
@@ -129,7 +125,9 @@ def compared_to_json(
             "node_size": [node.camera.width, node.camera.height],
             "verdict": pose.verdict,
         }
-        compared.append(facts | {"num_inliers": _num_inliers(pose), "matches": pixels.tolist()})
+        compared.append(
+            facts | {"num_inliers": pose.tried.fit.num_inliers, "matches": pixels.tolist()}
+        )
     return compared
 
 
@@ -138,13 +136,9 @@ def _find_explained_matches(
 ) -> NodeMatches:
     """What the pose explains, as far as its node would see it."""
     node, fit = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)], pose.tried.fit
-    assert fit.pose is not None
-    rows = np.flatnonzero(fit.pose.inliers)
     scale = image.shape[1] / fit.camera.width
-    query = (
-        fit.features.points_img[fit.matches.query_idx[rows]].astype(np.float64) + 0.5
-    ) * scale - 0.5
-    points = fit.local_map.points_world[fit.matches.train_idx[rows]]
+    query = (fit.features.points_img[fit.inlier_query_idx].astype(np.float64) + 0.5) * scale - 0.5
+    points = fit.local_map.points_world[fit.inlier_point_idx]
     seen = node.camera.img_from_cam(node.summary.world_from_cam.inverse().apply(points))
     inside = (
         np.isfinite(seen).all(axis=1)
@@ -154,10 +148,6 @@ def _find_explained_matches(
     return NodeMatches(
         query[inside], seen[inside], np.full(int(inside.sum()), pose.verdict == "the answer")
     )
-
-
-def _num_inliers(pose: EvaluatedPose) -> int:
-    return 0 if pose.tried.fit.pose is None else int(pose.tried.fit.pose.inliers.sum())
 
 
 def _render_pose(image: Image, pose: EvaluatedPose, topomap: TopoMetricMap) -> str:
@@ -171,7 +161,7 @@ def _render_pose(image: Image, pose: EvaluatedPose, topomap: TopoMetricMap) -> s
     kind = "good" if pose.verdict == "the answer" else "bad"
     node_id = node.summary.node_id
     facts = (
-        f'<div class="facts"><b>node {node_id}, {_num_inliers(pose)} inliers</b><p'
+        f'<div class="facts"><b>node {node_id}, {pose.tried.fit.num_inliers} inliers</b><p'
         f' class="{kind}">{escape(pose.verdict)}</p></div>'
     )
     figure = _render_figure(pair, f"left the image, right node {node_id}")

@@ -40,7 +40,7 @@ from topoloc.localization.evidence import (
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
-from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.pose_fit import PointMatches, PoseFit
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.candidate_places import CandidatePlaces, select_likeliest_places
 from topoloc.localization.walls.upright_pose import estimate_upright_pose
@@ -207,7 +207,7 @@ def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewPropos
     )
     if agreeing is None or agreeing[0] < config.min_agreeing:
         return None
-    fit = PoseFit(found.features, walls.camera, walls.camera, found.local_map, found.matches, None)
+    fit = PointMatches(found.features, walls.camera, walls.camera, found.local_map, found.matches)
     return VirtualViewProposal(
         "walls",
         fit,
@@ -241,7 +241,7 @@ def refine_virtual_view_pose(proposal: VirtualViewProposal) -> PoseFit | None:
 def score_virtual_view_pose(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis | None:
     """Score the refined pose and return it as a hypothesis. None if too few points were found."""
     walls, search, pose, camera = proposal.walls, proposal.walls.search, final.pose, final.camera
-    if pose is None or final.num_inliers < search.config.walls.min_found:
+    if final.num_inliers < search.config.walls.min_found:
         return None
     counts = count_virtual_views(
         _views_around(walls, pose.cam_from_world),
@@ -253,10 +253,8 @@ def score_virtual_view_pose(proposal: VirtualViewProposal, final: PoseFit) -> Hy
         + search.weights.walls.few_points / final.num_inliers
     )
     covariance = inflated * pose.covariance
-    depths = pose.cam_from_world.apply(
-        final.local_map.points_world[final.matches.train_idx[pose.inliers]]
-    )[:, 2]
-    points_img = final.features.points_img[final.matches.query_idx[pose.inliers]].astype(np.float64)
+    depths = pose.cam_from_world.apply(final.local_map.points_world[final.inlier_point_idx])[:, 2]
+    points_img = final.features.points_img[final.inlier_query_idx].astype(np.float64)
     num_left = int(np.count_nonzero(points_img[:, 0] < camera.cx))
     agreeing_img = points_img if counts.agreeing_img is None else counts.agreeing_img
     evidence = Evidence(
@@ -352,10 +350,7 @@ def _estimate(
 
 def _num_distinct(walls: VirtualViewSearch, final: PoseFit) -> int:
     """Count the inliers that match better here than with any distant point of the other places."""
-    assert final.pose is not None
-    rows, columns = (
-        index[final.pose.inliers] for index in (final.matches.query_idx, final.matches.train_idx)
-    )
+    rows, columns = final.inlier_query_idx, final.inlier_point_idx
     descriptors, points_world = (
         final.features.descriptors[rows],
         final.local_map.points_world[columns],
