@@ -264,7 +264,7 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
         [made_hypothesis(log_odds, even_share=0.3), made_hypothesis(log_odds - 3.0, x=9.0)]
     )
     assert isinstance(decide_result(search)[0], Localization)
-    strict = structs.replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
+    strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
     assert (
         isinstance(decide_result(replace(search, weights=strict))[0], Localization) == is_answered
     )
@@ -272,7 +272,7 @@ def test_a_pose_that_is_not_clear_must_lead_those_elsewhere_by_what_its_kind_ask
 
 def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
     """Each of their points was held against all other walls."""
-    strict = structs.replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
+    strict = replace(WEIGHTS, rivals=structs.replace(WEIGHTS.rivals, unclear_lead=4.0))
     for walls in (True, False):
         search = believed(
             [
