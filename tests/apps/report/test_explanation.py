@@ -1,6 +1,7 @@
 """What is said of an answer, or of none."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
