@@ -146,9 +146,9 @@ def _note(path: Path) -> None:
 def test_an_edit_in_an_object_store_is_taken_back(
     room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    pytest.importorskip("fsspec", reason="the extra cluster is not installed")
+    pytest.importorskip("obstore", reason="the extra cluster is not installed")
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "cache"))
-    where = f"memory://{uuid4().hex}/campus"
+    where = f"memory:///{uuid4().hex}/campus"
     create_atlas(where, new_tiles([str(room_map)]))
     edit_tile(where, "room", _note)
     assert len(Atlas.open(where).tile("room").previous) == 1

@@ -19,7 +19,7 @@ from topoloc.errors import AtlasError
 from topoloc.mapping.edit import read_history
 
 _OBJECT_STORES = "topoloc.apps.stores.object_store"
-"""Module of `ObjectStore`. It is imported by name, because fsspec is an optional extra and the
+"""Module of `ObjectStore`. It is imported by name, because obstore is an optional extra and the
 module belongs to the apps."""
 
 
