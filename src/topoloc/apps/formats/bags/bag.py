@@ -3,8 +3,8 @@ messages of all of them together."""
 
 from __future__ import annotations
 
+import importlib
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +16,12 @@ BAG_SUFFIXES = (".bag", ".bag.active", ".db3")
 MCAP_SUFFIXES = (".mcap",)
 _COMPRESSED_SUFFIX, _ZSTD_MAGIC = ".zstd", b"\x28\xb5\x2f\xfd"
 _MAX_MESSAGE_BYTES = 1 << 29
+# The first bytes of a file, and its reader, which is imported when it is needed.
+_READERS = {
+    b"#ROSBAG V2.0\n": ("ros1_file", "Ros1File"),
+    b"\x89MCAP0\r\n": ("mcap_file", "McapFile"),
+    b"SQLite format 3\0": ("sqlite_file", "SqliteFile"),
+}
 
 
 @dataclass(eq=False)
@@ -118,10 +124,10 @@ def _open_file(path: Path) -> MessageFile:
             begin = file.read(16)
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from None
-    for magic, kind in _OPENERS.items():
+    for magic, (module, name) in _READERS.items():
         if begin.startswith(magic):
             try:
-                return kind(path)
+                return getattr(importlib.import_module(f"{__package__}.{module}"), name)(path)
             except ModuleNotFoundError as error:
                 raise missing_bags_error(error, path) from error
     raise RecordingError(
@@ -142,31 +148,6 @@ def missing_bags_error(error: ModuleNotFoundError, path: Path) -> Exception:
     return MissingExtraError(
         f"{path}: bags and MCAP files need the extra bags: pip install 'topoloc[bags]'"
     )
-
-
-def _open_ros1(path: Path) -> MessageFile:
-    from topoloc.apps.formats.bags.ros1_file import Ros1File
-
-    return Ros1File(path)
-
-
-def _open_mcap(path: Path) -> MessageFile:
-    from topoloc.apps.formats.bags.mcap_file import McapFile
-
-    return McapFile(path)
-
-
-def _open_sqlite(path: Path) -> MessageFile:
-    from topoloc.apps.formats.bags.sqlite_file import SqliteFile
-
-    return SqliteFile(path)
-
-
-_OPENERS: dict[bytes, Callable[[Path], MessageFile]] = {
-    b"#ROSBAG V2.0\n": _open_ros1,
-    b"\x89MCAP0\r\n": _open_mcap,
-    b"SQLite format 3\0": _open_sqlite,
-}
 
 
 def _decompress(data: bytes) -> bytes:

@@ -14,7 +14,6 @@ from pathlib import Path
 from topoloc import RecordingError
 from topoloc.apps.formats.bags.message_file import MessageRef, Topic, damaged_message_error
 
-MAGIC = b"SQLite format 3\0"
 _ROW = -2  # in place of a chunk's number
 _DAMAGE_ERRORS = (
     sqlite3.Error,
