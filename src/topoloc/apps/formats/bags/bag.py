@@ -1,5 +1,5 @@
-"""A bag: one file of messages, or a folder of the parts that a recorder split it into; topics and
-messages of all of them together."""
+"""Read the topics and messages of a bag: one file, or a folder of the parts that a recorder
+wrote."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _READERS = {
 
 @dataclass(eq=False)
 class Bag:
-    """The files of a recording, opened. `notes` is what the user should know of them: what was cut
+    """Hold the open files of a recording. `notes` are for the user, such as a file that is cut
     off."""
 
     path: Path
@@ -41,7 +41,7 @@ class Bag:
                     self.topics.setdefault(name, topic)
 
     def messages(self, topic: str) -> list[MessageRef]:
-        """The messages of a topic in all files, in the order in which they were written."""
+        """Return the messages of a topic in all files, in the order in which they were written."""
         found = [
             (number, file.messages(topic))
             for number, file in enumerate(self.files)
@@ -50,18 +50,17 @@ class Bag:
         return sorted(ref._replace(file=number) for number, refs in found for ref in refs)
 
     def read(self, ref: MessageRef, most: int | None = None) -> bytes:
-        """The bytes of a message, or at least the first `most` of them; unpacked where each message
-        is packed.
+        """Return the bytes of a message, or at least the first `most` of them, decompressed.
 
         Raises:
-            RecordingError: they are not there.
+            RecordingError: the bytes do not exist.
         """
         file = self.files[ref.file]
         data = file.read(ref, most)
         return _decompress(file.read(ref)) if data.startswith(_ZSTD_MAGIC) else data
 
     def describe_topics(self) -> str:
-        """The topics with their types, for errors."""
+        """Return the topics with their types, for errors."""
         names = [
             f"{topic.name} ({topic.type or topic.encoding})"
             for topic in sorted(self.topics.values(), key=lambda its: its.name)
@@ -73,14 +72,15 @@ class Bag:
         )
 
     def add_fault_notes(self) -> None:
-        """Adds what is wrong with the files; after the messages that are used were looked for."""
+        """Add the faults of the files to `notes`. Call it after the messages were listed."""
         self.notes += [
             f"{self.path}: {file.fault}; what is whole is used" for file in self.files if file.fault
         ]
 
 
 def is_bag(path: Path, suffixes: tuple[str, ...] = BAG_SUFFIXES) -> bool:
-    """Whether this is a file of one of these names, or a folder of files that ROS 2 recorded."""
+    """Return whether this is a file with one of these suffixes, or a folder of files that ROS 2
+    recorded."""
     if path.is_dir():
         return suffixes == BAG_SUFFIXES and bool(
             (path / "metadata.yaml").is_file() or _list_parts(path)
@@ -89,7 +89,7 @@ def is_bag(path: Path, suffixes: tuple[str, ...] = BAG_SUFFIXES) -> bool:
 
 
 def open_bag_files(path: Path) -> Bag:
-    """Open a bag. Nothing but where its messages are is read.
+    """Open a bag. Only the positions of its messages are read.
 
     Raises:
         RecordingError: no bag, or damaged at its beginning.
@@ -136,7 +136,7 @@ def _open_file(path: Path) -> MessageFile:
 
 
 def missing_bags_error(error: ModuleNotFoundError, path: Path) -> Exception:
-    """What is said where a library of the extra is missing."""
+    """Return the error for a missing library of the extra."""
     if error.name is None or error.name.split(".")[0] not in (
         "rosbags",
         "mcap",
