@@ -5,7 +5,7 @@ manifest whole?
 
 Each writer adds so many tiles, one at a time, with the command's own code; the map is the same for
 all, under ids of their own. The atlas is a folder; with `--s3` a prefix of moto's server, which
-speaks the API of Amazon S3 on this machine (s3fs, 'moto[s3]', flask, flask-cors).
+speaks the API of Amazon S3 on this machine (obstore, 'moto[s3]', flask, flask-cors).
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
+
+import httpx
 
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles
@@ -35,7 +37,6 @@ def place(folder: str, is_s3: bool) -> Iterator[str]:
     if not is_s3:
         yield str(Path(folder) / "atlas")
         return
-    import s3fs  # pyright: ignore[reportMissingImports]
     from moto.server import ThreadedMotoServer  # pyright: ignore[reportMissingImports]
 
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
@@ -48,7 +49,7 @@ def place(folder: str, is_s3: bool) -> Iterator[str]:
         AWS_SECRET_ACCESS_KEY="x",
     )
     os.environ["TOPOLOC_CACHE"] = folder
-    s3fs.S3FileSystem().mkdir("bucket")
+    httpx.put(f"{address}/bucket").raise_for_status()
     yield "s3://bucket/atlas"
     server.stop()
 

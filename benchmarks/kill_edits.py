@@ -6,13 +6,14 @@ about?
 
 A child edits a copy of MAP without end, every third time taking the edit back. After each kill the
 map is looked at from end to end, all that can be undone is undone, and one more edit is made; then
-no file but the map and its undo file may be there. Exit status 1 where anything was wrong.
+no file but the map may be there. Exit status 1 where anything was wrong.
 
 With `--command-lines` whole processes are killed instead, in turns: `topoloc update MAP SEQ`,
 `prune --max-mb` to 90 % of the file, `undo` of an update, `merge MAP OTHER_MAP OUT` over a file
 that is there. Each is let run to its end once, and killed at a moment of the time that this took.
-The map, and OUT, must be the one before or the one after, to the byte, and nothing else may be
-there after one more edit; what processes leave in the folder for temporary files counts, too.
+The map, and OUT, must be the one before or the one after, to the byte, and nothing but kept
+files of the map may be there after one more edit; what processes leave in the folder for temporary
+files counts, too.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.mapping.edit import count_undoable_edits, edit_map, undo_edit
+from topoloc.mapping.edit import edit_map, undo_edit
 from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.kept_files import find_kept_files
 
 
 def edit_without_end(path: Path) -> None:
@@ -57,15 +59,12 @@ def kill_transactions(path: Path, kills: int, within_s: float) -> Counter[str]:
             time.sleep(rng.uniform(0.0, within_s))
             child.send_signal(signal.SIGKILL)
         counts["broken"] += bool(find_map_damage(path))
-        while count_undoable_edits(path):
+        while find_kept_files(path):
             undo_edit(path)
             counts["undone"] += 1
         counts["broken"] += bool(find_map_damage(path))
         _one_more_edit(path)
-        counts["left"] += sorted(one.name for one in path.parent.iterdir()) not in (
-            [path.name],
-            [path.name, f"{path.name}.undo"],
-        )
+        counts["left"] += [one.name for one in path.parent.iterdir()] != [path.name]
     print(f"{kills} kills, {counts['undone']} edits undone afterwards: {_said(counts)}")
     return counts
 
@@ -152,7 +151,8 @@ def _kill_once(command: KilledCommand, folder: Path, seconds: float, counts: Cou
         find_map_damage(folder / command.target)
     )
     _one_more_edit(folder / command.target)
-    kept = {*command.files, command.target, f"{command.target}.undo", "map.topo.undo", "temporary"}
+    of_target = [one.name for one in find_kept_files(folder / command.target)]
+    kept = {*command.files, *of_target, command.target, "temporary"}
     left = [path.name for path in folder.rglob("*") if path.name not in kept]
     counts["left"] += bool(left)
     if left:

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
 
+import httpx
 import pytest
 
+from topoloc.apps.stores.object_store import open_objects
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
 from topoloc.recordings.open import open_sequence
@@ -30,10 +32,10 @@ def other_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def s3_server() -> Iterator[str]:
     """The address of moto's server, which speaks the API of Amazon S3, on this machine."""
-    for needed in ("s3fs", "moto", "flask", "flask_cors"):
+    for needed in ("obstore", "moto", "flask", "flask_cors"):
         pytest.importorskip(
             needed,
-            reason="an S3 server to test on needs: pip install s3fs 'moto[s3]' flask flask-cors",
+            reason="an S3 server to test on needs: pip install obstore 'moto[s3]' flask flask-cors",
         )
     from moto.server import ThreadedMotoServer  # pyright: ignore[reportMissingImports]
 
@@ -47,8 +49,6 @@ def s3_server() -> Iterator[str]:
 @pytest.fixture
 def s3_bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
     """A new bucket, `s3://...`; files that are read of it are kept in a folder of the test."""
-    import s3fs  # pyright: ignore[reportMissingImports]
-
     said = {"AWS_ENDPOINT_URL": s3_server, "AWS_DEFAULT_REGION": "us-east-1"}
     said |= {
         "AWS_ACCESS_KEY_ID": "tests",
@@ -57,7 +57,7 @@ def s3_bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     }
     for name, value in said.items():
         monkeypatch.setenv(name, value)
-    s3fs.S3FileSystem.clear_instance_cache()
+    open_objects.cache_clear()
     name = f"atlas-{uuid4().hex}"
-    s3fs.S3FileSystem().mkdir(name)
+    httpx.put(f"{s3_server}/{name}").raise_for_status()
     return f"s3://{name}"

@@ -12,6 +12,9 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from topoloc.mapping.kept_files import kept_path
+
+from .edits import digest
 from .figures import Figure
 from .workplace import FIXTURES, ROOT, JobError, Workplace, last_line, need_module, run
 
@@ -92,12 +95,14 @@ def _of_script(work: Workplace, name: str, script: str, *words: object) -> Figur
 
 
 def _damaged_undo(work: Workplace, seed: int) -> str:
-    """Damage an undo file, run `topoloc undo`, and return what came of it."""
+    """Damage the kept file of a map, run `topoloc undo`, and return the outcome."""
     folder = work.folder / f"undo{seed}"
     folder.mkdir()
-    path, kept = folder / "pruned.topo", folder / "pruned.topo.undo"
-    shutil.copy(FIXTURES / "pruned.topo", path)
-    kept.write_bytes(_damaged((FIXTURES / "pruned.topo.undo").read_bytes(), random.Random(seed)))
+    after, before = FIXTURES / "pruned.topo", FIXTURES / "schema_3.topo"
+    path = folder / after.name
+    shutil.copy(after, path)
+    kept = kept_path(path, digest(after), digest(before))
+    kept.write_bytes(_damaged(before.read_bytes(), random.Random(seed)))
     try:
         words = [sys.executable, "-m", "topoloc", "undo", path]
         code, _, err = run(words, folder, timeout=30)
@@ -107,7 +112,7 @@ def _damaged_undo(work: Workplace, seed: int) -> str:
     shutil.rmtree(folder, ignore_errors=True)
     if "Traceback" in err or code not in (0, 1):
         return "traceback"
-    known = FIXTURES / ("schema_3.topo" if code == 0 else "pruned.topo")
+    known = before if code == 0 else after
     return "right" if same == known.read_bytes() else "another map"
 
 

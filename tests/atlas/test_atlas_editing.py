@@ -26,13 +26,13 @@ NUM_WRITES = {"folder": 25, "memory": 12, "s3": 12}
 
 @pytest.fixture(params=list(NUM_WRITES))
 def somewhere(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """Where an atlas may be made: a folder, fsspec's store in memory, and S3."""
+    """Where an atlas may be made: a folder, a store in memory, and S3."""
     if request.param == "folder":
         return str(tmp_path / "campus")
     if request.param == "s3":
         return f"{request.getfixturevalue('s3_bucket')}/campus"
-    pytest.importorskip("fsspec", reason="the extra cluster is not installed")
-    return f"memory://{uuid4().hex}/campus"
+    pytest.importorskip("obstore", reason="the extra cluster is not installed")
+    return f"memory:///{uuid4().hex}/campus"
 
 
 def _tiles(where: str) -> list[str]:
@@ -152,8 +152,6 @@ def test_two_writers_at_once_lose_nothing(
     num_writes = NUM_WRITES[somewhere.partition("://")[0] if "://" in somewhere else "folder"]
     create_atlas(somewhere, new_tiles([str(room_map)]))
     ready = Atlas.open(somewhere).tile("room")
-    if somewhere.startswith("memory:"):
-        _one_object_at_a_time(monkeypatch)
 
     def made(new: NewTile, store: Store) -> Tile:
         return replace(ready, tile_id=new.tile_id, world=new.world)
@@ -181,35 +179,6 @@ def test_two_writers_at_once_lose_nothing(
         f"{name}{number}" for name in "ab" for number in range(num_writes)
     }
     assert manifest.serial == 1 + 2 * num_writes
-
-
-def _one_object_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """fsspec's store in memory looks first and writes then, and lists what goes meanwhile, unlike
-    S3; here each is one step."""
-    from fsspec.implementations.memory import MemoryFileSystem
-
-    lock, write = threading.RLock(), MemoryFileSystem.pipe_file
-    listed, removed = MemoryFileSystem.ls, MemoryFileSystem._rm  # pyright: ignore[reportPrivateUsage]
-
-    def at_once(
-        self: MemoryFileSystem, path: str, value: bytes, mode: str = "overwrite", **kwargs: object
-    ) -> None:
-        with lock:
-            if mode == "create" and self.exists(path):
-                raise FileExistsError(path)
-            write(self, path, value, "overwrite")
-
-    def whole_list(self: MemoryFileSystem, *args: object, **kwargs: object) -> object:
-        with lock:
-            return listed(self, *args, **kwargs)
-
-    def gone_at_once(self: MemoryFileSystem, path: str) -> None:
-        with lock:
-            removed(self, path)
-
-    monkeypatch.setattr(MemoryFileSystem, "pipe_file", at_once)
-    monkeypatch.setattr(MemoryFileSystem, "ls", whole_list)
-    monkeypatch.setattr(MemoryFileSystem, "_rm", gone_at_once)
 
 
 def test_a_writer_that_comes_too_late_begins_anew(

@@ -50,8 +50,8 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def somewhere(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "folder":
         return str(tmp_path / "campus")
-    pytest.importorskip("fsspec", reason="the extra cluster is not installed")
-    return f"memory://{uuid4().hex}/campus"
+    pytest.importorskip("obstore", reason="the extra cluster is not installed")
+    return f"memory:///{uuid4().hex}/campus"
 
 
 def _updated(capsys: pytest.CaptureFixture[str], status: int, *args: object) -> dict[str, Any]:

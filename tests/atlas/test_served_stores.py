@@ -50,16 +50,16 @@ def store(
 def in_memory(
     room_map: Path, other_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> str:
-    """The same in fsspec's store in memory, which does what a test says."""
+    """The same in a store in memory, which does what a test says."""
     where = _in_memory(tmp_path, monkeypatch)
     create_atlas(where, new_tiles([str(room_map), str(other_map)]))
     return where
 
 
 def _in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    pytest.importorskip("fsspec", reason="the extra cluster is not installed")
+    pytest.importorskip("obstore", reason="the extra cluster is not installed")
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "cache"))
-    return f"memory://{uuid4().hex}/campus"
+    return f"memory:///{uuid4().hex}/campus"
 
 
 @contextmanager
@@ -168,11 +168,11 @@ def test_what_is_written_to_the_store_is_noticed(
 
 def test_a_look_reads_no_manifest_that_it_knows(in_memory: str, monkeypatch: pytest.MonkeyPatch):
     maps, read = MapCache([in_memory], Localizer, 1), list[str]()
-    cat_file = (files := ObjectStore(in_memory)._files).cat_file
+    get = type(ObjectStore(in_memory)._objects).get
     monkeypatch.setattr(
-        type(files),
-        "cat_file",
-        lambda self, path, **more: read.append(path) or cat_file(path, **more),
+        type(ObjectStore(in_memory)._objects),
+        "get",
+        lambda self, path: read.append(path) or get(self, path),
     )
     assert not maps.atlases[0].look()
     assert read == []
@@ -186,15 +186,15 @@ def test_a_look_reads_no_manifest_that_it_knows(in_memory: str, monkeypatch: pyt
 @pytest.fixture
 def silent_tiles(in_memory: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     """Maps do not come out of the store in memory until the event is set."""
-    speaks, files = threading.Event(), ObjectStore(in_memory)._files
-    get_file = type(files).get_file
+    speaks, kind = threading.Event(), type(ObjectStore(in_memory)._objects)
+    get = kind.get
 
-    def late(self: Any, remote: str, local: str, **more: Any) -> None:
-        if remote.endswith(".topo"):
+    def late(self: Any, name: str) -> Any:
+        if name.endswith(".topo"):
             speaks.wait(60.0)
-        get_file(self, remote, local, **more)
+        return get(self, name)
 
-    monkeypatch.setattr(type(files), "get_file", late)
+    monkeypatch.setattr(kind, "get", late)
     yield speaks
     speaks.set()
 
@@ -250,8 +250,8 @@ def test_what_was_opened_answers_while_the_store_is_gone(
             monkeypatch.context() as patched,
             caplog.at_level(logging.WARNING, "topoloc.apps.service"),
         ):
-            for name in ("ls", "get_file", "cat_file"):
-                patched.setattr(type(ObjectStore(in_memory)._files), name, gone)
+            for name in ("list", "get"):
+                patched.setattr(type(ObjectStore(in_memory)._objects), name, gone)
             _until(lambda: bool(caplog.records))
             time.sleep(0.2)
             assert [record.getMessage() for record in caplog.records] == [
@@ -272,9 +272,8 @@ def test_what_was_opened_answers_while_the_store_is_gone(
 def test_a_missing_or_rotten_tile_is_named_and_the_others_answer(
     in_memory: str, is_there: bool, said: str, queries: Path, caplog: pytest.LogCaptureFixture
 ):
-    files, name = ObjectStore(in_memory)._files, _file_of(in_memory, "other")
-    path = f"{in_memory.removeprefix('memory:/')}/{name}"
-    files.pipe_file(path, b"rotten") if is_there else files.rm_file(path)
+    objects, name = ObjectStore(in_memory)._objects, _file_of(in_memory, "other")
+    objects.put(name, b"rotten") if is_there else objects.delete(name)
     with (
         _served(in_memory) as (client, _),
         caplog.at_level(logging.WARNING, "topoloc.apps.service"),
@@ -324,7 +323,7 @@ def test_what_is_no_atlas_is_not_served(
     ):
         with pytest.raises(MapError, match=said):
             MapCache([where], Localizer, 1)
-    monkeypatch.setattr(type(ObjectStore(in_memory)._files), "ls", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(type(ObjectStore(in_memory)._objects), "list", lambda *_, **__: 1 / 0)
     with pytest.raises(ObjectStoreError, match="does not answer"):
         MapCache([in_memory], Localizer, 1)
 

@@ -53,7 +53,7 @@ def test_an_edit_of_a_tile_is_that_of_its_map_and_is_taken_back(
     assert _bytes(own_atlas, "room") == alone.read_bytes() != before
     tile = Atlas.open(str(own_atlas)).tile("room")
     assert tile.geo_box is not None
-    assert tile.undo is not None
+    assert len(tile.previous) == 1
     pruned = _done(
         capsys,
         "prune",
@@ -73,7 +73,7 @@ def test_an_edit_of_a_tile_is_that_of_its_map_and_is_taken_back(
     assert _bytes(own_atlas, "room") == alone.read_bytes()
     _done(capsys, "undo", own_atlas, "--tile", "room")
     assert _bytes(own_atlas, "room") == before
-    assert Atlas.open(str(own_atlas)).tile("room").undo is None
+    assert Atlas.open(str(own_atlas)).tile("room").previous == ()
     assert _bytes(own_atlas, "other") == other
 
 
@@ -91,15 +91,14 @@ def test_all_tiles_are_pruned_and_one_that_cannot_be_leaves_the_others(
     assert captured.err.count("\n") == 1
 
 
-def test_an_undo_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
+def test_a_kept_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
     own_atlas: Path, complaint: Complaint
 ):
     edit_tile(str(own_atlas), "room", _note)
     atlas = Atlas.open(str(own_atlas))
-    undo = atlas.tile("room").undo
-    assert undo is not None
-    assert Manifest.from_bytes(atlas.manifest.to_bytes(), "here").by_id["room"].undo == undo
-    path = atlas.store.local_path(undo.name, undo.sha256)
+    (kept,) = atlas.tile("room").previous
+    assert Manifest.from_bytes(atlas.manifest.to_bytes(), "here").by_id["room"].previous == (kept,)
+    path = atlas.store.local_path(kept.name, kept.sha256)
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     assert "checksum" in (tile_problem(atlas, atlas.tile("room")) or "")
     assert "checksum" in complaint("undo", own_atlas, "--tile", "room")
@@ -147,12 +146,12 @@ def _note(path: Path) -> None:
 def test_an_edit_in_an_object_store_is_taken_back(
     room_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    pytest.importorskip("fsspec", reason="the extra cluster is not installed")
+    pytest.importorskip("obstore", reason="the extra cluster is not installed")
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path / "cache"))
-    where = f"memory://{uuid4().hex}/campus"
+    where = f"memory:///{uuid4().hex}/campus"
     create_atlas(where, new_tiles([str(room_map)]))
     edit_tile(where, "room", _note)
-    assert Atlas.open(where).tile("room").undo is not None
+    assert len(Atlas.open(where).tile("room").previous) == 1
     assert main(["undo", where, "--tile", "room"]) == 0
     atlas = Atlas.open(where)
     assert atlas.map_path(atlas.tile("room")).read_bytes() == room_map.read_bytes()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import subprocess
@@ -16,13 +17,18 @@ from schema_1 import write_schema_1
 
 from topoloc import TopoMetricMap
 from topoloc.errors import MapError
-from topoloc.mapping.edit import count_undoable_edits, edit_map, undo_edit
+from topoloc.mapping.edit import edit_map, read_history, undo_edit
 from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.kept_files import find_kept_files
 
 
 @pytest.fixture
 def map_file(room_map: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(room_map, tmp_path / "room.topo"))
+
+
+def _names(path: Path) -> list[str]:
+    return sorted(one.name for one in path.parent.iterdir())
 
 
 def _without_a_node(path: Path, changes: dict | None = None) -> None:
@@ -47,7 +53,7 @@ def test_edits_are_taken_back_to_the_byte_the_last_one_first(map_file: Path):
     for k in range(3):
         _without_a_node(map_file, {"nodes": -1, "why": "a test"})
         files.append(map_file.read_bytes())
-        assert count_undoable_edits(map_file) == k + 1
+        assert len(find_kept_files(map_file)) == k + 1
         assert find_map_damage(map_file) == []
     with TopoMetricMap.load(map_file) as topomap:
         assert [edit.edit_id for edit in topomap.edits] == [1, 2, 3, 4]
@@ -55,18 +61,41 @@ def test_edits_are_taken_back_to_the_byte_the_last_one_first(map_file: Path):
     for before in reversed(files[:-1]):
         assert undo_edit(map_file).name.startswith("drop node")
         assert map_file.read_bytes() == before
-    assert [path.name for path in map_file.parent.iterdir()] == ["room.topo"]
+    assert _names(map_file) == ["room.topo"]
     with pytest.raises(MapError, match="nothing to undo: it is as built"):
         undo_edit(map_file)
 
 
-def test_what_an_undo_takes_is_small(map_file: Path):
+def test_the_file_before_an_edit_is_kept_as_a_link(map_file: Path):
+    status = map_file.stat()
     _without_a_node(map_file)
-    with TopoMetricMap.load(map_file) as topomap:
-        num_nodes = len(topomap.summaries)
-    assert (
-        map_file.parent / "room.topo.undo"
-    ).stat().st_size < 4 * map_file.stat().st_size / num_nodes + 20_000
+    (kept,) = find_kept_files(map_file)
+    assert kept.stat().st_ino == status.st_ino
+    undo_edit(map_file)
+    assert map_file.stat().st_ino == status.st_ino
+
+
+def test_without_hard_links_the_file_is_copied(map_file: Path, monkeypatch: pytest.MonkeyPatch):
+    before = map_file.read_bytes()
+
+    def no_links(*_: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_links)
+    _without_a_node(map_file)
+    undo_edit(map_file)
+    assert map_file.read_bytes() == before
+    assert _names(map_file) == ["room.topo"]
+
+
+def test_the_oldest_files_go_beyond_the_limit(map_file: Path, monkeypatch: pytest.MonkeyPatch):
+    for limit, num_kept in ((2.5 * map_file.stat().st_size, 2), (1, 1)):
+        monkeypatch.setattr("topoloc.mapping.kept_files._MAX_BYTES", limit)
+        for k in range(3):
+            with edit_map(map_file) as edit:
+                edit.commit(edit.topomap, f"edit {k}")
+        assert len(find_kept_files(map_file)) == num_kept
+        assert len(_names(map_file)) == 1 + num_kept
 
 
 def test_a_map_of_an_older_schema_is_taken_back_whole(map_file: Path, tmp_path: Path):
@@ -80,45 +109,98 @@ def test_a_map_of_an_older_schema_is_taken_back_whole(map_file: Path, tmp_path: 
     assert old.read_bytes() == before
 
 
-def test_without_its_undo_file_a_map_stays_as_it_is(map_file: Path):
+def test_without_its_kept_file_a_map_stays_as_it_is(map_file: Path):
     _without_a_node(map_file)
-    edited, log = map_file.read_bytes(), map_file.parent / "room.topo.undo"
-    log.write_bytes(b"not ours" * 1000)
-    with pytest.raises(MapError, match="move it away"):
-        undo_edit(map_file)
-    log.unlink()
-    with pytest.raises(MapError, match=r"what was before 'drop node .*' is not kept"):
+    edited, (kept,) = map_file.read_bytes(), find_kept_files(map_file)
+    kept.unlink()
+    with pytest.raises(MapError, match=r"the file before 'drop node .*' is not kept"):
         undo_edit(map_file)
     assert map_file.read_bytes() == edited
 
 
+def test_an_undo_file_of_row_differences_is_refused(tmp_path: Path):
+    folder = Path(__file__).parents[1] / "fixtures" / "aea690a"
+    for name in ("pruned.topo", "pruned.topo.undo"):
+        shutil.copy(folder / name, tmp_path)
+    path = tmp_path / "pruned.topo"
+    assert not any(edit["undoable"] for edit in read_history(path))
+    with pytest.raises(MapError, match=r"pruned\.topo\.undo is of an older topoloc"):
+        undo_edit(path)
+    before = path.read_bytes()
+    assert before == (folder / "pruned.topo").read_bytes()
+    with edit_map(path) as edit:
+        edit.commit(edit.topomap, "note")
+    undo_edit(path)
+    assert path.read_bytes() == before
+
+
 @pytest.mark.parametrize("seed", range(8))
-def test_a_damaged_undo_file_never_damages_the_map(map_file: Path, seed: int):
+def test_a_damaged_kept_file_is_refused(map_file: Path, seed: int):
     _without_a_node(map_file)
-    edited, log = map_file.read_bytes(), map_file.parent / "room.topo.undo"
-    before = (data := bytearray(log.read_bytes()))[:]
-    for at in np.random.default_rng(seed).integers(100, len(data), 60):
-        data[at] ^= 1 + seed
-    log.write_bytes(data)
-    try:
+    edited, (kept,) = map_file.read_bytes(), find_kept_files(map_file)
+    data = bytearray(kept.read_bytes())
+    rng = np.random.default_rng(seed)
+    if seed % 2:
+        data[rng.integers(len(data))] ^= 1 + seed
+    else:
+        del data[rng.integers(len(data)) :]
+    kept.write_bytes(data)
+    with pytest.raises(MapError, match=r"room\.topo\.undo-.* is damaged"):
         undo_edit(map_file)
-    except MapError:
-        assert map_file.read_bytes() == edited
-    assert find_map_damage(map_file) == []
-    assert bytes(before) != bytes(data)
-
-
-def test_an_entry_for_another_file_is_not_used(map_file: Path):
+    assert map_file.read_bytes() == edited
     _without_a_node(map_file)
-    stale = (map_file.parent / "room.topo.undo").read_bytes()
     undo_edit(map_file)
-    (map_file.parent / "room.topo.undo").write_bytes(
-        stale
-    )  # as a process leaves it that was killed before the map was renamed
-    assert count_undoable_edits(map_file) == 0
+    assert map_file.read_bytes() == edited
+
+
+def test_a_kept_file_of_another_map_is_not_used(map_file: Path):
     before = map_file.read_bytes()
     _without_a_node(map_file)
-    assert count_undoable_edits(map_file) == 1
+    (kept,) = find_kept_files(map_file)
+    stale = kept.read_bytes()
+    undo_edit(map_file)
+    kept.write_bytes(stale)  # as a process leaves it that was killed before it renamed the map
+    assert find_kept_files(map_file) == []
+    with edit_map(map_file) as edit:
+        edit.commit(edit.topomap, "note")
+    (kept,) = find_kept_files(map_file)
+    assert _names(map_file) == ["room.topo", kept.name]
+    undo_edit(map_file)
+    assert map_file.read_bytes() == before
+
+
+def test_a_map_that_is_replaced_during_an_edit_stays(map_file: Path, tmp_path: Path):
+    other = Path(shutil.copy(map_file, tmp_path / "other.topo"))
+    _without_a_node(other)
+    data = other.read_bytes()
+    with edit_map(map_file) as edit:
+        os.replace(other, map_file)
+        with pytest.raises(MapError, match="was replaced during the edit"):
+            edit.commit(edit.topomap, "nothing")
+    assert map_file.read_bytes() == data
+    assert find_kept_files(map_file) == []
+
+
+@pytest.mark.parametrize("function", ["link", "replace"])
+def test_an_edit_that_cannot_be_written_changes_nothing(
+    map_file: Path, monkeypatch: pytest.MonkeyPatch, function: str
+):
+    before = map_file.read_bytes()
+
+    def is_full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    _without_a_node(map_file)
+    after, names = map_file.read_bytes(), _names(map_file)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, function, is_full)
+        patched.setattr(shutil, "copyfile", is_full)
+        with pytest.raises(MapError, match="No space left"):
+            _without_a_node(map_file)
+        if function == "replace":
+            with pytest.raises(MapError, match="No space left"):
+                undo_edit(map_file)
+    assert (map_file.read_bytes(), _names(map_file)) == (after, names)
     undo_edit(map_file)
     assert map_file.read_bytes() == before
 
@@ -153,7 +235,7 @@ def test_nothing_is_left_of_an_edit_that_fails(map_file: Path):
     with pytest.raises(ZeroDivisionError), edit_map(map_file) as edit:
         edit.commit(replace(edit.topomap, place_images=Broken()), "broken")
     assert map_file.read_bytes() == before
-    assert [path.name for path in map_file.parent.iterdir()] == ["room.topo"]
+    assert _names(map_file) == ["room.topo"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no such permissions")

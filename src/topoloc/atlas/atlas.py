@@ -19,7 +19,7 @@ from topoloc.errors import AtlasError
 from topoloc.mapping.edit import read_history
 
 _OBJECT_STORES = "topoloc.apps.stores.object_store"
-"""Module of `ObjectStore`. It is imported by name, because fsspec is an optional extra and the
+"""Module of `ObjectStore`. It is imported by name, because obstore is an optional extra and the
 module belongs to the apps."""
 
 
@@ -168,8 +168,7 @@ class Atlas:
     def history(self, tile_id: str) -> list[dict[str, Any]]:
         """Return the edits of a tile's map, as `read_history` does. Raises AtlasError, MapError."""
         tile = self.tile(tile_id)
-        log = None if tile.undo is None else self.store.local_path(tile.undo.name, tile.undo.sha256)
-        return read_history(self.map_path(tile), log)
+        return read_history(self.map_path(tile), len(tile.previous))
 
     @cached_property
     def _opened(self) -> OpenedIndex:

@@ -23,9 +23,8 @@ from topoloc.atlas.store import MANIFEST, Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.mapping.contents import get_map_id
-from topoloc.mapping.edit import count_undoable_edits
+from topoloc.mapping.kept_files import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.undo_log import undo_log_path
 from topoloc.recordings.atomic import temporary_file
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
@@ -42,13 +41,15 @@ several times."""
 class NewTile:
     """Describe a map file to be added as a tile of this id, in this world.
 
-    `recipe` is the digest of the map's inputs, None if unknown.
+    `recipe` is the digest of the map's inputs, None if unknown. `older` are stored files of earlier
+    edits, in addition to the kept files beside the map.
     """
 
     tile_id: str
     path: Path
     world: str
     recipe: str | None = None
+    older: tuple[StoredFile, ...] = ()
 
 
 def new_tiles(
@@ -224,17 +225,14 @@ def store_tile(new: NewTile, store: Store) -> Tile:
         save_global_descriptors(places, vectors)
         tile = _describe_tile(new, topomap, versions)
         vectors = _store_file(store, f"{new.tile_id}.places", places)
-    undo = (
-        _store_file(store, f"{new.tile_id}.undo", undo_log_path(new.path))
-        if count_undoable_edits(new.path)
-        else None
-    )
+    kept = [_store_file(store, f"{new.tile_id}.topo", one) for one in find_kept_files(new.path)]
+    previous = [*kept, *new.older]
     return replace(
         tile,
         map=_store_file(store, f"{new.tile_id}.topo", new.path),
         places=vectors,
         recipe=new.recipe,
-        undo=undo,
+        previous=tuple(select_kept(previous, [stored.num_bytes for stored in previous])),
     )
 
 

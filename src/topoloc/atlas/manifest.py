@@ -59,7 +59,7 @@ class Tile:
         atlas_from_world: transform from the map's world to the atlas world. It may come from other
             tiles. None if unknown.
         recipe: digest of the recording and settings, if the map was built for this atlas.
-        undo: undo log of the map's last edits (`mapping/undo_log.py`), None if there is none.
+        previous: map files before the last edits, the newest first, to undo them.
     """
 
     tile_id: str
@@ -79,12 +79,12 @@ class Tile:
     atlas_from_world: Rigid3 | None = None
     recipe: str | None = None
     joint: JointPose | None = None
-    undo: StoredFile | None = None
+    previous: tuple[StoredFile, ...] = ()
 
     @property
     def files(self) -> tuple[StoredFile, ...]:
         """Return all files of the tile."""
-        return (self.map, self.places) if self.undo is None else (self.map, self.places, self.undo)
+        return (self.map, self.places, *self.previous)
 
     @property
     def in_joint_world(self) -> JointPose:
@@ -110,8 +110,8 @@ class Tile:
         made_of: dict[str, Any] = {} if self.recipe is None else {"recipe": self.recipe}
         if self.joint is not None:
             made_of["joint"] = self.joint.to_json()
-        if self.undo is not None:
-            made_of["undo"] = to_builtins(self.undo)
+        if self.previous:
+            made_of["previous"] = to_builtins(self.previous)
         return made_of | {
             "id": self.tile_id,
             "map": to_builtins(self.map),
@@ -296,7 +296,7 @@ class _TileJson(Struct, frozen=True):
     atlas_from_world: Matrix34 | None
     recipe: Sha256 | None = None
     joint: JointPoseJson | None = None
-    undo: StoredFile | None = None
+    previous: tuple[StoredFile, ...] = ()
 
     def tile(self) -> Tile:
         """Return the tile. Raises ValueError, GeoreferenceError or TrajectoryError."""
@@ -319,7 +319,7 @@ class _TileJson(Struct, frozen=True):
             atlas_from_world=None if pose is None else Rigid3.from_matrix(pose),
             recipe=self.recipe,
             joint=None if self.joint is None else self.joint.pose(),
-            undo=self.undo,
+            previous=self.previous,
         )
 
 

@@ -13,7 +13,7 @@ from topoloc.atlas.editing import NewTile, replace_tile
 from topoloc.atlas.manifest import StoredFile, Tile
 from topoloc.atlas.store import sha256_of
 from topoloc.errors import AtlasError, TopolocError
-from topoloc.mapping.undo_log import undo_log_path
+from topoloc.mapping.kept_files import kept_path
 from topoloc.recordings.atomic import temporary_folder
 
 _MAX_TRIES = 5
@@ -27,8 +27,8 @@ def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Tile
         where: the atlas.
         tile_id: the tile.
         edit: a function that edits the map file at a path, as `mapping/edit.py` does. It receives a
-            copy. The undo file beside the copy is stored with the tile. It is called again if
-            another writer replaced the tile in the meantime.
+            copy, with the file before the last edit kept beside it. It is called again if another
+            writer replaced the tile in the meantime.
 
     Returns:
         The tile after the edit, and the return value of `edit`.
@@ -44,12 +44,13 @@ def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> tuple[Tile
         with temporary_folder("topoloc-tile-") as folder:
             path = folder / f"{tile_id}.topo"
             _copy_map(atlas, before.map, path)
-            if before.undo is not None:
-                _copy_map(atlas, before.undo, undo_log_path(path))
+            for last in before.previous[:1]:
+                _copy_map(atlas, last, kept_path(path, before.map.sha256, last.sha256))
             done = _edit_with_tile_name(edit, path, f"{where}, tile {tile_id}")
             if sha256_of(path) == before.map.sha256:
                 return before, done
-            after = replace_tile(where, NewTile(tile_id, path, before.world, before.recipe), before)
+            new = NewTile(tile_id, path, before.world, before.recipe, before.previous[1:])
+            after = replace_tile(where, new, before)
         if after is not None:
             return after.by_id[tile_id], done
     raise AtlasError(

@@ -9,24 +9,17 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError
-from topoloc.mapping.map_file import MapFile
-from topoloc.mapping.map_writing import compute_map_digest, write_map
-from topoloc.mapping.schema import SCHEMA_VERSION, TABLES
+from topoloc.mapping.kept_files import drop_kept_files, find_kept_files, keep_file, restore_file
+from topoloc.mapping.map_writing import write_map
+from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.sessions import Edit, today
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.undo_log import (
-    add_undo_entry,
-    drop_undo_entries,
-    find_undo_entries,
-    undo_log_path,
-    write_previous_map,
-)
 from topoloc.recordings.atomic import atomic_write
 
 try:
@@ -42,10 +35,12 @@ WaitCallback = Callable[[], None]
 
 @dataclass(frozen=True, eq=False)
 class MapEdit:
-    """Hold a locked map file during an edit. `topomap` is the current map."""
+    """Hold a locked map file during an edit. `topomap` is the current map, `locked` the status of
+    its file."""
 
     path: Path
     topomap: TopoMetricMap
+    locked: os.stat_result
 
     def commit(
         self, changed: TopoMetricMap, name: str, changes: Mapping[str, Any] | None = None
@@ -58,17 +53,30 @@ class MapEdit:
             changes: numbers and texts for the history, by name.
 
         Raises:
-            MapError: the map or its undo file cannot be written. The map stays unchanged.
+            MapError: the map cannot be written, the file before cannot be kept, or another process
+                replaced the map. The file at the path stays unchanged.
         """
         edits = self.topomap.edits
         edit = Edit(self.topomap.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
+        kept = None
         try:
             with atomic_write(self.path) as temporary:
                 write_map(replace(changed, edits=[*edits, edit]), temporary)
-                add_undo_entry(self.path, temporary)
+                self.check_still_locked()
+                kept = keep_file(self.path, temporary)
         except OSError as error:
+            if kept is not None:
+                kept.unlink(missing_ok=True)
             raise MapError(f"cannot write map {self.path}: {error.strerror}") from error
+        drop_kept_files(self.path)
         return edit
+
+    def check_still_locked(self) -> None:
+        """Raise MapError if another file is at the path now, OSError if there is none."""
+        if not os.path.samestat(self.locked, self.path.stat()):
+            raise MapError(
+                f"map {self.path} was replaced during the edit: the new file stays, repeat the edit"
+            )
 
 
 @contextmanager
@@ -84,73 +92,70 @@ def edit_map(path: str | Path, on_wait: WaitCallback | None = None) -> Iterator[
         MapVersionError: the schema is unknown to this version.
     """
     path = Path(os.path.realpath(path))
-    with _lock_map_file(path, on_wait):
+    with _lock_map_file(path, on_wait) as locked:
         if (
             not os.access(path, os.W_OK) or not path.stat().st_mode & _WRITABLE
         ):  # read-only for all, even if root may write
             raise MapError(f"cannot write map {path}: it is read-only")
         with TopoMetricMap.load(path) as topomap:
-            yield MapEdit(path, topomap)
+            yield MapEdit(path, topomap, locked)
 
 
 def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
     """Undo the last edit of a map file and return it. The file is byte-identical to the one before.
 
     Raises:
-        MapError: there is nothing to undo, the undo file is damaged, or the map cannot be written.
+        MapError: there is nothing to undo, the kept file is damaged, or the map cannot be written.
             The map stays unchanged.
     """
     with edit_map(path, on_wait) as edit:
-        assert edit.topomap.file is not None, "a map that was just opened"
         last = max(edit.topomap.edits, key=lambda one: one.edit_id, default=None)
-        entries = find_undo_entries(undo_log_path(edit.path), edit.topomap.file.digest)
-        if last is None or not entries:
-            why = (
-                "it is as built"
-                if last is None or last.edit_id <= 1
-                else f"what was before {last.name!r} is not kept"
-            )
-            raise MapError(f"map {path}: nothing to undo: {why}")
+        kept = find_kept_files(edit.path)
+        if last is None or not kept:
+            raise MapError(f"map {path}: nothing to undo: {_explain_missing(edit.path, last)}")
         try:
-            with atomic_write(edit.path) as temporary:
-                write_previous_map(edit.path, entries[0], temporary)
-                _check_restored_map(temporary, entries[0].before, undo_log_path(edit.path))
-            drop_undo_entries(edit.path, entries[0].depth)
+            edit.check_still_locked()
+            restore_file(kept[0], edit.path)
         except OSError as error:
             raise MapError(f"cannot write map {path}: {error.strerror}") from error
     return last
 
 
-def count_undoable_edits(path: str | Path, log: Path | None = None) -> int:
-    """Count the edits of a map file that can be undone, by the undo file beside it or by `log`.
-    Raises MapError."""
-    path = Path(os.path.realpath(path))
-    with closing(MapFile(path)) as file:
-        return len(find_undo_entries(log or undo_log_path(path), file.digest))
-
-
-def read_history(path: str | Path, log: Path | None = None) -> list[dict[str, Any]]:
+def read_history(path: str | Path, num_undoable: int | None = None) -> list[dict[str, Any]]:
     """Return the edits of a map file as JSON, the first one first, each with whether it can be
     undone (`undoable`).
 
     Args:
-        log: the undo file, by default the one beside the map file.
+        num_undoable: number of edits that can be undone. By default the files are counted that are
+            kept beside the map.
 
     Raises:
         MapError: the map is missing or damaged.
     """
-    num_undoable = count_undoable_edits(path, log)
     with TopoMetricMap.load(path) as topomap:
         edits = [asdict(edit) for edit in topomap.edits]
+    if num_undoable is None:
+        num_undoable = len(find_kept_files(Path(os.path.realpath(path))))
     return [
         edit | {"undoable": number > len(edits) - num_undoable}
         for number, edit in enumerate(edits, start=1)
     ]
 
 
+def _explain_missing(path: Path, last: Edit | None) -> str:
+    """Return the reason why no file is kept from before the last edit."""
+    if last is None or last.edit_id <= 1:
+        return "it is as built"
+    old = path.with_name(f"{path.name}.undo")
+    if old.exists():
+        return f"{old} is of an older topoloc, and only that version can undo with it"
+    return f"the file before {last.name!r} is not kept"
+
+
 @contextmanager
-def _lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[None]:
-    """Lock the file at `path`. Repeats if the previous owner of the lock replaced the file."""
+def _lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[os.stat_result]:
+    """Lock the file at `path` and yield its status. Repeats if the previous owner of the lock
+    replaced the file."""
     while True:
         try:
             descriptor = os.open(path, os.O_RDONLY)
@@ -158,8 +163,9 @@ def _lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[None]:
             raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from None
         try:
             _wait_for_lock(descriptor, on_wait)
-            if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
-                yield
+            locked = os.fstat(descriptor)
+            if path.exists() and os.path.samestat(locked, path.stat()):
+                yield locked
                 return
         finally:
             os.close(descriptor)
@@ -176,17 +182,3 @@ def _wait_for_lock(descriptor: int, on_wait: WaitCallback | None) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
     except OSError:  # a file system without locks
         return
-
-
-def _check_restored_map(previous_file: Path, digest: str, log: Path) -> None:
-    """Check by the digest of its rows that a restored map is the previous one. Raises MapError."""
-    with closing(MapFile(previous_file)) as file:
-        rows = (
-            digest
-            if file.version == 1
-            else compute_map_digest({table: file.checksums(table) for table in TABLES})
-        )
-        if not digest == rows == file.digest:
-            raise MapError(
-                f"{log} is damaged: it does not lead back to the map before; the map stays as it is"
-            )

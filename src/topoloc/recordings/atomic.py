@@ -56,7 +56,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
         yield temporary
         _fsync(temporary)
         os.replace(temporary, path)
-        _fsync(path.parent)
+        with suppress(OSError):  # no handle is left: the file is in place
+            _fsync(path.parent)
     finally:
         with suppress(
             OSError

@@ -36,7 +36,6 @@ def cluster(scratch: Path) -> Iterator[Any]:
         patch.setenv("TMPDIR", str(scratch))
         patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
         patch.setenv("RAY_health_check_failure_threshold", "2")
-        patch.setenv("FSSPEC_FILE_AUTO_MKDIR", "true")
         cluster = Cluster(initialize_head=True, head_node_args={**_NODE, "temp_dir": folder})
         try:
             cluster.add_node(**_NODE)

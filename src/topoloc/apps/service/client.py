@@ -1,12 +1,16 @@
-"""A service asked from Python: results come as they come from a `Localizer`."""
+"""Query a service from Python. Results are those of a `Localizer`."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -25,33 +29,19 @@ if TYPE_CHECKING:
 
 ImageInput = str | Path | bytes | np.ndarray
 CameraSpec = Camera | str | None
-"""A camera, or what the service calls one: `map`, `unknown`, `exif`, `fx,fy,cx,cy`."""
+"""A camera, or a camera option of the service: `map`, `unknown`, `exif`, `fx,fy,cx,cy`."""
 _MAX_TRIES, _MAX_WAIT_S = 5, 10.0
 
 
-@dataclass(frozen=True)
-class _ClientRequest:
-    """One request, whoever sends it."""
-
-    method: str
-    path: str
-    data: dict[str, str] | None = None
-    picture: tuple[str, bytes] | None = None
-
-    def options(self) -> dict[str, Any]:
-        return {} if self.picture is None else {"data": self.data, "files": {"image": self.picture}}
-
-
 class Client:
-    """A service that `topoloc serve` runs. A context manager; `close` lets go of its connection.
+    """Query a service that `topoloc serve` runs. A context manager; `close` closes its connection.
 
-    Where the service says that too many wait, it is asked again after the time that it names, a few
-    times.
+    If too many requests wait, the service names a delay, and the request is repeated a few times.
 
     Args:
-        url: its address, as ``http://127.0.0.1:8571``.
-        token: what its `--token-file` holds.
-        timeout_s: how long an answer may take, seconds.
+        url: the address, as ``http://127.0.0.1:8571``.
+        token: the content of the service's `--token-file`.
+        timeout_s: time limit of a response, seconds.
 
     Raises:
         MissingExtraError: httpx is not installed.
@@ -70,13 +60,13 @@ class Client:
         self._http.close()
 
     def maps(self) -> list[str]:
-        """The names of its maps. Raises ServiceError."""
-        return self._send_request(_ClientRequest("GET", "/v1/maps"))["maps"]
+        """Return the names of the service's maps. Raises ServiceError."""
+        return self._send(_get_request())["maps"]
 
     def map(self, name: str) -> dict[str, Any]:
-        """What a map holds, as `topoloc info --json` says it, with its nodes. Raises
+        """Return the content of a map as `topoloc info --json`, with its nodes. Raises
         ServiceError."""
-        return self._send_request(_ClientRequest("GET", f"/v1/maps/{_quote_name(name)}"))
+        return self._send(_get_request(name))
 
     def localize(
         self,
@@ -86,53 +76,44 @@ class Client:
         prior: Rigid3 | None = None,
         max_ms: float | None = None,
     ) -> Localization | NotLocalized:
-        """Where in this map was the picture taken?
+        """Localize an image in a map.
 
         Args:
             image: a file, its bytes, or an array (H, W) or RGB (H, W, 3), uint8.
-            camera: its calibration; None takes what EXIF says of the focal length, else finds it.
-            prior: about where the camera is, world_from_cam.
-            max_ms: after so many milliseconds no further pose is sought.
+            camera: its calibration. None takes the focal length of EXIF, or estimates it.
+            prior: approximate pose of the camera, world_from_cam.
+            max_ms: time limit of the search for poses, milliseconds.
 
         Raises:
-            ServiceError: the service does not answer, or refuses; its text says why.
+            ServiceError: the service does not respond, or refuses with a reason.
         """
-        return result_from_json(
-            self._send_request(
-                _localize_request(
-                    f"/v1/maps/{_quote_name(map)}/localize", image, camera, prior, max_ms
-                )
-            )
-        )
+        request = _image_request(map, "/localize", image, camera, prior, max_ms)
+        return result_from_json(self._send(request))
 
     def localize_everywhere(
         self, image: ImageInput, camera: CameraSpec = None, max_ms: float | None = None
     ) -> dict[str, Any]:
-        """By all maps of the service: `{"map": ..., "answers": [{"map": ..., "result": ...}]}`.
-        Raises ServiceError."""
-        return self._send_request(_localize_request("/v1/localize", image, camera, None, max_ms))
+        """Localize an image in all maps of the service: `{"map": ..., "answers": [{"map": ...,
+        "result": ...}]}`. Raises ServiceError."""
+        return self._send(_image_request(None, "/localize", image, camera, None, max_ms))
 
     def explain(self, map: str, image: ImageInput, camera: CameraSpec = None) -> dict[str, Any]:
-        """Why the picture gets its answer, as `topoloc explain --json`. Raises ServiceError."""
-        return self._send_request(
-            _localize_request(f"/v1/maps/{_quote_name(map)}/explain", image, camera, None, None)
-        )
+        """Return the reasons for an image's result, as `topoloc explain --json`. Raises
+        ServiceError."""
+        return self._send(_image_request(map, "/explain", image, camera))
 
-    def _send_request(self, request: _ClientRequest) -> Any:
-        for tries_left in reversed(range(_MAX_TRIES)):
-            try:
-                response = self._http.request(request.method, request.path, **request.options())
-            except _import_httpx().HTTPError as error:
-                raise _connection_error(self._http, error) from error
-            wait_s = _retry_delay_s(response) if tries_left else None
-            if wait_s is None:
+    def _send(self, request: dict[str, Any]) -> Any:
+        attempts = count(1)
+        while True:
+            with _translate_errors(self._http):
+                response = self._http.request(**request)
+            if (wait_s := _retry_delay_s(response, next(attempts))) is None:
                 return _parse_response(response)
             time.sleep(wait_s)
-        raise AssertionError("the last try answers or raises")
 
 
 class AsyncClient:
-    """`Client` for programs that run in an event loop: the same methods, each to be awaited."""
+    """`Client` for programs with an event loop: the same methods as coroutines."""
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 60.0) -> None:
         self._http = _import_httpx().AsyncClient(**_client_options(url, token, timeout_s))
@@ -148,11 +129,11 @@ class AsyncClient:
 
     async def maps(self) -> list[str]:
         """As `Client.maps`."""
-        return (await self._send_request(_ClientRequest("GET", "/v1/maps")))["maps"]
+        return (await self._send(_get_request()))["maps"]
 
     async def map(self, name: str) -> dict[str, Any]:
         """As `Client.map`."""
-        return await self._send_request(_ClientRequest("GET", f"/v1/maps/{_quote_name(name)}"))
+        return await self._send(_get_request(name))
 
     async def localize(
         self,
@@ -163,45 +144,29 @@ class AsyncClient:
         max_ms: float | None = None,
     ) -> Localization | NotLocalized:
         """As `Client.localize`."""
-        return result_from_json(
-            await self._send_request(
-                _localize_request(
-                    f"/v1/maps/{_quote_name(map)}/localize", image, camera, prior, max_ms
-                )
-            )
-        )
+        request = _image_request(map, "/localize", image, camera, prior, max_ms)
+        return result_from_json(await self._send(request))
 
     async def localize_everywhere(
         self, image: ImageInput, camera: CameraSpec = None, max_ms: float | None = None
     ) -> dict[str, Any]:
         """As `Client.localize_everywhere`."""
-        return await self._send_request(
-            _localize_request("/v1/localize", image, camera, None, max_ms)
-        )
+        return await self._send(_image_request(None, "/localize", image, camera, None, max_ms))
 
     async def explain(
         self, map: str, image: ImageInput, camera: CameraSpec = None
     ) -> dict[str, Any]:
         """As `Client.explain`."""
-        return await self._send_request(
-            _localize_request(f"/v1/maps/{_quote_name(map)}/explain", image, camera, None, None)
-        )
+        return await self._send(_image_request(map, "/explain", image, camera))
 
-    async def _send_request(self, request: _ClientRequest) -> Any:
-        import asyncio
-
-        for tries_left in reversed(range(_MAX_TRIES)):
-            try:
-                response = await self._http.request(
-                    request.method, request.path, **request.options()
-                )
-            except _import_httpx().HTTPError as error:
-                raise _connection_error(self._http, error) from error
-            wait_s = _retry_delay_s(response) if tries_left else None
-            if wait_s is None:
+    async def _send(self, request: dict[str, Any]) -> Any:
+        attempts = count(1)
+        while True:
+            with _translate_errors(self._http):
+                response = await self._http.request(**request)
+            if (wait_s := _retry_delay_s(response, next(attempts))) is None:
                 return _parse_response(response)
             await asyncio.sleep(wait_s)
-        raise AssertionError("the last try answers or raises")
 
 
 def _import_httpx() -> Any:
@@ -219,26 +184,41 @@ def _client_options(url: str, token: str | None, timeout_s: float) -> dict[str, 
     return {"base_url": url, "headers": headers, "timeout": timeout_s}
 
 
-def _localize_request(
-    path: str, image: ImageInput, camera: CameraSpec, prior: Rigid3 | None, max_ms: float | None
-) -> _ClientRequest:
-    said = {"camera": json.dumps(camera.to_json()) if isinstance(camera, Camera) else camera}
-    if prior is not None:
-        said["prior"] = json.dumps(
+def _get_request(map: str | None = None) -> dict[str, Any]:
+    """Return the arguments of httpx's `request` for a map, or for the list of maps."""
+    return {
+        "method": "GET",
+        "url": "/v1/maps" if map is None else f"/v1/maps/{quote(map, safe='')}",
+    }
+
+
+def _image_request(
+    map: str | None,
+    action: str,
+    image: ImageInput,
+    camera: CameraSpec,
+    prior: Rigid3 | None = None,
+    max_ms: float | None = None,
+) -> dict[str, Any]:
+    """Return the arguments of httpx's `request` for an image and a map, or all maps."""
+    data = {
+        "camera": json.dumps(camera.to_json()) if isinstance(camera, Camera) else camera,
+        "prior": prior
+        and json.dumps(
             {"translation": prior.translation.tolist(), "quat_wxyz": prior.quat_wxyz().tolist()}
-        )
-    if max_ms is not None:
-        said["max_ms"] = str(max_ms)
-    return _ClientRequest(
-        "POST",
-        path,
-        {name: value for name, value in said.items() if value is not None},
-        _encode_image(image),
-    )
+        ),
+        "max_ms": max_ms,
+    }
+    return {
+        "method": "POST",
+        "url": f"/v1{action}" if map is None else _get_request(map)["url"] + action,
+        "data": {name: value for name, value in data.items() if value is not None},
+        "files": {"image": _encode_image(image)},
+    }
 
 
 def _encode_image(image: ImageInput) -> tuple[str, bytes]:
-    """Name and bytes; an array goes without loss."""
+    """Return a name and the bytes of an image. Arrays are encoded without loss."""
     if isinstance(image, bytes):
         return "image", image
     if isinstance(image, np.ndarray):
@@ -252,15 +232,9 @@ def _encode_image(image: ImageInput) -> tuple[str, bytes]:
         raise ServiceError(f"{image}: {error.strerror}") from None
 
 
-def _quote_name(name: str) -> str:
-    from urllib.parse import quote
-
-    return quote(name, safe="")
-
-
-def _retry_delay_s(response: httpx.Response) -> float | None:
-    """Seconds after which to ask again; None where this is the answer."""
-    if response.status_code != 429:
+def _retry_delay_s(response: httpx.Response, attempt: int) -> float | None:
+    """Return the delay before the request is repeated, seconds. None if this is the response."""
+    if response.status_code != 429 or attempt == _MAX_TRIES:
         return None
     named = response.headers.get("retry-after", "1")
     return min(float(named), _MAX_WAIT_S) if named.isdigit() else 1.0
@@ -282,7 +256,11 @@ def _parse_response(response: httpx.Response) -> Any:
     return data
 
 
-def _connection_error(http: httpx.Client | httpx.AsyncClient, error: Exception) -> ServiceError:
-    return ServiceError(
-        f"{http.base_url}: no answer ({' '.join(str(error).split()) or type(error).__name__})"
-    )
+@contextmanager
+def _translate_errors(http: httpx.Client | httpx.AsyncClient) -> Iterator[None]:
+    """Convert connection errors to ServiceError."""
+    try:
+        yield
+    except _import_httpx().HTTPError as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ServiceError(f"{http.base_url}: no answer ({text})") from error

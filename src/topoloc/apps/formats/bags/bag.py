@@ -1,10 +1,10 @@
-"""A bag: one file of messages, or a folder of the parts that a recorder split it into; topics and
-messages of all of them together."""
+"""Read the topics and messages of a bag: one file, or a folder of the parts that a recorder
+wrote."""
 
 from __future__ import annotations
 
+import importlib
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,11 +16,17 @@ BAG_SUFFIXES = (".bag", ".bag.active", ".db3")
 MCAP_SUFFIXES = (".mcap",)
 _COMPRESSED_SUFFIX, _ZSTD_MAGIC = ".zstd", b"\x28\xb5\x2f\xfd"
 _MAX_MESSAGE_BYTES = 1 << 29
+# The first bytes of a file, and its reader, which is imported when it is needed.
+_READERS = {
+    b"#ROSBAG V2.0\n": ("ros1_file", "Ros1File"),
+    b"\x89MCAP0\r\n": ("mcap_file", "McapFile"),
+    b"SQLite format 3\0": ("sqlite_file", "SqliteFile"),
+}
 
 
 @dataclass(eq=False)
 class Bag:
-    """The files of a recording, opened. `notes` is what the user should know of them: what was cut
+    """Hold the open files of a recording. `notes` are for the user, such as a file that is cut
     off."""
 
     path: Path
@@ -35,7 +41,7 @@ class Bag:
                     self.topics.setdefault(name, topic)
 
     def messages(self, topic: str) -> list[MessageRef]:
-        """The messages of a topic in all files, in the order in which they were written."""
+        """Return the messages of a topic in all files, in the order in which they were written."""
         found = [
             (number, file.messages(topic))
             for number, file in enumerate(self.files)
@@ -44,18 +50,17 @@ class Bag:
         return sorted(ref._replace(file=number) for number, refs in found for ref in refs)
 
     def read(self, ref: MessageRef, most: int | None = None) -> bytes:
-        """The bytes of a message, or at least the first `most` of them; unpacked where each message
-        is packed.
+        """Return the bytes of a message, or at least the first `most` of them, decompressed.
 
         Raises:
-            RecordingError: they are not there.
+            RecordingError: the bytes do not exist.
         """
         file = self.files[ref.file]
         data = file.read(ref, most)
         return _decompress(file.read(ref)) if data.startswith(_ZSTD_MAGIC) else data
 
     def describe_topics(self) -> str:
-        """The topics with their types, for errors."""
+        """Return the topics with their types, for errors."""
         names = [
             f"{topic.name} ({topic.type or topic.encoding})"
             for topic in sorted(self.topics.values(), key=lambda its: its.name)
@@ -67,14 +72,15 @@ class Bag:
         )
 
     def add_fault_notes(self) -> None:
-        """Adds what is wrong with the files; after the messages that are used were looked for."""
+        """Add the faults of the files to `notes`. Call it after the messages were listed."""
         self.notes += [
             f"{self.path}: {file.fault}; what is whole is used" for file in self.files if file.fault
         ]
 
 
 def is_bag(path: Path, suffixes: tuple[str, ...] = BAG_SUFFIXES) -> bool:
-    """Whether this is a file of one of these names, or a folder of files that ROS 2 recorded."""
+    """Return whether this is a file with one of these suffixes, or a folder of files that ROS 2
+    recorded."""
     if path.is_dir():
         return suffixes == BAG_SUFFIXES and bool(
             (path / "metadata.yaml").is_file() or _list_parts(path)
@@ -83,7 +89,7 @@ def is_bag(path: Path, suffixes: tuple[str, ...] = BAG_SUFFIXES) -> bool:
 
 
 def open_bag_files(path: Path) -> Bag:
-    """Open a bag. Nothing but where its messages are is read.
+    """Open a bag. Only the positions of its messages are read.
 
     Raises:
         RecordingError: no bag, or damaged at its beginning.
@@ -118,10 +124,10 @@ def _open_file(path: Path) -> MessageFile:
             begin = file.read(16)
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from None
-    for magic, kind in _OPENERS.items():
+    for magic, (module, name) in _READERS.items():
         if begin.startswith(magic):
             try:
-                return kind(path)
+                return getattr(importlib.import_module(f"{__package__}.{module}"), name)(path)
             except ModuleNotFoundError as error:
                 raise missing_bags_error(error, path) from error
     raise RecordingError(
@@ -130,7 +136,7 @@ def _open_file(path: Path) -> MessageFile:
 
 
 def missing_bags_error(error: ModuleNotFoundError, path: Path) -> Exception:
-    """What is said where a library of the extra is missing."""
+    """Return the error for a missing library of the extra."""
     if error.name is None or error.name.split(".")[0] not in (
         "rosbags",
         "mcap",
@@ -142,31 +148,6 @@ def missing_bags_error(error: ModuleNotFoundError, path: Path) -> Exception:
     return MissingExtraError(
         f"{path}: bags and MCAP files need the extra bags: pip install 'topoloc[bags]'"
     )
-
-
-def _open_ros1(path: Path) -> MessageFile:
-    from topoloc.apps.formats.bags.ros1_file import Ros1File
-
-    return Ros1File(path)
-
-
-def _open_mcap(path: Path) -> MessageFile:
-    from topoloc.apps.formats.bags.mcap_file import McapFile
-
-    return McapFile(path)
-
-
-def _open_sqlite(path: Path) -> MessageFile:
-    from topoloc.apps.formats.bags.sqlite_file import SqliteFile
-
-    return SqliteFile(path)
-
-
-_OPENERS: dict[bytes, Callable[[Path], MessageFile]] = {
-    b"#ROSBAG V2.0\n": _open_ros1,
-    b"\x89MCAP0\r\n": _open_mcap,
-    b"SQLite format 3\0": _open_sqlite,
-}
 
 
 def _decompress(data: bytes) -> bytes:

@@ -1,5 +1,5 @@
-"""Pictures and depth of messages: raw ones by their encoding, compressed ones as any picture
-file."""
+"""Decode images and depth of messages: raw ones by their encoding, compressed ones as image
+files."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _COMPRESSED_DEPTH = struct.Struct(
 
 
 def decode_image(message: Any, name: str) -> Image:
-    """The picture of a message, grey (H, W) or RGB (H, W, 3), uint8.
+    """Return the image of a message, grey (H, W) or RGB (H, W, 3), uint8.
 
     Raises:
         UnreadableImageError: damaged, of an encoding that is no picture, or of more than 100
@@ -72,8 +72,8 @@ def decode_image(message: Any, name: str) -> Image:
 
 
 def decode_depth(message: Any, name: str) -> Float32[np.ndarray, "h w"]:
-    """The depth of a message in metres, NaN where unknown: 16UC1 in millimetres or 32FC1 in metres
-    (REP 118), raw or compressedDepth.
+    """Return the depth of a message in metres, NaN if unknown. It is 16UC1 in millimetres or 32FC1
+    in metres (REP 118), raw or compressedDepth.
 
     Raises:
         UnreadableImageError: damaged, or of another encoding.
@@ -117,7 +117,7 @@ def _message_bytes(message: Any, name: str) -> bytes:
 
 
 def _decode_pixels(message: Any, name: str) -> tuple[np.ndarray, int | None]:
-    """The pixels as they are stored, without what pads the rows."""
+    """Return the stored pixels without the padding of rows."""
     encoding = str(message.encoding)
     if encoding not in _ENCODINGS:
         raise UnreadableImageError(

@@ -1,5 +1,4 @@
-"""Poses of a bag's pictures: from TF, odometry or a topic of poses, brought to the camera of the
-pictures."""
+"""Compute camera poses from TF, odometry or a topic of poses of a bag."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ from topoloc.plugin import interpolate_poses, read_ground_truth
 
 
 def read_transform_tree(bag: Bag) -> TransformTree:
-    """All transforms of the bag. Messages that are damaged are left out, and counted in the bag's
+    """Return all transforms of the bag. Damaged messages are skipped and counted in the bag's
     notes."""
     tree, num_damaged = TransformTree(), 0
     for name, topic in bag.topics.items():
@@ -36,8 +35,8 @@ def read_transform_tree(bag: Bag) -> TransformTree:
 def camera_poses(
     bag: Bag, roles: Roles, camera_frame: str, tree: TransformTree, t_ns: list[int]
 ) -> list[Rigid3 | None]:
-    """world_from_cam of each frame, None where unknown; without a topic of poses those of a TUM
-    file beside the bag.
+    """Return world_from_cam of each frame, None if unknown. Without a topic of poses they are those
+    of a TUM file beside the bag.
 
     Raises:
         TrajectoryError: what was asked for (`--topics pose=`) gives no frame a pose, or the TUM
@@ -75,8 +74,8 @@ def _poses_from_tf(
 def _poses_from_topic(
     bag: Bag, name: str, frame: str | None, camera_frame: str, tree: TransformTree, t_ns: list[int]
 ) -> list[Rigid3 | None]:
-    """Poses of a topic, which are those of `frame`, or else of what its messages name, brought to
-    the camera."""
+    """Return camera poses from a topic with the poses of `frame`, or else of the frame that its
+    messages name."""
     transforms = _read_topic_transforms(bag, name)
     if not transforms:
         return [None] * len(t_ns)

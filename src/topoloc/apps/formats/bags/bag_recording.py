@@ -1,5 +1,4 @@
-"""ROS bags and MCAP files as recordings: opened by an index of their messages, a picture read when
-its frame is asked for."""
+"""Open ROS bags and MCAP files as recordings. An image is read when its frame is accessed."""
 
 from __future__ import annotations
 
@@ -49,18 +48,18 @@ MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
 
 
 def can_open(path: Path) -> bool:
-    """Whether this is a ROS bag, by its name."""
+    """Return whether this is a ROS bag, by its name."""
     return is_bag(path)
 
 
 def can_open_mcap(path: Path) -> bool:
-    """Whether this is an MCAP file, by its name."""
+    """Return whether this is an MCAP file, by its name."""
     return is_bag(path, MCAP_SUFFIXES)
 
 
 @dataclass(frozen=True, eq=False)
 class ImageMessages:
-    """The messages of a topic of pictures: one a frame."""
+    """Hold the messages of a topic of images, one for each frame."""
 
     topic: Topic
     refs: list[MessageRef]
@@ -68,8 +67,8 @@ class ImageMessages:
 
 @dataclass(frozen=True, eq=False)
 class BagRecording:
-    """A StereoSequence in a bag. `names` are the times of the frames in seconds; `notes` what the
-    user should know."""
+    """Hold a StereoSequence of a bag. `names` are the times of the frames in seconds, `notes` are
+    for the user."""
 
     name: str
     bag: Bag
@@ -95,7 +94,7 @@ class BagRecording:
         return len(self.t_ns)
 
     def monocular(self) -> BagRecording:
-        """The same recording without its right and depth pictures."""
+        """Return the same recording without its right and depth images."""
         return replace(self, right=None, depth=None)
 
     def __getitem__(self, index: int) -> StereoFrame:
@@ -118,7 +117,7 @@ class BagRecording:
         return frame
 
     def read_left_frame(self, index: int) -> StereoFrame:
-        """Read one frame but for its right or depth picture. Raises as the whole frame does."""
+        """Read one frame without its right or depth image. Raises the errors of `__getitem__`."""
         image, rig = (
             self._read_image(self.left, index, self.camera),
             None if self.right is None else self.right[1],
@@ -148,7 +147,7 @@ class BagRecording:
 
 
 def open_bag(path: Path, topics: str | Mapping[str, str] | None = None) -> BagRecording:
-    """Open a bag: its topics are guessed but for those that are said. No picture is read.
+    """Open a bag. Topics that are not given are guessed. No image is read.
 
     Args:
         topics: the topic of a role (``left``, ``right``, ``depth``, ``left_info``, ``right_info``,
@@ -198,7 +197,8 @@ def _open_recording(bag: Bag, roles: Roles) -> BagRecording:
 
 
 def _index_by_time(bag: Bag, name: str) -> tuple[list[int], ImageMessages]:
-    """The messages of a topic by their own times, in order; damaged ones are left out, and said."""
+    """Return the messages of a topic sorted by their own times. Damaged ones are skipped with a
+    note."""
     topic, num_damaged = bag.topics[name], 0
     stamped: list[tuple[int | None, MessageRef]] = []
     for ref in sorted(
@@ -225,8 +225,8 @@ def _index_by_time(bag: Bag, name: str) -> tuple[list[int], ImageMessages]:
 def _match_by_time(
     bag: Bag, first: tuple[list[int], ImageMessages], name: str, delay_ms: int
 ) -> tuple[list[int], ImageMessages, ImageMessages]:
-    """Times and pictures that have a partner on the topic `name` within `delay_ms`, and the
-    partners."""
+    """Return the times and images that have a partner on the topic `name` within `delay_ms`, and
+    the partners."""
     t_ns, left = first
     others, images = _index_by_time(bag, name)
     nearest = find_nearest_idx(np.array(t_ns), np.array(others))
@@ -255,7 +255,7 @@ def _match_by_time(
 
 
 def _read_camera_info(bag: Bag, name: str | None) -> CameraInfo | None:
-    """The first whole calibration of a topic."""
+    """Return the first complete calibration of a topic."""
     if name is None:
         return None
     for ref in bag.messages(name)[:10]:
@@ -276,8 +276,8 @@ def _read_frame_id(bag: Bag, images: ImageMessages) -> str:
 
 
 def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: TransformTree) -> StereoRig:
-    """By P of both calibrations; else by the transform between their frames; else by a camera.json
-    with a baseline."""
+    """Return the rig: from P of both calibrations, else from the transform between their frames,
+    else from a camera.json with a baseline."""
     right = _read_camera_info(bag, roles.right_info)
     if left is not None and right is not None:
         rig = left.rig(right, is_rectified(roles.left))
@@ -314,8 +314,8 @@ def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: TransformTree) -
 def _depth_camera(
     bag: Bag, roles: Roles, camera: Camera, frame: str, tree: TransformTree
 ) -> tuple[Camera, Rigid3]:
-    """The camera of the depth pictures, and cam_from_depth; registered ones are the colour
-    camera's."""
+    """Return the camera of the depth images, and cam_from_depth. Registered ones have the colour
+    camera."""
     info = _read_camera_info(bag, roles.depth_info)
     if info is None:
         return camera, Rigid3.identity()

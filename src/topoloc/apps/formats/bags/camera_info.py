@@ -1,7 +1,7 @@
-"""Calibrations of messages (REP 104) as cameras and rigs: the raw camera by K and D, the rectified
-one by P.
+"""Convert calibrations of messages (REP 104) to cameras and rigs: the raw camera from K and D, the
+rectified one from P.
 
-ROS counts pixels from the centre of the top-left one, as this house does.
+In ROS the centre of the top-left pixel is (0, 0), as in topoloc.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _FISHEYE = ("equidistant", "fisheye", "kannala_brandt4", "kannala_brandt")
 
 @dataclass(frozen=True, eq=False)
 class CameraInfo:
-    """A calibration as its topic has it. `rotation` turns the raw camera into the rectified one,
-    whose projection is `projection`."""
+    """Hold the calibration of a topic. `rotation` rotates the raw camera to the rectified one,
+    which has the projection `projection`."""
 
     topic: str
     frame: str
@@ -38,7 +38,7 @@ class CameraInfo:
     projection: Float[np.ndarray, "3 4"]
 
     def camera(self, is_rectified: bool) -> Camera:
-        """Of the raw pictures, or of the rectified ones.
+        """Return the camera of the raw images, or of the rectified ones.
 
         Raises:
             CalibrationError: of a model that is not known here, or no camera's numbers.
@@ -60,8 +60,8 @@ class CameraInfo:
         return self._make_camera("OPENCV", self.matrix, coefficients[:4])
 
     def rig(self, right: CameraInfo, is_rectified: bool) -> StereoRig | None:
-        """The pair of this left camera and its right one; None where P says nothing of where the
-        right one is.
+        """Return the rig of this left camera and its right one. None if P does not contain the
+        baseline.
 
         Raises:
             CalibrationError: as of `camera`, or the right camera is not to the right.
@@ -97,7 +97,7 @@ class CameraInfo:
         )
 
     def _projection_offset(self) -> float:
-        """Where the rectified camera is, along x, as P = K [I | t] has it; NaN without a P."""
+        """Return the x offset of the rectified camera, from P = K [I | t]. NaN without a P."""
         return (
             float(self.projection[0, 3]) / float(self.projection[0, 0])
             if self.projection[0, 0] > 0.0
@@ -113,7 +113,7 @@ class CameraInfo:
 
 
 def camera_info(message: Any, topic: str) -> CameraInfo:
-    """The calibration of a message of ROS 1 (D, K, R, P), ROS 2 (d, k, r, p) or Foxglove.
+    """Return the calibration of a message of ROS 1 (D, K, R, P), ROS 2 (d, k, r, p) or Foxglove.
 
     Raises:
         CalibrationError: a field is missing, or not finite numbers of its shape.

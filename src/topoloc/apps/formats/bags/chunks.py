@@ -1,8 +1,6 @@
-"""Bytes of a chunked file: of the file itself, and of its chunks, unpacked when they are asked for
-and no more of them kept than needed.
+"""Read bytes of a file and of its chunks, which are decompressed when they are needed.
 
-Sizes are what the file says of itself, so nothing is read or unpacked beyond them, whatever the
-packed bytes say.
+The sizes are stored in the file. Nothing is read or decompressed beyond them.
 """
 
 from __future__ import annotations
@@ -26,8 +24,8 @@ _MAX_CACHE_BYTES = 1 << 26  # of unpacked chunks; pictures of a pair lie in neig
 
 @dataclass(frozen=True)
 class Chunk:
-    """Where a chunk's bytes begin in the file, how many there are, how they are packed, and how
-    many they are unpacked."""
+    """Hold the position of a chunk in the file, its compressed size, its compression and its size
+    in bytes."""
 
     start: int
     num_compressed_bytes: int
@@ -41,7 +39,7 @@ class Chunk:
 
 @dataclass(eq=False)
 class ChunkedBytes:
-    """Random access to a file and to its chunks."""
+    """Read from any position of a file and its chunks."""
 
     path: Path
     chunks: list[Chunk] = field(default_factory=list)
@@ -60,7 +58,7 @@ class ChunkedBytes:
         self.size = os.fstat(self._descriptor).st_size
 
     def add(self, chunk: Chunk) -> None:
-        """Adds a chunk; of one that was cut off, what is left and can be unpacked."""
+        """Add a chunk. Of one that is cut off, the part that can be decompressed is added."""
         left = self.size - chunk.start
         if chunk.is_compressed and chunk.num_compressed_bytes > left:
             content = _decompressed(
@@ -72,8 +70,8 @@ class ChunkedBytes:
         self.chunks.append(chunk)
 
     def readable_size(self, chunk: int) -> int:
-        """How many bytes there are to read in a chunk, or in the file: of an open chunk that was
-        cut off, those that are left."""
+        """Return the number of bytes of a chunk, or of the file. Of an uncompressed chunk that is
+        cut off, the bytes that are left count."""
         if chunk == WHOLE_FILE:
             return self.size
         its = self.chunks[chunk]
@@ -84,7 +82,7 @@ class ChunkedBytes:
         )
 
     def read(self, chunk: int, offset: int, length: int) -> bytes:
-        """`length` bytes. Raises TruncatedFileError if the file has fewer."""
+        """Return `length` bytes. Raises TruncatedFileError if the file has fewer."""
         if offset < 0 or length < 0 or offset + length > self.readable_size(chunk):
             raise TruncatedFileError
         if chunk != WHOLE_FILE and self.chunks[chunk].is_compressed:
@@ -99,8 +97,8 @@ class ChunkedBytes:
         return data
 
     def _read_decompressed(self, chunk: int, end: int) -> bytes:
-        """At least the first `end` bytes of a chunk. Where few are needed, as for a message's time,
-        the others stay packed."""
+        """Return at least the first `end` bytes of a chunk. If few are needed, such as the time of
+        a message, the rest is not decompressed."""
         with self._lock:
             content = self._decompressed.pop(chunk, b"")
             self._num_cached_bytes -= len(content)
@@ -132,7 +130,7 @@ class ChunkedBytes:
 
 
 def _decompressed(packed: bytes, compression: str, num_bytes: int) -> bytes:
-    """Unpacked, at most `num_bytes`."""
+    """Return the decompressed bytes, at most `num_bytes`."""
     import lz4.frame
     import zstandard
 

@@ -1,5 +1,5 @@
-"""What a file of messages is, whatever its container: topics, where each message lies, and its
-bytes when they are asked for."""
+"""Define the interface of a file of messages: its topics, the positions of messages, and their
+bytes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from topoloc import RecordingError
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic: `type` as ROS 2 writes it (``sensor_msgs/msg/Image``) or Foxglove's
+    """A topic. `type` is written as in ROS 2 (``sensor_msgs/msg/Image``) or as in Foxglove
     (``foxglove.CompressedImage``).
 
-    `encoding` is how its messages are written: cdr, ros1, json or protobuf; `schema` what protobuf
-    is decoded by.
+    `encoding` of its messages is cdr, ros1, json or protobuf. `schema` is that of protobuf.
     """
 
     name: str
@@ -25,8 +24,8 @@ class Topic:
 
 
 class MessageRef(NamedTuple):
-    """Where a message lies: the chunk's number (-1: in none) and the place in it, or a table's row.
-    `log_t_ns`: when it was written."""
+    """Hold the position of a message: the number of its chunk (-1: none) and the offset in it, or
+    the row of a table. `log_t_ns` is the time of writing."""
 
     log_t_ns: int
     chunk: int
@@ -36,7 +35,7 @@ class MessageRef(NamedTuple):
 
 @runtime_checkable
 class MessageFile(Protocol):
-    """A file of messages, opened: its index is in memory, its messages are not."""
+    """An open file of messages. Its index is in memory, its messages are not."""
 
     @property
     def topics(self) -> dict[str, Topic]:
@@ -45,24 +44,24 @@ class MessageFile(Protocol):
 
     @property
     def fault(self) -> str | None:
-        """Why the file is not whole, where it is not: what comes before is used."""
+        """The reason if the file is not complete. The messages before the fault are used."""
         ...
 
     def messages(self, topic: str) -> list[MessageRef]:
-        """The messages of a topic, in the order in which they were written."""
+        """Return the messages of a topic in the order in which they were written."""
         ...
 
     def read(self, ref: MessageRef, most: int | None = None) -> bytes:
-        """The bytes of a message, or the first `most` of them. Raises RecordingError."""
+        """Return the bytes of a message, or the first `most` of them. Raises RecordingError."""
         ...
 
 
 class TruncatedFileError(Exception):
-    """The bytes asked for are not there: the file ends, or what says so is damaged."""
+    """The bytes do not exist: the file ends, or its index is damaged."""
 
 
 def damaged_message_error(name: str, ref: MessageRef) -> RecordingError:
-    """What is said of a message that the index names and that is not there."""
+    """Return the error for a message that the index names and that does not exist."""
     place = (
         f"row {ref.offset}"
         if ref.chunk < -1

@@ -1,7 +1,7 @@
-"""Messages of cameras and poses, in one form whether ROS 1, ROS 2 or Foxglove wrote them.
+"""Decode messages of cameras and poses of ROS 1, ROS 2 and Foxglove to one form.
 
-ROS's types are those of sensor_msgs, geometry_msgs, nav_msgs and tf2_msgs, decoded by rosbags;
-Foxglove's are its schemas of the same things, as JSON or protobuf.
+rosbags decodes the types of ROS: sensor_msgs, geometry_msgs, nav_msgs and tf2_msgs. The schemas of
+Foxglove are JSON or protobuf.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ _MAX_TRANSLATION, _ROTATION_TOLERANCE = (
 
 @dataclass(frozen=True)
 class StampedTransform:
-    """`child` as seen from `parent` at a time: translation in metres, quaternion x y z w. An empty
-    `child` is one that nobody named."""
+    """Hold the pose of `child` in `parent` at a time: translation in metres, quaternion x y z w.
+    `child` may be empty."""
 
     t_ns: int
     parent: str
@@ -60,7 +60,7 @@ class StampedTransform:
 
 
 def decode(topic: Topic, data: bytes) -> Any:
-    """A message with its fields as attributes.
+    """Return a message with its fields as attributes.
 
     Raises:
         RecordingError: an encoding that is not known, or bytes that are no message of the topic's
@@ -97,13 +97,13 @@ def decode(topic: Topic, data: bytes) -> Any:
 
 
 def num_header_bytes(topic: Topic) -> int | None:
-    """How many bytes of a message are needed for its time; None where all are."""
+    """Return the number of bytes of a message that contain its time. None means all."""
     return None if topic.encoding == "json" else _HEADER_BYTES
 
 
 def header_stamp_ns(topic: Topic, header: bytes) -> int | None:
-    """The time (nanoseconds) in the first bytes of a message that begins with a header; None where
-    it has none."""
+    """Return the time (nanoseconds) in the first bytes of a message that begins with a header. None
+    if it has none."""
     try:
         if topic.encoding == "cdr":
             seconds, nanoseconds = struct.unpack_from("<iI" if header[1] & 1 else ">iI", header, 4)
@@ -125,7 +125,7 @@ def header_stamp_ns(topic: Topic, header: bytes) -> int | None:
 
 
 def stamp_ns(stamp: Any) -> int:
-    """Nanoseconds of a time, which ROS, JSON and protobuf write with names of their own."""
+    """Return the nanoseconds of a time. ROS, JSON and protobuf name its fields differently."""
     for seconds, nanoseconds in (
         ("sec", "nanosec"),
         ("sec", "nsec"),
@@ -138,22 +138,22 @@ def stamp_ns(stamp: Any) -> int:
 
 
 def frame_id(message: Any) -> str:
-    """The frame that a message is in."""
+    """Return the frame of a message."""
     return _frame_name(message.header.frame_id if hasattr(message, "header") else message.frame_id)
 
 
 def _frame_name(text: Any) -> str:
-    """Without the slash of older ROS, and without what a line cannot show."""
+    """Return the name without the leading slash of older ROS and without unprintable characters."""
     return "".join(letter for letter in str(text) if letter.isprintable()).lstrip("/")
 
 
 def image_bytes(message: Any) -> bytes:
-    """The data of a picture."""
+    """Return the data of an image."""
     return base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
 
 
 def decode_transforms(topic: Topic, data: bytes) -> list[StampedTransform]:
-    """The transforms of a message of TF, or the one of a message of a pose.
+    """Return the transforms of a TF message, or the one of a pose message.
 
     Raises:
         RecordingError: no whole message of this type, or numbers that are no pose.

@@ -1,8 +1,7 @@
-"""ROS 2 bags in SQLite (``.db3``): one row a message. Of a database that was cut off, the rows
-before are read.
+"""Read ROS 2 bags in SQLite (``.db3``): one row for each message. Of a database that is cut off,
+the rows before are read.
 
-Beginnings of messages are read through SQLite's incremental blobs, which leaves the pages of a
-picture where they are.
+Incremental blobs of SQLite read the first bytes of a message without the pages of an image.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from pathlib import Path
 from topoloc import RecordingError
 from topoloc.apps.formats.bags.message_file import MessageRef, Topic, damaged_message_error
 
-MAGIC = b"SQLite format 3\0"
 _ROW = -2  # in place of a chunk's number
 _DAMAGE_ERRORS = (
     sqlite3.Error,
@@ -24,7 +22,7 @@ _DAMAGE_ERRORS = (
 
 @dataclass(eq=False)
 class SqliteFile:
-    """A ROS 2 bag's database."""
+    """The database of a ROS 2 bag."""
 
     path: Path
     topics: dict[str, Topic] = field(default_factory=dict)
@@ -58,7 +56,7 @@ class SqliteFile:
                 self._numbers.setdefault(name, []).append(number)
 
     def messages(self, topic: str) -> list[MessageRef]:
-        """The messages of a topic, in the order in which they were written."""
+        """Return the messages of a topic in the order in which they were written."""
         refs: list[MessageRef] = []
         for number in self._numbers[topic]:
             try:
@@ -75,7 +73,7 @@ class SqliteFile:
         return refs
 
     def read(self, ref: MessageRef, most: int | None = None) -> bytes:
-        """The bytes of a message, or the first `most` of them. Raises RecordingError."""
+        """Return the bytes of a message, or the first `most` of them. Raises RecordingError."""
         try:
             with self._database.blobopen("messages", "data", ref.offset, readonly=True) as blob:
                 return blob.read(-1 if most is None else most)
@@ -89,8 +87,8 @@ class SqliteFile:
             return False
 
     def _is_cut(self) -> bool:
-        """Whether the database says in its header that it has more pages than the file, which is
-        then noted."""
+        """Return whether the header gives more pages than the file has, and store this as the
+        fault."""
         with self.path.open("rb") as file:
             header = file.read(32)
         page_size, size = int.from_bytes(header[16:18], "big"), self.path.stat().st_size

@@ -1,5 +1,5 @@
-"""Which topic of a bag is what: guessed by types and by the names that drivers give, or said by
-``--topics``."""
+"""Select the topics of a bag: given by ``--topics``, or guessed from types and the usual names of
+drivers."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ _TRANSPORT_SUFFIXES = ("/compressedDepth", "/compressed")
 
 @dataclass(frozen=True)
 class Roles:
-    """The topic of each role, where there is one. `poses` are tried in order, and may be `tf`;
-    `pose_frame` is the frame they are of."""
+    """Hold the topic of each role. `poses` are tried in order and may be `tf`. `pose_frame` is the
+    frame of the poses."""
 
     left: str = ""
     right: str | None = None
@@ -66,7 +66,7 @@ class Roles:
 
 
 def parse_topics(text: str) -> dict[str, str]:
-    """``left=/cam0/image_raw,pose=/odom`` as a dictionary.
+    """Parse ``left=/cam0/image_raw,pose=/odom`` to a dictionary.
 
     Raises:
         RecordingError: not of this form, or a role that there is not.
@@ -89,7 +89,7 @@ def parse_topics(text: str) -> dict[str, str]:
 
 
 def select_topics(bag: Bag, requested: Mapping[str, str]) -> Roles:
-    """The topic of each role: what is said, and for the others what is guessed.
+    """Return the topic of each role: the given one, or the guessed one.
 
     Raises:
         RecordingError: a topic that is not in the bag or of another kind, or no pictures in it;
@@ -142,8 +142,8 @@ def _check_topic(bag: Bag, name: str | None, role: str, kinds: frozenset[str]) -
 
 
 def _guess_images(bag: Bag, requested: Mapping[str, str]) -> Roles:
-    """What is said of left, right and depth; where nothing is, a pair, or a picture with depth, or
-    a picture."""
+    """Return left, right and depth as given. If none is given: a pair, an image with depth, or an
+    image."""
     if "left" in requested:
         right, depth = (
             None if requested.get(role) == _NONE else requested.get(role)
@@ -182,7 +182,7 @@ def _guess_images(bag: Bag, requested: Mapping[str, str]) -> Roles:
 
 
 def _sort_key(bag: Bag, name: str) -> tuple[bool, bool, bool, bool, int, str]:
-    """Sorts the better topic first: rectified, calibrated, of a colour camera, not compressed."""
+    """Sort the better topic first: rectified, calibrated, of a colour camera, not compressed."""
     is_compressed = bag.topics[name].type in COMPRESSED_IMAGE_TYPES
     return (
         not is_rectified(name),
@@ -203,7 +203,7 @@ def _find_right_topic(bag: Bag, left: str) -> str | None:
 
 
 def _find_calibration_topic(bag: Bag, picture: str | None) -> str | None:
-    """The topic that drivers publish the calibration of a topic of pictures on."""
+    """Return the topic on which drivers publish the calibration of a topic of images."""
     if not picture:
         return None
     base = next(
@@ -222,7 +222,7 @@ def _find_calibration_topic(bag: Bag, picture: str | None) -> str | None:
 
 
 def _guess_poses(bag: Bag) -> tuple[str, ...]:
-    """Truth by its name, then TF, then odometry, then other poses."""
+    """Return ground truth by its name, then TF, then odometry, then other poses."""
     poses = sorted(name for name, topic in bag.topics.items() if topic.type in POSE_TYPES)
     truth = [name for name in poses if _contains_any(name, _TRUTH_WORDS)]
     odometry = [name for name in poses if bag.topics[name].type == "nav_msgs/msg/Odometry"]
@@ -233,13 +233,13 @@ def _guess_poses(bag: Bag) -> tuple[str, ...]:
 
 
 def is_rectified(topic: str) -> bool:
-    """Whether the name of a topic says that its pictures are rectified (image_rect, but not
+    """Return whether the name of a topic is that of rectified images (image_rect, but not
     direct)."""
     return re.search(r"(?<![a-z])rect", topic.lower()) is not None
 
 
 def is_registered(depth: str) -> bool:
-    """Whether the name of a topic of depth says that it is of the colour camera's pixels."""
+    """Return whether the name of a depth topic is that of depth in the colour camera's pixels."""
     return _contains_any(depth, _REGISTERED_WORDS)
 
 

@@ -1,5 +1,4 @@
-"""Frames and the transforms between them, as TF has them: each frame has one parent, and stands or
-moves in it."""
+"""Compose transforms of TF: each frame has one parent and is static or moves in it."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ from topoloc.plugin import interpolate_poses
 
 
 def trajectory_from_transforms(transforms: list[StampedTransform]) -> Trajectory:
-    """In order of time, of equal times the last."""
+    """Return the poses in order of time. Of equal times the last one is used."""
     by_time = {its.t_ns: its for its in sorted(transforms, key=lambda its: its.t_ns)}
     rows = [(*its.translation, *its.quat_xyzw) for its in by_time.values()]
     numbers = np.array(rows, dtype=np.float64).reshape(-1, 7)
@@ -29,14 +28,14 @@ def _pose_of_transform(its: StampedTransform) -> Rigid3:
 
 @dataclass(eq=False)
 class TransformTree:
-    """The transforms of each frame in its parent; those of `static_frames` frames hold for all
+    """Hold the transforms of each frame in its parent. Those of `static_frames` hold for all
     times."""
 
     transforms: dict[str, list[StampedTransform]] = field(default_factory=dict)
     static_frames: set[str] = field(default_factory=set)
 
     def add(self, its: StampedTransform, is_static: bool) -> None:
-        """Adds a transform. Of a frame with several parents the first counts."""
+        """Add a transform. If a frame has several parents, the first one is used."""
         known = self.transforms.setdefault(its.child, [])
         if its.child and not (known and known[0].parent != its.parent):
             known.append(its)
@@ -44,12 +43,12 @@ class TransformTree:
                 self.static_frames.add(its.child)
 
     def is_moving(self, frame: str) -> bool:
-        """Whether anything moves between this frame and the root of its tree."""
+        """Return whether a transform between this frame and the root of its tree changes."""
         return any(not self._is_static(below) for below, _ in self._edges_to_root(frame))
 
     def poses(self, frame: str, t_ns: Sequence[int]) -> list[Rigid3 | None]:
-        """world_from_frame at each time, the root being the world; None where a transform on the
-        way is not known then.
+        """Return world_from_frame at each time, with the root as world. None if a transform is
+        unknown at that time.
 
         Raises:
             TrajectoryError: a quaternion without length.
@@ -64,7 +63,7 @@ class TransformTree:
         return poses
 
     def find_static_transform(self, target: str, source: str) -> Rigid3 | None:
-        """to_from_of, where both stand still in a common frame; else None."""
+        """Return to_from_of if both are static in a common frame, else None."""
         paths = [
             [end, *(parent for child, parent in self._static_edges(end))]
             for end in (target, source)
@@ -78,7 +77,7 @@ class TransformTree:
         return common_from_to.inverse() @ common_from_of
 
     def _compose_along(self, path: list[str]) -> Rigid3:
-        """last_from_first."""
+        """Return last_from_first."""
         pose = Rigid3.identity()
         for child, _ in pairwise(path):
             pose = _pose_of_transform(self.transforms[child][-1]) @ pose
@@ -91,7 +90,7 @@ class TransformTree:
             yield child, parent
 
     def _edges_to_root(self, frame: str) -> Iterator[tuple[str, str]]:
-        """(child, parent) from a frame up to its root."""
+        """Yield (child, parent) from a frame up to its root."""
         seen = {frame}
         while self.transforms.get(frame):
             parent = self.transforms[frame][0].parent
@@ -105,7 +104,7 @@ class TransformTree:
         return frame in self.static_frames or len(self.transforms[frame]) == 1
 
     def _poses_at(self, child: str, t_ns: Sequence[int]) -> Sequence[Rigid3 | None]:
-        """parent_from_child at each time."""
+        """Return parent_from_child at each time."""
         if self._is_static(child):
             return [_pose_of_transform(self.transforms[child][-1])] * len(t_ns)
         return interpolate_poses(trajectory_from_transforms(self.transforms[child]), t_ns)
