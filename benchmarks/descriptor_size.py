@@ -35,7 +35,7 @@ from jaxtyping import Float32
 from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.lifelong.prune import PruneConfig, _drop_landmarks
+from topoloc.lifelong.prune import _drop_landmarks
 from topoloc.localization.result import Localization
 from topoloc.mapping.map_writing import write_map
 from topoloc.mapping.point_encoding import compress_array, dequantize_descriptors
@@ -189,7 +189,7 @@ def main(args: Args) -> None:
             for kind in whole.kinds
         }
         for most in args.landmarks:
-            fewer = _drop_landmarks(whole, nothing, most, PruneConfig()).topomap
+            fewer = _drop_landmarks(whole, nothing, most).topomap
             size, of_descriptors = written(fewer)
             for name in args.forms:
                 quantised, num_bytes = with_descriptors(fewer, name, whole)

@@ -30,7 +30,7 @@ from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.recordings.open import open_sequence
 
@@ -203,7 +203,7 @@ def matched(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Map points (metres, the map picture's camera frame) and the query's pixels that they are
     matched with."""
-    located = locate_points(features_map, mapped, MetricPointsConfig())
+    located = locate_points(features_map, mapped)
     rows = np.flatnonzero(located.valid)
     matches = match_features(
         features_query.descriptors, features_map.descriptors[rows], MatchingConfig()

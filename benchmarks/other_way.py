@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from topoloc.errors import MapError
-from topoloc.features.virtual_views import VirtualViewConfig, make_virtual_views
+from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.config import VirtualViewSearchConfig
@@ -92,7 +92,7 @@ def num_in_view(
     camera: Camera, world_from_cam: Rigid3, world_from_node: Rigid3, points: np.ndarray
 ) -> int:
     best = 0
-    for view in make_virtual_views(camera, VirtualViewConfig()):
+    for view in make_virtual_views(camera):
         world_from_side = world_from_cam @ view.cam_from_virtual
         is_near = (
             np.linalg.norm(world_from_node.translation - world_from_side.translation) < MAX_METRES

@@ -22,7 +22,7 @@ import tyro
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.matching import MatchingConfig, match_features, match_pooled
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
-from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.open import open_sequence
 
@@ -97,7 +97,7 @@ def main(args: Args) -> None:
     for node_id in range(0, len(sequence), 10):
         view = prepare_frame(sequence[node_id])
         features = extract_features(view.grey, config)
-        located = locate_points(features, view, MetricPointsConfig())
+        located = locate_points(features, view)
         rows = np.flatnonzero(located.valid)
         sigmas = np.sqrt(np.trace(located.covariances[rows], axis1=1, axis2=2))
         points_world = view.world_from_cam.apply(located.points_cam[rows])

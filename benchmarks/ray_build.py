@@ -29,7 +29,6 @@ from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
 from topoloc.apps.cluster.tiles import Outcome, TileJob, derive_tile_ids
 from topoloc.atlas.atlas import Atlas
 from topoloc.mapping.build import BuildConfig
-from topoloc.slam.slam import SlamConfig
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -111,7 +110,7 @@ def on_cluster(
             recording,
             name,
             name,
-            MapJob((recording,), PoseOptions(), BuildConfig(), SlamConfig()),
+            MapJob((recording,), PoseOptions(), BuildConfig()),
         )
         for recording, name in zip(recordings, names, strict=True)
     ]

@@ -29,8 +29,7 @@ from topoloc.bounds import (
 )
 from topoloc.errors import ConfigError
 from topoloc.mapping.nodes import NodeConfig
-from topoloc.slam.odometry import OdometryConfig
-from topoloc.slam.slam import SlamConfig, run_slam
+from topoloc.tracking.motion import MotionConfig
 from topoloc.tracking.pose_hypotheses import HypothesesConfig
 
 
@@ -150,13 +149,12 @@ def test_callers_from_python_are_told_too(tiny_recording: Path):
         topoloc.build_map([], topoloc.BuildConfig(nodes=nodes))
     with pytest.raises(ConfigError, match=r"^LocalizerConfig\.num_candidates: must be from 1"):
         topoloc.Localizer(topomap, topoloc.LocalizerConfig(num_candidates=0))
-    gating = HypothesesConfig(max_surprise=math.nan)
+    unknown = HypothesesConfig(motion=MotionConfig(sigma_acceleration=math.nan))
     with pytest.raises(
-        ConfigError, match=r"^TrackerConfig\.hypotheses\.max_surprise: must be a finite number"
+        ConfigError,
+        match=r"^TrackerConfig\.hypotheses\.motion\.sigma_acceleration: must be a finite number",
     ):
-        topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(hypotheses=gating))
-    with pytest.raises(ConfigError, match=r"^SlamConfig\.odometry\.window: must be from 1"):
-        run_slam([], SlamConfig(odometry=OdometryConfig(window=0)))
+        topoloc.Tracker(topoloc.Localizer(topomap), topoloc.TrackerConfig(hypotheses=unknown))
 
 
 @dataclass(frozen=True)

@@ -61,17 +61,14 @@ if TYPE_CHECKING:
     from topoloc.geometry.rigid import Rigid3
     from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
     from topoloc.lifelong.map_files import merge, prune, update
-    from topoloc.lifelong.prune import PruneConfig
-    from topoloc.lifelong.tile_comparison import TileJoinConfig
     from topoloc.lifelong.tile_editing import edit_tile
     from topoloc.lifelong.tile_joining import PairResult, join_tiles
-    from topoloc.lifelong.tile_selection import TileSelectionConfig, find_tile_of_recording
-    from topoloc.lifelong.update import MapUpdate, UpdateConfig
+    from topoloc.lifelong.tile_selection import find_tile_of_recording
+    from topoloc.lifelong.update import MapUpdate
     from topoloc.lifelong.weak_regions import (
         NodeQuality,
         WeakRegion,
         WeakRegions,
-        WeakRegionsConfig,
         find_weak_regions,
     )
     from topoloc.localization.image_calibration_check import check_camera_calibrations
@@ -105,7 +102,7 @@ if TYPE_CHECKING:
         write_tum,
     )
     from topoloc.recordings.trajectory_alignment import align_to_trajectory
-    from topoloc.slam.slam import SlamConfig, SlamResult, run_slam
+    from topoloc.slam.slam import SlamResult, run_slam
     from topoloc.tracking.config import TrackerConfig
     from topoloc.tracking.stream_result import StreamedPose
     from topoloc.tracking.tracker import Tracker
@@ -154,7 +151,6 @@ __all__ = [
     "PairResult",
     "PoseConventions",
     "Provenance",
-    "PruneConfig",
     "QueryError",
     "RecordingError",
     "ResultError",
@@ -162,7 +158,6 @@ __all__ = [
     "ServiceError",
     "SharedWorld",
     "SkippedChecks",
-    "SlamConfig",
     "SlamResult",
     "StereoFrame",
     "StereoRig",
@@ -170,8 +165,6 @@ __all__ = [
     "StreamedPose",
     "Tile",
     "TileFetcher",
-    "TileJoinConfig",
-    "TileSelectionConfig",
     "TopoMetricMap",
     "TopoNode",
     "TopolocError",
@@ -183,10 +176,8 @@ __all__ = [
     "TriedProposal",
     "UncalibratedCamera",
     "UnreadableImageError",
-    "UpdateConfig",
     "WeakRegion",
     "WeakRegions",
-    "WeakRegionsConfig",
     "WeightsError",
     "WorldFit",
     "__version__",
@@ -271,7 +262,6 @@ _MODULES = {
     "PairResult": "topoloc.lifelong.tile_joining",
     "PoseConventions": "topoloc.geometry.pose_conventions",
     "Provenance": "topoloc.localization.provenance",
-    "PruneConfig": "topoloc.lifelong.prune",
     "QueryError": "topoloc.errors",
     "RecordingError": "topoloc.errors",
     "ResultError": "topoloc.errors",
@@ -279,7 +269,6 @@ _MODULES = {
     "ServiceError": "topoloc.errors",
     "SharedWorld": "topoloc.atlas.shared_world",
     "SkippedChecks": "topoloc.localization.map_facts.map_building",
-    "SlamConfig": "topoloc.slam.slam",
     "SlamResult": "topoloc.slam.slam",
     "StereoFrame": "topoloc.recordings.frame",
     "StereoRig": "topoloc.geometry.rig",
@@ -287,8 +276,6 @@ _MODULES = {
     "StreamedPose": "topoloc.tracking.stream_result",
     "Tile": "topoloc.atlas.manifest",
     "TileFetcher": "topoloc.atlas.tile_fetcher",
-    "TileJoinConfig": "topoloc.lifelong.tile_comparison",
-    "TileSelectionConfig": "topoloc.lifelong.tile_selection",
     "TopoMetricMap": "topoloc.mapping.topomap",
     "TopoNode": "topoloc.mapping.entries",
     "TopolocError": "topoloc.errors",
@@ -300,10 +287,8 @@ _MODULES = {
     "TriedProposal": "topoloc.localization.search",
     "UncalibratedCamera": "topoloc.geometry.uncalibrated_camera",
     "UnreadableImageError": "topoloc.errors",
-    "UpdateConfig": "topoloc.lifelong.update",
     "WeakRegion": "topoloc.lifelong.weak_regions",
     "WeakRegions": "topoloc.lifelong.weak_regions",
-    "WeakRegionsConfig": "topoloc.lifelong.weak_regions",
     "WeightsError": "topoloc.errors",
     "WorldFit": "topoloc.evaluation.world_alignment",
     "absolute_trajectory_errors": "topoloc.geometry.alignment",

@@ -70,6 +70,8 @@ if TYPE_CHECKING:
         read_ground_truth,
     )
     from topoloc.recordings.video import Video, silence_opencv
+    from topoloc.removed_settings import drop_removed_settings
+
 
 __all__ = [
     "MAX_PIXELS",
@@ -95,6 +97,7 @@ __all__ = [
     "check_tile_id",
     "decode_json",
     "describe_range",
+    "drop_removed_settings",
     "encode_jpeg",
     "exif_focal_length",
     "field_annotations",
@@ -157,6 +160,7 @@ _MODULES = {
     "check_tile_id": "topoloc.atlas.manifest",
     "decode_json": "topoloc.json_data",
     "describe_range": "topoloc.bounds",
+    "drop_removed_settings": "topoloc.removed_settings",
     "encode_jpeg": "topoloc.recordings.image_io",
     "exif_focal_length": "topoloc.recordings.image_io",
     "field_annotations": "topoloc.bounds",

@@ -22,7 +22,7 @@ from topoloc.atlas.manifest import Tile
 from topoloc.errors import AtlasError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.tile_editing import edit_tile
-from topoloc.lifelong.tile_selection import TileSelectionConfig, select_tile
+from topoloc.lifelong.tile_selection import select_tile
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization
 from topoloc.mapping.edit import edit_map
@@ -236,10 +236,10 @@ def test_a_recording_is_of_the_tile_that_most_pictures_name_or_of_none(
     own_atlas: Path, room_map: Path
 ):
     add_tiles(str(own_atlas), [NewTile("annex", room_map, "room")])
-    tiles, config = Atlas.open(str(own_atlas)).manifest.by_id, TileSelectionConfig()
+    tiles = Atlas.open(str(own_atlas)).manifest.by_id
 
     def chosen(**counts: int) -> Tile:
-        return select_tile("walk", 12, _answers(**counts), tiles, config)
+        return select_tile("walk", 12, _answers(**counts), tiles)
 
     assert chosen(room=3).tile_id == "room"
     assert chosen(room=6, other=2).tile_id == "room"

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from tiny_world import LEVEL_FROM_CAM, Panel, render
 from topoloc.features.features import Features
-from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_virtual_views
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 
-CONFIG = VirtualViewConfig()
 CAMERAS = {
     "pinhole": Camera.pinhole(480, 320, 240.0, 250.0, 231.5, 166.5),
     # EuRoC's left camera.
@@ -56,7 +55,7 @@ def wall(name: str, texture: np.ndarray) -> Panel:
 
 
 def view_of(name: str, camera: Camera) -> VirtualView:
-    return {view.name: view for view in make_virtual_views(camera, CONFIG)}[name]
+    return {view.name: view for view in make_virtual_views(camera)}[name]
 
 
 def seen(name: str, camera: Camera, texture: np.ndarray) -> tuple[VirtualView, np.ndarray]:
@@ -70,9 +69,9 @@ def seen(name: str, camera: Camera, texture: np.ndarray) -> tuple[VirtualView, n
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_there_is_one_view_to_each_side_and_it_holds_the_way_ahead(camera: Camera):
-    assert [view.name for view in make_virtual_views(camera, CONFIG)] == list(SIDES)
-    for view in make_virtual_views(camera, CONFIG):
-        assert max(view.camera.width, view.camera.height) <= CONFIG.max_side_px
+    assert [view.name for view in make_virtual_views(camera)] == list(SIDES)
+    for view in make_virtual_views(camera):
+        assert max(view.camera.width, view.camera.height) <= 700
         to_the_side = view.cam_from_virtual.rotation[:, 2]
         np.testing.assert_allclose(to_the_side, [SIDES[view.name], 0.0, 0.0], atol=1e-12)
         np.testing.assert_allclose(
@@ -90,7 +89,7 @@ def test_there_is_one_view_to_each_side_and_it_holds_the_way_ahead(camera: Camer
 def test_a_pixel_and_where_it_lies_in_the_picture_are_one_direction(
     camera: Camera, side: int, at: tuple[float, float]
 ):
-    view = make_virtual_views(camera, CONFIG)[side]
+    view = make_virtual_views(camera)[side]
     rows, columns = np.nonzero(view.inside)
     k = round(at[0] * (len(rows) - 1))
     row, column = int(rows[k]), int(columns[k])
@@ -115,7 +114,7 @@ def test_features_between_pixels_are_the_points_of_the_same_wall_in_the_picture(
     camera: Camera, side: int, seed: int
 ):
     """The point of the wall is found without the view's own tables."""
-    view, rng = make_virtual_views(camera, CONFIG)[side], np.random.default_rng(seed)
+    view, rng = make_virtual_views(camera)[side], np.random.default_rng(seed)
     ahead, up, distance = (
         rng.uniform(1.7, 2.8, 20),
         rng.uniform(-0.4, 0.4, 20),
@@ -200,7 +199,7 @@ def test_a_wall_along_the_way_has_the_same_scale_everywhere(name: str, camera: C
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_what_the_picture_does_not_hold_is_dropped(camera: Camera):
-    for view in make_virtual_views(camera, CONFIG):
+    for view in make_virtual_views(camera):
         rows, columns = np.mgrid[0 : view.camera.height : 3, 0 : view.camera.width : 3]
         everywhere = features_at(np.column_stack([columns.ravel(), rows.ravel()]))
         kept = view.select_inside(everywhere)
@@ -225,13 +224,12 @@ def test_what_the_picture_does_not_hold_is_dropped(camera: Camera):
 
 @pytest.mark.parametrize(("share", "num_views"), [(0.3, 2), (0.95, 2), (1.05, 0), (4.0, 0)])
 def test_a_lens_that_sees_no_wall_near_enough_has_no_side_views(share: float, num_views: int):
-    focal = share * 239.5 * CONFIG.nearest
+    focal = share * 239.5 * 1.5
     assert (
-        len(make_virtual_views(Camera.pinhole(480, 320, focal, focal, 239.5, 159.5), CONFIG))
-        == num_views
+        len(make_virtual_views(Camera.pinhole(480, 320, focal, focal, 239.5, 159.5))) == num_views
     )
 
 
 def test_a_lens_off_the_middle_may_see_one_side_alone():
-    views = make_virtual_views(Camera.pinhole(480, 320, 400.0, 400.0, 120.0, 159.5), CONFIG)
+    views = make_virtual_views(Camera.pinhole(480, 320, 400.0, 400.0, 120.0, 159.5))
     assert [view.name for view in views] == ["right"]

@@ -7,9 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.transform_consensus import ConsensusConfig, _residuals, find_consensus
+from topoloc.geometry.transform_consensus import _residuals, find_consensus
 
-CONFIG = ConsensusConfig()
 seeds = st.integers(0, 2**31)
 
 
@@ -56,7 +55,7 @@ def test_the_truth_is_found_among_twice_as_many_outliers(seed, num_right, num_wr
         random_rigid(rng, 10.0) for _ in range(num_wrong)
     ]
     order = rng.permutation(len(estimates))
-    found = find_consensus([estimates[k] for k in order], covariances[order], CONFIG)
+    found = find_consensus([estimates[k] for k in order], covariances[order])
     assert found is not None
     assert not found.is_inlier[order >= num_right].any()
     assert (
@@ -70,7 +69,7 @@ def test_the_covariance_says_how_wrong_the_consensus_is():
     squares = []
     for _ in range(100):
         a_from_b, covariances = random_rigid(rng, 5.0), random_covariances(rng, 8)
-        found = find_consensus(estimates_of(a_from_b, covariances, rng), covariances, CONFIG)
+        found = find_consensus(estimates_of(a_from_b, covariances, rng), covariances)
         assert found is not None
         squares.append(in_sigma(found.a_from_b, a_from_b, found.covariance) ** 2)
     assert np.mean(squares) == pytest.approx(6.0, rel=0.25)
@@ -81,9 +80,7 @@ def test_the_covariance_says_how_wrong_the_consensus_is():
 def test_estimates_of_different_transforms_are_no_consensus(seed):
     rng = np.random.default_rng(seed)
     assert (
-        find_consensus(
-            [random_rigid(rng, 10.0) for _ in range(30)], random_covariances(rng, 30), CONFIG
-        )
+        find_consensus([random_rigid(rng, 10.0) for _ in range(30)], random_covariances(rng, 30))
         is None
     )
 
@@ -99,7 +96,7 @@ def test_as_likely_as_another_one_is_not_believed(num_rivals, is_believed):
     estimates = estimates_of(a_from_b, covariances[:6], rng) + estimates_of(
         beside, covariances[6:], rng
     )
-    assert (find_consensus(estimates, covariances, CONFIG) is not None) == is_believed
+    assert (find_consensus(estimates, covariances) is not None) == is_believed
 
 
 def test_many_estimates_from_one_picture_are_one():
@@ -107,11 +104,11 @@ def test_many_estimates_from_one_picture_are_one():
     a_from_b, covariances = random_rigid(rng), random_covariances(rng, 8)
     estimates = estimates_of(a_from_b, covariances, rng)
     one_picture = np.column_stack([np.zeros(8, np.int64), np.arange(8)])
-    assert find_consensus(estimates, covariances, CONFIG, one_picture) is None
+    assert find_consensus(estimates, covariances, one_picture) is None
     # three pictures of a with three of b, crosswise: nine estimates say what three do
     crosswise = np.array([[i, j] for i in range(3) for j in range(3)])
     covariances = random_covariances(rng, 9)
-    found = find_consensus(estimates_of(a_from_b, covariances, rng), covariances, CONFIG, crosswise)
+    found = find_consensus(estimates_of(a_from_b, covariances, rng), covariances, crosswise)
     assert found is not None
     assert found.num_independent == 3
     assert (
@@ -128,7 +125,7 @@ def test_the_order_of_the_estimates_does_not_matter(seed):
     estimates = estimates_of(a_from_b, covariances[:6], rng) + [random_rigid(rng) for _ in range(3)]
     order = rng.permutation(9)
     first, second = (
-        find_consensus([estimates[k] for k in rows], covariances[rows], CONFIG)
+        find_consensus([estimates[k] for k in rows], covariances[rows])
         for rows in (np.arange(9), order)
     )
     assert first is not None
@@ -143,11 +140,11 @@ def test_of_very_many_a_sample_of_hypotheses_is_enough():
     estimates = estimates_of(a_from_b, covariances[:100], rng) + [
         random_rigid(rng, 10.0) for _ in range(400)
     ]
-    found = find_consensus(estimates, covariances, ConsensusConfig(max_hypotheses=100))
+    found = find_consensus(estimates, covariances, max_hypotheses=100)
     assert found is not None
     assert np.count_nonzero(found.is_inlier) == 100
 
 
 def test_fewer_than_asked_for_say_nothing():
-    assert find_consensus([], np.zeros((0, 6, 6)), CONFIG) is None
-    assert find_consensus([Rigid3.identity()] * 2, np.tile(np.eye(6), (2, 1, 1)), CONFIG) is None
+    assert find_consensus([], np.zeros((0, 6, 6))) is None
+    assert find_consensus([Rigid3.identity()] * 2, np.tile(np.eye(6), (2, 1, 1))) is None

@@ -9,11 +9,10 @@ import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.lifelong.noise_scale import LocalizedStep, NoiseScale, estimate_noise_scale
-from topoloc.lifelong.session_poses import SessionPosesConfig, align_motion_to_map
+from topoloc.lifelong.session_poses import align_motion_to_map
 from topoloc.localization.result import Localization
 
-CONFIG = SessionPosesConfig()
-FACTORS = CONFIG.motion_factors, CONFIG.answer_factors
+FACTORS = (0.5, 1.0, 3.0, 10.0), (1.0 / 3.0, 1.0)
 D_THRESH, SIGMA_M = 0.3, 0.02
 TRUTH = {
     k: Rigid3(exp_so3(np.array([0.0, 0.01 * k, 0.0])), np.array([0.0, 0.0, 0.2 * k]))
@@ -48,7 +47,7 @@ def _motion(sigma_m: float, seed: int = 1) -> dict[int, Rigid3]:
 def _rms(
     own: dict[int, Rigid3], answers: dict[int, Localization | None], trust: NoiseScale | None
 ) -> float:
-    held = align_motion_to_map("walk", own, answers, D_THRESH, CONFIG, trust).world_from_cams
+    held = align_motion_to_map("walk", own, answers, D_THRESH, trust).world_from_cams
     return float(
         np.sqrt(
             np.mean(

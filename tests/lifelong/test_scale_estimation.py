@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.scale_estimation import ScaleConfig, find_largest_consensus, scale_to_metres
-from topoloc.lifelong.session_poses import SessionPosesConfig
+from topoloc.lifelong.scale_estimation import find_largest_consensus, scale_to_metres
 from topoloc.lifelong.single_camera_poses import align_stretch_to_map
 from topoloc.localization.result import Localization
 
@@ -46,13 +45,13 @@ def _answers(numbers: list[int], wrong: list[int]) -> dict[int, Localization]:
 
 def test_wrong_answers_are_left_out():
     answers = _answers(list(range(0, 80, 4)), [8, 40, 64])
-    agreeing = find_largest_consensus(_motion(0.05), answers, 0.2, 2.0, ScaleConfig())
+    agreeing = find_largest_consensus(_motion(0.05), answers, 0.2, 2.0)
     assert agreeing == [k for k in answers if k not in (8, 40, 64)]
 
 
 def test_a_drifting_unit_is_held_between_answers_and_wrong_ones_bend_nothing():
     answers = _answers([*range(0, 20, 2), 40, *range(60, 80, 2)], [40])
-    poses, agreeing = align_stretch_to_map("walk", _motion(0.1), answers, 0.6, SessionPosesConfig())
+    poses, agreeing = align_stretch_to_map("walk", _motion(0.1), answers, 0.6)
     assert poses is not None
     assert agreeing == [k for k in answers if k != 40]
     off = [
@@ -63,15 +62,13 @@ def test_a_drifting_unit_is_held_between_answers_and_wrong_ones_bend_nothing():
 
 
 def test_too_few_answers_hold_nothing():
-    poses, _ = align_stretch_to_map(
-        "walk", _motion(0.0), _answers([0, 30, 60], []), 0.6, SessionPosesConfig()
-    )
+    poses, _ = align_stretch_to_map("walk", _motion(0.0), _answers([0, 30, 60], []), 0.6)
     assert poses is None
 
 
 def test_where_the_unit_is_not_known_there_are_no_poses():
-    config = ScaleConfig(drift=0.1, max_sigma=0.2)
-    metric = scale_to_metres(_motion(0.0), _answers(list(range(0, 20, 2)), []), config)
+    answers = _answers(list(range(0, 20, 2)), [])
+    metric = scale_to_metres(_motion(0.0), answers, drift=0.1, max_sigma=0.2)
     assert 0 in metric
     assert 25 in metric
     assert 79 not in metric
@@ -86,7 +83,7 @@ def test_where_the_map_and_the_motion_contradict_each_other_nothing_is_said():
             motion[k].rotation, motion[k].translation + np.array([0.0, 0.0, 0.6 - 0.1 * k])
         )
     answers = _answers([0, 1, 3, 4, *range(6, 60, 2)], [])
-    poses, agreeing = align_stretch_to_map("walk", motion, answers, 0.6, SessionPosesConfig())
+    poses, agreeing = align_stretch_to_map("walk", motion, answers, 0.6)
     assert poses is not None
     assert min(agreeing) >= 4
     assert poses[:4] == [None] * 4
@@ -100,6 +97,6 @@ def test_two_ways_that_the_map_answers_are_none():
     for k in range(0, 30, 2):
         wrong = WORLD_FROM_OWN @ turned @ TRUTH[k]
         answers[k] = Localization(wrong, answers[k].covariance, 0.99, 0, [], 100, 80)
-    poses, agreeing = align_stretch_to_map("walk", _motion(0.0), answers, 0.6, SessionPosesConfig())
+    poses, agreeing = align_stretch_to_map("walk", _motion(0.0), answers, 0.6)
     assert poses is None
     assert agreeing == []

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.lifelong.shared_images import estimate_by_shared_images
-from topoloc.lifelong.tile_comparison import NotJoined, TileJoinConfig
+from topoloc.lifelong.tile_comparison import NotJoined, compare_tiles
 from topoloc.lifelong.tile_joining import TileJoiningResult, find_candidate_pairs, join_tiles
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import SkippedChecks, build_map
@@ -40,7 +41,7 @@ WORLDS = {
     "right": Rigid3(exp_so3(np.array([-0.3, 0.1, 2.0])), np.array([20.0, -3.0, 0.5])),
 }
 PARTS = {"left": range(9), "middle": range(4, 13), "right": range(6, 15)}
-FEW = TileJoinConfig(num_probed=4, num_asked=6, min_near=8)
+FEW = partial(compare_tiles, num_probed=4, max_queries=6, min_near=8)
 
 
 def _map_of(
@@ -70,6 +71,14 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_nodes() -> Iterator[None]:
+    """The tiles have fewer nodes than a join takes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("topoloc.lifelong.tile_joining.compare_tiles", FEW)
+        yield
+
+
 @pytest.fixture(scope="module")
 def joined_once(
     parts: dict[str, Path], other_room: Path, tmp_path_factory: pytest.TempPathFactory
@@ -77,7 +86,7 @@ def joined_once(
     """An atlas of the three, joined, and of another room; not to be written to."""
     where = tmp_path_factory.mktemp("atlas") / "campus"
     create_atlas(str(where), new_tiles([*map(str, parts.values()), str(other_room)]))
-    return where, join_tiles(str(where), config=FEW)
+    return where, join_tiles(str(where))
 
 
 @pytest.fixture
@@ -160,8 +169,7 @@ def test_a_room_of_the_same_plan_is_not_joined(joined_once: tuple[Path, TileJoin
         if isinstance(one.found, NotJoined)
     )
     pairs = [
-        (a.tile_id, b.tile_id)
-        for a, b in find_candidate_pairs(Atlas.open(str(where)), {"left"}, FEW)
+        (a.tile_id, b.tile_id) for a, b in find_candidate_pairs(Atlas.open(str(where)), {"left"})
     ]
     assert pairs == [("left", "other")]  # what is joined is not compared again
 
@@ -206,9 +214,7 @@ def test_one_tile_on_earth_puts_all_there(own: Path, parts: dict[str, Path], tmp
     assert [join.pair for join in replaced.joins] == [("left", "right")]
     assert replaced.by_id["left"].atlas_from_world is None
     remove_tiles(str(own), ["other"])
-    manifest = join_tiles(
-        str(own), config=FEW, pairs=[("middle", "left"), ("left", "right")]
-    ).manifest
+    manifest = join_tiles(str(own), pairs=[("middle", "left"), ("left", "right")]).manifest
     assert [join.pair for join in manifest.joins] == [("left", "middle"), ("left", "right")]
     for name in PARTS:
         tile = manifest.by_id[name]
@@ -329,12 +335,11 @@ def test_pieces_of_one_recording_are_joined_by_the_pictures_that_both_have(
     for rows, own_from_room in ((range(5), WORLDS["left"]), (range(2, 7), WORLDS["middle"])):
         poses = [own_from_room @ path_pose(float(k)) for k in rows]
         maps.append(_built(SequenceView(recording, list(rows), poses)))
-    config = TileJoinConfig()
-    found = estimate_by_shared_images(*maps, config.along, config.consensus)
+    found = estimate_by_shared_images(*maps)
     assert found is not None
     a_from_b, covariance, num_agreeing = found
     assert num_agreeing == 3
     assert np.allclose(a_from_b.matrix(), WORLDS["middle"].inverse().matrix(), atol=1e-6)
     assert sigmas_at(path_pose(6.0).translation, covariance)[0] < 0.02
     with TopoMetricMap.load(parts["left"]) as left, TopoMetricMap.load(parts["middle"]) as middle:
-        assert estimate_by_shared_images(left, middle, config.along, config.consensus) is None
+        assert estimate_by_shared_images(left, middle) is None

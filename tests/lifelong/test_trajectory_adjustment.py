@@ -8,11 +8,9 @@ import pytest
 
 from tiny_world import CAMERA, path_pose, render, room
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.session_poses import SessionPosesConfig
 from topoloc.lifelong.trajectory_adjustment import adjust_trajectory
 from topoloc.localization.result import Localization
 from topoloc.recordings.frame import StereoFrame
-from topoloc.slam.monocular_config import MonocularOdometryConfig
 from topoloc.slam.monocular_odometry import MonocularOdometry, MonocularSubmap
 
 TRUTH = [path_pose(0.5 * number) for number in range(20)]
@@ -21,7 +19,7 @@ KNOWN = range(8)
 
 @pytest.fixture
 def stretch() -> MonocularSubmap:
-    odometry, panels = MonocularOdometry(MonocularOdometryConfig()), room()
+    odometry, panels = MonocularOdometry(), room()
     for number, pose in enumerate(TRUTH):
         odometry.process(
             number,
@@ -60,12 +58,12 @@ def _answers() -> dict[int, Localization]:
 
 def test_the_whole_says_how_long_the_rest_is(stretch: MonocularSubmap):
     held = _too_long(1.15)
-    adjusted = adjust_trajectory(stretch, held, _answers(), 8.0, SessionPosesConfig().adjustment)
+    adjusted = adjust_trajectory(stretch, held, _answers())
     assert _off(held) > 0.08
     assert _off(adjusted) < 0.03
 
 
 def test_frames_without_a_pose_stay_without(stretch: MonocularSubmap):
     held: list[Rigid3 | None] = [None, *_too_long(1.02)[1:15]]
-    adjusted = adjust_trajectory(stretch, held, _answers(), 8.0, SessionPosesConfig().adjustment)
+    adjusted = adjust_trajectory(stretch, held, _answers())
     assert [pose is None for pose in adjusted] == [True] + [False] * 14

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.trajectory_correction import CorrectionConfig, correct_trajectory
+from topoloc.lifelong.trajectory_correction import correct_trajectory
 from topoloc.localization.result import Localization
 
-D_THRESH, CONFIG = 0.3, CorrectionConfig()
+D_THRESH = 0.3
 TRUTH = [Rigid3(np.eye(3), np.array([0.0, 0.05 * k, 0.0])) for k in range(100)]
 ANSWERED = range(60)
 
@@ -41,7 +41,7 @@ def _off(poses: list[Rigid3 | None]) -> np.ndarray:
 
 def test_where_the_map_answers_the_walk_is_as_it_says():
     walk, answers = _bent(0.05, 1.5), {k: _localized(TRUTH[k], 0.03, 0.6) for k in ANSWERED}
-    straight = correct_trajectory(walk, answers, D_THRESH, CONFIG)
+    straight = correct_trajectory(walk, answers, D_THRESH)
     known, before = _off(straight)[:60], _off(walk)[:60]
     assert np.all(before.max(axis=0) > (0.049, 1.49))
     assert np.all(known.max(axis=0) < 0.5 * before.max(axis=0))
@@ -49,7 +49,7 @@ def test_where_the_map_answers_the_walk_is_as_it_says():
 
 def test_far_beyond_the_answers_it_keeps_its_own_shape():
     walk, answers = _bent(0.05, 1.5), {k: _localized(TRUTH[k]) for k in ANSWERED}
-    straight = correct_trajectory(walk, answers, D_THRESH, CONFIG)
+    straight = correct_trajectory(walk, answers, D_THRESH)
     np.testing.assert_allclose(_off(straight)[90:], _off(walk)[90:], atol=1e-6)
 
 
@@ -57,12 +57,12 @@ def test_single_answers_and_ones_that_are_not_sure_hardly_move_it():
     walk: list[Rigid3 | None] = [*TRUTH]
     beside = Rigid3(np.eye(3), TRUTH[30].translation + np.array([0.08, 0.0, 0.0]))
     answers = {k: _localized(TRUTH[k]) for k in ANSWERED} | {30: _localized(beside)}
-    assert _off(correct_trajectory(walk, answers, D_THRESH, CONFIG))[:, 0].max() < 0.012
+    assert _off(correct_trajectory(walk, answers, D_THRESH))[:, 0].max() < 0.012
     unsure = {
         k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.1, 0.0, 0.0])), 0.5)
         for k in range(0, 60, 6)
     }
-    assert _off(correct_trajectory(walk, unsure, D_THRESH, CONFIG))[:, 0].max() < 0.005
+    assert _off(correct_trajectory(walk, unsure, D_THRESH))[:, 0].max() < 0.005
 
 
 def test_what_the_map_is_sure_of_and_contradicts_is_no_bend():
@@ -71,16 +71,12 @@ def test_what_the_map_is_sure_of_and_contradicts_is_no_bend():
         k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.2, 0.0, 0.0])))
         for k in range(50, 60)
     }
-    np.testing.assert_array_equal(
-        _off(correct_trajectory(walk, elsewhere, D_THRESH, CONFIG)), _off(walk)
-    )
+    np.testing.assert_array_equal(_off(correct_trajectory(walk, elsewhere, D_THRESH)), _off(walk))
 
 
 @pytest.mark.parametrize("answers", [{}, {3: _localized(TRUTH[3])}])
 def test_frames_without_a_pose_stay_without(answers: dict[int, Localization]):
     walk: list[Rigid3 | None] = [*TRUTH[:3], None, *TRUTH[4:], None]
     assert [
-        k
-        for k, pose in enumerate(correct_trajectory(walk, answers, D_THRESH, CONFIG))
-        if pose is None
+        k for k, pose in enumerate(correct_trajectory(walk, answers, D_THRESH)) if pose is None
     ] == [3, 100]

@@ -29,7 +29,7 @@ from topoloc.apps.cli import main
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.update import UpdateConfig, update_map
+from topoloc.lifelong.update import update_map
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
@@ -142,7 +142,7 @@ def test_stretches_that_nothing_joins_are_each_held_by_the_map(map_file: Path, s
     ):
         with TopoMetricMap.load(map_file) as topomap:
             view = SequenceView(sequence, list(range(len(sequence))), poses, apart)
-            update = update_map(topomap, view, "slam", UpdateConfig(earlier_asked=0))
+            update = update_map(topomap, view, "slam")
         posed = update.sequence.poses
         assert [k for k, pose in enumerate(posed) if pose is not None] == list(known)
         assert (

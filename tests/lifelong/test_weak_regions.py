@@ -19,7 +19,7 @@ from topoloc.apps.cli import main
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.leave_one_out import sample_evenly
 from topoloc.lifelong.prune import select_landmarks
-from topoloc.lifelong.weak_regions import WeakRegionsConfig, find_weak_regions
+from topoloc.lifelong.weak_regions import find_weak_regions
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
@@ -67,7 +67,7 @@ def test_a_node_is_not_held_by_itself(with_outpost: Path):
 def test_those_beside_a_node_are_left_out_too_where_that_is_wished(room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
         alone, beside, all_out = (
-            find_weak_regions(Localizer(topomap), WeakRegionsConfig(max_asked=3, beside=width))
+            find_weak_regions(Localizer(topomap), max_queries=3, beside=width)
             for width in (0.0, 3.0, 1e6)
         )
     inliers = [
@@ -115,8 +115,8 @@ def test_few_landmarks_other_sessions_and_who_looks_back(room_map: Path):
 
     with TopoMetricMap.load(room_map) as topomap:
         changed = Localizer(_changed(topomap, change))
-        weak = find_weak_regions(changed, WeakRegionsConfig(max_asked=0, reach=0.05, stood_by=0.0))
-        everywhere = find_weak_regions(changed, WeakRegionsConfig(max_asked=0, reach=1e3))
+        weak = find_weak_regions(changed, max_queries=0, reach=0.05, stood_by=0.0)
+        everywhere = find_weak_regions(changed, max_queries=0, reach=1e3)
     first, second, third, *_, back = weak.nodes
     assert weak.queried_nodes == []
     assert first.reasons == ("few_landmarks", "single_session")

@@ -16,7 +16,6 @@ from topoloc.mapping.landmark_statistics import (
     merge_count_statistics,
 )
 from topoloc.mapping.landmarks import (
-    LandmarkConfig,
     Observations,
     compute_session_statistics,
     refine_points,
@@ -74,9 +73,9 @@ def test_a_session_can_be_taken_away_again():
         )
 
     first, second = [observed(-0.3, 0), observed(0.2, 0)], [observed(0.5, 7), observed(-0.6, 7)]
-    config = LandmarkConfig(num_iterations=20)
     alone, both = (
-        refine_points(measured, covariances, seen, config) for seen in (first, [*first, *second])
+        refine_points(measured, covariances, seen, num_iterations=20)
+        for seen in (first, [*first, *second])
     )
     session_statistics = compute_session_statistics(
         both.points_cam, measured, covariances, [*first, *second], np.arange(40), node_session_id=0
@@ -140,7 +139,7 @@ def test_sessions_that_only_counted_take_the_room_of_two():
         _counts(3, [1, 2], 3, [3, 1]),
         _counts(4, [2], 2, [0]),
     ]
-    together = merge_count_statistics(session_statistics, 0.3)
+    together = merge_count_statistics(session_statistics)
     assert [part.session_id for part in together] == [0, 3, 4]
     assert together[0] is own
     assert together[1].rows.tolist() == [0, 1, 2]

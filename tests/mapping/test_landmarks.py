@@ -12,10 +12,9 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.geometry.stereo import ray_covariances
-from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_points, refine_points
+from topoloc.mapping.landmarks import Observations, observe_points, refine_points
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
-CONFIG = LandmarkConfig()
 SIGMA_PX = 0.8
 
 
@@ -60,7 +59,7 @@ def view(points: np.ndarray, cam_from_node: Rigid3, rng: np.random.Generator) ->
 
 def test_errors_shrink_and_covariances_stay_honest():
     s = scene()
-    refined = refine_points(s.measured, s.covariances, s.observations, CONFIG)
+    refined = refine_points(s.measured, s.covariances, s.observations)
     before, after = (np.linalg.norm(p - s.truth, axis=1) for p in (s.measured, refined.points_cam))
     assert np.median(after) < 0.3 * np.median(before)
     error = refined.points_cam - s.truth
@@ -73,7 +72,7 @@ def test_errors_shrink_and_covariances_stay_honest():
 
 def test_covariance_never_grows():
     s = scene()
-    refined = refine_points(s.measured, s.covariances, s.observations, CONFIG)
+    refined = refine_points(s.measured, s.covariances, s.observations)
     assert (np.linalg.eigvalsh(s.covariances - refined.covariances) > -1e-9).all()
 
 
@@ -83,7 +82,7 @@ def test_a_point_that_moved_is_dropped_and_its_neighbours_are_not():
     s.truth[moved, 0] += 1.0
     rng = np.random.default_rng(5)
     observations = [view(s.truth, seen.cam_from_node, rng) for seen in s.observations]
-    refined = refine_points(s.measured, s.covariances, observations, CONFIG)
+    refined = refine_points(s.measured, s.covariances, observations)
     assert not refined.is_consistent[moved].any()
     assert refined.is_consistent[20:].mean() > 0.99
 
@@ -91,8 +90,8 @@ def test_a_point_that_moved_is_dropped_and_its_neighbours_are_not():
 def test_one_wrong_observation_does_not_pull_a_point_away():
     s = scene()
     s.observations[3].normalized[:, 0] += 30.0 / 500.0
-    refined = refine_points(s.measured, s.covariances, s.observations, CONFIG)
-    clean = refine_points(s.measured, s.covariances, scene().observations, CONFIG)
+    refined = refine_points(s.measured, s.covariances, s.observations)
+    clean = refine_points(s.measured, s.covariances, scene().observations)
     assert np.median(np.linalg.norm(refined.points_cam - s.truth, axis=1)) < 1.5 * np.median(
         np.linalg.norm(clean.points_cam - s.truth, axis=1)
     )
@@ -100,7 +99,7 @@ def test_one_wrong_observation_does_not_pull_a_point_away():
 
 def test_without_observations_everything_stays_as_measured():
     s = scene(10)
-    refined = refine_points(s.measured, s.covariances, [], CONFIG)
+    refined = refine_points(s.measured, s.covariances, [])
     np.testing.assert_allclose(refined.points_cam, s.measured)
     np.testing.assert_allclose(refined.covariances, s.covariances, rtol=1e-6)
     assert refined.is_consistent.all()
@@ -132,7 +131,6 @@ def observed(offset_px: np.ndarray) -> tuple[Observations, np.ndarray]:
         sigmas,
         CAMERA,
         cam_from_node,
-        CONFIG,
     )
     return seen, points_img
 
@@ -143,7 +141,7 @@ def test_points_are_found_by_descriptor_where_they_must_be():
     np.testing.assert_allclose(
         seen.normalized, CAMERA.normalized_from_img(points_img)[seen.rows], atol=1e-6
     )
-    assert seen.sigmas == pytest.approx(np.hypot(SIGMA_PX, CONFIG.pose_sigma_px) / 500.0)
+    assert seen.sigmas == pytest.approx(np.hypot(SIGMA_PX, 0.7) / 500.0)
 
 
 def test_a_match_that_geometry_forbids_is_no_observation():
@@ -158,6 +156,6 @@ def test_points_behind_the_other_camera_are_not_observed():
     behind = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     features = features_at(CAMERA.img_from_cam(s.truth))
     seen = observe_points(
-        features, s.truth, s.covariances, features, np.full(30, 1.0), CAMERA, behind, CONFIG
+        features, s.truth, s.covariances, features, np.full(30, 1.0), CAMERA, behind
     )
     assert len(seen.rows) == 0

@@ -19,7 +19,7 @@ from built_corridor import WalkAhead, built_corridor, corridor
 from tiny_world import render
 from topoloc.errors import MapError
 from topoloc.features.extraction import FeatureConfig
-from topoloc.features.virtual_views import VirtualViewConfig
+from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.build import BuildConfig, build_map
@@ -31,7 +31,6 @@ from topoloc.mapping.virtual_nodes import (
     create_virtual_nodes,
     select_virtual_view_nodes,
 )
-from topoloc.points.metric_points import MetricPointsConfig
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.retrieval.vlad import SurfVlad
 
@@ -45,11 +44,9 @@ def sides() -> VirtualNodes:
     return found
 
 
-def described(view: PreparedFrame, config: VirtualNodesConfig | None = None) -> list[TopoNode]:
+def described(view: PreparedFrame, **limits: int) -> list[TopoNode]:
     of_node = NodeSummary(-1, "walk", "a picture", 7, Rigid3.identity(), 99)
-    return create_virtual_nodes(
-        of_node, view, FeatureConfig(), MetricPointsConfig(), config or VirtualNodesConfig()
-    )
+    return create_virtual_nodes(of_node, view, FeatureConfig(), **limits)
 
 
 def depth_errors(node: TopoNode) -> np.ndarray:
@@ -132,30 +129,27 @@ def test_each_is_ranked_first_by_its_own_looks_and_its_centre_is_where_it_looks(
 def test_limits_on_points_are_kept():
     view = prepare_frame(WalkAhead(0)[4])
     few, all_of_them = (
-        described(view, VirtualNodesConfig(max_points=50)),
-        described(view, VirtualNodesConfig(max_points=5000)),
+        described(view, max_points=50),
+        described(view, max_points=5000),
     )
     assert [len(node.features) for node in few] == [50, 50]
     for node, whole in zip(few, all_of_them, strict=True):
         assert len(whole.features) > 400
         assert (np.diff(node.features.responses) <= 0).all()  # the strongest
         np.testing.assert_array_equal(node.features.points_img, whole.features.points_img[:50])
-    assert described(view, VirtualNodesConfig(min_points=5001, max_points=5001)) == []
+    assert described(view, min_points=5001, max_points=5001) == []
 
 
 def test_pictures_that_show_no_walls_have_no_sides():
     view = prepare_frame(WalkAhead(0)[4])
     blank = np.full_like(view.grey, 90)
     assert described(replace(view, grey=blank, right_grey=blank)) == []
-    assert described(view, VirtualNodesConfig(views=VirtualViewConfig(nearest=0.5))) == []
-    assert collect_virtual_nodes([], "surf", VirtualNodesConfig()) is None
+    assert make_virtual_views(view.camera, max_nearest=0.5) == ()
+    assert collect_virtual_nodes([], "surf") is None
 
 
 def test_without_spacing_a_map_has_none(tiny_recording: Path):
-    assert (
-        select_virtual_view_nodes([Rigid3.identity()], SPACED, VirtualNodesConfig(spacing=0.0))
-        == set()
-    )
+    assert select_virtual_view_nodes([Rigid3.identity()], SPACED, 0.0) == set()
     config = BuildConfig(
         nodes=NodeConfig(d_thresh=0.5, lambda_rot=1.0), sides=VirtualNodesConfig(spacing=0.0)
     )
@@ -178,7 +172,7 @@ def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(
         Rigid3(exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, way]))
         for way, turn in zip(ways, turns, strict=True)
     ]
-    chosen = sorted(select_virtual_view_nodes(poses, SPACED, VirtualNodesConfig(spacing=spacing)))
+    chosen = sorted(select_virtual_view_nodes(poses, SPACED, spacing))
     assert chosen[0] == 0
     for k, pose in enumerate(poses):
         distances = node_distances(pose, NodePoses.of([poses[i] for i in chosen]), 1.5)
@@ -193,15 +187,12 @@ def test_a_way_that_was_mapped_in_both_directions_needs_no_sides():
         Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.array([0.5, 0.0, 0.3 * k]))
         for k in reversed(range(40))
     ]
-    config = VirtualNodesConfig()
     alone, both = (
-        select_virtual_view_nodes(poses, SPACED, config) for poses in (there, there + back_again)
+        select_virtual_view_nodes(poses, SPACED, 3.0) for poses in (there, there + back_again)
     )
     assert both < alone
     assert all(0.3 * k > 0.3 * 39 for k in both)  # only beyond where anybody came back
-    assert {k for k in alone if k > 39 + config.opposite} == {
-        k for k in both if k > 39 + config.opposite
-    }
+    assert {k for k in alone if k > 39 + 10} == {k for k in both if k > 39 + 10}
 
 
 def test_a_narrow_lens_makes_a_map_without_sides():

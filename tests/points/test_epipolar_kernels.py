@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from topoloc.points.epipolar_kernels import match_in_ranges
-from topoloc.points.metric_points import MetricPointsConfig
 
 WIDTH, HEIGHT = 320, 200
 
@@ -103,15 +102,7 @@ def test_disparity_is_unbiased_and_as_precise_as_it_says(plane: tuple[float, flo
     # a slanted window fits no other one exactly, which its own residuals show in part only: this is
     # what the floor is for
     else:
-        assert (
-            1.4826
-            * np.median(
-                np.abs(
-                    errors / np.hypot(sigmas[found], MetricPointsConfig().min_sigma_disparity_px)
-                )
-            )
-            < 1.0
-        )
+        assert 1.4826 * np.median(np.abs(errors / np.hypot(sigmas[found], 0.12))) < 1.0
 
 
 def test_no_fraction_of_a_pixel_is_preferred():

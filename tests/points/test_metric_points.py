@@ -15,13 +15,11 @@ from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.metric_points import (
     MetricPoints,
-    MetricPointsConfig,
     keypoint_sigmas,
     locate_points,
+    select_certain_points,
 )
 from topoloc.recordings.frame_preparation import PreparedFrame
-
-CONFIG = MetricPointsConfig()
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +51,7 @@ def depth_errors_in_sigmas(located: MetricPoints, truth: np.ndarray) -> np.ndarr
 def test_stereo_points_lie_where_they_are_seen(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     features = extract_features(view.grey, FeatureConfig())
-    located = locate_points(features, view, CONFIG)
+    located = locate_points(features, view)
     assert located.valid.mean() > 0.7
     errors = depth_errors_in_sigmas(located, true_depths(features, depth))
     assert abs(np.median(errors)) < 0.2
@@ -65,7 +63,7 @@ def test_stereo_points_lie_where_they_are_seen(room_view: tuple[PreparedFrame, n
 def test_depth_points_lie_where_they_are_seen(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     features = extract_features(view.grey, FeatureConfig())
-    located = locate_points(features, depth_view(view, depth), CONFIG)
+    located = locate_points(features, depth_view(view, depth))
     errors = depth_errors_in_sigmas(located, true_depths(features, depth))
     assert located.valid.mean() > 0.7
     assert np.quantile(np.abs(errors), 0.95) < 2.0
@@ -75,7 +73,7 @@ def test_covariances_are_positive_definite_and_largest_along_the_ray(
     room_view: tuple[PreparedFrame, np.ndarray],
 ):
     view, _ = room_view
-    located = locate_points(extract_features(view.grey, FeatureConfig()), view, CONFIG)
+    located = locate_points(extract_features(view.grey, FeatureConfig()), view)
     values, vectors = np.linalg.eigh(located.covariances[located.valid])
     assert (values > 0).all()
     rays = located.points_cam[located.valid]
@@ -89,8 +87,11 @@ def test_uncertain_depth_is_dropped(room_view: tuple[PreparedFrame, np.ndarray])
     view, _ = room_view
     assert view.rig is not None
     features = extract_features(view.grey, FeatureConfig())
-    strict = locate_points(features, view, replace(CONFIG, max_relative_sigma=0.015))
-    loose = locate_points(features, view, CONFIG)
+    loose = locate_points(features, view)
+    sigma_z = np.sqrt(loose.covariances[:, 2, 2])
+    strict = select_certain_points(
+        loose.points_cam, sigma_z, view.camera, keypoint_sigmas(features), 0.015
+    )
     assert 0 < strict.valid.sum() < loose.valid.sum()
     assert (
         np.sqrt(strict.covariances[strict.valid, 2, 2]).max()
@@ -126,7 +127,7 @@ def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[PreparedFram
             (319.0, 239.0),
         ]
     )
-    located = locate_points(features, depth_view(room_view[0], depth), CONFIG)
+    located = locate_points(features, depth_view(room_view[0], depth))
     assert located.valid.tolist() == [True, False, False, True, False, True, True]
     assert located.points_cam[0, 2] == pytest.approx(2.0)
 
@@ -134,17 +135,17 @@ def test_depth_beside_a_jump_or_unknown_is_dropped(room_view: tuple[PreparedFram
 def test_no_features_give_no_points(room_view: tuple[PreparedFrame, np.ndarray]):
     view, depth = room_view
     for one in (view, depth_view(view, depth)):
-        assert locate_points(Features.empty(64), one, CONFIG).points_cam.shape == (0, 3)
+        assert locate_points(Features.empty(64), one).points_cam.shape == (0, 3)
 
 
 def test_a_single_picture_has_no_points(room_view: tuple[PreparedFrame, np.ndarray]):
     with pytest.raises(RecordingError, match="a stereo pair or a depth image"):
-        locate_points(Features.empty(64), replace(room_view[0], right_grey=None, rig=None), CONFIG)
+        locate_points(Features.empty(64), replace(room_view[0], right_grey=None, rig=None))
 
 
 def test_larger_key_points_are_less_certain():
     features = points_at([(0, 0), (1, 1)])
     features.sizes_px[:] = 9.0, 90.0
-    small, large = keypoint_sigmas(features, CONFIG)
-    assert large == pytest.approx(CONFIG.sigma_scale * 12.0)
-    assert small == pytest.approx(max(0.3, CONFIG.sigma_scale * 1.2))
+    small, large = keypoint_sigmas(features)
+    assert large == pytest.approx(0.4 * 12.0)
+    assert small == pytest.approx(max(0.3, 0.4 * 1.2))

@@ -13,16 +13,14 @@ from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.points.metric_points import MetricPoints, MetricPointsConfig, keypoint_sigmas
+from topoloc.points.metric_points import MetricPoints, keypoint_sigmas
 from topoloc.points.motion_triangulation import (
-    MotionTriangulationConfig,
     SourceImage,
     compute_median_step,
     select_source_images,
     triangulate_from_motion,
 )
 
-CONFIG = MotionTriangulationConfig(pose_sigma_px=0.0)
 LENS = Camera("OPENCV", 640, 480, (500.0, 500.0, 319.5, 239.5, -0.1, 0.02, 0.0, 0.0))
 SIGMA_PX = 0.5
 POSES = [
@@ -67,7 +65,7 @@ def _located(
         )
         shown = descriptors if order is None else descriptors[order[k]]
         others.append(SourceImage(_features(seen, shown), sigmas, LENS, other_from_cam))
-    return triangulate_from_motion(own, sigmas, LENS, others, 0.3, CONFIG)
+    return triangulate_from_motion(own, sigmas, LENS, others, pose_sigma_px=0.0)
 
 
 def test_errors_are_as_large_as_the_covariances_say():
@@ -105,32 +103,28 @@ def test_one_picture_or_none_or_no_motion_locates_nothing():
 
 
 def test_points_of_the_rendered_room():
-    panels, config = tiny_world.room(), MetricPointsConfig()
+    panels = tiny_world.room()
     poses = [tiny_world.path_pose(index) for index in range(10)]
     (left, depth), *others = (
         tiny_world.render(panels, pose, noise_seed=k) for k, pose in enumerate(poses)
     )
     features = extract_features(left, FeatureConfig())
     pictures = []
-    for k in select_source_images(
-        poses, 0, compute_median_step(poses), MotionTriangulationConfig()
-    ):
+    for k in select_source_images(poses, 0, compute_median_step(poses)):
         found = extract_features(others[k - 1][0], FeatureConfig())
         pictures.append(
             SourceImage(
                 found,
-                keypoint_sigmas(found, config),
+                keypoint_sigmas(found),
                 tiny_world.CAMERA,
                 poses[k].inverse() @ poses[0],
             )
         )
     located = triangulate_from_motion(
         features,
-        keypoint_sigmas(features, config),
+        keypoint_sigmas(features),
         tiny_world.CAMERA,
         pictures,
-        0.3,
-        MotionTriangulationConfig(),
     )
     columns, rows = np.rint(features.points_img[located.valid]).astype(int).T
     truth = depth[rows, columns]
@@ -147,9 +141,7 @@ class TestChoice:
     LINE = tuple(Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(40))
 
     def test_distances_grow(self):
-        chosen = select_source_images(
-            self.LINE, 5, compute_median_step(self.LINE), MotionTriangulationConfig()
-        )
+        chosen = select_source_images(self.LINE, 5, compute_median_step(self.LINE))
         assert sorted(abs(k - 5) for k in chosen) == [1, 2, 4, 7, 12, 20, 33, 34]
 
     def test_pictures_that_look_elsewhere_or_stand_in_one_place_do_not_count(self):
@@ -157,12 +149,10 @@ class TestChoice:
             replace(pose, rotation=exp_so3(np.array([0.0, 1.5 * (k % 2), 0.0])))
             for k, pose in enumerate(self.LINE)
         ]
-        assert all(
-            k % 2 == 0 for k in select_source_images(turned, 4, 0.1, MotionTriangulationConfig())
-        )
+        assert all(k % 2 == 0 for k in select_source_images(turned, 4, 0.1))
         standing = [Rigid3.identity()] * 5
         assert compute_median_step(standing) == 0.0
-        assert select_source_images(standing, 0, 0.0, MotionTriangulationConfig()) == []
+        assert select_source_images(standing, 0, 0.0) == []
 
     def test_the_step_is_that_of_pictures_that_moved(self):
         waited = [self.LINE[k] for k in (0, 0, 0, 1, 1, 2, 3)]

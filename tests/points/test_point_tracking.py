@@ -8,13 +8,12 @@ import pytest
 
 import tiny_world
 from topoloc.points.point_tracking import (
-    TrackingConfig,
     align_with_reference,
     find_corners,
     track_points,
 )
 
-CONFIG = TrackingConfig(num_corners=120)
+NUM_CORNERS = 120
 SHIFT = np.array([3.3, -2.6], np.float32)
 
 
@@ -34,17 +33,19 @@ def warped(picture: np.ndarray, scale: float = 1.0) -> np.ndarray:
 
 
 def test_corners_are_spread_and_keep_out_of_taken_cells(picture: np.ndarray):
-    corners = find_corners(picture, np.zeros((0, 2)), CONFIG)
+    corners = find_corners(picture, np.zeros((0, 2)), num_corners=NUM_CORNERS)
     assert len(corners) > 60
     quarters = (corners > np.array(picture.shape[::-1]) / 2).astype(int) @ [1, 2]
     assert np.bincount(quarters, minlength=4).min() > 8
-    assert len(find_corners(picture, corners, CONFIG)) == 0
-    assert len(find_corners(np.full_like(picture, 90), np.zeros((0, 2)), CONFIG)) == 0
+    assert len(find_corners(picture, corners, num_corners=NUM_CORNERS)) == 0
+    assert (
+        len(find_corners(np.full_like(picture, 90), np.zeros((0, 2)), num_corners=NUM_CORNERS)) == 0
+    )
 
 
 def test_points_are_followed_across_a_shift(picture: np.ndarray):
-    corners = find_corners(picture, np.zeros((0, 2)), CONFIG)
-    found, is_found = track_points(picture, warped(picture), corners, corners, CONFIG)
+    corners = find_corners(picture, np.zeros((0, 2)), num_corners=NUM_CORNERS)
+    found, is_found = track_points(picture, warped(picture), corners, corners)
     assert is_found.mean() > 0.9
     assert np.median(np.linalg.norm(found - corners - SHIFT, axis=1)[is_found]) < 0.1
 
@@ -53,12 +54,12 @@ def test_points_are_followed_across_a_shift(picture: np.ndarray):
 def test_alignment_takes_drift_away_whatever_the_light(
     picture: np.ndarray, gain: float, offset: float
 ):
-    corners = find_corners(picture, np.zeros((0, 2)), CONFIG)
+    corners = find_corners(picture, np.zeros((0, 2)), num_corners=NUM_CORNERS)
     rng = np.random.default_rng(0)
     start = (corners + SHIFT + rng.uniform(-0.8, 0.8, corners.shape)).astype(np.float32)
     moved = (gain * warped(picture).astype(np.float32) + offset).astype(np.float32)
     ones = np.ones(len(corners), np.float32)
-    found = align_with_reference(picture.astype(np.float32), moved, corners, start, ones, CONFIG)
+    found = align_with_reference(picture.astype(np.float32), moved, corners, start, ones)
     assert found.is_matched.mean() > 0.7
     assert (
         np.median(np.linalg.norm(found.points_img - corners - SHIFT, axis=1)[found.is_matched])
@@ -67,7 +68,7 @@ def test_alignment_takes_drift_away_whatever_the_light(
 
 
 def test_known_growth_is_allowed_for(picture: np.ndarray):
-    corners = find_corners(picture, np.zeros((0, 2)), CONFIG)
+    corners = find_corners(picture, np.zeros((0, 2)), num_corners=NUM_CORNERS)
     middle, scale = (np.array(picture.shape[::-1]) - 1) / 2, 1.3
     true = ((corners - middle) * scale + middle + SHIFT).astype(np.float32)
     inside = ((true > 15) & (true < np.array(picture.shape[::-1]) - 15)).all(axis=1)
@@ -76,9 +77,7 @@ def test_known_growth_is_allowed_for(picture: np.ndarray):
     results = {}
     for assumed in (1.0, scale):
         scales = np.full(len(corners), assumed, np.float32)
-        found = align_with_reference(
-            picture.astype(np.float32), grown, corners, true, scales, CONFIG
-        )
+        found = align_with_reference(picture.astype(np.float32), grown, corners, true, scales)
         results[assumed] = (
             found.is_matched.sum(),
             np.median(np.linalg.norm(found.points_img - true, axis=1)[found.is_matched]),
@@ -89,17 +88,17 @@ def test_known_growth_is_allowed_for(picture: np.ndarray):
 
 
 def test_a_point_that_became_something_else_is_let_go(picture: np.ndarray):
-    corners = find_corners(picture, np.zeros((0, 2)), CONFIG)
+    corners = find_corners(picture, np.zeros((0, 2)), num_corners=NUM_CORNERS)
     other = tiny_world.render(tiny_world.room(seed=5), tiny_world.path_pose(4))[0].astype(
         np.float32
     )
     ones = np.ones(len(corners), np.float32)
-    found = align_with_reference(picture.astype(np.float32), other, corners, corners, ones, CONFIG)
+    found = align_with_reference(picture.astype(np.float32), other, corners, corners, ones)
     assert found.is_matched.mean() < 0.25
 
 
 def test_what_is_uncertain_is_off_by_more(picture: np.ndarray):
-    corners = find_corners(picture, np.zeros((0, 2)), CONFIG)
+    corners = find_corners(picture, np.zeros((0, 2)), num_corners=NUM_CORNERS)
     levels = np.linspace(1, 16, picture.shape[1])  # ever more noise from left to right
     noisy = (
         warped(picture) + levels * np.random.default_rng(3).normal(0, 1, picture.shape)
@@ -110,7 +109,6 @@ def test_what_is_uncertain_is_off_by_more(picture: np.ndarray):
         corners,
         corners + np.float32(SHIFT),
         np.ones(len(corners), np.float32),
-        CONFIG,
     )
     off, sigmas = (
         np.linalg.norm(found.points_img - corners - SHIFT, axis=1)[found.is_matched],

@@ -108,17 +108,21 @@ def test_few_descriptors_give_few_words():
 
 
 def test_words_are_the_same_each_time():
-    config = VladConfig(num_words=16, max_training_descriptors=2000)
     rows = descriptors(3000, 6)
-    np.testing.assert_array_equal(learn_words(rows, config), learn_words(rows, config))
+    once, again = (
+        learn_words_from_parts([3000], lambda _: rows, VladConfig(num_words=16), 2000)
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(once, again)
 
 
 @pytest.mark.parametrize("limit", [40, 10_000])
 def test_words_of_parts_are_those_of_all(limit: int):
     parts = [descriptors(count, seed=count) for count in (50, 1, 200)]
-    config = VladConfig(num_words=2, max_training_descriptors=limit)
-    words = learn_words_from_parts([len(part) for part in parts], lambda k: parts[k], config)
-    np.testing.assert_array_equal(words, learn_words(np.concatenate(parts), config))
+    config, every = VladConfig(num_words=2), np.concatenate(parts)
+    words = learn_words_from_parts([len(part) for part in parts], lambda k: parts[k], config, limit)
+    whole = learn_words_from_parts([len(every)], lambda _: every, config, limit)
+    np.testing.assert_array_equal(words, whole)
 
 
 @pytest.mark.parametrize("dimension", [128, 4])

@@ -8,7 +8,7 @@ import pytest
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import StereoCamera
-from topoloc.slam.bundle_adjustment import BundleConfig, PosePrior, adjust_bundle
+from topoloc.slam.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations
 
 STEREO = StereoCamera(Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5), 45.0)
@@ -56,7 +56,7 @@ def pose_errors(keyframes: list[KeyFrame], poses: list[Rigid3]) -> np.ndarray:
 def test_wrong_poses_and_points_are_put_right_and_the_first_stays():
     keyframes, landmarks, poses, points = world()
     before = pose_errors(keyframes, poses)
-    adjust_bundle(keyframes, [], landmarks, BundleConfig())
+    adjust_bundle(keyframes, [], landmarks)
     after = pose_errors(keyframes, poses)
     assert after[0] == 0.0
     assert after.max() < 0.005 < before[1:].min()
@@ -67,7 +67,7 @@ def test_held_keyframes_do_not_move():
     keyframes, landmarks, poses, _ = world()
     keyframes[0].cam_from_world, keyframes[1].cam_from_world = poses[0], poses[1]
     held = [keyframe.cam_from_world for keyframe in keyframes[:2]]
-    adjust_bundle(keyframes[2:], keyframes[:2], landmarks, BundleConfig())
+    adjust_bundle(keyframes[2:], keyframes[:2], landmarks)
     assert [keyframe.cam_from_world for keyframe in keyframes[:2]] == held
     assert pose_errors(keyframes, poses).max() < 0.005
 
@@ -75,7 +75,7 @@ def test_held_keyframes_do_not_move():
 @pytest.mark.parametrize("bias_px", [-1.5, 0.8])
 def test_a_bias_of_all_disparities_is_found_with_the_motion(bias_px: float):
     keyframes, landmarks, poses, _ = world(8, bias_px)
-    adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=20))
+    adjust_bundle(keyframes, [], landmarks, max_steps=20)
     assert keyframes[0].bias.value_px == pytest.approx(bias_px, abs=0.25)
     assert pose_errors(keyframes, poses).max() < 0.1
 
@@ -84,7 +84,7 @@ def test_wrong_observations_are_outvoted_and_marked():
     keyframes, landmarks, poses, _ = world()
     seen = keyframes[3].observations
     seen.measured[:20, 0] += 30.0
-    adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=15))
+    adjust_bundle(keyframes, [], landmarks, max_steps=15)
     assert not seen.active[:20].any()
     assert seen.active[20:].mean() > 0.95
     assert pose_errors(keyframes, poses).max() < 0.01
@@ -95,7 +95,7 @@ def test_unknown_disparities_do_no_harm():
     for keyframe in keyframes[1:]:
         keyframe.observations.measured[::2, 2] = np.nan
         keyframe.observations.weights[::2, 2] = 0.0
-    adjust_bundle(keyframes, [], landmarks, BundleConfig())
+    adjust_bundle(keyframes, [], landmarks)
     assert pose_errors(keyframes, poses).max() < 0.01
 
 
@@ -145,8 +145,8 @@ def test_part_by_part_is_the_same_as_all_at_once():
     whole, parts = (walk_around(24, 20) for _ in range(2))
     for keyframe in (*whole[0], *parts[0]):
         keyframe.observations.measured[0, 0] += 40.0
-    adjust_bundle(whole[0], [], whole[1], BundleConfig())
-    adjust_bundle(parts[0], [], parts[1], BundleConfig(part_observations=37))
+    adjust_bundle(whole[0], [], whole[1])
+    adjust_bundle(parts[0], [], parts[1], chunk_size=37)
     for a, b in zip(whole[0], parts[0], strict=True):
         np.testing.assert_allclose(a.cam_from_world.matrix(), b.cam_from_world.matrix(), atol=1e-9)
         np.testing.assert_array_equal(a.observations.active, b.observations.active)
@@ -161,7 +161,7 @@ def test_a_walk_of_many_key_frames_is_adjusted_whole():
     """More of them than a dense matrix was ever allowed."""
     keyframes, landmarks, poses = walk_around(700, 8)
     before = pose_errors(keyframes, poses)
-    adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=12, part_observations=5000))
+    adjust_bundle(keyframes, [], landmarks, max_steps=12, chunk_size=5000)
     assert before.max() > 0.05
     assert pose_errors(keyframes, poses).max() < 0.5 * before.max()
 
@@ -172,7 +172,7 @@ def test_anchors_hold_all_poses_and_a_wrong_one_bends_nothing():
     there = [pose @ shift for pose in poses]
     told = [PosePrior(keyframes[k], there[k], 1e6 * np.eye(6)) for k in (0, 2, 4, 5, 7)]
     told.append(PosePrior(keyframes[6], Rigid3.exp(np.full(6, 0.4)) @ there[6], 1e6 * np.eye(6)))
-    adjust_bundle(keyframes, [], landmarks, BundleConfig(max_steps=60, min_decrease=1e-9), told)
+    adjust_bundle(keyframes, [], landmarks, told, max_steps=60, min_decrease=1e-9)
     assert pose_errors(keyframes, there).max() < 0.005
 
 

@@ -8,12 +8,11 @@ import numpy as np
 from tiny_world import CAMERA, path_pose, render, room
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.frame import StereoFrame
-from topoloc.slam.monocular_config import MonocularOdometryConfig
 from topoloc.slam.monocular_odometry import MonocularOdometry, MonocularSubmap
 
 
 def _stretches(world_from_cams: list[Rigid3]) -> list[MonocularSubmap]:
-    odometry, panels = MonocularOdometry(MonocularOdometryConfig()), room()
+    odometry, panels = MonocularOdometry(), room()
     for number, pose in enumerate(world_from_cams):
         picture, _ = render(panels, pose, noise_seed=number)
         odometry.process(number, StereoFrame(f"{number}", number * 100_000_000, picture, CAMERA))

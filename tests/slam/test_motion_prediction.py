@@ -7,11 +7,10 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.motion_prediction import (
     MotionHistory,
     Prediction,
-    PredictionConfig,
     select_expected_pose,
 )
 
-CONFIG = PredictionConfig()
+WAY_SHARE = 0.1  # of a prediction after a gap
 TENTH = 100_000_000
 
 
@@ -21,7 +20,7 @@ def ahead(metres: float) -> Rigid3:
 
 
 def walked(places: list[float]) -> MotionHistory:
-    history = MotionHistory(CONFIG)
+    history = MotionHistory()
     before = None
     for number, place in enumerate(places):
         pose = ahead(place)
@@ -44,14 +43,14 @@ def test_a_steady_walk_goes_on():
         )
     assert not predicted(history, 1).is_gap
     assert predicted(history, 5).is_gap
-    assert predicted(history, 5).sigma == pytest.approx(CONFIG.way_share * 0.5, rel=0.01)
+    assert predicted(history, 5).sigma == pytest.approx(WAY_SHARE * 0.5, rel=0.01)
 
 
 def test_an_unsteady_walk_is_trusted_less_and_less_as_time_goes():
     steps = 0.1 + 0.02 * np.array([0, 1, -1, 1, 1, -1, 0, -1, 1, -1])
     history = walked(list(np.cumsum(steps)))
     three, six = predicted(history, 3).sigma, predicted(history, 6).sigma
-    assert three > CONFIG.way_share * 0.3
+    assert three > WAY_SHARE * 0.3
     assert six / three == pytest.approx((6 * 7) / (3 * 4), rel=0.05)
 
 
@@ -63,13 +62,14 @@ def test_sigma_covers_what_acceleration_does():
     for _ in range(200):
         speeds = 0.1 + np.cumsum(rng.normal(0.0, 0.01, 14))
         places = np.cumsum(speeds)
-        distances.append(predicted(walked(list(places[:10])), 4).distance(ahead(float(places[13]))))
-    assert np.mean(np.array(distances) < CONFIG.max_sigmas) > 0.99
+        prediction = predicted(walked(list(places[:10])), 4)
+        distances.append(prediction.distance(ahead(float(places[13]))))
+    assert np.mean(np.array(distances) < prediction.max_sigmas) > 0.99
     assert np.median(distances) > 0.1, "nor is it boundless"
 
 
 def test_nothing_is_known_before_anything_moved():
-    history = MotionHistory(CONFIG)
+    history = MotionHistory()
     assert history.predict(0) is None
     history.add_pose(0, ahead(0.0))
     first = history.predict(TENTH)
@@ -83,10 +83,8 @@ def test_nothing_is_known_before_anything_moved():
 def test_the_motion_singles_out_one_of_two_or_none():
     gap = predicted(walked([0.1 * k for k in range(10)]), 5)
     near, far, half = ahead(1.42), ahead(2.42), ahead(1.9)
-    assert select_expected_pose(gap, [far, near], CONFIG) is near
-    assert select_expected_pose(gap, [half, ahead(0.9)], CONFIG) is None, (
-        "half a metre to either side"
-    )
-    assert select_expected_pose(gap, [ahead(1.42), ahead(1.45)], CONFIG) is None
-    assert select_expected_pose(gap, [far], CONFIG) is far, "alone, it has no rival"
-    assert select_expected_pose(None, [near, far], CONFIG) is None
+    assert select_expected_pose(gap, [far, near]) is near
+    assert select_expected_pose(gap, [half, ahead(0.9)]) is None, "half a metre to either side"
+    assert select_expected_pose(gap, [ahead(1.42), ahead(1.45)]) is None
+    assert select_expected_pose(gap, [far]) is far, "alone, it has no rival"
+    assert select_expected_pose(None, [near, far]) is None

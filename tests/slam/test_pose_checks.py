@@ -13,7 +13,7 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import SequenceView
-from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
+from topoloc.slam.measured_steps import MeasuredStep, measure_steps
 from topoloc.slam.pose_checks import check_pose_coverage, check_poses, evaluate_poses
 
 BODY_FROM_CAM = Rigid3(exp_so3(np.array([1.2, -1.1, 0.7])), np.array([0.3, -0.1, 0.5]))
@@ -152,7 +152,7 @@ def test_a_camera_that_stands_still_tells_nothing():
 def test_steps_are_measured_from_pictures(tiny_recording: Path):
     sequence = open_sequence(tiny_recording)
     posed = list(range(len(sequence)))
-    steps = measure_steps(sequence, posed, MeasuredStepsConfig(num_steps=6))
+    steps = measure_steps(sequence, posed, num_steps=6)
     assert len(steps) >= 5
     for step in steps:
         first, last = sequence.poses[step.first], sequence.poses[step.last]

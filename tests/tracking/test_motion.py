@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -32,7 +31,7 @@ def pose_at(seconds: float) -> Rigid3:
 def followed(num: int, noise: bool = False) -> MotionState:
     """The state after so many measured poses."""
     rng = np.random.default_rng(0)
-    state = start_motion(0, pose_at(0.0), SIGMA, CONFIG)
+    state = start_motion(0, pose_at(0.0), SIGMA)
     for number in range(1, num):
         predicted = predict_motion(state, number * STEP_NS, CONFIG)
         error = rng.multivariate_normal(np.zeros(6), SIGMA) if noise else np.zeros(6)
@@ -51,7 +50,7 @@ def test_a_steady_motion_is_predicted():
 
 def test_a_wrong_velocity_is_forgotten_where_poses_are_exact_and_times_uneven():
     exact = np.diag(np.full(6, 1e-12))
-    state = start_motion(0, pose_at(0.0), exact, CONFIG)
+    state = start_motion(0, pose_at(0.0), exact)
     state = MotionState(
         0,
         state.world_from_cam,
@@ -92,7 +91,7 @@ def test_surprise_tells_noise_from_a_jump_whatever_the_origin():
 
 
 def test_a_camera_seen_once_may_be_on_a_car():
-    state = predict_motion(start_motion(0, pose_at(0.0), SIGMA, CONFIG), STEP_NS * 2, CONFIG)
+    state = predict_motion(start_motion(0, pose_at(0.0), SIGMA), STEP_NS * 2, CONFIG)
     assert (
         squared_mahalanobis(
             state, pose_at(0.0) @ Rigid3(np.eye(3), np.array([0.0, 0.0, 2.0])), SIGMA
@@ -104,7 +103,7 @@ def test_a_camera_seen_once_may_be_on_a_car():
 def test_noise_is_averaged():
     rng = np.random.default_rng(1)
     config = MotionConfig(sigma_acceleration=0.2, sigma_angular_acceleration=0.2)
-    state = start_motion(0, pose_at(0.0), SIGMA, config)
+    state = start_motion(0, pose_at(0.0), SIGMA)
     raw, filtered = [], []
     for number in range(1, 80):
         truth = pose_at(number * STEP_NS / 1e9)
@@ -116,12 +115,11 @@ def test_noise_is_averaged():
     assert np.mean(filtered[20:]) < 0.7 * np.mean(raw[20:])
 
 
-@pytest.mark.parametrize("share", [0.02, 0.05])
-def test_odometry_replaces_the_velocity(share: float):
-    config = MotionConfig(odometry_share=share)
-    state = start_motion(0, pose_at(0.0), SIGMA, config)
+def test_odometry_replaces_the_velocity():
+    share = 0.05  # of the way, the error of the odometry
+    state = start_motion(0, pose_at(0.0), SIGMA)
     motion = pose_at(0.0).inverse() @ pose_at(2.0)
-    predicted = predict_motion(state, 2_000_000_000, config, motion)
+    predicted = predict_motion(state, 2_000_000_000, CONFIG, motion)
     assert translation_error(predicted.world_from_cam, pose_at(2.0)) < 1e-9
     np.testing.assert_allclose(predicted.velocity, VELOCITY, atol=1e-9)
     sigma = np.sqrt(predicted.pose_covariance[2, 2])

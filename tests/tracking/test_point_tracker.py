@@ -10,8 +10,8 @@ import tiny_world
 from room_stream import room_stream
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.points.point_tracking import TrackingConfig, find_corners
-from topoloc.tracking.point_tracker import PointTracker, PointTrackerConfig
+from topoloc.points.point_tracking import find_corners
+from topoloc.tracking.point_tracker import PointTracker
 
 CAMERA = tiny_world.CAMERA
 
@@ -20,7 +20,7 @@ CAMERA = tiny_world.CAMERA
 def follower() -> PointTracker:
     _, grey, pose = room_stream()[0]
     depth = tiny_world.render(tiny_world.room(), pose)[1]
-    corners = find_corners(grey, np.zeros((0, 2)), TrackingConfig())
+    corners = find_corners(grey, np.zeros((0, 2)))
     z = depth[np.rint(corners[:, 1]).astype(int), np.rint(corners[:, 0]).astype(int)]
     corners, z = corners[np.isfinite(z)], z[np.isfinite(z)]
     points_cam = (
@@ -30,7 +30,7 @@ def follower() -> PointTracker:
     seen = PointObservations(
         corners, pose.apply(points_cam), np.tile(1e-6 * np.eye(3), (len(z), 1, 1))
     )
-    return PointTracker(grey, seen, pose.inverse(), CAMERA, PointTrackerConfig())
+    return PointTracker(grey, seen, pose.inverse(), CAMERA)
 
 
 def test_the_motion_is_measured_to_millimetres(follower: PointTracker):
@@ -59,8 +59,5 @@ def test_points_are_spread_and_too_few_are_none():
     _, grey, pose = room_stream()[0]
     none = PointObservations(np.zeros((0, 2), np.float32), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     assert (
-        PointTracker(grey, none, pose.inverse(), CAMERA, PointTrackerConfig()).track_points(
-            grey, pose.inverse()
-        )
-        is None
+        PointTracker(grey, none, pose.inverse(), CAMERA).track_points(grey, pose.inverse()) is None
     )

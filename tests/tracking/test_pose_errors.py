@@ -47,16 +47,16 @@ def test_noise_has_a_floor_that_grows_with_the_depth():
 def test_what_lasts_changes_with_the_view():
     errors = compute_pose_errors(found(0.1), 4.0, 0.001)
     still, step, far = (Rigid3(np.eye(3), np.array([way, 0.0, 0.0])) for way in (0.0, 0.04, 400.0))
-    np.testing.assert_allclose(compute_correlated_change(errors, still, 2.0), 0.0, atol=1e-15)
+    np.testing.assert_allclose(compute_correlated_change(errors, still), 0.0, atol=1e-15)
     np.testing.assert_allclose(
-        compute_correlated_change(errors, step, 2.0), 0.01 * errors.correlated, rtol=1e-2
+        compute_correlated_change(errors, step), 0.01 * errors.correlated, rtol=1e-2
     )
     np.testing.assert_allclose(
-        compute_correlated_change(errors, far, 2.0), 2.0 * errors.correlated, rtol=1e-6
+        compute_correlated_change(errors, far), 2.0 * errors.correlated, rtol=1e-6
     )
     turned = Rigid3(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
     np.testing.assert_allclose(
-        compute_correlated_change(errors, turned, 2.0),
-        compute_correlated_change(errors, step, 2.0),
+        compute_correlated_change(errors, turned),
+        compute_correlated_change(errors, step),
         rtol=1e-6,
     )

@@ -7,7 +7,8 @@ import pytest
 
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.tracking.pose_hypotheses import Candidate, HypothesesConfig, PoseHypotheses
+from topoloc.tracking.motion import MotionConfig
+from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses
 
 SIGMA = np.diag(np.full(6, 1e-4))
 SECOND = 1_000_000_000
@@ -35,7 +36,7 @@ def seen(
 
 def walked_a_second() -> PoseHypotheses:
     """A camera that has been going along x at 1 m/s for a second."""
-    hypotheses = PoseHypotheses(HypothesesConfig())
+    hypotheses = PoseHypotheses(MotionConfig())
     for tenth in range(11):
         seen(hypotheses, tenth * STEP_NS, at(tenth / 10))
     return hypotheses
@@ -47,7 +48,7 @@ def best_x(hypotheses: PoseHypotheses) -> float:
 
 
 def test_nothing_is_predicted_before_the_first_pose_nor_long_after_the_last():
-    hypotheses = PoseHypotheses(HypothesesConfig())
+    hypotheses = PoseHypotheses(MotionConfig())
     assert hypotheses.predict(SECOND) is None
     assert hypotheses.is_unambiguous
     hypotheses = walked_a_second()
@@ -63,7 +64,7 @@ def test_nothing_is_predicted_before_the_first_pose_nor_long_after_the_last():
 def test_a_pose_that_is_not_sure_is_believed_once_another_picture_says_so(
     new_evidence_ratio: float, is_unambiguous: bool
 ):
-    hypotheses = PoseHypotheses(HypothesesConfig())
+    hypotheses = PoseHypotheses(MotionConfig())
     hypotheses.update_weights(0, one_of(at(0.0), sum_=0.8))
     assert not hypotheses.is_unambiguous
     hypotheses.predict(STEP_NS)
@@ -74,7 +75,7 @@ def test_a_pose_that_is_not_sure_is_believed_once_another_picture_says_so(
 
 
 def test_pictures_without_a_pose_count_against_what_little_speaks_for():
-    doubtful, established = PoseHypotheses(HypothesesConfig()), walked_a_second()
+    doubtful, established = PoseHypotheses(MotionConfig()), walked_a_second()
     doubtful.update_weights(0, one_of(at(0.0), sum_=0.95))
     assert doubtful.is_unambiguous
     for hypotheses in (doubtful, established):
@@ -85,7 +86,7 @@ def test_pictures_without_a_pose_count_against_what_little_speaks_for():
 
 
 def test_odometry_carries_further():
-    hypotheses = PoseHypotheses(HypothesesConfig())
+    hypotheses = PoseHypotheses(MotionConfig())
     seen(hypotheses, 0, at(5.0), odom_from_cam=at(100.0))
     late = hypotheses.predict(10 * SECOND, at(103.0))
     assert late is not None
@@ -148,7 +149,7 @@ def test_answers_that_miss_the_true_pose_begin_a_doubt_and_no_more():
 
 
 def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
-    hypotheses = PoseHypotheses(HypothesesConfig())
+    hypotheses = PoseHypotheses(MotionConfig())
     for k in range(8):
         seen(
             hypotheses,
@@ -169,7 +170,7 @@ def test_equal_panels_stay_ambiguous_until_something_unique_is_seen():
 
 
 def test_the_motion_decides_between_alternatives_of_which_only_one_moves_as_the_camera_does():
-    hypotheses, rng = PoseHypotheses(HypothesesConfig()), np.random.default_rng(2)
+    hypotheses, rng = PoseHypotheses(MotionConfig()), np.random.default_rng(2)
     decided = []
     for k in range(6):
         wrong = [at(x, z=20.0) for x in rng.uniform(-30, 30, 3)]
@@ -181,7 +182,7 @@ def test_the_motion_decides_between_alternatives_of_which_only_one_moves_as_the_
 
 
 def test_followed_points_move_all_hypotheses():
-    hypotheses = PoseHypotheses(HypothesesConfig())
+    hypotheses = PoseHypotheses(MotionConfig())
     seen(hypotheses, 0, at(0.0), at(5.0))
     hypotheses.predict(STEP_NS)
     assert hypotheses.best is not None
@@ -197,7 +198,7 @@ def test_followed_points_move_all_hypotheses():
 
 
 def test_the_number_is_bounded():
-    hypotheses = PoseHypotheses(HypothesesConfig(max_number=5))
+    hypotheses = PoseHypotheses(MotionConfig(), max_number=5)
     seen(hypotheses, 0, *(at(float(x)) for x in range(20)))
     assert len(hypotheses.alternatives()) == 5
     seen(hypotheses, STEP_NS, *(at(float(x)) for x in range(20)))

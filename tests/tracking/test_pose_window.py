@@ -6,7 +6,7 @@ import numpy as np
 
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.tracking.pose_window import PoseWindow, PoseWindowConfig
+from topoloc.tracking.pose_window import PoseWindow
 
 FIRST = Rigid3(exp_so3(np.array([0.2, -0.4, 0.1])), np.array([3.0, -1.0, 5.0]))
 STEP = Rigid3(exp_so3(np.array([0.0, 0.05, 0.0])), np.array([0.1, 0.0, 0.02]))
@@ -23,7 +23,7 @@ def truths(num: int) -> list[Rigid3]:
 def test_noise_shrinks_with_the_number_of_pictures():
     rng = np.random.default_rng(0)
     raw, smoothed = [], []
-    window = PoseWindow(PoseWindowConfig())
+    window = PoseWindow()
     for truth in truths(60):
         measured = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MEASURED)) @ truth
         step = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MOVED)) @ STEP
@@ -37,7 +37,7 @@ def test_noise_shrinks_with_the_number_of_pictures():
 
 
 def test_an_outlier_is_outvoted():
-    window, smoothed = PoseWindow(PoseWindowConfig()), FIRST
+    window, smoothed = PoseWindow(), FIRST
     for number, truth in enumerate(truths(8)):
         wrong = Rigid3(np.eye(3), np.array([0.5, 0.0, 0.0])) if number == 7 else Rigid3.identity()
         smoothed, _ = window.add(wrong @ truth, MEASURED, STEP, MOVED)
@@ -45,7 +45,7 @@ def test_an_outlier_is_outvoted():
 
 
 def test_a_cleared_window_begins_where_it_is_told():
-    window = PoseWindow(PoseWindowConfig(size=4))
+    window = PoseWindow(size=4)
     for truth in truths(6):
         window.add(truth, MEASURED, STEP, MOVED)
     window.clear()
@@ -59,7 +59,7 @@ def test_the_covariance_is_that_of_the_errors():
     rng = np.random.default_rng(2)
     squares = []
     for _ in range(40):
-        window, smoothed, covariance = PoseWindow(PoseWindowConfig()), FIRST, MEASURED
+        window, smoothed, covariance = PoseWindow(), FIRST, MEASURED
         for truth in truths(8):
             measured = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MEASURED)) @ truth
             step = Rigid3.exp(rng.multivariate_normal(np.zeros(6), MOVED)) @ STEP

@@ -22,6 +22,7 @@ from topoloc.localization.result import Localization, NotLocalized
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
+from topoloc.tracking.tracker_state import downscale_image
 
 CAMERA = tiny_world.CAMERA
 NOTHING = np.random.default_rng(3).integers(0, 255, (CAMERA.height, CAMERA.width), dtype=np.uint8)
@@ -236,8 +237,14 @@ def test_another_resolution_with_its_camera_goes_on_and_without_it_is_refused(lo
         assert translation_error(_smoothed(answer), truth) < 0.03
 
 
-def test_pictures_larger_than_those_that_points_are_followed_in(localizer: Localizer):
-    tracker = Tracker(localizer, TrackerConfig(max_side_px=200))
+def test_pictures_larger_than_those_that_points_are_followed_in(
+    localizer: Localizer, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(
+        "topoloc.tracking.map_stream.downscale_image",
+        lambda grey, camera, _: downscale_image(grey, camera, 200),
+    )
+    tracker = Tracker(localizer)
     answers = _stream(tracker, 0, 12)
     assert [answer.state for answer in answers].count("tracked") >= 6
     for answer, (_, _, truth) in zip(answers, room_stream(), strict=False):

@@ -24,7 +24,7 @@ from topoloc.features.patch_normalization import PatchNormalizationConfig, patch
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.image_io import to_grey
@@ -78,9 +78,7 @@ class PaperStep:
         view = prepare_frame(frame)
         points_img, sizes, descriptors = self._features(view.grey)
         zeros = np.zeros(len(points_img), np.float32)
-        located = locate_points(
-            Features(points_img, sizes, zeros, zeros, descriptors), view, MetricPointsConfig()
-        )
+        located = locate_points(Features(points_img, sizes, zeros, zeros, descriptors), view)
         return _Node(
             frame.world_from_cam @ view.view_from_cam.inverse(),
             located.points_cam[located.valid],

@@ -21,7 +21,6 @@ from topoloc.geometry.geodesy import GeoPoint
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.slam.pose_graph import (
     Edge,
-    PoseGraphConfig,
     compute_normalized_residuals,
     optimize_pose_graph,
 )
@@ -108,17 +107,15 @@ def adjust_joins(
         atlas_from_worlds: poses of the georeferenced worlds. A joint world is named after one of
             these if it contains one.
     """
-    config, kept = (
-        PoseGraphConfig(),
-        sorted(joins, key=lambda join: (-join.num_agreeing, join.pair)),
-    )
+    max_residual = 8.0  # of a join that is kept, in standard deviations
+    kept = sorted(joins, key=lambda join: (-join.num_agreeing, join.pair))
     dropped: list[Join] = []
     while True:
         far = _first_inconsistent_join(kept, worlds, atlas_from_worlds)
         if far is None:
-            places = _optimize_worlds(kept, worlds, atlas_from_worlds, config)
+            places = _optimize_worlds(kept, worlds, atlas_from_worlds)
             residuals = _residuals(kept, worlds, places)
-            if not kept or max(residuals) <= config.max_residual:
+            if not kept or max(residuals) <= max_residual:
                 break
             far = kept[int(np.argmax(residuals))]
         kept.remove(far)
@@ -244,7 +241,6 @@ def _optimize_worlds(
     joins: Sequence[Join],
     worlds: Mapping[str, str],
     anchored: Mapping[str, Rigid3],
-    config: PoseGraphConfig,
 ) -> dict[str, JointPose]:
     """Return the pose of each world after the adjustment of all joins.
 
@@ -256,7 +252,7 @@ def _optimize_worlds(
         rows = {name: row for row, name in enumerate(names)}
         edges = [_edge(join, worlds, rows) for join in joins if worlds[join.first] in rows]
         poses = [group[name].joint_from_world.inverse() for name in names]
-        poses = optimize_pose_graph(poses, edges, config) if len(edges) >= len(names) else poses
+        poses = optimize_pose_graph(poses, edges) if len(edges) >= len(names) else poses
         for name, world_from_joint in zip(names, poses, strict=True):
             places[name] = replace(group[name], joint_from_world=world_from_joint.inverse())
     return places

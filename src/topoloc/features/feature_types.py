@@ -37,9 +37,6 @@ class FeatureConfig:
     feature type."""
     max_features: Annotated[int, Between(1, 100_000)] = 1000
     """Number of features to keep, strongest first."""
-    hessian_threshold: Annotated[float, AtLeast(0)] = 20.0
-    """Detection threshold of SURF for images of 0..255. The default is low on purpose: a fixed
-    threshold depends on contrast, and a high one finds almost nothing in a dark image."""
     contrast_threshold: Annotated[float, AtLeast(0)] = 0.01
     """Detection threshold of SIFT, as in OpenCV."""
 
@@ -111,10 +108,13 @@ class FeatureType:
 def _extract_surf(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
 ) -> Features:
+    # Detection threshold of SURF for images of 0..255. The default is low on purpose: a fixed
+    # threshold depends on contrast, and a high one finds almost nothing in a dark image.
+    hessian_threshold = 20.0
     from topoloc.features.surf import SurfConfig, extract_surf
 
     settings = SurfConfig(
-        hessian_threshold=config.hessian_threshold,
+        hessian_threshold=hessian_threshold,
         max_features=config.max_features,
         num_threads=num_threads,
     )

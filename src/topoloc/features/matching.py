@@ -37,10 +37,6 @@ class MatchingConfig:
     neighbour. Unset: the default of the feature type."""
     mutual: bool = True
     """Require that the query feature is also the nearest one of its train feature."""
-    trees: Annotated[int, Between(1, 64)] = 5
-    """FLANN: number of KD-trees."""
-    checks: Annotated[int, Between(1, 1_000_000)] = 50
-    """FLANN: number of leaves visited per query."""
 
     def resolved(self, ratio: float) -> MatchingConfig:
         """Return this configuration with `ratio`, unless its own is set."""
@@ -248,10 +244,12 @@ def _nearest_flann(
     config: MatchingConfig,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
     """Compute `_nearest` with approximate neighbours."""
+    trees = 5  # FLANN: number of KD-trees
+    checks = 50  # FLANN: number of leaves visited per query
     assert config.ratio is not None
     cv2.setRNGSeed(0)  # the trees split at random, but two runs must be byte-identical
     matcher = cv2.FlannBasedMatcher(
-        {"algorithm": _FLANN_KDTREE, "trees": config.trees}, {"checks": config.checks}
+        {"algorithm": _FLANN_KDTREE, "trees": trees}, {"checks": checks}
     )
     found = matcher.knnMatch(
         np.ascontiguousarray(query),

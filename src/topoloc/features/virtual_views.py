@@ -11,34 +11,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from topoloc.bounds import Between
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-
-
-@dataclass(frozen=True)
-class VirtualViewConfig:
-    """Hold the field of view of the virtual views. Tangents are of angles off the virtual camera's
-    axis: 1 is 45 degrees ahead."""
-
-    farthest: Annotated[float, Between(0.1, 10)] = 3.0
-    """Largest tangent ahead. Walls farther ahead are too slanted to be seen well."""
-    half_height: Annotated[float, Between(0.1, 10)] = 0.9
-    """Largest tangent up and down."""
-    nearest: Annotated[float, Between(0.1, 10)] = 1.5
-    """A camera whose field of view begins beyond this tangent is too narrow and has no virtual
-    views."""
-    max_side_px: Annotated[int, Between(64, 4096)] = 700
-    """Maximum length of the longer side of a virtual view."""
-    margin_px: Annotated[int, Between(0, 1000)] = 8
-    """Features nearer than this to the border of the rendered area are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,39 +68,43 @@ class VirtualView:
 
 
 @lru_cache(maxsize=8)
-def make_virtual_views(camera: Camera, config: VirtualViewConfig) -> tuple[VirtualView, ...]:
+def make_virtual_views(camera: Camera, max_nearest: float = 1.5) -> tuple[VirtualView, ...]:
     """Return the virtual views to the left and to the right, without those for which the field of
-    view is too narrow."""
+    view is too narrow: it begins beyond `max_nearest`, a tangent off the virtual camera's axis."""
     views = (
-        _make_virtual_view(camera, name, sign, config)
+        _make_virtual_view(camera, name, sign, max_nearest)
         for name, sign in (("left", -1.0), ("right", 1.0))
     )
     return tuple(view for view in views if view is not None)
 
 
 def _make_virtual_view(
-    camera: Camera, name: str, sign: float, config: VirtualViewConfig
+    camera: Camera, name: str, sign: float, max_nearest: float
 ) -> VirtualView | None:
     """Return one virtual view, or None. `sign` is that of x in the camera's frame. The virtual
     camera's x axis points ahead on the left and back on the right."""
+    farthest = 3.0  # largest tangent ahead. Walls farther ahead are too slanted to be seen well
+    half_height = 0.9  # largest tangent up and down
+    max_side_px = 700  # maximum length of the longer side of a virtual view
+    margin_px = 8  # features nearer than this to the border of the rendered area are dropped
     cam_from_virtual = Rigid3(
         np.array([[0.0, 0.0, sign], [0.0, 1.0, 0.0], [-sign, 0.0, 0.0]]), np.zeros(3)
     )
     tangent = _max_tangent(camera, sign)
-    if tangent * config.nearest < 1.0:
+    if tangent * max_nearest < 1.0:
         return None
     nearest, focal = 1.0 / tangent, camera.fx
-    extent = np.array([config.farthest - nearest, 2.0 * config.half_height])
-    focal *= min(1.0, config.max_side_px / (focal * extent.max()))
+    extent = np.array([farthest - nearest, 2.0 * half_height])
+    focal *= min(1.0, max_side_px / (focal * extent.max()))
     width, height = np.maximum(np.rint(focal * extent), 1).astype(int)
     # x points ahead on the left and back on the right, so the image lies on one side of the axis or
     # on the other
-    cx = -focal * nearest if sign < 0 else focal * config.farthest
-    virtual = Camera.pinhole(int(width), int(height), focal, focal, cx, focal * config.half_height)
+    cx = -focal * nearest if sign < 0 else focal * farthest
+    virtual = Camera.pinhole(int(width), int(height), focal, focal, cx, focal * half_height)
     points_img = _points_img(camera, virtual, cam_from_virtual)
     reach = np.isfinite(points_img).all(axis=2) & (points_img >= 0).all(axis=2)
     reach &= (points_img <= [camera.width - 1, camera.height - 1]).all(axis=2)
-    kernel = np.ones((2 * config.margin_px + 1,) * 2, np.uint8)
+    kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)
     inside = cv2.erode(
         np.asarray(reach, np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0
     ).astype(bool)  # pyright: ignore

@@ -9,49 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
 
 _NUM_ITERATIONS = 10
 _MIN_STEP = 1e-9
-
-
-@dataclass(frozen=True)
-class ConsensusConfig:
-    """Hold the conditions under which estimates agree and a consensus is accepted."""
-
-    max_sigmas: Annotated[float, Above(0)] = 4.8
-    """Estimates agree if they differ by no more than this (all six residuals together, in sigma).
-    One correct pair in a thousand does not."""
-    rival_sigmas: Annotated[float, Above(0)] = 8.0
-    """Estimates that differ from the consensus by more than this contradict it."""
-    min_independent: Annotated[int, AtLeast(1)] = 3
-    """Minimum number of independent estimates that agree."""
-    rival_share: Annotated[float, Between(0, 1)] = 0.5
-    """The consensus is rejected if this fraction of its number of independent estimates, and at
-    least two, agrees on another transform."""
-    max_hypotheses: Annotated[int, AtLeast(1)] = 300
-    """Maximum number of hypotheses. With more estimates, this many are drawn with a fixed seed."""
-
-
-@dataclass(frozen=True)
-class DriftConfig:
-    """Hold the drift of the motion along which an estimate is propagated."""
-
-    drift: Annotated[float, AtLeast(0)] = 0.02
-    """Standard deviation of the translation, as a fraction of the distance."""
-    drift_deg: Annotated[float, AtLeast(0)] = 0.3
-    """Standard deviation of the rotation, degrees per metre."""
-
-    def covariance(self, motion: Rigid3) -> Float[np.ndarray, "6 6"]:
-        """Return the covariance of a motion, m and rad."""
-        distance = float(np.linalg.norm(motion.translation))
-        return diagonal_covariance(self.drift * distance, self.drift_deg * distance)
 
 
 def diagonal_covariance(metres: float, degrees: float) -> Float[np.ndarray, "6 6"]:
@@ -65,13 +30,21 @@ def propagate_estimate(
     a_from_b: Rigid3,
     covariance: Float[np.ndarray, "6 6"],
     b_from_d: Rigid3,
-    config: DriftConfig,
+    drift: float = 0.02,
+    drift_deg: float = 0.3,
 ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
     """Propagate an estimate of a_from_b along two motions. Return c_from_d and the covariance of
-    its left perturbation, which grows with the length of the motions."""
+    its left perturbation, which grows with the length of the motions.
+
+    Args:
+        drift: standard deviation of the motions' translation, as a fraction of the distance.
+        drift_deg: standard deviation of their rotation, degrees per metre.
+    """
+    lengths = (float(np.linalg.norm(motion.translation)) for motion in (c_from_a, b_from_d))
+    of_c, of_d = (diagonal_covariance(drift * way, drift_deg * way) for way in lengths)
     to_c, to_d = c_from_a.adjoint(), (c_from_a @ a_from_b).adjoint()
-    at_c = to_c @ covariance @ to_c.T + config.covariance(c_from_a)
-    return c_from_a @ a_from_b @ b_from_d, at_c + to_d @ config.covariance(b_from_d) @ to_d.T
+    at_c = to_c @ covariance @ to_c.T + of_c
+    return c_from_a @ a_from_b @ b_from_d, at_c + to_d @ of_d @ to_d.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +60,24 @@ class TransformConsensus:
     covariance: Float[np.ndarray, "6 6"]
     is_inlier: Bool[np.ndarray, " n"]
     num_independent: int
+    max_sigmas: float
+
+    def is_consistent(self, a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> bool:
+        """Return whether an estimate agrees with the transform."""
+        residual = (a_from_b @ self.a_from_b.inverse()).log()
+        square = residual @ np.linalg.solve(covariance + self.covariance, residual)
+        return bool(square <= self.max_sigmas**2)
 
 
 def find_consensus(
     a_from_bs: Sequence[Rigid3],
     covariances: Float[np.ndarray, "n 6 6"],
-    config: ConsensusConfig,
     image_ids: Int[np.ndarray, "n 2"] | None = None,
+    *,
+    rival_share: float = 0.5,
+    min_independent: int = 3,
+    max_sigmas: float = 4.8,
+    max_hypotheses: int = 300,
 ) -> TransformConsensus | None:
     """Return the transform that the estimates support. Return None if the support is too small, or
     if another transform has nearly as much.
@@ -105,25 +89,31 @@ def find_consensus(
             information.
         image_ids: image of a and image of b of each estimate. Estimates that share an image are not
             independent. Default: all are independent.
+        rival_share: the consensus is rejected if this fraction of its number of independent
+            estimates, and at least two, agrees on another transform.
+        min_independent: minimum number of independent estimates that agree.
+        max_sigmas: estimates agree if they differ by no more than this (all six residuals together,
+            in sigma). One correct pair in a thousand does not.
+        max_hypotheses: maximum number of hypotheses. With more estimates, this many are drawn with
+            a fixed seed.
     """
+    rival_sigmas = 8.0  # estimates that differ from the consensus by more than this contradict it
     num = len(a_from_bs)
-    if num < config.min_independent:
+    if num < min_independent:
         return None
     if image_ids is None:
         image_ids = np.column_stack([np.arange(num), np.arange(num)])
-    distances = _pairwise_distances(a_from_bs, covariances, config)
-    best, agreeing = _select_best_hypothesis(distances <= config.max_sigmas, image_ids)
-    if agreeing < config.min_independent:
+    distances = _pairwise_distances(a_from_bs, covariances, max_hypotheses)
+    best, agreeing = _select_best_hypothesis(distances <= max_sigmas, image_ids)
+    if agreeing < min_independent:
         return None
-    is_inlier = distances[best] <= config.max_sigmas
+    is_inlier = distances[best] <= max_sigmas
     a_from_b, covariance = _refine_transform(a_from_bs, covariances, is_inlier)
     sigmas = _distances(a_from_b, covariance, a_from_bs, covariances)
-    is_inlier, others = sigmas <= config.max_sigmas, sigmas > config.rival_sigmas
+    is_inlier, others = sigmas <= max_sigmas, sigmas > rival_sigmas
     num_independent = _count_independent(is_inlier, image_ids)
-    _, rivals = _select_best_hypothesis((distances <= config.max_sigmas) & others, image_ids)
-    if num_independent < config.min_independent or rivals >= max(
-        config.rival_share * num_independent, 2
-    ):
+    _, rivals = _select_best_hypothesis((distances <= max_sigmas) & others, image_ids)
+    if num_independent < min_independent or rivals >= max(rival_share * num_independent, 2):
         return None
     a_from_b, covariance = _refine_transform(a_from_bs, covariances, is_inlier)
     return TransformConsensus(
@@ -131,17 +121,18 @@ def find_consensus(
         covariance * np.count_nonzero(is_inlier) / num_independent,
         is_inlier,
         num_independent,
+        max_sigmas,
     )
 
 
 def _pairwise_distances(
-    a_from_bs: Sequence[Rigid3], covariances: Float[np.ndarray, "n 6 6"], config: ConsensusConfig
+    a_from_bs: Sequence[Rigid3], covariances: Float[np.ndarray, "n 6 6"], max_hypotheses: int
 ) -> Float[np.ndarray, "h n"]:
     """Return for each hypothesis (row) the distances of all estimates, in sigma of both."""
     num = len(a_from_bs)
     tried = np.arange(num)
-    if num > config.max_hypotheses:
-        tried = np.sort(np.random.default_rng(0).choice(num, config.max_hypotheses, replace=False))
+    if num > max_hypotheses:
+        tried = np.sort(np.random.default_rng(0).choice(num, max_hypotheses, replace=False))
     return np.stack(
         [_distances(a_from_bs[k], covariances[k], a_from_bs, covariances) for k in tried.tolist()]
     )

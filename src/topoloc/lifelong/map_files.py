@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from topoloc.lifelong.merge import merge_maps
-from topoloc.lifelong.prune import PruneConfig, prune_map
-from topoloc.lifelong.update import MapUpdate, UpdateConfig, check_session_is_new, update_map
+from topoloc.lifelong.prune import prune_map
+from topoloc.lifelong.update import MapUpdate, check_session_is_new, update_map
 from topoloc.localization.config import LocalizerConfig
 from topoloc.mapping.build import Progress
 from topoloc.mapping.edit import WaitCallback, edit_map
@@ -46,7 +46,6 @@ def update(
     sequence: StereoSequence | str | Path,
     poses_from: str | None = None,
     find_poses: Callable[[str], StereoSequence] | None = None,
-    config: UpdateConfig | None = None,
     localizer_config: LocalizerConfig | None = None,
     light: str | None = None,
     is_checked: bool = True,
@@ -91,7 +90,7 @@ def update(
             posed = sequence
         if is_checked and poses_from not in ("map", "slam"):
             check_poses(posed)
-        updated = update_map(edit.topomap, posed, poses_from, config, localizer_config, progress)
+        updated = update_map(edit.topomap, posed, poses_from, localizer_config, progress)
         changes = updated.changes | {"bytes_before": edit.path.stat().st_size}
         topomap = updated.topomap
         if light is not None:
@@ -104,7 +103,7 @@ def update(
 def prune(
     path: str | Path,
     max_mb: float | None = None,
-    config: PruneConfig | None = None,
+    descriptors: Literal["fine", "coarse"] = "fine",
     on_wait: WaitCallback | None = None,
 ) -> PrunedFile:
     """Remove from a map file the landmarks that are gone and, with a budget, those that add least.
@@ -112,21 +111,21 @@ def prune(
     Args:
         path: the map file, which is replaced if anything is removed.
         max_mb: megabytes that the file may have; None removes only landmarks that are gone.
+        descriptors: as of `prune_map`.
         on_wait: called if another process edits the map, before this one waits.
 
     Raises:
         ConfigError: a setting is out of its bounds.
         MapError: the budget is too small, or the map is missing, damaged, or cannot be written.
     """
-    config = config or PruneConfig()
     with edit_map(path, on_wait) as edit:
         before, length_m = edit.path.stat().st_size, edit.topomap.length_m
         max_bytes = None if max_mb is None else round(max_mb * 1e6)
-        pruned = prune_map(edit.topomap, edit.path, max_bytes, config)
+        pruned = prune_map(edit.topomap, edit.path, max_bytes, descriptors)
         changes = pruned.changes | {"bytes_before": before}
         if pruned.topomap is not edit.topomap:
             to_size = "" if max_mb is None else f" to {max_mb:g} MB"
-            how = ", descriptors coarse" if config.descriptors == "coarse" else ""
+            how = ", descriptors coarse" if descriptors == "coarse" else ""
             edit.commit(pruned.topomap, f"prune{to_size}{how}", changes)
     return PrunedFile(changes | {"bytes": Path(path).stat().st_size}, length_m)
 
@@ -135,7 +134,6 @@ def merge(
     first: str | Path,
     second: str | Path,
     out: str | Path,
-    config: UpdateConfig | None = None,
     localizer_config: LocalizerConfig | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -152,7 +150,7 @@ def merge(
         FeatureTypeError, MissingExtraError, WeightsError: their features are not available here.
     """
     with TopoMetricMap.load(first) as one, TopoMetricMap.load(second) as other:
-        merged = merge_maps(one, other, config, localizer_config, progress)
+        merged = merge_maps(one, other, localizer_config, progress)
         edit = Edit(
             one.free_ids.edit,
             f"merge {Path(second).name}",

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from topoloc.bounds import check_bounds
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.coarse_model_update import PlaceFeatures, update_coarse_models
@@ -20,7 +19,7 @@ from topoloc.lifelong.lazy_sequences import OverlaySequence
 from topoloc.lifelong.node_localization import localize_nodes
 from topoloc.lifelong.recall_change import measure_recall_change
 from topoloc.lifelong.session_poses import Progress, SessionPoses, align_motion_to_map
-from topoloc.lifelong.update import UpdateConfig, is_well_localized
+from topoloc.lifelong.update import is_well_localized
 from topoloc.lifelong.virtual_node_update import add_virtual_nodes
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
@@ -40,21 +39,19 @@ class MergedMap:
 def merge_maps(
     first: TopoMetricMap,
     second: TopoMetricMap,
-    config: UpdateConfig | None = None,
     localizer_config: LocalizerConfig | None = None,
     progress: Progress | None = None,
 ) -> MergedMap:
     """Merge the second map into the first and return the result in the first map's world.
 
     Raises:
-        ConfigError: a setting is out of its bounds.
+        ConfigError: a setting of the localizer is out of its bounds.
         MapError: both are versions of one map, or the second lacks a feature type of the first.
         TrajectoryError: the maps overlap too little, or their distances disagree.
         FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
             this machine.
     """
-    config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
-    check_bounds(config)
+    progress = progress or (lambda stage, done, total: None)
     if missing := set(first.kinds) - set(second.kinds):
         raise MapError(
             f"the second map holds no features {', '.join(sorted(missing))}, which the first has;"
@@ -62,13 +59,11 @@ def merge_maps(
         )
     if first.map_id is not None and first.map_id == second.map_id:
         raise MapError("they are one map in two versions; nothing is merged")
-    aligned = _align_second_map(first, second, config, localizer_config, progress)
+    aligned = _align_second_map(first, second, localizer_config, progress)
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
     added = [
-        row
-        for row, answer in aligned.answers.items()
-        if not is_well_localized(answer, d_thresh, config)
+        row for row, answer in aligned.answers.items() if not is_well_localized(answer, d_thresh)
     ]
     poses = {row: pose for row, pose in enumerate(aligned.world_from_cams) if pose is not None}
     merged, not_updated = _add_nodes(first, second, added, poses)
@@ -82,14 +77,13 @@ def merge_maps(
     merged = with_map_statistics(merged, progress)
     return MergedMap(
         merged,
-        changes | measure_recall_change(first, merged, config.earlier_asked, localizer_config),
+        changes | measure_recall_change(first, merged, localizer_config),
     )
 
 
 def _align_second_map(
     first: TopoMetricMap,
     second: TopoMetricMap,
-    config: UpdateConfig,
     localizer_config: LocalizerConfig | None,
     progress: Progress,
 ) -> SessionPoses:
@@ -105,7 +99,7 @@ def _align_second_map(
     d_thresh = first.config.nodes.d_thresh
     assert d_thresh is not None, "a map's own configuration is resolved"
     try:
-        return align_motion_to_map("the second map", odom, answers, d_thresh, config.poses)
+        return align_motion_to_map("the second map", odom, answers, d_thresh)
     except TrajectoryError as error:
         raise TrajectoryError(
             str(error).replace("the map stays as it is", "nothing is merged")

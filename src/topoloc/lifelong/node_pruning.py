@@ -81,7 +81,7 @@ def _count_recognised_landmarks(node: TopoNode, view: TopoNode, topomap: TopoMet
     if len(node.features) == 0 or len(view.features) == 0:
         return 0
     cam_from_node = view.summary.world_from_cam.inverse() @ node.summary.world_from_cam
-    return len(observe_node(node, view.features, view.camera, cam_from_node, topomap.config).rows)
+    return len(observe_node(node, view.features, view.camera, cam_from_node).rows)
 
 
 def iterate_node_removals(
@@ -194,7 +194,6 @@ def _remove_virtual_nodes(topomap: TopoMetricMap, new_id: Mapping[int, int]) -> 
     return collect_virtual_nodes(
         [node for node in sides.nodes if node.summary.of_node not in new_id],
         sides.kind,
-        topomap.config.sides,
     )
 
 

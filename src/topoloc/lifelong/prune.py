@@ -1,7 +1,7 @@
 """Make a map smaller. Start reading at `prune_map`.
 
 Vanished landmarks are removed first. A landmark has vanished if many images that show its
-neighbours again never show it. Descriptors are then quantized if configured
+neighbours again never show it. Descriptors are then quantized on request
 (`descriptor_quantization.py`). With a size budget, nodes supported by others are removed if every
 node would otherwise keep few landmarks (`node_pruning.py`). Each remaining node then keeps as many
 landmarks as fit. Landmarks with a high observation probability are preferred. They are spread over
@@ -17,12 +17,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from topoloc.bounds import AtLeast, Between, check_bounds
 from topoloc.errors import MapError
 from topoloc.lifelong.descriptor_quantization import quantize_map_descriptors
 from topoloc.lifelong.lazy_sequences import OverlaySequence, TransformedSequence
@@ -36,43 +35,6 @@ from topoloc.recordings.atomic import temporary_file
 
 _PAGE_SLACK_BYTES = 4096  # reserved for an entry in the map's history
 _POINT_COLUMNS = ("points_img", "shapes", "descriptors", "points_cam", "sqrt_covs")
-
-
-@dataclass(frozen=True)
-class PruneConfig:
-    """Configure which landmarks count as vanished and which limits apply to pruning."""
-
-    min_expected: Annotated[int, Between(1, 1000)] = 4
-    """Minimum number of images of later sessions that should have shown a landmark, before it can
-    count as vanished."""
-    min_seen_share: Annotated[float, Between(0, 1)] = 0.3
-    """Sessions count only if they saw at least this share of a node's landmarks again. A session in
-    other light may see none of them."""
-    max_chance: Annotated[float, Between(1e-9, 1)] = 0.02
-    """A landmark counts as vanished if an existing landmark would stay unseen in all these images
-    with at most this probability. The probability follows from the shares that the sessions saw of
-    the node."""
-    cells: Annotated[int, Between(1, 100)] = 8
-    """Number of cell columns in the image. The kept landmarks are spread over the cells."""
-    min_points: Annotated[int, Between(10, 100_000)] = 100
-    """Minimum number of landmarks per node. A budget that requires fewer is an error."""
-    few_points: Annotated[int, Between(10, 100_000)] = 200
-    """Whole nodes are removed if the budget leaves fewer landmarks per node than this."""
-    min_held: Annotated[int, Between(1, 100_000)] = 60
-    """A node is removed only if every place keeps a node with at least this many recognised
-    landmarks."""
-    num_compared: Annotated[int, Between(1, 1000)] = 12
-    """Number of near nodes that each node is compared with."""
-    descriptors: Literal["fine", "coarse"] = "fine"
-    """`coarse` quantizes the descriptors in steps of `descriptor_step`. `fine` keeps them."""
-    descriptor_step: Annotated[float, Between(0.04, 1.5)] = 0.64
-    """Step of coarse descriptors, in root mean squares of a descriptor's numbers. They are
-    quantized before any landmark is removed for the budget."""
-    max_gone_share: Annotated[float, AtLeast(0)] = 0.7
-    """If more than this share of a node's landmarks would count as vanished, none of them does."""
-    earlier_asked: Annotated[int, Between(0, 10_000)] = 24
-    """Maximum number of nodes localized before and after the edit, to record the change of recall
-    in the map's history. 0 skips this."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +105,7 @@ def prune_map(
     topomap: TopoMetricMap,
     path: Path,
     max_bytes: int | None = None,
-    config: PruneConfig | None = None,
+    descriptors: Literal["fine", "coarse"] = "fine",
 ) -> PrunedMap:
     """Return the map without vanished landmarks and, if there is a budget, small enough for it.
 
@@ -151,37 +113,36 @@ def prune_map(
         topomap: the map.
         path: the map's file. Its size is the basis of the budget.
         max_bytes: the budget in bytes. None removes vanished landmarks only.
-        config: the settings. Defaults to `PruneConfig()`.
+        descriptors: `coarse` quantizes the descriptors before any landmark is removed for the
+            budget. `fine` keeps them.
 
     Raises:
-        ConfigError: a setting is out of its bounds.
         MapError: the budget is too small for the map with `min_points` landmarks per node.
     """
-    config = config or PruneConfig()
-    check_bounds(config)
-    counted = _merge_session_counts(topomap, config)
-    if config.descriptors == "coarse":
-        counted = quantize_map_descriptors(counted, config.descriptor_step)
+    # Step of coarse descriptors, in root mean squares of a descriptor's numbers. They are
+    # quantized before any landmark is removed for the budget.
+    descriptor_step = 0.64
+    counted = _merge_session_counts(topomap)
+    if descriptors == "coarse":
+        counted = quantize_map_descriptors(counted, descriptor_step)
     file = (
         _FileSize.of(path, topomap.kinds)
         if counted is topomap
         else _measure_file_size(counted, path)
     )
-    fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes, config)
+    fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes)
     file = file if fewer is counted else _measure_file_size(fewer, path)
-    return _prune_landmarks(topomap, fewer, path, file, max_bytes, config)
+    return _prune_landmarks(topomap, fewer, path, file, max_bytes)
 
 
-def _merge_session_counts(topomap: TopoMetricMap, config: PruneConfig) -> TopoMetricMap:
+def _merge_session_counts(topomap: TopoMetricMap) -> TopoMetricMap:
     """Merge the observation counts of sessions that only counted. Return the same map if nothing
     changes."""
 
     def merge_counts(node: TopoNode) -> TopoNode:
         return replace(
             node,
-            session_statistics=merge_count_statistics(
-                node.session_statistics, config.min_seen_share
-            ),
+            session_statistics=merge_count_statistics(node.session_statistics),
         )
 
     if not any(
@@ -196,18 +157,22 @@ def _merge_session_counts(topomap: TopoMetricMap, config: PruneConfig) -> TopoMe
     return replace(topomap, nodes=nodes.pop(topomap.kind), other_kinds=nodes)
 
 
-def _drop_nodes(
-    topomap: TopoMetricMap, file: _FileSize, max_bytes: int, config: PruneConfig
-) -> TopoMetricMap:
+def _drop_nodes(topomap: TopoMetricMap, file: _FileSize, max_bytes: int) -> TopoMetricMap:
     """Remove nodes until each remaining node can keep `few_points` landmarks, or no further node
     can be removed. Return the same map if none needs to be removed."""
+    # Whole nodes are removed if the budget leaves fewer landmarks per node than this.
+    few_points = 200
+    num_compared = 12  # number of near nodes that each node is compared with
+    # A node is removed only if every place keeps a node with at least this many recognised
+    # landmarks.
+    min_held = 60
     remaining = {
-        kind: np.array([(~_find_vanished(node, config)).sum() for node in topomap.nodes_of(kind)])
+        kind: np.array([(~_find_vanished(node)).sum() for node in topomap.nodes_of(kind)])
         for kind in topomap.kinds
     }
     min_bytes = sum(
         (
-            np.minimum(remaining[kind], config.few_points) * file.bytes_per_point[kind]
+            np.minimum(remaining[kind], few_points) * file.bytes_per_point[kind]
             for kind in topomap.kinds
         ),
         np.zeros(1),
@@ -215,9 +180,9 @@ def _drop_nodes(
     excess_bytes = file.bytes_without_points(topomap) + float(min_bytes.sum()) - max_bytes
     if excess_bytes <= 0:
         return topomap
-    of_node, support = min_bytes + file.of_node, compute_node_support(topomap, config.num_compared)
+    of_node, support = min_bytes + file.of_node, compute_node_support(topomap, num_compared)
     chosen = select_removed_nodes(
-        support, config.min_held, lambda rows: float(of_node[rows].sum()) >= excess_bytes
+        support, min_held, lambda rows: float(of_node[rows].sum()) >= excess_bytes
     )
     return topomap if chosen is None else remove_nodes(topomap, *chosen)
 
@@ -228,7 +193,6 @@ def _prune_landmarks(
     path: Path,
     file: _FileSize,
     max_bytes: int | None,
-    config: PruneConfig,
 ) -> PrunedMap:
     """Remove vanished landmarks and reduce the others to the budget.
 
@@ -238,11 +202,9 @@ def _prune_landmarks(
         path: the map's file.
         file: the file sizes of `topomap`.
         max_bytes: the budget in bytes, or None.
-        config: the settings.
     """
     vanished = {
-        kind: [_find_vanished(node, config) for node in topomap.nodes_of(kind)]
-        for kind in topomap.kinds
+        kind: [_find_vanished(node) for node in topomap.nodes_of(kind)] for kind in topomap.kinds
     }
     remaining = {
         kind: [int((~of_node).sum()) for of_node in vanished[kind]] for kind in topomap.kinds
@@ -254,7 +216,7 @@ def _prune_landmarks(
         if budget is not None:
             most = min(
                 most,
-                _max_points_per_node(remaining, file.bytes_per_point, fixed_bytes, budget, config),
+                _max_points_per_node(remaining, file.bytes_per_point, fixed_bytes, budget),
             )
         if (
             topomap is before
@@ -264,7 +226,7 @@ def _prune_landmarks(
             return PrunedMap(
                 before, {"nodes_dropped": 0, "landmarks_gone": 0, "landmarks_dropped": 0}
             )
-        pruned = _drop_landmarks(topomap, vanished, most, config)
+        pruned = _drop_landmarks(topomap, vanished, most)
         if (
             max_bytes is None
             or budget is None
@@ -274,8 +236,7 @@ def _prune_landmarks(
             changes = {"nodes_dropped": num_nodes} | pruned.changes
             return replace(
                 pruned,
-                changes=changes
-                | measure_recall_change(before, pruned.topomap, config.earlier_asked),
+                changes=changes | measure_recall_change(before, pruned.topomap),
             )
         budget -= (
             round(1.1 * (written - max_bytes)) + _PAGE_SLACK_BYTES
@@ -283,7 +244,7 @@ def _prune_landmarks(
 
 
 def _drop_landmarks(
-    topomap: TopoMetricMap, vanished: Mapping[str, list[np.ndarray]], most: int, config: PruneConfig
+    topomap: TopoMetricMap, vanished: Mapping[str, list[np.ndarray]], most: int
 ) -> PrunedMap:
     """Remove the `vanished` landmarks (a mask per node) and keep at most `most` of the others per
     node."""
@@ -294,7 +255,7 @@ def _drop_landmarks(
             zip(topomap.nodes_of(kind), vanished[kind], strict=True)
         ):
             rows = np.flatnonzero(~of_node)
-            kept = rows if len(rows) <= most else rows[_select_landmarks(node, rows, most, config)]
+            kept = rows if len(rows) <= most else rows[_select_landmarks(node, rows, most)]
             num_gone, num_dropped = (
                 num_gone + int(of_node.sum()),
                 num_dropped + len(rows) - len(kept),
@@ -338,18 +299,28 @@ def select_landmarks(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
     )
 
 
-def _find_vanished(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"]:
+def _find_vanished(node: TopoNode) -> Bool[np.ndarray, " n"]:
     """Return the mask of landmarks that later sessions never saw although they saw the rest of the
     node.
 
     The number of missed images must be large enough: a session that finds a third of the landmarks
     misses an existing one in four images with a probability of one in five.
     """
+    # Minimum number of images of later sessions that should have shown a landmark, before it
+    # can count as vanished.
+    min_expected = 4
+    # A landmark counts as vanished if an existing landmark would stay unseen in all these
+    # images with at most this probability. The probability follows from the shares that the
+    # sessions saw of the node.
+    max_chance = 0.02
+    # If more than this share of a node's landmarks would count as vanished, none of them
+    # does.
+    max_gone_share = 0.7
     num = len(node.features)
     expected, seen, log_missed = np.zeros(num, np.int64), np.zeros(num, np.int64), np.zeros(num)
     for session_statistics in node.session_statistics:
         later = session_statistics.session_id != node.summary.session_id
-        if later and session_statistics.is_reobserved(config.min_seen_share):
+        if later and session_statistics.is_reobserved():
             share = session_statistics.seen.sum(dtype=np.int64) / max(
                 int(session_statistics.expected.sum(dtype=np.int64)), 1
             )
@@ -358,10 +329,8 @@ def _find_vanished(node: TopoNode, config: PruneConfig) -> Bool[np.ndarray, " n"
             log_missed[session_statistics.rows] += session_statistics.expected * np.log1p(
                 -min(share, 0.99)
             )
-    vanished = (
-        (expected >= config.min_expected) & (seen == 0) & (log_missed <= np.log(config.max_chance))
-    )
-    return vanished if vanished.sum() <= config.max_gone_share * num else np.zeros(num, bool)
+    vanished = (expected >= min_expected) & (seen == 0) & (log_missed <= np.log(max_chance))
+    return vanished if vanished.sum() <= max_gone_share * num else np.zeros(num, bool)
 
 
 def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
@@ -375,13 +344,14 @@ def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
 
 
 def _select_landmarks(
-    node: TopoNode, rows: Int[np.ndarray, " m"], most: int, config: PruneConfig
+    node: TopoNode, rows: Int[np.ndarray, " m"], most: int
 ) -> Int[np.ndarray, " k"]:
     """Select the rows that a node keeps. Greedy choice: each next landmark adds most to the
     coverage of its cell."""
-    size = node.camera.width / config.cells
+    cells = 8  # number of cell columns in the image. The kept landmarks are spread over the cells
+    size = node.camera.width / cells
     cell = (node.features.points_img[rows] / size).astype(np.int64)
-    key = cell[:, 1] * (config.cells + 1) + cell[:, 0]
+    key = cell[:, 1] * (cells + 1) + cell[:, 0]
     chances, gains = _observation_probability(node)[rows], np.empty(len(rows))
     for one in np.unique(key):
         of_cell = np.flatnonzero(key == one)
@@ -398,10 +368,11 @@ def _max_points_per_node(
     bytes_per_point: dict[str, float],
     fixed_bytes: float,
     max_bytes: int,
-    config: PruneConfig,
 ) -> int:
     """Return the largest number of landmarks per node and feature type that fits the budget.
     `fixed_bytes` is the size of the file without landmarks."""
+    # Minimum number of landmarks per node. A budget that requires fewer is an error.
+    min_points = 100
 
     def file_size_with(most: int) -> float:
         return fixed_bytes + sum(
@@ -409,16 +380,16 @@ def _max_points_per_node(
             for kind, of_kind in remaining.items()
         )
 
-    if file_size_with(config.min_points) > max_bytes:
+    if file_size_with(min_points) > max_bytes:
         least, num = (
-            file_size_with(config.min_points) / 1e6,
+            file_size_with(min_points) / 1e6,
             max(len(of_kind) for of_kind in remaining.values()),
         )
         raise MapError(
-            f"with {config.min_points} landmarks each its {num} nodes take {least:.2f} MB; nothing"
+            f"with {min_points} landmarks each its {num} nodes take {least:.2f} MB; nothing"
             " is dropped"
         )
-    low, high = config.min_points, max(max(of_kind) for of_kind in remaining.values())
+    low, high = min_points, max(max(of_kind) for of_kind in remaining.values())
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if file_size_with(middle) <= max_bytes else (low, middle - 1)

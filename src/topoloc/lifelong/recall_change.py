@@ -16,24 +16,24 @@ from topoloc.mapping.topomap import TopoMetricMap
 def measure_recall_change(
     before: TopoMetricMap,
     after: TopoMetricMap,
-    max_asked: int,
     localizer_config: LocalizerConfig | None = None,
+    max_queries: int = 24,
 ) -> dict[str, int]:
     """Count how many nodes of `before` each of the two map versions localizes.
 
     Args:
         before: the map before the edit.
         after: the map after the edit.
-        max_asked: the maximum number of nodes, evenly spaced.
         localizer_config: the localizer's settings.
+        max_queries: the maximum number of nodes, evenly spaced.
 
     Returns:
-        The counts by the names used in the map's history. Empty if `max_asked` is 0.
+        The counts by the names used in the map's history. Empty if `max_queries` is 0.
 
     Raises:
         MapError: a map cannot be read. Further errors as of `Localizer`.
     """
-    rows = sample_evenly(range(len(before.summaries)), max_asked)
+    rows = sample_evenly(range(len(before.summaries)), max_queries)
     if not rows:
         return {}
     counts = {"earlier_asked": len(rows)}

@@ -10,35 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from topoloc.bounds import Above, Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 
-
-@dataclass(frozen=True)
-class ScaleConfig:
-    """Configure the scale estimation and its limits."""
-
-    drift: Annotated[float, Above(0)] = 0.01
-    """Sigma of the logarithm of the scale after one metre. It grows with the square root of the
-    distance."""
-    max_sigma: Annotated[float, Above(0)] = 0.1
-    """Frames have no pose if the relative sigma of the scale is larger than this."""
-    max_error: Annotated[float, Above(0)] = 0.05
-    """Tolerance of one similarity transform, as a share of the distance travelled between two
-    localizations."""
-    widened: Annotated[float, Above(0)] = 3.0
-    """Factor applied to the sigmas of the localizations."""
-    max_pairs: Annotated[int, Between(2, 1000)] = 40
-    """Number of localizations, evenly spaced, of which all pairs are tried as a similarity
-    transform."""
-    max_knots: Annotated[int, Between(2, 10_000)] = 200
-    """Maximum number of knots along the trajectory at which the scale is estimated."""
+# Factor applied to the sigmas of localizations, because neighbours share errors of the map.
+WIDENED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +44,6 @@ def find_largest_consensus(
     localized: Mapping[int, Localization],
     slack_m: float,
     slack_deg: float,
-    config: ScaleConfig,
 ) -> list[int]:
     """Return the frames of the largest set of localizations that one similarity transform of the
     motion explains.
@@ -76,19 +55,21 @@ def find_largest_consensus(
         localized: the localizations by frame.
         slack_m: the constant tolerance in metres.
         slack_deg: the constant tolerance in degrees.
-        config: the settings.
     """
+    # Number of localizations, evenly spaced, of which all pairs are tried as a similarity
+    # transform.
+    max_pairs = 40
     answers = _collect_localized_frames(odom, localized)
     num = len(answers.rows)
     tried = (
-        np.unique(np.linspace(0, num - 1, min(num, config.max_pairs)).astype(int))
+        np.unique(np.linspace(0, num - 1, min(num, max_pairs)).astype(int))
         if num
         else np.zeros(0, int)
     )
     best: Bool[np.ndarray, " k"] = np.zeros(num, np.bool_)
     for i in tried:
         for j in tried[tried != i]:
-            agrees = _find_inliers(answers, int(i), int(j), slack_m, slack_deg, config)
+            agrees = _find_inliers(answers, int(i), int(j), slack_m, slack_deg)
             best = agrees if agrees.sum() > best.sum() else best
     return (
         [index for index, is_in in zip(localized, best, strict=True) if is_in]
@@ -98,16 +79,17 @@ def find_largest_consensus(
 
 
 def _find_inliers(
-    answers: _LocalizedFrames, i: int, j: int, slack_m: float, slack_deg: float, config: ScaleConfig
+    answers: _LocalizedFrames, i: int, j: int, slack_m: float, slack_deg: float
 ) -> Bool[np.ndarray, " k"]:
     """Return the inliers of the similarity with the rotation of localization i and the scale of the
     distance from i to j."""
+    # Tolerance of one similarity transform, as a share of the distance travelled between two
+    # localizations.
+    max_error = 0.05
     apart, own_apart = (
         float(np.linalg.norm(places[i] - places[j])) for places in (answers.world, answers.odom)
     )
-    if own_apart <= 0.0 or apart <= config.widened * float(
-        np.hypot(answers.sigmas[i], answers.sigmas[j])
-    ):
+    if own_apart <= 0.0 or apart <= WIDENED * float(np.hypot(answers.sigmas[i], answers.sigmas[j])):
         return np.zeros(len(answers.rows), np.bool_)
     scale, turn = apart / own_apart, answers.world_rotations[i] @ answers.odom_rotations[i].T
     off = np.linalg.norm(
@@ -116,31 +98,38 @@ def _find_inliers(
     traces = np.einsum("kij,kij->k", answers.world_rotations, turn @ answers.odom_rotations)
     turned = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
     way = scale * np.abs(answers.path_lengths - answers.path_lengths[i])
-    return (off <= slack_m + config.max_error * way) & (turned <= slack_deg + way)
+    return (off <= slack_m + max_error * way) & (turned <= slack_deg + way)
 
 
 def scale_to_metres(
-    odom: Mapping[int, Rigid3], localized: Mapping[int, Localization], config: ScaleConfig
+    odom: Mapping[int, Rigid3],
+    localized: Mapping[int, Localization],
+    drift: float = 0.01,
+    max_sigma: float = 0.1,
 ) -> dict[int, Rigid3]:
     """Return the motion with its steps in metres, according to localizations that agree with each
     other.
 
-    The world of the motion stays at its first frame. Frames whose scale has a sigma above
-    `max_sigma` are left out.
+    The world of the motion stays at its first frame.
+
+    Args:
+        drift: sigma of the logarithm of the scale after one metre. It grows with the square root of
+            the distance.
+        max_sigma: frames whose scale has a larger relative sigma are left out.
     """
     answers = _collect_localized_frames(odom, localized)
     positions = np.array([pose.translation for pose in odom.values()])
     path_lengths = compute_path_lengths(positions)
-    pairs = _select_pairs(answers, config)
+    pairs = _select_pairs(answers)
     if len(pairs) == 0:
         return {}
-    logs, sigmas = _estimate_scale_profile(path_lengths, answers, pairs, config)
+    logs, sigmas = _estimate_scale_profile(path_lengths, answers, pairs, drift)
     steps = np.exp(0.5 * (logs[1:] + logs[:-1]))[:, None] * np.diff(positions, axis=0)
     metric = positions[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     return {
         index: Rigid3(pose.rotation, position)
         for (index, pose), position, sigma in zip(odom.items(), metric, sigmas, strict=True)
-        if sigma <= config.max_sigma
+        if sigma <= max_sigma
     }
 
 
@@ -148,21 +137,20 @@ def _estimate_scale_profile(
     path_lengths: Float[np.ndarray, " n"],
     answers: _LocalizedFrames,
     pairs: Int[np.ndarray, "p 2"],
-    config: ScaleConfig,
+    drift: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the logarithm of the scale at each frame and its sigma."""
+    max_knots = 200  # maximum number of knots along the trajectory at which the scale is estimated
     a, b = answers.select(pairs[:, 0]), answers.select(pairs[:, 1])
     apart, own_apart = (
         np.linalg.norm(a.world - b.world, axis=1),
         np.linalg.norm(a.odom - b.odom, axis=1),
     )
     measured = np.log(apart / own_apart)
-    sigmas = config.widened * np.hypot(a.sigmas, b.sigmas) / apart
+    sigmas = WIDENED * np.hypot(a.sigmas, b.sigmas) / apart
     knots = np.unique(
         path_lengths[
-            np.linspace(0, len(path_lengths) - 1, min(len(path_lengths), config.max_knots)).astype(
-                int
-            )
+            np.linspace(0, len(path_lengths) - 1, min(len(path_lengths), max_knots)).astype(int)
         ]
     )
     metre = float(np.exp(np.median(measured)))
@@ -174,7 +162,7 @@ def _estimate_scale_profile(
     )
     difference = (
         np.diff(np.eye(len(knots)), axis=0)
-        / (config.drift * np.sqrt(np.maximum(np.diff(knots) * metre, 1e-9)))[:, None]
+        / (drift * np.sqrt(np.maximum(np.diff(knots) * metre, 1e-9)))[:, None]
     )
     matrix = np.concatenate([mean / sigmas[:, None], difference])
     covariance = np.linalg.inv(matrix.T @ matrix + 1e-12 * np.eye(len(knots)))
@@ -184,7 +172,7 @@ def _estimate_scale_profile(
     )
 
 
-def _select_pairs(answers: _LocalizedFrames, config: ScaleConfig) -> Int[np.ndarray, "p 2"]:
+def _select_pairs(answers: _LocalizedFrames) -> Int[np.ndarray, "p 2"]:
     """Pair each localization with the 1st, 2nd, 4th, ... after it. Keep pairs whose distance is
     clearly larger than its uncertainty."""
     num, pairs = len(answers.rows), []
@@ -193,9 +181,7 @@ def _select_pairs(answers: _LocalizedFrames, config: ScaleConfig) -> Int[np.ndar
         second = first + offset
         apart = np.linalg.norm(answers.world[first] - answers.world[second], axis=1)
         own_apart = np.linalg.norm(answers.odom[first] - answers.odom[second], axis=1)
-        clear = apart > 3.0 * config.widened * np.hypot(
-            answers.sigmas[first], answers.sigmas[second]
-        )
+        clear = apart > 3.0 * WIDENED * np.hypot(answers.sigmas[first], answers.sigmas[second])
         pairs.append(np.column_stack([first, second])[clear & (own_apart > 0.0)])
     return np.concatenate(pairs) if pairs else np.zeros((0, 2), np.int64)
 

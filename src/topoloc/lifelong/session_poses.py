@@ -10,91 +10,32 @@ then combines the motion and the localizations. Their weights follow from the se
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
 from topoloc.lifelong.noise_scale import LocalizedStep, NoiseScale, estimate_noise_scale
-from topoloc.lifelong.scale_estimation import ScaleConfig
-from topoloc.lifelong.trajectory_correction import CorrectionConfig
+from topoloc.lifelong.scale_estimation import WIDENED
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import select_node_frames
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.recording import SequenceView
-from topoloc.slam.bundle_adjustment import BundleConfig
-from topoloc.slam.monocular_config import MonocularOdometryConfig
-from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimize_pose_graph
+from topoloc.slam.pose_graph import Edge, optimize_pose_graph
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the number of steps done and the number of all steps."""
 
 
-@dataclass(frozen=True)
-class SessionPosesConfig:
-    """Configure how a session is aligned and when it is refused."""
-
-    max_scale: Annotated[float, Above(0)] = 0.03
-    """Maximum relative difference between the motion's scale and the map's. Three sigmas of the
-    measured scale are added, and the ratio of one localization sigma to the longest distance."""
-    max_drift: Annotated[float, Between(0, 1)] = 0.03
-    """Tolerance of the position between two agreeing localizations, as a share of the distance
-    travelled between them. `slack` is added."""
-    max_turn_drift_deg: Annotated[float, AtLeast(0)] = 0.3
-    """Tolerance of the rotation between two agreeing localizations, in degrees per metre travelled.
-    `slack_deg` is added."""
-    slack: Annotated[float, Above(0)] = 0.3
-    """Constant part of the position tolerance, in D_thresh."""
-    slack_deg: Annotated[float, Above(0)] = 2.0
-    """Constant part of the rotation tolerance, in degrees."""
-    min_agreeing: Annotated[int, Between(2, 1000)] = 5
-    """Minimum number of localized images that agree with the motion. The session is refused if
-    there are fewer."""
-    min_share: Annotated[float, Between(0, 1)] = 0.5
-    """Minimum share of the localized images that agree. The session is refused if the share is
-    smaller."""
-    drift: Annotated[float, Above(0)] = 0.01
-    """Sigma of the motion between images, as a share of the distance. A millimetre is added."""
-    turn_drift: Annotated[float, Above(0)] = 0.002
-    """Sigma of the rotation between images, in radians per metre and per radian of rotation. Half a
-    milliradian is added."""
-    widened: Annotated[float, Above(0)] = 3.0
-    """Factor applied to the sigmas of the localizations, because neighbours share errors of the
-    map."""
-    motion_factors: Annotated[tuple[float, ...], Above(0)] = (0.5, 1.0, 3.0, 10.0)
-    """Candidate factors for the sigmas of the motion (stereo, RGB-D and given poses). The most
-    likely pair of a motion factor and an answer factor is selected."""
-    answer_factors: Annotated[tuple[float, ...], Above(0)] = (1.0 / 3.0, 1.0)
-    """Candidate factors for the sigmas of the localizations, applied in addition to `widened`."""
-    rival_share: Annotated[float, Between(0, 1)] = 0.3
-    """Of a single camera, the agreeing localizations are rejected if a rival set with at least this
-    share of their number agrees on another trajectory."""
-    contradiction: Annotated[float, Above(0)] = 0.1
-    """Of a single camera, a frame has no pose if map and motion differ by more than this many
-    D_thresh. Three sigmas of the localization, multiplied by `widened`, are added."""
-    max_sigma: Annotated[float, Above(0)] = 0.1
-    """A frame without odometry takes the map's pose if its position sigma is at most this many
-    D_thresh."""
-    graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
-    adjustment: BundleConfig = field(
-        default_factory=lambda: BundleConfig(max_steps=30, min_decrease=1e-5, cauchy_scale=0.5)
-    )
-    """Settings of the bundle adjustment of a single camera's whole trajectory."""
-    points_widened: Annotated[float, Above(0)] = 8.0
-    """Factor applied to the sigmas of tracked points in that adjustment. A sliding point does so in
-    all of its key frames."""
-    bend: CorrectionConfig = field(default_factory=CorrectionConfig)
-    """Settings of the correction of a single camera's trajectory towards the localizations."""
-    odometry: MonocularOdometryConfig = field(default_factory=MonocularOdometryConfig)
-    scale: ScaleConfig = field(default_factory=ScaleConfig)
+MIN_AGREEING = 5  # localized images that agree with the motion
+# Constant part of the tolerance of two agreeing localizations: position, in D_thresh, and rotation.
+SLACK, SLACK_DEG = 0.3, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +58,6 @@ def estimate_poses_by_motion(
     sequence: StereoSequence,
     localizer: Localizer,
     map_config: MapConfig,
-    config: SessionPosesConfig,
     progress: Progress,
 ) -> SessionPoses:
     """Estimate the poses of a session that has its own poses.
@@ -146,10 +86,7 @@ def estimate_poses_by_motion(
         results.append(localizer.localize(frame.image, frame.camera))
         progress(f"localizing {sequence.name}", done + 1, len(indices))
     check_calibration(sequence.name, results)
-    if (
-        config.min_agreeing > sum(result.localized for result in results)
-        and len(indices) >= config.min_agreeing
-    ):
+    if sum(result.localized for result in results) < MIN_AGREEING and len(indices) >= MIN_AGREEING:
         check_focal_length(sequence, indices, localizer)
     answers = {
         index: result if isinstance(result, Localization) else None
@@ -160,7 +97,6 @@ def estimate_poses_by_motion(
         motions,
         [{index: answers[index] for index in of_motion} for of_motion in queried],
         d_thresh,
-        config,
     )
 
 
@@ -179,14 +115,13 @@ def _align_stretches(
     motions: Sequence[Mapping[int, Rigid3]],
     answers: Sequence[Mapping[int, Localization | None]],
     d_thresh: float,
-    config: SessionPosesConfig,
 ) -> SessionPoses:
     """Align each stretch by the localizations of its own images. Stretches that cannot be aligned
     have no poses. Raises the TrajectoryError of the first stretch if none can be aligned."""
     aligned, refused = list[SessionPoses](), list[TrajectoryError]()
     for odom, of_motion in zip(motions, answers, strict=True):
         try:
-            aligned.append(align_motion_to_map(name, odom, of_motion, d_thresh, config))
+            aligned.append(align_motion_to_map(name, odom, of_motion, d_thresh))
         except TrajectoryError as error:
             refused.append(error)
     if not aligned:
@@ -206,7 +141,6 @@ def align_motion_to_map(
     odom: Mapping[int, Rigid3],
     answers: Mapping[int, Localization | None],
     d_thresh: float,
-    config: SessionPosesConfig,
     noise_scale: NoiseScale | None = None,
 ) -> SessionPoses:
     """Align a motion in its own world with the map, by localizations of some of its frames.
@@ -216,19 +150,16 @@ def align_motion_to_map(
         odom: the poses of the motion, by frame.
         answers: the localizations of the queried frames, None if not localized.
         d_thresh: D_thresh of the map, in metres.
-        config: the settings.
         noise_scale: the noise scales of motion and localizations. Estimated if None.
 
     Raises:
         TrajectoryError: the map recognises too little of it, or contradicts the motion.
     """
     localized = {index: result for index, result in answers.items() if result is not None}
-    inlier_idx = _find_consensus(name, odom, localized, len(answers), d_thresh, config)
+    inlier_idx = _find_consensus(name, odom, localized, len(answers), d_thresh)
     anchors = {k: localized[k] for k in inlier_idx}
     return SessionPoses(
-        _optimize_motion(
-            odom, anchors, noise_scale or _estimate_noise(odom, anchors, config), config
-        ),
+        _optimize_motion(odom, anchors, noise_scale or _estimate_noise(odom, anchors)),
         answers,
         inlier_idx,
     )
@@ -240,27 +171,25 @@ def _find_consensus(
     localized: Mapping[int, Localization],
     num_queried: int,
     d_thresh: float,
-    config: SessionPosesConfig,
 ) -> list[int]:
     """Return the largest set of localized frames that one transform of the motion explains. Raises
     TrajectoryError."""
+    # Minimum share of the localized images that agree. The session is refused if the share is
+    # smaller.
+    min_share = 0.5
     indices = list(localized)
-    if num_queried < config.min_agreeing:
-        raise TrajectoryError(
-            f"{name}: {_too_few_message(num_queried, config)}; the map stays as it is"
-        )
-    if len(indices) < config.min_agreeing:
+    if num_queried < MIN_AGREEING:
+        raise TrajectoryError(f"{name}: {_too_few_message(num_queried)}; the map stays as it is")
+    if len(indices) < MIN_AGREEING:
         raise TrajectoryError(
             f"{name}: the map recognises {len(indices)} of {num_queried} pictures asked: another"
             " place, or changed; the map stays as it is"
         )
-    _check_scale(name, odom, localized, config)
-    path_lengths, slack_m = _path_lengths(odom), config.slack * d_thresh
-    agrees = np.array(
-        [_find_inliers(k, odom, localized, path_lengths, slack_m, config) for k in indices]
-    )
+    _check_scale(name, odom, localized)
+    path_lengths, slack_m = _path_lengths(odom), SLACK * d_thresh
+    agrees = np.array([_find_inliers(k, odom, localized, path_lengths, slack_m) for k in indices])
     best = agrees[int(np.argmax(agrees.sum(axis=1)))]
-    if best.sum() < max(config.min_agreeing, config.min_share * len(indices)):
+    if best.sum() < max(MIN_AGREEING, min_share * len(indices)):
         raise TrajectoryError(
             f"{name}: of {len(indices)} pictures that the map localizes {int(best.sum())} agree"
             " with its poses; the map stays as it is"
@@ -274,39 +203,43 @@ def _find_inliers(
     localized: Mapping[int, Localization],
     path_lengths: Mapping[int, float],
     slack_m: float,
-    config: SessionPosesConfig,
 ) -> Bool[np.ndarray, " n"]:
     """Return the mask of localizations that agree with the transform defined by localization
     `k`."""
+    # Tolerance of the position between two agreeing localizations, as a share of the distance
+    # travelled between them. `slack` is added.
+    max_drift = 0.03
+    # Tolerance of the rotation between two agreeing localizations, in degrees per metre
+    # travelled. `slack_deg` is added.
+    max_turn_drift_deg = 0.3
     world_from_odom = localized[k].world_from_cam @ odom[k].inverse()
     agrees = []
     for index, answer in localized.items():
         off = answer.world_from_cam.inverse() @ world_from_odom @ odom[index]
         path_length = abs(path_lengths[index] - path_lengths[k])
-        near = float(np.linalg.norm(off.translation)) <= slack_m + config.max_drift * path_length
+        near = float(np.linalg.norm(off.translation)) <= slack_m + max_drift * path_length
         agrees.append(
-            near
-            and np.degrees(off.angle())
-            <= config.slack_deg + config.max_turn_drift_deg * path_length
+            near and np.degrees(off.angle()) <= SLACK_DEG + max_turn_drift_deg * path_length
         )
     return np.array(agrees)
 
 
-def _too_few_message(num_queried: int, config: SessionPosesConfig) -> str:
+def _too_few_message(num_queried: int) -> str:
     found = f"{num_queried} of its pictures are" if num_queried > 1 else "one of its pictures is"
-    return (
-        f"{found} as far apart as nodes of the map, too few to join: it takes {config.min_agreeing}"
-    )
+    return f"{found} as far apart as nodes of the map, too few to join: it takes {MIN_AGREEING}"
 
 
 def _check_scale(
     name: str,
     odom: Mapping[int, Rigid3],
     localized: Mapping[int, Localization],
-    config: SessionPosesConfig,
 ) -> None:
     """Check by distances between localized frames that the motion is in metres of the map. Raises
     TrajectoryError."""
+    # Maximum relative difference between the motion's scale and the map's. Three sigmas of
+    # the measured scale are added, and the ratio of one localization sigma to the longest
+    # distance.
+    max_scale = 0.03
     a = np.array([odom[k].translation for k in localized])
     b = np.array([answer.world_from_cam.translation for answer in localized.values()])
     rows, columns = np.triu_indices(len(a), 1)
@@ -324,7 +257,7 @@ def _check_scale(
     # largest part.
     sigma_m = float(np.median([answer.position_sigma_m for answer in localized.values()]))
     uncertainty = 3.0 * spread / np.sqrt(len(a)) + sigma_m / lengths.max()
-    if abs(scale - 1.0) > config.max_scale + uncertainty:
+    if abs(scale - 1.0) > max_scale + uncertainty:
         raise TrajectoryError(
             f"{name}: a metre of its poses is {scale:.3g} m of the map; the map stays as it is"
         )
@@ -341,7 +274,6 @@ def _optimize_motion(
     odom: Mapping[int, Rigid3],
     anchors: Mapping[int, Localization],
     noise_scale: NoiseScale,
-    config: SessionPosesConfig,
 ) -> list[Rigid3 | None]:
     """Optimize the motion with its anchors as a pose graph. The first node is the world of the map
     and is fixed."""
@@ -349,36 +281,39 @@ def _optimize_motion(
     first = min(anchors)
     world_from_odom = anchors[first].world_from_cam @ odom[first].inverse()
     cam_from_worlds = [Rigid3.identity(), *((world_from_odom @ odom[k]).inverse() for k in indices)]
-    steps = [_relative_motion(odom[a], odom[b], config) for a, b in pairwise(indices)]
+    steps = [_relative_motion(odom[a], odom[b]) for a, b in pairwise(indices)]
     edges = [
         Edge(row, row + 1, step, noise_scale.motion**2 * spread, is_loop=False)
         for row, (step, spread) in enumerate(steps, 1)
     ]
     row_of = {index: row for row, index in enumerate(indices, 1)}
     for index, answer in anchors.items():
-        covariance = (noise_scale.answers * config.widened) ** 2 * inverse_covariance(
+        covariance = (noise_scale.answers * WIDENED) ** 2 * inverse_covariance(
             answer.world_from_cam, answer.covariance
         )
         edges.append(
             Edge(0, row_of[index], answer.world_from_cam.inverse(), covariance, is_loop=True)
         )
-    optimised = optimize_pose_graph(cam_from_worlds, edges, config.graph)[1:]
+    optimised = optimize_pose_graph(cam_from_worlds, edges)[1:]
     poses: list[Rigid3 | None] = [None] * (max(odom) + 1)
     for index, cam_from_world in zip(indices, optimised, strict=True):
         poses[index] = cam_from_world.inverse()
     return poses
 
 
-def _estimate_noise(
-    odom: Mapping[int, Rigid3], anchors: Mapping[int, Localization], config: SessionPosesConfig
-) -> NoiseScale:
+def _estimate_noise(odom: Mapping[int, Rigid3], anchors: Mapping[int, Localization]) -> NoiseScale:
     """Estimate the noise scales of the motion between anchors and of the anchors. The anchors'
     sigmas are not widened, because shared errors do not scatter."""
+    # Candidate factors for the sigmas of the motion (stereo, RGB-D and given poses). The most
+    # likely pair of a motion factor and an answer factor is selected.
+    motion_factors = (0.5, 1.0, 3.0, 10.0)
+    # Candidate factors for the sigmas of the localizations, applied in addition to `widened`.
+    answer_factors = (1.0 / 3.0, 1.0)
     seen, moved, spread = list[LocalizedStep](), Rigid3.identity(), np.zeros((6, 6))
     before = None
     for index, pose in odom.items():
         if before is not None:
-            step, of_step = _relative_motion(before, pose, config)
+            step, of_step = _relative_motion(before, pose)
             adjoint = step.adjoint()
             moved, spread = step @ moved, adjoint @ spread @ adjoint.T + of_step
         before = pose
@@ -387,17 +322,22 @@ def _estimate_noise(
             of_answer = inverse_covariance(answer.world_from_cam, answer.covariance)
             seen.append(LocalizedStep(moved, spread, answer.world_from_cam.inverse(), of_answer))
             moved, spread = Rigid3.identity(), np.zeros((6, 6))
-    return estimate_noise_scale(seen, config.motion_factors, config.answer_factors)
+    return estimate_noise_scale(seen, motion_factors, answer_factors)
 
 
 def _relative_motion(
-    odom_from_a: Rigid3, odom_from_b: Rigid3, config: SessionPosesConfig
+    odom_from_a: Rigid3, odom_from_b: Rigid3
 ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
     """Return b_from_a and the covariance of its left perturbation."""
+    # Sigma of the motion between images, as a share of the distance. A millimetre is added.
+    drift = 0.01
+    # Sigma of the rotation between images, in radians per metre and per radian of rotation.
+    # Half a milliradian is added.
+    turn_drift = 0.002
     b_from_a = odom_from_b.inverse() @ odom_from_a
     path_length = float(np.linalg.norm(b_from_a.translation))
     sigma_m, sigma_rad = (
-        0.001 + config.drift * path_length,
-        0.0005 + config.turn_drift * (path_length + b_from_a.angle()),
+        0.001 + drift * path_length,
+        0.0005 + turn_drift * (path_length + b_from_a.angle()),
     )
     return b_from_a, np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)

@@ -13,8 +13,6 @@ import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import (
-    ConsensusConfig,
-    DriftConfig,
     TransformConsensus,
     diagonal_covariance,
     find_consensus,
@@ -22,12 +20,11 @@ from topoloc.geometry.transform_consensus import (
 )
 from topoloc.mapping.topomap import TopoMetricMap
 
-_MAX_IMAGES = 200
 _SIGMA_M, _SIGMA_DEG = 0.01, 0.1  # of the transform between the maps as one image gives it
 
 
 def estimate_by_shared_images(
-    first: TopoMetricMap, second: TopoMetricMap, along: DriftConfig, config: ConsensusConfig
+    first: TopoMetricMap, second: TopoMetricMap
 ) -> tuple[Rigid3, np.ndarray, int] | None:
     """Estimate first_from_second (metres) from the images that both maps contain.
 
@@ -35,17 +32,16 @@ def estimate_by_shared_images(
         first_from_second, the covariance of its left perturbation (m, rad), and the number of
         images that agree. None if the maps share too few images or the images do not agree.
     """
+    max_images = 200  # evenly spaced
     here, there = _image_poses(first), _image_poses(second)
     shared = sorted(here.keys() & there.keys(), key=lambda image_key: (image_key[0], image_key[1]))
     chosen = (
-        np.unique(
-            np.linspace(0, len(shared) - 1, min(len(shared), _MAX_IMAGES)).round().astype(int)
-        )
+        np.unique(np.linspace(0, len(shared) - 1, min(len(shared), max_images)).round().astype(int))
         if shared
         else []
     )
     poses = [(here[shared[k]], there[shared[k]]) for k in chosen]
-    if len(poses) < config.min_independent:
+    if not poses:
         return None
     one, other = poses[len(poses) // 2]
     estimates = [
@@ -54,14 +50,15 @@ def estimate_by_shared_images(
             Rigid3.identity(),
             diagonal_covariance(_SIGMA_M, _SIGMA_DEG),
             b.inverse() @ other,
-            along,
+            drift=0.01,
+            drift_deg=0.1,
         )
         for a, b in poses
     ]
     consensus = find_consensus(
         [pose for pose, _ in estimates],
         np.stack([covariance for _, covariance in estimates]),
-        config,
+        rival_share=0.34,
     )
     return None if consensus is None else _to_worlds(consensus, one, other)
 

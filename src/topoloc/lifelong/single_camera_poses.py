@@ -19,11 +19,13 @@ from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
 from topoloc.lifelong.noise_scale import NoiseScale
-from topoloc.lifelong.scale_estimation import find_largest_consensus, scale_to_metres
+from topoloc.lifelong.scale_estimation import WIDENED, find_largest_consensus, scale_to_metres
 from topoloc.lifelong.session_poses import (
+    MIN_AGREEING,
+    SLACK,
+    SLACK_DEG,
     Progress,
     SessionPoses,
-    SessionPosesConfig,
     align_motion_to_map,
 )
 from topoloc.lifelong.trajectory_adjustment import adjust_trajectory
@@ -35,7 +37,6 @@ from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.monocular_odometry import MonocularOdometry
 from topoloc.tracking.tracker import Tracker
 
-_NUM_REFITS = 3
 _NUM_FRAMES_AROUND = 3
 
 
@@ -43,7 +44,6 @@ def estimate_poses_by_map(
     sequence: StereoSequence,
     tracker: Tracker,
     map_config: MapConfig,
-    config: SessionPosesConfig,
     progress: Progress,
 ) -> SessionPoses:
     """Estimate the poses of a session without poses by localizing each of its images.
@@ -55,12 +55,15 @@ def estimate_poses_by_map(
         CalibrationError: a frame has no calibration, or the images contradict it.
         UnreadableImageError, QueryError: an image cannot be read or localized.
     """
+    # A frame without odometry takes the map's pose if its position sigma is at most this many
+    # D_thresh.
+    max_sigma = 0.1
     by_map, localized, results = (
         dict[int, Rigid3](),
         dict[int, Localization](),
         list[Localization | NotLocalized](),
     )
-    odometry = MonocularOdometry(config.odometry)
+    odometry = MonocularOdometry()
     for index, t_ns in enumerate(sequence.t_ns):
         frame = sequence[index]
         if frame.camera is None:
@@ -79,7 +82,7 @@ def estimate_poses_by_map(
             by_map[index], localized[index] = found.smoothed, found.result
         progress(f"localizing {sequence.name}", index + 1, len(sequence))
     check_calibration(sequence.name, results)
-    if len(by_map) < config.min_agreeing:
+    if len(by_map) < MIN_AGREEING:
         check_focal_length(sequence, range(len(sequence)), tracker.localizer)
         raise TrajectoryError(
             f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures:"
@@ -90,30 +93,26 @@ def estimate_poses_by_map(
     clear = {
         index
         for index, answer in localized.items()
-        if answer.position_sigma_m <= config.max_sigma * d_thresh
+        if answer.position_sigma_m <= max_sigma * d_thresh
     }
     poses: list[Rigid3 | None] = [
         by_map[index] if index in clear else None for index in range(len(sequence))
     ]
     for stretch in odometry.submaps:
         odom = stretch.submap_from_cams()
-        aligned, inlier_idx = align_stretch_to_map(sequence.name, odom, localized, d_thresh, config)
+        aligned, inlier_idx = align_stretch_to_map(sequence.name, odom, localized, d_thresh)
         if aligned is not None:
             anchors = {index: localized[index] for index in inlier_idx}
-            adjusted = adjust_trajectory(
-                stretch, aligned, anchors, config.points_widened, config.adjustment
-            )
-            corrected = correct_trajectory(adjusted, anchors, d_thresh, config.bend)
-            aligned, inlier_idx = _reject_contradicted(
-                corrected, localized, inlier_idx, d_thresh, config
-            )
+            adjusted = adjust_trajectory(stretch, aligned, anchors)
+            corrected = correct_trajectory(adjusted, anchors, d_thresh)
+            aligned, inlier_idx = _reject_contradicted(corrected, localized, inlier_idx, d_thresh)
         for index in odom:
             answer = localized[index] if index in inlier_idx else localized.pop(index, None)
             if aligned is None:
                 poses[index] = by_map[index] if index in inlier_idx and index in clear else None
             else:
                 poses[index] = _pose_if_consistent(
-                    aligned[index] if index < len(aligned) else None, answer, d_thresh, config
+                    aligned[index] if index < len(aligned) else None, answer, d_thresh
                 )
     known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
     if not known:
@@ -147,7 +146,6 @@ def align_stretch_to_map(
     odom: Mapping[int, Rigid3],
     localized: Mapping[int, Localization],
     d_thresh: float,
-    config: SessionPosesConfig,
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
     """Align a stretch of odometry with the map.
 
@@ -157,33 +155,28 @@ def align_stretch_to_map(
         motion contradict each other there.
     """
     within_stretch = {index: answer for index, answer in localized.items() if index in odom}
-    inlier_idx = find_largest_consensus(
-        odom, within_stretch, config.slack * d_thresh, config.slack_deg, config.scale
-    )
+    inlier_idx = find_largest_consensus(odom, within_stretch, SLACK * d_thresh, SLACK_DEG)
+    num_refits = 3  # each with another scale
     aligned = None
-    for _ in range(_NUM_REFITS):  # each refit uses the inliers found with the previous scale
+    for _ in range(num_refits):  # each refit uses the inliers found with the previous scale
         metric = (
-            scale_to_metres(
-                odom, {index: within_stretch[index] for index in inlier_idx}, config.scale
-            )
-            if len(inlier_idx) >= config.min_agreeing
+            scale_to_metres(odom, {index: within_stretch[index] for index in inlier_idx})
+            if len(inlier_idx) >= MIN_AGREEING
             else {}
         )
         within = {index: answer for index, answer in within_stretch.items() if index in metric}
-        if len(within) < config.min_agreeing:
-            return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config)
+        if len(within) < MIN_AGREEING:
+            return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh)
         try:
             aligned = align_motion_to_map(
-                name, metric, within, d_thresh, config, NoiseScale()
+                name, metric, within, d_thresh, NoiseScale()
             )  # fixed noise scales: the drift of the scale is not a random walk
         except TrajectoryError:
-            return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config)
+            return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh)
         inlier_idx = aligned.inlier_idx
-    if aligned is None or not _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh, config):
+    if aligned is None or not _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh):
         return None, []
-    return _reject_contradicted(
-        aligned.world_from_cams, within_stretch, inlier_idx, d_thresh, config
-    )
+    return _reject_contradicted(aligned.world_from_cams, within_stretch, inlier_idx, d_thresh)
 
 
 def _reject_ambiguous(
@@ -191,19 +184,15 @@ def _reject_ambiguous(
     within_stretch: Mapping[int, Localization],
     inlier_idx: list[int],
     d_thresh: float,
-    config: SessionPosesConfig,
 ) -> list[int]:
     """Return the agreeing localizations, or none if a large rival set agrees on another trajectory.
     A place that looks like another one is localized wrongly for as long as it is in view."""
+    # Of a single camera, the agreeing localizations are rejected if a rival set with at least
+    # this share of their number agrees on another trajectory.
+    rival_share = 0.3
     rest = {index: answer for index, answer in within_stretch.items() if index not in inlier_idx}
-    rivals = find_largest_consensus(
-        odom, rest, config.slack * d_thresh, config.slack_deg, config.scale
-    )
-    return (
-        []
-        if len(rivals) >= max(config.min_agreeing, config.rival_share * len(inlier_idx))
-        else inlier_idx
-    )
+    rivals = find_largest_consensus(odom, rest, SLACK * d_thresh, SLACK_DEG)
+    return [] if len(rivals) >= max(MIN_AGREEING, rival_share * len(inlier_idx)) else inlier_idx
 
 
 def _reject_contradicted(
@@ -211,7 +200,6 @@ def _reject_contradicted(
     localized: Mapping[int, Localization],
     inlier_idx: Sequence[int],
     d_thresh: float,
-    config: SessionPosesConfig,
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
     """Remove poses and localizations of frames for which map and motion contradict each other.
     Return None for the poses if too few localizations are left."""
@@ -223,16 +211,16 @@ def _reject_contradicted(
     apart = {
         index
         for index, answer in within_stretch.items()
-        if _contradicts(answer, poses[index], d_thresh, config)
+        if _contradicts(answer, poses[index], d_thresh)
     }
     contradicted = _find_contradicted_frames(list(within_stretch), apart)
     left = [None if index in contradicted else pose for index, pose in enumerate(poses)]
     consistent = [index for index in inlier_idx if index not in apart]
-    return (left, consistent) if len(consistent) >= config.min_agreeing else (None, [])
+    return (left, consistent) if len(consistent) >= MIN_AGREEING else (None, [])
 
 
 def _pose_if_consistent(
-    pose: Rigid3 | None, answer: Localization | None, d_thresh: float, config: SessionPosesConfig
+    pose: Rigid3 | None, answer: Localization | None, d_thresh: float
 ) -> Rigid3 | None:
     """Return the pose, or None if the localization differs from it. A node there would contradict
     the map's nodes."""
@@ -240,18 +228,19 @@ def _pose_if_consistent(
         return pose
     apart = answer.world_from_cam.inverse() @ pose
     is_near = (
-        np.linalg.norm(apart.translation) <= config.slack * d_thresh
-        and np.degrees(apart.angle()) <= config.slack_deg
+        np.linalg.norm(apart.translation) <= SLACK * d_thresh
+        and np.degrees(apart.angle()) <= SLACK_DEG
     )
     return pose if is_near else None
 
 
-def _contradicts(
-    answer: Localization, pose: Rigid3 | None, d_thresh: float, config: SessionPosesConfig
-) -> bool:
+def _contradicts(answer: Localization, pose: Rigid3 | None, d_thresh: float) -> bool:
+    # Of a single camera, a frame has no pose if map and motion differ by more than this many
+    # D_thresh. Three sigmas of the localization, multiplied by `widened`, are added.
+    contradiction = 0.1
     assert pose is not None
     off = float(np.linalg.norm(answer.world_from_cam.translation - pose.translation))
-    return off > config.contradiction * d_thresh + 3.0 * config.widened * answer.position_sigma_m
+    return off > contradiction * d_thresh + 3.0 * WIDENED * answer.position_sigma_m
 
 
 def _find_contradicted_frames(answered: list[int], apart: Set[int]) -> set[int]:

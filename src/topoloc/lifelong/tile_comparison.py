@@ -13,19 +13,15 @@ something else.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from topoloc.atlas.global_descriptors import GlobalDescriptors
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.transform_consensus import (
-    ConsensusConfig,
-    DriftConfig,
     TransformConsensus,
     diagonal_covariance,
     find_consensus,
@@ -37,47 +33,6 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
-
-
-@dataclass(frozen=True)
-class TileJoinConfig:
-    """Configure which tiles are compared and which comparisons lead to a join."""
-
-    num_neighbours: Annotated[int, Between(1, 1000)] = 6
-    """Number of most similar other tiles that each tile is compared with."""
-    max_pairs: Annotated[int, Between(0, 1_000_000)] = 10_000
-    """Maximum number of pairs of tiles to compare. The most similar pairs come first."""
-    min_likeness: Annotated[float, Between(-1, 1)] = 0.35
-    """Minimum similarity of two tiles: the median over their few most similar places. Less similar
-    tiles are not compared."""
-    num_probed: Annotated[int, Between(1, 1000)] = 8
-    """Number of nodes of each tile that are localized in the other one first. The comparison ends
-    if none is localized."""
-    num_asked: Annotated[int, Between(1, 10_000)] = 32
-    """Maximum number of nodes of each tile that are localized in the other one in each step."""
-    consensus: ConsensusConfig = field(
-        default_factory=lambda: ConsensusConfig(min_independent=3, rival_share=0.34)
-    )
-    along: DriftConfig = field(default_factory=lambda: DriftConfig(0.01, 0.1))
-    """Drift of the poses between two nodes of a tile."""
-    widened: Annotated[float, Above(0)] = 3.0
-    """Factor applied to the sigmas of the localizations, because neighbours share errors of the
-    map."""
-    sigma: Annotated[float, Above(0)] = 0.01
-    """Additional position sigma of a localization, in metres."""
-    sigma_deg: Annotated[float, Above(0)] = 0.2
-    """Additional rotation sigma of a localization, in degrees."""
-    near: Annotated[float, Above(0)] = 3.0
-    """A node must be localized if it is within this many D_thresh (distance of Eq. 1) of a node of
-    the other tile."""
-    min_near: Annotated[int, AtLeast(1)] = 12
-    """Minimum number of such nodes, of both tiles together."""
-    min_recognised: Annotated[float, Between(0, 1)] = 0.9
-    """Minimum share of these nodes that are localized at their expected pose."""
-    min_agreeing: Annotated[float, Between(0, 1)] = 0.75
-    """Minimum share of unguided matches that agree with the pose, in three quarters of these nodes.
-    Another place of the same plan may match as often, but its different parts match something
-    else."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,19 +103,28 @@ class _Answer:
 
 
 def compare_tiles(
-    first: OpenTile, second: OpenTile, config: TileJoinConfig
+    first: OpenTile,
+    second: OpenTile,
+    num_probed: int = 8,
+    max_queries: int = 32,
+    min_near: int = 12,
 ) -> TileTransform | NotJoined:
     """Return the transform from the second map to the first, if they overlap and the evidence is
     sufficient.
+
+    Args:
+        num_probed: number of nodes of each tile that are localized in the other one first. The
+            comparison ends if none is localized.
+        max_queries: maximum number of nodes of each tile that are localized in each step.
+        min_near: minimum number of nodes, of both tiles together, that stand near a node of the
+            other tile.
 
     Raises:
         MapError: a map cannot be read.
         FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
             this machine.
     """
-    shared = estimate_by_shared_images(
-        first.topomap, second.topomap, config.along, config.consensus
-    )
+    shared = estimate_by_shared_images(first.topomap, second.topomap)
     if shared is not None:
         return TileTransform(*shared, is_from_shared_images=True)
     is_of_kinds = any(
@@ -169,28 +133,29 @@ def compare_tiles(
     )
     if not is_of_kinds or not first.vectors.keys() & second.vectors.keys():
         return NotJoined("their features are not of the same kinds")
-    return _Comparison(first, second, config).verdict()
+    return _Comparison(first, second).verdict(num_probed, max_queries, min_near)
 
 
 class _Comparison:
     """Hold two tiles and the localizations so far of each tile's nodes in the other, by row. None
     if a node is not localized."""
 
-    def __init__(self, first: OpenTile, second: OpenTile, config: TileJoinConfig) -> None:
-        self._tiles, self._config = (first, second), config
+    def __init__(self, first: OpenTile, second: OpenTile) -> None:
+        self._tiles = first, second
         self._answers: tuple[dict[int, Localization | None], ...] = (
             {},
             {},
         )  # nodes of the second tile in the first, and nodes of the first in the second
 
-    def verdict(self) -> TileTransform | NotJoined:
+    def verdict(
+        self, num_probed: int, max_queries: int, min_near: int
+    ) -> TileTransform | NotJoined:
         """Compare the tiles and return the transform, or the reason for no join."""
-        config = self._config
         orders = self._rank_nodes_by_similarity()
-        self._localize_nodes([order[: config.num_probed] for order in orders])
+        self._localize_nodes([order[:num_probed] for order in orders])
         if not self._localized_nodes():
             return NotJoined("no node of either is recognised in the other")
-        self._localize_nodes([order[: config.num_asked] for order in orders])
+        self._localize_nodes([order[:max_queries] for order in orders])
         found = self._find_consensus()
         if isinstance(found, NotJoined):
             return found
@@ -200,7 +165,7 @@ class _Comparison:
             @ consensus.a_from_b
             @ self._tiles[1].world_from_node(ends[1]).inverse()
         )
-        near = self._find_nearby_nodes(first_from_second)
+        near = self._find_nearby_nodes(first_from_second, max_queries)
         self._localize_nodes(near)
         tested = self._verify(first_from_second, near)
         to_world = self._tiles[0].world_from_node(ends[0]).adjoint()
@@ -211,21 +176,26 @@ class _Comparison:
             int(np.count_nonzero(consensus.is_inlier)),
             *tested,
         )
-        return self._decide(joint)
+        return self._decide(joint, min_near)
 
-    def _decide(self, found: TileTransform) -> TileTransform | NotJoined:
-        config = self._config
-        if found.num_near < config.min_near:
+    def _decide(self, found: TileTransform, min_near: int) -> TileTransform | NotJoined:
+        # Minimum share of these nodes that are localized at their expected pose.
+        min_recognised = 0.9
+        # Minimum share of unguided matches that agree with the pose, in three quarters of
+        # these nodes. Another place of the same plan may match as often, but its
+        # different parts match something else.
+        min_agreeing = 0.75
+        if found.num_near < min_near:
             return NotJoined(
                 f"{found.num_agreeing} answers agree, but only {found.num_near} nodes stand near"
                 " one of the other tile"
             )
-        if found.num_recognised < config.min_recognised * found.num_near:
+        if found.num_recognised < min_recognised * found.num_near:
             return NotJoined(
                 f"{found.num_agreeing} answers agree, but {found.num_near - found.num_recognised}"
                 f" of {found.num_near} nodes that should be recognised are not"
             )
-        if found.agreeing < config.min_agreeing:
+        if found.agreeing < min_agreeing:
             return NotJoined(
                 f"{found.num_agreeing} answers agree, but {1.0 - found.agreeing:.0%} of what is"
                 " matched there does not"
@@ -282,7 +252,7 @@ class _Comparison:
             estimates.append(estimate)
             covariances.append(covariance)
         consensus = find_consensus(
-            estimates, np.stack(covariances), self._config.consensus, np.array(pairs)
+            estimates, np.stack(covariances), np.array(pairs), rival_share=0.34
         )
         return (
             NotJoined(f"{len(answers)} nodes are recognised, but do not agree")
@@ -295,14 +265,18 @@ class _Comparison:
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """Return the transform between the nodes `ends` according to one localization:
         first_from_second."""
-        config, (first, second) = self._config, self._tiles
+        # Factor applied to the sigmas of the localizations, because neighbours share
+        # errors of the map.
+        widened = 3.0
+        sigma = 0.01  # additional position sigma of a localization, in metres
+        sigma_deg = 0.2  # additional rotation sigma of a localization, in degrees
+        first, second = self._tiles
         matched_row = second if is_from_second else first
         node_from_world = matched_row.world_from_node(one.matched_row).inverse()
         adjoint = node_from_world.adjoint()
         by_from_asked = node_from_world @ one.result.world_from_cam
-        covariance = (
-            config.widened** 2 * adjoint @ one.result.covariance @ adjoint.T
-            + diagonal_covariance(config.sigma, config.sigma_deg)
+        covariance = widened**2 * adjoint @ one.result.covariance @ adjoint.T + diagonal_covariance(
+            sigma, sigma_deg
         )
         a, b = one.matched_row, one.queried
         if is_from_second:
@@ -313,11 +287,16 @@ class _Comparison:
             a, b = b, a
         to_first = first.world_from_node(ends[0]).inverse() @ first.world_from_node(a)
         from_second = second.world_from_node(b).inverse() @ second.world_from_node(ends[1])
-        return propagate_estimate(to_first, by_from_asked, covariance, from_second, config.along)
+        return propagate_estimate(
+            to_first, by_from_asked, covariance, from_second, drift=0.01, drift_deg=0.1
+        )
 
-    def _find_nearby_nodes(self, first_from_second: Rigid3) -> list[list[int]]:
+    def _find_nearby_nodes(self, first_from_second: Rigid3, max_queries: int) -> list[list[int]]:
         """Return nodes of the second tile, and of the first, that the transform puts near a node of
-        the other. At most `num_asked` of each tile are chosen, evenly spaced."""
+        the other. At most `max_queries` of each tile are chosen, evenly spaced."""
+        # A node must be localized if it is within this many D_thresh (distance of Eq. 1)
+        # of a node of the other tile.
+        max_distance = 3.0
         rows = []
         for queried, of, pose in zip(
             self._tiles,
@@ -330,11 +309,9 @@ class _Comparison:
                 node_distances(pose @ summary.world_from_cam, queried.poses, lambda_rot).min()
                 for summary in of.topomap.summaries
             ]
-            near = np.flatnonzero(np.array(apart) <= self._config.near * d_thresh)
+            near = np.flatnonzero(np.array(apart) <= max_distance * d_thresh)
             chosen = np.unique(
-                np.linspace(0, len(near) - 1, min(len(near), self._config.num_asked))
-                .round()
-                .astype(int)
+                np.linspace(0, len(near) - 1, min(len(near), max_queries)).round().astype(int)
             )
             rows.append(near[chosen].tolist() if len(near) else [])
         return rows

@@ -19,12 +19,10 @@ from topoloc.atlas.joins import Join
 from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.map_cache import MapCache
-from topoloc.bounds import check_bounds
 from topoloc.errors import AtlasError, MapError
 from topoloc.lifelong.tile_comparison import (
     NotJoined,
     OpenTile,
-    TileJoinConfig,
     TileTransform,
     compare_tiles,
 )
@@ -94,7 +92,6 @@ class TileJoiningResult:
 def join_tiles(
     where: str,
     tile_ids: Sequence[str] = (),
-    config: TileJoinConfig | None = None,
     on_compared: OnCompared | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
     run_jobs: RunPairJobs | None = None,
@@ -104,22 +101,20 @@ def join_tiles(
     Args:
         where: the atlas.
         tile_ids: compare only pairs with one of these tiles. Empty means all tiles.
-        config: the settings. Defaults to `TileJoinConfig()`.
         on_compared: is called with the result of each pair.
         pairs: compare exactly these pairs of tile ids. None means pairs of similar tiles.
         run_jobs: compares the pairs instead, as jobs; `on_compared` is not called then.
 
     Raises:
-        ConfigError: a setting is out of its bounds.
         AtlasError: there is no such atlas or tile, or the atlas cannot be written.
         FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
             this machine.
     """
-    config, atlas = config or TileJoinConfig(), Atlas.open(where)
-    selected = _select_pairs(atlas, tile_ids, config, pairs)
+    atlas = Atlas.open(where)
+    selected = _select_pairs(atlas, tile_ids, pairs)
     if run_jobs is not None:
         jobs = [
-            PairJob(absolute_address(where), first.tile_id, second.tile_id, config)
+            PairJob(absolute_address(where), first.tile_id, second.tile_id)
             for first, second in selected
         ]
         done = run_jobs(jobs) if jobs else []
@@ -127,7 +122,7 @@ def join_tiles(
     maps, pair_results = MapCache([], Localizer, _MAX_BYTES), list[PairResult]()
     try:
         for first, second in selected:
-            pair_results.append(_join_pair(atlas, maps, (first, second), config))
+            pair_results.append(_join_pair(atlas, maps, (first, second)))
             if on_compared is not None:
                 on_compared(pair_results[-1])
     finally:
@@ -143,7 +138,6 @@ class PairJob:
     where: str
     first: str
     second: str
-    config: TileJoinConfig
 
     @property
     def name(self) -> str:
@@ -156,9 +150,7 @@ class PairJob:
         maps = MapCache([], Localizer, _MAX_BYTES)
         try:
             atlas = Atlas.open(self.where)
-            return _join_pair(
-                atlas, maps, (atlas.tile(self.first), atlas.tile(self.second)), self.config
-            )
+            return _join_pair(atlas, maps, (atlas.tile(self.first), atlas.tile(self.second)))
         finally:
             maps.close()
 
@@ -170,25 +162,19 @@ class PairJob:
 def _select_pairs(
     atlas: Atlas,
     tile_ids: Sequence[str],
-    config: TileJoinConfig,
     pairs: Sequence[tuple[str, str]] | None,
 ) -> list[tuple[Tile, Tile]]:
-    check_bounds(config)
     wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
     return (
-        find_candidate_pairs(atlas, wanted, config)
-        if pairs is None
-        else _find_unjoined_pairs(atlas, pairs)
+        find_candidate_pairs(atlas, wanted) if pairs is None else _find_unjoined_pairs(atlas, pairs)
     )
 
 
-def _join_pair(
-    atlas: Atlas, maps: MapCache[Localizer], pair: tuple[Tile, Tile], config: TileJoinConfig
-) -> PairResult:
+def _join_pair(atlas: Atlas, maps: MapCache[Localizer], pair: tuple[Tile, Tile]) -> PairResult:
     """Compare a pair of tiles and return the result. A join is added to the manifest."""
     first, second = pair
     try:
-        found = _compare_pair(atlas, maps, first, second, config)
+        found = _compare_pair(atlas, maps, first, second)
     except (MapError, AtlasError) as error:
         found = NotJoined(str(error))
     if isinstance(found, TileTransform):
@@ -204,16 +190,14 @@ def _join_pair(
 
 
 def _compare_pair(
-    atlas: Atlas, maps: MapCache[Localizer], first: Tile, second: Tile, config: TileJoinConfig
+    atlas: Atlas, maps: MapCache[Localizer], first: Tile, second: Tile
 ) -> TileTransform | NotJoined:
     places = [atlas.places_of(tile) for tile in (first, second)]
     with (
         maps.use_map(first.tile_id, atlas.map_path(first)) as one,
         maps.use_map(second.tile_id, atlas.map_path(second)) as other,
     ):
-        return compare_tiles(
-            OpenTile(one.content, places[0]), OpenTile(other.content, places[1]), config
-        )
+        return compare_tiles(OpenTile(one.content, places[0]), OpenTile(other.content, places[1]))
 
 
 def _find_unjoined_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list[tuple[Tile, Tile]]:
@@ -227,14 +211,17 @@ def _find_unjoined_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list
     ]
 
 
-def find_candidate_pairs(
-    atlas: Atlas, wanted: Collection[str], config: TileJoinConfig
-) -> list[tuple[Tile, Tile]]:
+def find_candidate_pairs(atlas: Atlas, wanted: Collection[str]) -> list[tuple[Tile, Tile]]:
     """Return pairs of tiles that may overlap, the most similar first, each in the order of its ids.
 
     The tiles of a pair are in different worlds, have no join yet and are not known to be far apart.
     Their most similar places have at least `min_likeness`.
     """
+    # Minimum similarity of two tiles: the median over their few most similar places. Less
+    # similar tiles are not compared.
+    min_likeness = 0.35
+    # Maximum number of pairs of tiles to compare. The most similar pairs come first.
+    max_pairs = 10_000
     manifest, index = atlas.manifest, atlas.index
     scores = dict[tuple[str, str], float]()
     known = {join.pair for join in manifest.joins}
@@ -243,22 +230,21 @@ def find_candidate_pairs(
             continue
         candidate_ids = [other.tile_id for other in manifest.tiles if _may_overlap(tile, other)]
         for other_id, score in (
-            _find_similar_tiles(atlas, tile, candidate_ids, config)
-            if candidate_ids and index.kinds
-            else ()
+            _find_similar_tiles(atlas, tile, candidate_ids) if candidate_ids and index.kinds else ()
         ):
             pair = (min(tile.tile_id, other_id), max(tile.tile_id, other_id))
-            if pair not in known and score >= config.min_likeness:
+            if pair not in known and score >= min_likeness:
                 scores[pair] = max(score, scores.get(pair, -1.0))
-    best = sorted(scores, key=lambda pair: (-scores[pair], pair))[: config.max_pairs]
+    best = sorted(scores, key=lambda pair: (-scores[pair], pair))[:max_pairs]
     return [(manifest.by_id[first], manifest.by_id[second]) for first, second in best]
 
 
 def _find_similar_tiles(
-    atlas: Atlas, tile: Tile, candidate_ids: Sequence[str], config: TileJoinConfig
+    atlas: Atlas, tile: Tile, candidate_ids: Sequence[str]
 ) -> Iterator[tuple[str, float]]:
     """Yield the most similar tiles with their similarity: the median over the most similar
     places."""
+    num_neighbours = 6  # number of most similar other tiles that each tile is compared with
     places, found = atlas.places_of(tile), dict[str, list[float]]()
     kind = next((kind for kind in tile.kinds if kind in places), next(iter(places)))
     rows = np.unique(
@@ -268,14 +254,14 @@ def _find_similar_tiles(
     )
     for row in rows:
         for other_id, likeness in atlas.index.rank(
-            {kind: places[kind][row]}, config.num_neighbours, candidate_ids
+            {kind: places[kind][row]}, num_neighbours, candidate_ids
         ):
             found.setdefault(other_id, []).append(likeness)
     scores = {
         other_id: float(np.median(sorted(values)[-_NUM_BEST:]))
         for other_id, values in found.items()
     }
-    yield from sorted(scores.items(), key=lambda pair: -pair[1])[: config.num_neighbours]
+    yield from sorted(scores.items(), key=lambda pair: -pair[1])[:num_neighbours]
 
 
 def _may_overlap(tile: Tile, other: Tile) -> bool:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
-from topoloc.bounds import Between, check_bounds
 from topoloc.errors import TrajectoryError
 from topoloc.lifelong.session_poses import Progress
 from topoloc.localization.localizer import Localizer
@@ -19,35 +16,22 @@ from topoloc.localization.result import Localization
 from topoloc.recordings.frame import StereoSequence
 
 
-@dataclass(frozen=True)
-class TileSelectionConfig:
-    """Configure when a recording is assigned to a tile."""
-
-    num_asked: Annotated[int, Between(1, 10_000)] = 12
-    """Number of images of the recording, evenly spaced, that are localized in the atlas."""
-    min_answers: Annotated[int, Between(1, 10_000)] = 3
-    """Minimum number of images localized in the tile."""
-    min_share: Annotated[float, Between(0.5, 1)] = 0.67
-    """Minimum share of the localized images that are in the tile or in tiles of the same world."""
-
-
 def find_tile_of_recording(
     atlas: Atlas,
     localizer: Localizer,
     sequence: StereoSequence,
-    config: TileSelectionConfig,
     progress: Progress,
 ) -> Tile:
     """Return the tile in which most sampled images of a recording are localized.
 
     Raises:
-        ConfigError: a setting is out of its bounds.
         TrajectoryError: too few images are localized, or they are in tiles of several worlds.
         UnreadableImageError, QueryError, AtlasError: raised by `Localizer.localize`.
     """
-    check_bounds(config)
+    # Number of images of the recording, evenly spaced, that are localized in the atlas.
+    num_queries = 12
     rows = np.unique(
-        np.linspace(0, max(len(sequence) - 1, 0), min(config.num_asked, len(sequence)))
+        np.linspace(0, max(len(sequence) - 1, 0), min(num_queries, len(sequence)))
         .round()
         .astype(int)
     ).tolist()
@@ -58,7 +42,7 @@ def find_tile_of_recording(
         if isinstance(result, Localization):
             answers.append(result)
         progress("which tile", done + 1, len(rows))
-    return select_tile(sequence.name, len(rows), answers, atlas.manifest.by_id, config)
+    return select_tile(sequence.name, len(rows), answers, atlas.manifest.by_id)
 
 
 def select_tile(
@@ -66,7 +50,6 @@ def select_tile(
     num_asked: int,
     answers: Sequence[Localization],
     tiles: Mapping[str, Tile],
-    config: TileSelectionConfig,
 ) -> Tile:
     """Return the tile with the most localizations.
 
@@ -75,15 +58,18 @@ def select_tile(
         num_asked: the number of sampled images.
         answers: the localizations of the sampled images.
         tiles: the tiles by id.
-        config: the settings.
 
     Raises:
         TrajectoryError: no tile has enough localizations, or they are in tiles of several worlds.
     """
+    min_answers = 3  # minimum number of images localized in the tile
+    # Minimum share of the localized images that are in the tile or in tiles of the same
+    # world.
+    min_share = 0.67
     counts = Counter(
         answer.provenance.tile for answer in answers if answer.provenance.tile is not None
     )
-    if not counts or max(counts.values()) < config.min_answers:
+    if not counts or max(counts.values()) < min_answers:
         raise TrajectoryError(
             f"{name}: no tile recognises it: {_format_counts(counts)} of {num_asked} pictures"
             " asked; the atlas stays as it is"
@@ -93,7 +79,7 @@ def select_tile(
     of_world = sum(
         number for tile_id, number in counts.items() if tiles[tile_id].in_joint_world.joint == world
     )
-    if of_world < config.min_share * counts.total():
+    if of_world < min_share * counts.total():
         raise TrajectoryError(
             f"{name}: it looks like several tiles: {_format_counts(counts)} of {num_asked} pictures"
             " asked; the atlas stays as it is"

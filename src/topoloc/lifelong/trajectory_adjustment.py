@@ -15,19 +15,15 @@ from jaxtyping import Float
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.lifelong.scale_estimation import compute_path_lengths
 from topoloc.localization.result import Localization
-from topoloc.slam.bundle_adjustment import BundleConfig, PosePrior, adjust_bundle
+from topoloc.slam.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import FramePose, KeyFrame
 from topoloc.slam.monocular_odometry import MonocularSubmap
-
-_NUM_NEIGHBOURS = 3
 
 
 def adjust_trajectory(
     stretch: MonocularSubmap,
     world_from_cams: Sequence[Rigid3 | None],
     anchors: Mapping[int, Localization],
-    points_widened: float,
-    config: BundleConfig,
 ) -> list[Rigid3 | None]:
     """Return the adjusted world_from_cam of each frame. None stays None.
 
@@ -38,10 +34,9 @@ def adjust_trajectory(
         stretch: the odometry of the trajectory.
         world_from_cams: the initial poses of the frames, in the map's world and metres.
         anchors: the trusted localizations, by frame.
-        points_widened: the factor by which the sigmas of tracked points are larger than in
-            odometry.
-        config: the settings of the bundle adjustment.
     """
+    # Factor of the sigmas of tracked points. A sliding point does so in all of its key frames.
+    points_widened = 8.0
     keyframes = _transform_to_map(stretch, world_from_cams)
     moved = set(map(id, keyframes))
     frames = {
@@ -57,7 +52,15 @@ def adjust_trajectory(
         for index, frame in frames.items()
         if index in anchors
     ]
-    adjust_bundle(keyframes, [], stretch.landmarks, config, map_anchors)
+    adjust_bundle(
+        keyframes,
+        [],
+        stretch.landmarks,
+        map_anchors,
+        max_steps=30,
+        min_decrease=1e-5,
+        cauchy_scale=0.5,
+    )
     adjusted = list(world_from_cams)
     for index, frame in frames.items():
         adjusted[index] = (
@@ -131,7 +134,8 @@ def _metres_per_unit(before: Sequence[Rigid3], after: Sequence[Rigid3]) -> Float
         )
         for poses in (before, after)
     ]
-    first = np.maximum(np.arange(len(before)) - _NUM_NEIGHBOURS, 0)
-    last = np.minimum(np.arange(len(before)) + _NUM_NEIGHBOURS, len(before) - 1)
+    num_neighbours = 3  # on either side
+    first = np.maximum(np.arange(len(before)) - num_neighbours, 0)
+    last = np.minimum(np.arange(len(before)) + num_neighbours, len(before) - 1)
     odom, metres = (path_length[last] - path_length[first] for path_length in path_lengths)
     return metres / np.maximum(odom, 1e-12)

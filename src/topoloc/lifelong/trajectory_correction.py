@@ -13,30 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.bounds import Above
 from topoloc.geometry.rigid import Rigid3, exp_so3, log_so3
 from topoloc.lifelong.scale_estimation import compute_path_lengths
 from topoloc.localization.result import Localization
 
 _NUM_ITERATIONS, _MAX_SIGMAS = 4, 3.0
-
-
-@dataclass(frozen=True)
-class CorrectionConfig:
-    """Configure the correction of a trajectory towards the localizations."""
-
-    reach: Annotated[float, Above(0)] = 1.0
-    """Length scale over which the correction is smoothed, in D_thresh."""
-    stray: Annotated[float, Above(0)] = 0.1
-    """Prior sigma of the correction, in D_thresh. A localization this far from the local mean has
-    half the weight."""
-    stray_deg: Annotated[float, Above(0)] = 0.5
-    """The same for the rotation, in degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +53,13 @@ def correct_trajectory(
     world_from_cams: Sequence[Rigid3 | None],
     answers: Mapping[int, Localization],
     d_thresh: float,
-    config: CorrectionConfig,
 ) -> list[Rigid3 | None]:
     """Return the corrected poses. None stays None.
 
     Args:
         world_from_cams: the poses by frame.
         answers: the trusted localizations, by frame.
-        d_thresh: D_thresh of the map, in metres.
-        config: the settings.
+        d_thresh: D_thresh of the map, in metres. The correction is smoothed over this distance.
     """
     poses = {index: pose for index, pose in enumerate(world_from_cams) if pose is not None}
     answered = [
@@ -99,12 +82,9 @@ def correct_trajectory(
         [answers[index] for index in answered],
         at,
         d_thresh,
-        config,
     )
     moved = {
-        index: _apply_correction(
-            pose, *corrections.at(path_lengths[index], config.reach * d_thresh)
-        )
+        index: _apply_correction(pose, *corrections.at(path_lengths[index], d_thresh))
         for index, pose in poses.items()
     }
     return [moved.get(index) for index in range(len(world_from_cams))]
@@ -140,17 +120,18 @@ def _estimate_corrections(
     answers: Sequence[Localization],
     path_lengths: Float[np.ndarray, " k"],
     d_thresh: float,
-    config: CorrectionConfig,
 ) -> _Corrections:
     """Estimate the correction at each localization from the localizations around it."""
+    # Prior sigma of the correction, in D_thresh. A localization this far from the local mean
+    # has half the weight.
+    stray = 0.1
+    stray_deg = 0.5  # the same for the rotation, in degrees
     errors = [_pose_error(pose, answer) for pose, answer in zip(poses, answers, strict=True)]
     sigmas_m = np.array([answer.position_sigma_m for answer in answers])
     sigmas = np.radians([answer.rotation_sigma_deg for answer in answers])
-    near = np.exp(
-        -0.5 * (np.subtract.outer(path_lengths, path_lengths) / (config.reach * d_thresh)) ** 2
-    )
+    near = np.exp(-0.5 * (np.subtract.outer(path_lengths, path_lengths) / (d_thresh)) ** 2)
     shifts = _robust_mean(
-        near, np.array([shift for shift, _ in errors]), sigmas_m, config.stray * d_thresh
+        near, np.array([shift for shift, _ in errors]), sigmas_m, stray * d_thresh
     )
     return _Corrections(
         path_lengths,
@@ -159,7 +140,7 @@ def _estimate_corrections(
             near,
             np.array([rotation_vector for _, rotation_vector in errors]),
             sigmas,
-            math.radians(config.stray_deg),
+            math.radians(stray_deg),
         ),
     )
 

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 
-from topoloc.bounds import Above, Between, check_bounds
 from topoloc.errors import DuplicateSessionError
 from topoloc.geometry.rigid import inverse_covariance, position_covariance
 from topoloc.lifelong.coarse_model_update import PlaceFeatures, update_coarse_models
@@ -28,7 +27,6 @@ from topoloc.lifelong.recall_change import measure_recall_change
 from topoloc.lifelong.session_poses import (
     Progress,
     SessionPoses,
-    SessionPosesConfig,
     estimate_poses_by_motion,
 )
 from topoloc.lifelong.single_camera_poses import estimate_poses_by_map
@@ -36,41 +34,30 @@ from topoloc.lifelong.virtual_node_update import add_virtual_nodes, find_new_vir
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.localization.result import Localization
-from topoloc.mapping.landmarks import Observations, count_session_observations
+from topoloc.mapping.landmarks import NODES_PER_IMAGE, Observations, count_session_observations
 from topoloc.mapping.mapping_frames import (
-    PLACE_JPEG_QUALITY,
     MappingFrame,
     MappingImage,
     PointLocator,
-    encode_thumbnail,
+    encode_place_image,
     extract_mapping_image,
     select_posed_frames,
 )
-from topoloc.mapping.node_drafts import NodeDraft, create_node_draft, finish_node, observe_draft
+from topoloc.mapping.node_drafts import (
+    MIN_NODE_POINTS,
+    NodeDraft,
+    create_node_draft,
+    finish_node,
+    observe_draft,
+)
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.sessions import Illumination, Session, average_illumination, find_source_path
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import SequenceView
+from topoloc.retrieval.network_images import decode_stored_image
 from topoloc.tracking.tracker import Tracker
-
-_NUM_IMAGES_COMPARED = 3
-
-
-@dataclass(frozen=True)
-class UpdateConfig:
-    """Configure when a session's images become nodes."""
-
-    poses: SessionPosesConfig = field(default_factory=SessionPosesConfig)
-    min_inliers: Annotated[int, Between(1, 10_000)] = 60
-    """Minimum number of inliers of a well localized image. Such an image becomes no node."""
-    max_sigma: Annotated[float, Above(0)] = 0.3
-    """Maximum position sigma of a well localized image, in D_thresh. Correlated errors of the map's
-    points are left out, because a node aligned by the map would share them."""
-    earlier_asked: Annotated[int, Between(0, 10_000)] = 24
-    """Maximum number of earlier nodes localized before and after the edit, to record the change of
-    recall in the map's history. 0 skips this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +90,6 @@ def update_map(
     topomap: TopoMetricMap,
     sequence: StereoSequence,
     poses_from: str,
-    config: UpdateConfig | None = None,
     localizer_config: LocalizerConfig | None = None,
     progress: Progress | None = None,
 ) -> MapUpdate:
@@ -115,37 +101,33 @@ def update_map(
             form a stream and need no poses.
         poses_from: the source of the poses, which the map records. `map` localizes every image in
             the map.
-        config: the settings. Defaults to `UpdateConfig()`.
         localizer_config: the localizer's settings.
         progress: is called with a stage's name, steps done and all steps.
 
     Raises:
-        ConfigError: a setting is out of its bounds.
+        ConfigError: a setting of the localizer is out of its bounds.
         DuplicateSessionError: the session is in the map already.
         TrajectoryError: the map recognises too little of it, or contradicts its poses.
         FeatureTypeError, MissingExtraError, WeightsError: the map's features cannot be extracted on
             this machine.
         RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
     """
-    config, progress = config or UpdateConfig(), progress or (lambda stage, done, total: None)
-    check_bounds(config)
+    progress = progress or (lambda stage, done, total: None)
     check_session_is_new(topomap, sequence)
     localizer = Localizer(topomap, localizer_config)
     if poses_from == "map":
         session_poses = estimate_poses_by_map(
-            sequence, Tracker(localizer), topomap.config, config.poses, progress
+            sequence, Tracker(localizer), topomap.config, progress
         )
     else:
-        session_poses = estimate_poses_by_motion(
-            sequence, localizer, topomap.config, config.poses, progress
-        )
+        session_poses = estimate_poses_by_motion(sequence, localizer, topomap.config, progress)
     session_id = topomap.free_ids.session
     without = [None] * (len(sequence) - len(session_poses.world_from_cams))
     posed_sequence = SequenceView(
         sequence, list(range(len(sequence))), [*session_poses.world_from_cams, *without]
     )
     frames = select_posed_frames(posed_sequence, session_id)
-    content = _create_session_content(topomap, frames, session_poses, config, progress)
+    content = _create_session_content(topomap, frames, session_poses, progress)
     session = _create_session(session_id, sequence, frames, content, poses_from)
     updated = update_coarse_models(topomap, content.views, content.images)
     changed = replace(_add_session(topomap, session, frames, content), coarse_models=updated.models)
@@ -164,7 +146,7 @@ def update_map(
     return MapUpdate(
         changed,
         posed_sequence,
-        changes | measure_recall_change(topomap, changed, config.earlier_asked, localizer_config),
+        changes | measure_recall_change(topomap, changed, localizer_config),
     )
 
 
@@ -220,25 +202,27 @@ def _has_same_images(
     common = [image for image in kept if image.name in rows]
     if not common:
         return is_same_path and bool(kept)
+    num_compared = 3  # images, evenly spaced
     tried = [
-        common[k]
-        for k in np.unique(np.linspace(0, len(common) - 1, _NUM_IMAGES_COMPARED).astype(int))
+        common[k] for k in np.unique(np.linspace(0, len(common) - 1, num_compared).astype(int))
     ]
-    side = topomap.config.place_side_px
     return any(
-        encode_thumbnail(
-            prepare_frame(sequence[rows[image.name]], False).picture, side, PLACE_JPEG_QUALITY
+        encode_place_image(
+            prepare_frame(sequence[rows[image.name]], False).picture, _shorter_side(image.jpeg)
         )
         == image.jpeg
         for image in tried
     )
 
 
+def _shorter_side(jpeg: bytes) -> int:
+    return min(decode_stored_image(jpeg).shape[:2])
+
+
 def _create_session_content(
     topomap: TopoMetricMap,
     frames: Sequence[MappingFrame],
     session_poses: SessionPoses,
-    config: UpdateConfig,
     progress: Progress,
 ) -> _SessionContent:
     map_config = topomap.config
@@ -250,7 +234,7 @@ def _create_session_content(
     wanted = [
         by_index[k]
         for k, answer in session_poses.answers.items()
-        if k in by_index and not is_well_localized(answer, d_thresh, config)
+        if k in by_index and not is_well_localized(answer, d_thresh)
     ]
     with_virtual_views = find_new_virtual_views(topomap, [frame.world_from_cam for frame in wanted])
     drafts = list[NodeDraft]()
@@ -258,7 +242,7 @@ def _create_session_content(
         draft = create_node_draft(
             frame, frame.view(), locator, done in with_virtual_views, map_config
         )
-        if len(draft.points[topomap.kind].features) >= map_config.min_node_points:
+        if len(draft.points[topomap.kind].features) >= MIN_NODE_POINTS:
             drafts.append(draft)
         progress("new nodes", done + 1, len(wanted))
     covered = {by_index[k] for k in session_poses.answers if k in by_index} - {
@@ -297,7 +281,7 @@ def _create_session_content(
         progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
     for kind in topomap.kinds:
         content.nodes[kind] = [
-            finish_node(first_id + k, draft, kind, map_config) for k, draft in enumerate(drafts)
+            finish_node(first_id + k, draft, kind) for k, draft in enumerate(drafts)
         ]
     for k, draft in enumerate(drafts):
         content.sides.extend(
@@ -307,13 +291,18 @@ def _create_session_content(
     return content
 
 
-def is_well_localized(answer: Localization | None, d_thresh: float, config: UpdateConfig) -> bool:
+def is_well_localized(answer: Localization | None, d_thresh: float) -> bool:
     """Return whether the map localizes an image well enough that it needs no node."""
-    if answer is None or answer.num_inliers < config.min_inliers:
+    # Minimum number of inliers of a well localized image. Such an image becomes no node.
+    min_inliers = 60
+    # Maximum position sigma of a well localized image, in D_thresh. Correlated errors of the
+    # map's points are left out, because a node aligned by the map would share them.
+    max_sigma = 0.3
+    if answer is None or answer.num_inliers < min_inliers:
         return False
     of_inverse = answer.noise_share * inverse_covariance(answer.world_from_cam, answer.covariance)
     at_camera = position_covariance(answer.world_from_cam.inverse(), of_inverse)
-    return float(np.sqrt(np.linalg.eigvalsh(at_camera)[-1])) <= config.max_sigma * d_thresh
+    return float(np.sqrt(np.linalg.eigvalsh(at_camera)[-1])) <= max_sigma * d_thresh
 
 
 def _observe_new_nodes(
@@ -323,9 +312,9 @@ def _observe_new_nodes(
     nearest: Int[np.ndarray, " n"],
     topomap: TopoMetricMap,
 ) -> None:
-    for k in nearest[: topomap.config.landmarks.nodes_per_image]:
+    for k in nearest[:NODES_PER_IMAGE]:
         if frame not in drafts[k].sources:
-            drafts[k].add(observe_draft(drafts[k], image, frame.session_id, topomap.config))
+            drafts[k].add(observe_draft(drafts[k], image, frame.session_id))
 
 
 def _observe_map_nodes(
@@ -336,13 +325,12 @@ def _observe_map_nodes(
     content: _SessionContent,
 ) -> None:
     """Add an image's observations of existing nodes to `content`."""
-    config = topomap.config
-    for row in nearest[: config.landmarks.nodes_per_image].tolist():
+    for row in nearest[:NODES_PER_IMAGE].tolist():
         cam_from_node = image.world_from_cam.inverse() @ topomap.summaries[row].world_from_cam
         for kind, features in image.features.items():
             node = topomap.nodes_of(kind)[row]
             content.observations[kind, row].append(
-                observe_node(node, features, image.camera, cam_from_node, config, session_id)
+                observe_node(node, features, image.camera, cam_from_node, session_id)
             )
 
 

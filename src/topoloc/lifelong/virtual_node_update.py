@@ -20,7 +20,7 @@ def find_new_virtual_views(topomap: TopoMetricMap, world_from_cams: Sequence[Rig
     if topomap.sides is not None and topomap.sides.kind != config.virtual_view_type:
         return set()
     old = [summary.world_from_cam for summary in topomap.summaries]
-    chosen = select_virtual_view_nodes([*old, *world_from_cams], config.nodes, config.sides)
+    chosen = select_virtual_view_nodes([*old, *world_from_cams], config.nodes, config.sides.spacing)
     return {row - len(old) for row in chosen if row >= len(old)}
 
 
@@ -34,4 +34,4 @@ def add_virtual_nodes(topomap: TopoMetricMap, new_nodes: Sequence[TopoNode]) -> 
         if topomap.sides is None
         else (list(topomap.sides.nodes), topomap.sides.kind)
     )
-    return collect_virtual_nodes([*before, *new_nodes], kind, topomap.config.sides)
+    return collect_virtual_nodes([*before, *new_nodes], kind)

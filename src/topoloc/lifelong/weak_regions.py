@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from topoloc.bounds import Above, AtLeast, Between, check_bounds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.leave_one_out import LeaveOneOutResult, localize_left_out, sample_evenly
 from topoloc.localization.localizer import Localizer
@@ -25,36 +24,6 @@ from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 Reason = Literal["not_held", "few_landmarks", "one_direction", "single_session"]
 REASONS: tuple[Reason, ...] = get_args(Reason)
 """The reasons, the most severe first."""
-_BATCH_SIZE = 512  # nodes compared with all others in one step
-
-
-@dataclass(frozen=True)
-class WeakRegionsConfig:
-    """Configure when nodes are weak."""
-
-    max_asked: Annotated[int, AtLeast(0)] = 200
-    """Maximum number of nodes, evenly spaced, that are localized in the rest of the map. 0 skips
-    this."""
-    beside: Annotated[float, AtLeast(0)] = 0.0
-    """Nodes of the same session within this many D_thresh (Eq. 1) are hidden together with a node.
-    Nodes of one session are more than one D_thresh apart, so 0 hides only the node itself. Its
-    nearest remaining node is then further away than for any query on the trajectory."""
-    min_inliers: Annotated[int, Between(1, 10_000)] = 60
-    """The rest of the map must localize a node with at least this many inliers. An update adds no
-    node for such an image."""
-    min_landmarks: Annotated[int, Between(1, 100_000)] = 100
-    """A node with fewer landmarks than this is weak."""
-    reach: Annotated[float, Above(0)] = 4.0
-    """Maximum distance of a node with the opposite view, in D_thresh."""
-    min_turn_deg: Annotated[float, Between(1, 180)] = 120.0
-    """Minimum angle between opposite views, in degrees."""
-    min_seen_share: Annotated[float, Between(0, 1)] = 0.2
-    """A node is weak if other sessions saw less than this share of its landmarks and none has a
-    node beside it."""
-    stood_by: Annotated[float, AtLeast(0)] = 1.5
-    """Maximum distance of another session's node beside a node, in D_thresh (Eq. 1)."""
-    apart: Annotated[float, Above(0)] = 3.0
-    """Weak nodes within this many D_thresh of each other form one region."""
 
 
 @dataclass(frozen=True)
@@ -207,33 +176,43 @@ class WeakRegions:
 
 def find_weak_regions(
     localizer: Localizer,
-    config: WeakRegionsConfig | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    *,
+    max_queries: int = 200,
+    beside: float = 0.0,
+    reach: float = 4.0,
+    stood_by: float = 1.5,
 ) -> WeakRegions:
     """Assess each node of a map by the rest of the map.
 
+    Args:
+        max_queries: maximum number of nodes, evenly spaced, that are localized in the rest of the
+            map.
+        beside: nodes of the same session within this many D_thresh (Eq. 1) are hidden together with
+            a node. Nodes of one session are more than one D_thresh apart, so 0 hides only the node
+            itself.
+        reach: maximum distance of a node with the opposite view, in D_thresh.
+        stood_by: maximum distance of another session's node beside a node, in D_thresh (Eq. 1).
+
     Raises:
-        ConfigError: a setting is out of its bounds.
         MapError: the map cannot be read.
     """
-    config = config or WeakRegionsConfig()
-    check_bounds(config)
+    min_turn_deg = 120.0  # minimum angle between opposite views, in degrees
+    apart = 3.0  # weak nodes within this many D_thresh of each other form one region
     topomap, rows = (
         localizer.topomap,
-        sample_evenly(range(len(localizer.topomap.summaries)), config.max_asked),
+        sample_evenly(range(len(localizer.topomap.summaries)), max_queries),
     )
 
     def report_progress(done: int, total: int) -> None:
         if progress is not None:
             progress("asking the map without the node", done, total)
 
-    answers = localize_left_out(localizer, topomap, rows, config.beside, report_progress)
+    answers = localize_left_out(localizer, topomap, rows, beside, report_progress)
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    has_opposite_view = _has_opposite_view(
-        poses, config.reach * topomap.config.d_thresh, config.min_turn_deg
-    )
+    has_opposite_view = _has_opposite_view(poses, reach * topomap.config.d_thresh, min_turn_deg)
     nodes = [
-        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), poses, config)
+        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), poses, stood_by)
         for row in range(len(topomap.summaries))
     ]
     names = {session.session_id: session.name for session in topomap.sessions}
@@ -242,7 +221,7 @@ def find_weak_regions(
         for summary in topomap.summaries
         if summary.session_id not in names
     }
-    return WeakRegions(nodes, _group_regions(nodes, config.apart * topomap.config.d_thresh), names)
+    return WeakRegions(nodes, _group_regions(nodes, apart * topomap.config.d_thresh), names)
 
 
 def _assess_node(
@@ -251,19 +230,24 @@ def _assess_node(
     answer: LeaveOneOutResult | None,
     has_opposite_view: bool,
     poses: NodePoses,
-    config: WeakRegionsConfig,
+    stood_by: float,
 ) -> NodeQuality:
+    # The rest of the map must localize a node with at least this many inliers. An update adds
+    # no node for such an image.
+    min_inliers = 60
+    min_landmarks = 100  # A node with fewer landmarks than this is weak
+    # A node is weak if other sessions saw less than this share of its landmarks and none has
+    # a node beside it.
+    min_seen_share = 0.2
     node, summary = topomap.nodes[row], topomap.summaries[row]
     seen_share, reasons = _seen_share(node), list[Reason]()
-    if answer is not None and answer.num_inliers < config.min_inliers:
+    if answer is not None and answer.num_inliers < min_inliers:
         reasons.append("not_held")
-    if summary.num_points < config.min_landmarks:
+    if summary.num_points < min_landmarks:
         reasons.append("few_landmarks")
     if not has_opposite_view:
         reasons.append("one_direction")
-    if seen_share < config.min_seen_share and not _has_other_session(
-        topomap, row, poses, config.stood_by
-    ):
+    if seen_share < min_seen_share and not _has_other_session(topomap, row, poses, stood_by):
         reasons.append("single_session")
     return NodeQuality(
         summary.node_id,
@@ -303,8 +287,9 @@ def _has_opposite_view(
 ) -> Bool[np.ndarray, " nodes"]:
     """Return for each node whether another one within reach looks in the opposite direction."""
     axes, found = poses.rotations[:, :, 2], np.zeros(len(poses.centres), bool)
-    for start in range(0, len(axes), _BATCH_SIZE):
-        some = slice(start, start + _BATCH_SIZE)
+    batch_size = 512  # nodes compared with all others in one step
+    for start in range(0, len(axes), batch_size):
+        some = slice(start, start + batch_size)
         away = np.linalg.norm(poses.centres[some, None] - poses.centres[None], axis=2)
         found[some] = (
             (away <= reach_m) & (axes[some] @ axes.T <= np.cos(np.deg2rad(min_turn_deg)))

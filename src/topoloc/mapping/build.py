@@ -23,7 +23,7 @@ from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.entries import Edge, PlaceImage, TopoNode
-from topoloc.mapping.landmarks import Observations
+from topoloc.mapping.landmarks import NODES_PER_IMAGE, Observations
 from topoloc.mapping.mapping_frames import (
     MappingFrame,
     MappingImage,
@@ -33,6 +33,7 @@ from topoloc.mapping.mapping_frames import (
     select_posed_frames,
 )
 from topoloc.mapping.node_drafts import (
+    MIN_NODE_POINTS,
     NodeDraft,
     NodeDrafts,
     create_node_draft,
@@ -117,7 +118,7 @@ def build_map(
         coarse_models={model.name: model for model in coarse},
         config=replace(config, nodes=node_config),
         length_m=_compute_trajectory_length(frames),
-        sides=collect_virtual_nodes(sides, config.virtual_view_type, config.sides),
+        sides=collect_virtual_nodes(sides, config.virtual_view_type),
         sessions=[
             _make_session(k, sequence, frames, lights, poses_from[k], drafts.cameras)
             for k, sequence in enumerate(sequences)
@@ -195,7 +196,7 @@ def _draft_nodes(
     ]
     kind = find_feature_type(config.features.kind)
     rows = select_virtual_view_nodes(
-        [frame.world_from_cam for frame in chosen], node_config, config.sides
+        [frame.world_from_cam for frame in chosen], node_config, config.sides.spacing
     )
     virtual_view_frames = {chosen[row] for row in rows}
     drafts = NodeDrafts(DiskList(shared_objects=frames))
@@ -206,12 +207,12 @@ def _draft_nodes(
         )
 
     for done, draft in enumerate(locator.map_frames(make_draft, chosen)):
-        if len(draft.points[kind.name].features) >= config.min_node_points:
+        if len(draft.points[kind.name].features) >= MIN_NODE_POINTS:
             drafts.append(draft)
         progress("nodes", done + 1, len(chosen))
     if not drafts.rows:
         raise EmptyMapError(
-            f"{frames[0].sequence.name}: no picture has {config.min_node_points} features with a"
+            f"{frames[0].sequence.name}: no picture has {MIN_NODE_POINTS} features with a"
             " 3-D position"
         )
     return drafts
@@ -304,10 +305,10 @@ def _observe_image(
         if read is None
         else extract_mapping_image(frame, prepare_view(read, with_depth=False), config)
     )
-    nearest = nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)).tolist()
-    around = {row: drafts.disk_list[row] for row in nearest[: config.landmarks.nodes_per_image]}
+    nearest = nodes.rows(image.world_from_cam, NODES_PER_IMAGE).tolist()
+    around = {row: drafts.disk_list[row] for row in nearest}
     observed = {
-        row: observe_draft(draft, image, frame.session_id, config)
+        row: observe_draft(draft, image, frame.session_id)
         for row, draft in around.items()
         if frame not in draft.sources
     }
@@ -346,7 +347,7 @@ def _finish_nodes(
 
     def finish_nodes(node_id: int) -> tuple[list[TopoNode], list[TopoNode]]:
         draft = drafts.disk_list[node_id]
-        return [finish_node(node_id, draft, kind, config) for kind in config.kinds], draft.sides
+        return [finish_node(node_id, draft, kind) for kind in config.kinds], draft.sides
 
     for node_id, (nodes, of_node) in enumerate(
         parallel_map(finish_nodes, range(len(drafts.disk_list)))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any
+from typing import Any
 
-from topoloc.bounds import Between, parse_settings
+from topoloc.bounds import parse_settings
 from topoloc.errors import ConfigError, MissingExtraError, WeightsError
 from topoloc.features.feature_types import (
     SURF,
@@ -15,12 +15,10 @@ from topoloc.features.feature_types import (
     find_feature_type,
 )
 from topoloc.json_data import decode_json
-from topoloc.mapping.landmarks import LandmarkConfig
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.validation import CorruptDataError
 from topoloc.mapping.virtual_nodes import VirtualNodesConfig
-from topoloc.points.metric_points import MetricPointsConfig
-from topoloc.points.motion_triangulation import MotionTriangulationConfig
+from topoloc.removed_settings import drop_removed_settings
 from topoloc.retrieval.vlad import VladConfig
 
 CONFIG_VERSION = 1
@@ -36,20 +34,8 @@ class MapConfig:
     other_kinds: tuple[str, ...] | None = None
     """Further feature types of the same nodes. A query uses them if the first type leaves its pose
     uncertain. None: beside SURF, the default learned type if its network is installed."""
-    points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
-    motion: MotionTriangulationConfig = field(default_factory=MotionTriangulationConfig)
-    landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     vlad: VladConfig = field(default_factory=VladConfig)
     sides: VirtualNodesConfig = field(default_factory=VirtualNodesConfig)
-    max_node_points: Annotated[int, Between(1, 100_000)] = 800
-    """Maximum number of features per node. The strongest are kept."""
-    min_node_points: Annotated[int, Between(1, 100_000)] = 20
-    """An image with fewer located features becomes no node."""
-    template_side_px: Annotated[int, Between(16, 4096)] = 240
-    """Maximum length of the shorter side of a node's template image, in pixels."""
-    place_side_px: Annotated[int, Between(16, 4096)] = 160
-    """Maximum length of the shorter side of the mapping images kept for the coarse localizers
-    (section III-B), in pixels."""
 
     @property
     def kinds(self) -> list[str]:
@@ -115,7 +101,7 @@ def config_from_text(text: str, version: int | None) -> MapConfig:
     data = decode_json(text, dict[str, Any], CorruptDataError, "config")
     if version is not None and data.pop("version", None) != version:
         raise ConfigError(f"config: of another version than {version}, which is known")
-    config = parse_settings(MapConfig, data, "config")
+    config = parse_settings(MapConfig, drop_removed_settings(data, "build"), "config")
     for name in ("d_thresh", "lambda_rot"):
         if getattr(config.nodes, name) is None:
             raise ConfigError(f"config.nodes.{name}: is missing")

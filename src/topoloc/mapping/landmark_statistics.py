@@ -83,8 +83,11 @@ class LandmarkStatistics:
             and float(np.abs(self.roots).max()) <= _MAX_EMPTY_ROOT
         )
 
-    def is_reobserved(self, min_seen_share: float) -> bool:
-        """Return whether the session saw at least this share of its expected observations."""
+    def is_reobserved(self, min_seen_share: float = 0.3) -> bool:
+        """Return whether the session saw at least this share of its expected observations.
+
+        A session in other light may see none of them.
+        """
         return bool(
             self.seen.sum(dtype=np.int64) >= min_seen_share * self.expected.sum(dtype=np.int64)
         )
@@ -144,18 +147,16 @@ class AccumulatedStatistics:
         return points_cam - (covariances @ self.pulls[:, :, None])[:, :, 0], covariances
 
 
-def merge_count_statistics(
-    statistics: Iterable[LandmarkStatistics], min_seen_share: float
-) -> list[LandmarkStatistics]:
+def merge_count_statistics(statistics: Iterable[LandmarkStatistics]) -> list[LandmarkStatistics]:
     """Merge the count-only sessions into at most two, each with the id of its last session.
 
-    One holds the sessions that saw at least `min_seen_share` of their expected observations. The
+    One holds the sessions that observed the node again (`is_reobserved`). The
     other holds the rest (other light). So a node's size does not grow with the number of sessions.
     """
     kept, counted = list[LandmarkStatistics](), dict[bool, list[LandmarkStatistics]]()
     for of_session in statistics:
         if of_session.is_count_only:
-            counted.setdefault(of_session.is_reobserved(min_seen_share), []).append(of_session)
+            counted.setdefault(of_session.is_reobserved(), []).append(of_session)
         else:
             kept.append(of_session)
     return sorted([*kept, *map(_add_counts, counted.values())], key=lambda part: part.session_id)

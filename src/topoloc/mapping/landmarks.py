@@ -9,12 +9,10 @@ Each session's contribution is kept as sums (`landmark_statistics.py`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.features import Features
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.camera import Camera
@@ -25,25 +23,7 @@ from topoloc.mapping.landmark_statistics import LandmarkStatistics
 _CAUCHY_SCALE = 2.385  # in standard deviations of a residual
 
 
-@dataclass(frozen=True)
-class LandmarkConfig:
-    """Configure how points are observed and refined."""
-
-    nodes_per_image: Annotated[int, Between(0, 1000)] = 3
-    """Each mapping image is matched with this many nearest nodes. 0 keeps the first
-    measurements."""
-    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
-    gate: Annotated[float, Above(0)] = 4.0
-    """Maximum distance of an observation from the point's projection, in standard deviations of
-    both."""
-    pose_sigma_px: Annotated[float, AtLeast(0)] = 0.7
-    """Sigma in pixels added to a key point's own sigma, for errors of mapping poses and
-    rectification."""
-    num_iterations: Annotated[int, Between(0, 1000)] = 6
-    """Number of Gauss-Newton steps that refine a point."""
-    max_disagreement: Annotated[float, Above(0)] = 3.0
-    """Points are dropped if the root mean square of their refined residuals exceeds this, in
-    standard deviations."""
+NODES_PER_IMAGE = 3  # nodes whose points a mapping image observes, the nearest ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,21 +62,28 @@ def observe_points(
     feature_sigmas_px: Float[np.ndarray, " m"],
     camera: Camera,
     cam_from_node: Rigid3,
-    config: LandmarkConfig,
     session_id: int = 0,
 ) -> Observations:
     """Find a node's points among the features of another mapping image, by descriptor and by
     expected projection."""
-    matches = match_features(node_features.descriptors, features.descriptors, config.matching)
+    # Sigma in pixels added to a key point's own sigma, for errors of mapping poses and
+    # rectification.
+    pose_sigma_px = 0.7
+    # Maximum distance of an observation from the point's projection, in standard deviations
+    # of both.
+    gate = 4.0
+    matches = match_features(
+        node_features.descriptors, features.descriptors, MatchingConfig(ratio=0.85)
+    )
     rows, columns = matches.query_idx.astype(np.int64), matches.train_idx
     normalized = camera.normalized_from_img(features.points_img[columns].astype(np.float64))
-    sigmas = np.hypot(feature_sigmas_px[columns], config.pose_sigma_px) / camera.fx
+    sigmas = np.hypot(feature_sigmas_px[columns], pose_sigma_px) / camera.fx
     residuals, jacobians, in_front = _project(points_cam[rows], normalized, cam_from_node)
     expected = jacobians @ covariances[rows] @ jacobians.transpose(0, 2, 1) + sigmas[
         :, None, None
     ] ** 2 * np.eye(2)
     squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)
-    seen = in_front & (squares < config.gate**2)
+    seen = in_front & (squares < gate**2)
     in_view = _in_view(points_cam, camera, cam_from_node)
     return Observations(
         rows[seen], normalized[seen], sigmas[seen], cam_from_node, in_view, session_id
@@ -107,18 +94,24 @@ def refine_points(
     points_cam: Float[np.ndarray, "n 3"],
     covariances: Float[np.ndarray, "n 3 3"],
     observations: list[Observations],
-    config: LandmarkConfig,
+    num_iterations: int = 6,
 ) -> RefinedPoints:
     """Triangulate a node's points (node's camera frame, metres) from all observations with fixed
     poses.
 
     Gauss-Newton per point with Cauchy loss on each observation. The first measurement and its
     covariance are the prior.
+
+    Args:
+        num_iterations: number of Gauss-Newton steps.
     """
+    # Points are dropped if the root mean square of their refined residuals exceeds this, in
+    # standard deviations.
+    max_disagreement = 3.0
     prior = np.linalg.inv(covariances)
     points = points_cam.copy()
     information = prior
-    for _ in range(config.num_iterations):
+    for _ in range(num_iterations):
         information, gradient, _ = _normal_equations(points, points_cam, prior, observations)
         points = points - np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
     information, _, squares = _normal_equations(points, points_cam, prior, observations)
@@ -126,9 +119,7 @@ def refine_points(
     for seen in observations:
         num_observations[seen.rows] += 1
     rms = np.sqrt(squares / np.maximum(2 * num_observations, 1))
-    is_consistent = (
-        (rms < config.max_disagreement) & np.isfinite(points).all(axis=1) & (points[:, 2] > 0)
-    )
+    is_consistent = (rms < max_disagreement) & np.isfinite(points).all(axis=1) & (points[:, 2] > 0)
     return RefinedPoints(points, np.linalg.inv(information), num_observations, is_consistent)
 
 

@@ -36,7 +36,6 @@ from topoloc.recordings.recording import has_scale, read_left_frame
 
 R = TypeVar("R")
 
-PLACE_JPEG_QUALITY = 60  # JPEG quality of place images
 _MAX_CACHED_IMAGES = (
     48  # monocular images locate the points of several nodes, so their features are cached
 )
@@ -117,7 +116,7 @@ def extract_mapping_image(
     frame: MappingFrame, view: PreparedFrame, config: MapConfig
 ) -> MappingImage:
     """Extract the features of all types from a frame that has been read."""
-    jpeg = encode_thumbnail(view.picture, config.place_side_px, PLACE_JPEG_QUALITY)
+    jpeg = encode_place_image(view.picture)
     world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     features = {
         kind: extract_features(view.grey, config.feature_config_for(kind)) for kind in config.kinds
@@ -125,6 +124,12 @@ def extract_mapping_image(
     return MappingImage(
         view.camera, world_from_view, features, jpeg, Illumination.of_image(view.picture)
     )
+
+
+def encode_place_image(picture: Image, side_px: int = 160) -> bytes:
+    """Encode a mapping image for the coarse localizers (section III-B), with its shorter side at
+    most `side_px`."""
+    return encode_thumbnail(picture, side_px, quality=60)
 
 
 def encode_thumbnail(picture: Image, side_px: int, quality: int) -> bytes:
@@ -180,30 +185,24 @@ class PointLocator:
         triangulate them."""
         if view.right_grey is not None or view.depth is not None:
             return {
-                kind: locate_points(features, view, self._config.points)
-                for kind, features in image.features.items()
+                kind: locate_points(features, view) for kind, features in image.features.items()
             }, []
         frames = self._sessions[frame.session_id]
         poses = [other.world_from_cam for other in frames]
-        chosen = select_source_images(
-            poses, frames.index(frame), self._steps[frame.session_id], self._config.motion
-        )
+        chosen = select_source_images(poses, frames.index(frame), self._steps[frame.session_id])
         others = [frames[k] for k in chosen]
         images = [self.image(other, other.view()) for other in others]
         points = {}
         for kind, features in image.features.items():
-            sigmas = keypoint_sigmas(features, self._config.points)
+            sigmas = keypoint_sigmas(features)
             source_images = [self._make_source_image(of_other, kind, image) for of_other in images]
-            relative = self._config.points.max_relative_sigma
-            points[kind] = triangulate_from_motion(
-                features, sigmas, image.camera, source_images, relative, self._config.motion
-            )
+            points[kind] = triangulate_from_motion(features, sigmas, image.camera, source_images)
         return points, others
 
     def _make_source_image(
         self, other: MappingImage, kind: str, image: MappingImage
     ) -> SourceImage:
-        sigmas = keypoint_sigmas(other.features[kind], self._config.points)
+        sigmas = keypoint_sigmas(other.features[kind])
         return SourceImage(
             other.features[kind],
             sigmas,

@@ -31,6 +31,8 @@ from topoloc.points.metric_points import keypoint_sigmas
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.retrieval.vlad import append_positions
 
+MIN_NODE_POINTS = 20  # an image with fewer located features becomes no node
+
 
 @dataclass(frozen=True, eq=False)
 class DraftPoints:
@@ -119,7 +121,7 @@ def create_node_draft(
             located[kind].covariances[rows],
             [],
         )
-    template_jpeg = encode_thumbnail(view.picture, config.template_side_px, quality=75)
+    template_jpeg = encode_thumbnail(view.picture, 240, quality=75)
     summary = NodeSummary(
         -1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id
     )
@@ -128,8 +130,6 @@ def create_node_draft(
             summary,
             view,
             config.feature_config_for(config.virtual_view_type),
-            config.points,
-            config.sides,
         )
         if has_virtual_views and not sources
         else []
@@ -138,33 +138,29 @@ def create_node_draft(
 
 
 def observe_draft(
-    draft: NodeDraft, image: MappingImage, session_id: int, config: MapConfig
+    draft: NodeDraft, image: MappingImage, session_id: int
 ) -> dict[str, Observations]:
     """Return an image's observations of a draft's points, by feature type."""
     cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
     observed = {}
     for kind, features in image.features.items():
-        points, sigmas_px = draft.points[kind], keypoint_sigmas(features, config.points)
+        points, sigmas_px = draft.points[kind], keypoint_sigmas(features)
         known, seen_by = (
             (points.features, points.points_cam, points.covariances),
             (features, sigmas_px, image.camera, cam_from_node),
         )
-        observed[kind] = observe_points(*known, *seen_by, config.landmarks, session_id)
+        observed[kind] = observe_points(*known, *seen_by, session_id)
     return observed
 
 
-def finish_node(node_id: int, draft: NodeDraft, kind: str, config: MapConfig) -> TopoNode:
+def finish_node(node_id: int, draft: NodeDraft, kind: str, max_points: int = 800) -> TopoNode:
     """Refine the points of a feature type and return the node. Points observed again are preferred,
-    then the strongest."""
+    then the strongest. At most `max_points` are kept."""
     points, frame, image = draft.points[kind], draft.frame, draft.image
-    refined = refine_points(
-        points.points_cam, points.covariances, points.observations, config.landmarks
-    )
+    refined = refine_points(points.points_cam, points.covariances, points.observations)
     rows = np.flatnonzero(refined.is_consistent)
     rows = np.sort(
-        rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][
-            : config.max_node_points
-        ]
+        rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][:max_points]
     )
     sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
     session_statistics = compute_session_statistics(

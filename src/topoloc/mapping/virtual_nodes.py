@@ -11,20 +11,20 @@ gives a pose (`localization/walls/`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from topoloc.bounds import AtLeast, Between
+from topoloc.bounds import AtLeast
 from topoloc.disk_list import DiskList
 from topoloc.features.extraction import FeatureConfig, extract_features
-from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_virtual_views
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.mapping.nodes import NodeConfig, select_node_frames
-from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.retrieval.vlad import (
     SurfVlad,
@@ -37,35 +37,27 @@ from topoloc.retrieval.vlad import (
 
 @dataclass(frozen=True)
 class VirtualNodesConfig:
-    """Configure which nodes have virtual nodes, and their content."""
+    """Configure which nodes have virtual nodes."""
 
     spacing: Annotated[float, AtLeast(0)] = 3.0
     """Nodes are selected by Eq. 1 with this many times the map's D_thresh and half the weight of
     rotation. 0 creates no virtual nodes."""
-    opposite: Annotated[float, AtLeast(0)] = 10.0
-    """A node needs no virtual nodes if another node within this many D_thresh looks in the opposite
-    direction."""
-    views: VirtualViewConfig = field(default_factory=VirtualViewConfig)
-    max_points: Annotated[int, Between(1, 100_000)] = 400
-    """Maximum number of features per virtual node. The strongest are kept."""
-    min_points: Annotated[int, Between(1, 100_000)] = 20
-    """A virtual view with fewer features becomes no virtual node."""
-    vlad: VladConfig = field(default_factory=lambda: VladConfig(position_weight=0.0))
-    """Positions in the image have no weight, because they depend on the camera's position along the
-    wall."""
 
 
 def select_virtual_view_nodes(
-    world_from_nodes: list[Rigid3], node_config: NodeConfig, config: VirtualNodesConfig
+    world_from_nodes: list[Rigid3], node_config: NodeConfig, spacing: float
 ) -> set[int]:
     """Return the rows of the poses that need virtual views. `node_config` (of the map) must be
-    resolved."""
-    if config.spacing == 0.0:
+    resolved. `spacing` is that of `VirtualNodesConfig`."""
+    # A node needs no virtual nodes if another node within this many D_thresh looks in the
+    # opposite direction.
+    max_opposite = 10.0
+    if spacing == 0.0:
         return set()
     assert node_config.d_thresh is not None, "resolve the configuration first"
     assert node_config.lambda_rot is not None, "resolve the configuration first"
-    reach = config.opposite * node_config.d_thresh
-    spaced = NodeConfig(config.spacing * node_config.d_thresh, node_config.lambda_rot / 2.0)
+    reach = max_opposite * node_config.d_thresh
+    spaced = NodeConfig(spacing * node_config.d_thresh, node_config.lambda_rot / 2.0)
     centres = np.array([pose.translation for pose in world_from_nodes])
     axes = np.array([pose.rotation[:, 2] for pose in world_from_nodes])
 
@@ -84,20 +76,24 @@ def create_virtual_nodes(
     of_node: NodeSummary,
     view: PreparedFrame,
     features: FeatureConfig,
-    points: MetricPointsConfig,
-    config: VirtualNodesConfig,
+    max_points: int = 400,
+    min_points: int = 20,
 ) -> list[TopoNode]:
-    """Return the virtual nodes of a node's image, at most two, without ids."""
+    """Return the virtual nodes of a node's image, at most two, without ids.
+
+    Args:
+        features: the settings of features.
+        max_points: maximum number of features per virtual node. The strongest are kept.
+        min_points: a virtual view with fewer features becomes no virtual node.
+    """
     sides = (
-        _create_virtual_node(of_node, view, virtual_view, features, points, config)
-        for virtual_view in make_virtual_views(view.camera, config.views)
+        _create_virtual_node(of_node, view, virtual_view, features, max_points, min_points)
+        for virtual_view in make_virtual_views(view.camera)
     )
     return [node for node in sides if node is not None]
 
 
-def collect_virtual_nodes(
-    described: Sequence[TopoNode], kind: str, config: VirtualNodesConfig
-) -> VirtualNodes | None:
+def collect_virtual_nodes(described: Sequence[TopoNode], kind: str) -> VirtualNodes | None:
     """Number all virtual nodes of a map, of one feature type, and fit their retrieval model. Return
     None if there are none. `of_node` must be set."""
     if len(described) == 0:
@@ -105,7 +101,7 @@ def collect_virtual_nodes(
     nodes = DiskList(
         replace(node, summary=replace(node.summary, node_id=k)) for k, node in enumerate(described)
     )
-    model = _fit_vlad(nodes, config.vlad).to_model()
+    model = _fit_vlad(nodes).to_model()
     model = replace(
         model,
         arrays={**model.arrays, "centres": np.array([_median_point_world(node) for node in nodes])},
@@ -118,21 +114,21 @@ def _create_virtual_node(
     view: PreparedFrame,
     virtual_view: VirtualView,
     feature_config: FeatureConfig,
-    points: MetricPointsConfig,
-    config: VirtualNodesConfig,
+    max_points: int,
+    min_points: int,
 ) -> TopoNode | None:
     features = virtual_view.select_inside(
         extract_features(virtual_view.picture(view.grey), feature_config)
     )
-    located = locate_points(virtual_view.to_image_pixels(features, view.camera), view, points)
+    located = locate_points(virtual_view.to_image_pixels(features, view.camera), view)
     # points too slanted from the virtual camera are not on the wall in front of it
     side_from_cam = virtual_view.cam_from_virtual.inverse()
     points_side = side_from_cam.apply(located.points_cam)
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero(located.valid & (points_side[:, 2] > 0.1 * located.points_cam[:, 2]))[
-            : config.max_points
+            :max_points
         ]
-    if len(rows) < config.min_points:
+    if len(rows) < min_points:
         return None
     turn = side_from_cam.rotation
     roots = np.linalg.cholesky(turn @ located.covariances[rows] @ turn.T)
@@ -157,7 +153,10 @@ def _median_point_world(node: TopoNode) -> Float[np.ndarray, " 3"]:
     )[0]
 
 
-def _fit_vlad(nodes: Sequence[TopoNode], config: VladConfig) -> SurfVlad:
+def _fit_vlad(nodes: Sequence[TopoNode]) -> SurfVlad:
+    # Positions have no weight: they depend on the camera's position along the wall.
+    config = VladConfig(position_weight=0.0)
+
     def described(row: int) -> Float32[np.ndarray, "n d"]:
         return append_positions(
             nodes[row].features, nodes[row].camera.width, nodes[row].camera.height, config

@@ -8,12 +8,10 @@ image is converted to the disparity that a second camera 8 cm to the right would
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from topoloc.bounds import Above, Between
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.stereo import depth_sigmas
@@ -24,31 +22,6 @@ from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 
 _DEPTH_BASELINE = 0.08
 _MIN_DEPTH_SIGMA_PX = 0.03
-
-
-@dataclass(frozen=True)
-class DisparityConfig:
-    """Hold the settings of disparity measurement."""
-
-    half_px: Annotated[int, Between(1, 50)] = 5
-    """Half side of the window that is correlated along the row."""
-    min_correlation: Annotated[float, Between(-1, 1)] = 0.8
-    """Minimum normalised correlation of the two images."""
-    max_second_correlation: Annotated[float, Between(0, 1)] = 0.95
-    """A point is ambiguous if a second place on the row reaches this fraction of the best
-    correlation."""
-    search_px: Annotated[int, Between(0, 1000)] = 4
-    """Search range on either side of a disparity guess."""
-    min_sigma_px: Annotated[float, Above(0)] = 0.15
-    """Stereo: standard deviation that calibration and interpolation leave even at perfect
-    correlation."""
-    max_sigma_px: Annotated[float, Above(0)] = 1.0
-    """Disparities with a larger standard deviation are not used."""
-    max_share_of_width: Annotated[float, Between(0, 1)] = 0.2
-    """Maximum disparity, as a fraction of the image width."""
-    max_depth_step: Annotated[float, Between(0, 1)] = 0.05
-    """RGB-D: maximum spread of depth around a point, as a fraction of depth. A larger spread is a
-    depth edge."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +75,6 @@ def measure_disparities(
     measured: MeasuredView,
     points_img: Float32[np.ndarray, "n 2"],
     guesses_px: Float[np.ndarray, " n"],
-    config: DisparityConfig,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the disparity of points of the left image and its standard deviation, pixels. The
     disparity of an infinitely distant point is 0.
@@ -110,19 +82,30 @@ def measure_disparities(
     A point with a guess (not NaN) is searched around it, others on the whole row. Points without a
     result are NaN.
     """
+    max_share_of_width = 0.2  # maximum disparity, as a fraction of the image width
+    search_px = 4  # search range on either side of a disparity guess
+    half_px = 5  # half side of the window that is correlated along the row
+    min_correlation = 0.8  # minimum normalised correlation of the two images
+    # A point is ambiguous if a second place on the row reaches this fraction of the best
+    # correlation.
+    max_second_correlation = 0.95
+    # Standard deviation that calibration and interpolation leave even at perfect
+    # correlation.
+    min_sigma_px = 0.15
+    max_sigma_px = 1.0  # disparities with a larger standard deviation are not used
     if measured.right is None:
-        return _disparities_from_depth(measured, points_img, config)
+        return _disparities_from_depth(measured, points_img)
     rig = measured.view.rig
     assert rig is not None
     at_infinity = rig.left.cx - rig.right.cx
-    largest = int(measured.view.camera.width * config.max_share_of_width)
+    largest = int(measured.view.camera.width * max_share_of_width)
     known = np.isfinite(guesses_px)
     min_disparities = (
-        np.where(known, np.floor(np.nan_to_num(guesses_px) + at_infinity) - config.search_px, 0.0)
+        np.where(known, np.floor(np.nan_to_num(guesses_px) + at_infinity) - search_px, 0.0)
         .clip(0, largest)
         .astype(np.int64)
     )
-    range_lengths = np.where(known, 2 * config.search_px + 2, largest + 1)
+    range_lengths = np.where(known, 2 * search_px + 2, largest + 1)
     disparities, sigmas = (
         np.empty(len(points_img), np.float32),
         np.empty(len(points_img), np.float32),
@@ -140,22 +123,22 @@ def measure_disparities(
         part = slice(first, last)
         match_in_ranges(
             measured.left, measured.right, points[part],
-            min_disparities[part], range_lengths[part], config.half_px,
-            config.min_correlation, config.max_second_correlation, disparities[part], sigmas[part],
+            min_disparities[part], range_lengths[part], half_px,
+            min_correlation, max_second_correlation, disparities[part], sigmas[part],
         )  # fmt: skip
 
     parallel_for_rows(run, len(points))
     found, found_sigmas = np.full(len(points), np.nan), np.full(len(points), np.nan)
     found[order] = disparities.astype(np.float64) - at_infinity
-    found_sigmas[order] = np.hypot(sigmas.astype(np.float64), config.min_sigma_px)
-    good = (found > 0.0) & (found_sigmas < config.max_sigma_px)
+    found_sigmas[order] = np.hypot(sigmas.astype(np.float64), min_sigma_px)
+    good = (found > 0.0) & (found_sigmas < max_sigma_px)
     return np.where(good, found, np.nan), np.where(good, found_sigmas, np.nan)
 
 
 def _disparities_from_depth(
-    measured: MeasuredView, points_img: Float32[np.ndarray, "n 2"], config: DisparityConfig
+    measured: MeasuredView, points_img: Float32[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     assert measured.view.depth is not None
-    depth = smooth_depth(measured.view.depth, points_img, config.max_depth_step)
+    depth = smooth_depth(measured.view.depth, points_img)
     sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth)
     return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_DEPTH_SIGMA_PX)

@@ -14,14 +14,13 @@ These points are dropped:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from topoloc.bounds import Above, Between
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.stereo import (
     depth_sigmas,
     depth_sigmas_of_disparity,
@@ -37,29 +36,6 @@ from topoloc.recordings.frame_preparation import PreparedFrame
 SCALES_PER_SIZE = 1.2 / 9.0
 
 
-@dataclass(frozen=True)
-class MetricPointsConfig:
-    """Hold the settings for the 3-D positions of features."""
-
-    max_relative_sigma: Annotated[float, Above(0)] = 0.3
-    """Points whose depth has a larger standard deviation than this fraction of it are dropped."""
-    correlation_half_px: Annotated[int, Between(1, 50)] = 5
-    """Stereo: half side of the window that is correlated along the row."""
-    min_correlation: Annotated[float, Between(-1, 1)] = 0.8
-    """Stereo: minimum normalised correlation of the two images."""
-    max_second_correlation: Annotated[float, Between(0, 1)] = 0.97
-    """Stereo: a point is ambiguous if a second place on the row reaches this fraction of the best
-    correlation."""
-    min_sigma_disparity_px: Annotated[float, Above(0)] = 0.12
-    """Stereo: standard deviation that calibration and interpolation leave even at perfect
-    correlation."""
-    max_depth_step: Annotated[float, Between(0, 1)] = 0.05
-    """RGB-D: maximum spread of depth over the 5x5 neighbourhood, as a fraction of depth. A larger
-    spread is a depth edge."""
-    sigma_scale: Annotated[float, Above(0)] = 0.4
-    """Standard deviation of a key point's position, in units of its scale."""
-
-
 @dataclass(frozen=True, eq=False)
 class MetricPoints:
     """Hold one 3-D point per feature, in the features' order. `points_cam` is in metres. Rows are
@@ -70,9 +46,7 @@ class MetricPoints:
     valid: Bool[np.ndarray, " n"]
 
 
-def locate_points(
-    features: Features, view: PreparedFrame, config: MetricPointsConfig
-) -> MetricPoints:
+def locate_points(features: Features, view: PreparedFrame) -> MetricPoints:
     """Return the 3-D positions (camera frame of the view) of `features`, which were detected in
     `view.grey`.
 
@@ -80,34 +54,58 @@ def locate_points(
         RecordingError: the view has neither a right image nor depth.
     """
     if view.right_grey is not None and view.rig is not None:
-        points_cam, sigma_z = _points_from_stereo(features, view, config)
+        points_cam, sigma_z = _points_from_stereo(features, view)
     elif view.depth is not None:
-        points_cam, sigma_z = _points_from_depth(features, view, config)
+        points_cam, sigma_z = _points_from_depth(features, view)
     else:
         raise RecordingError("3-D positions need a stereo pair or a depth image")
+    return select_certain_points(points_cam, sigma_z, view.camera, keypoint_sigmas(features))
+
+
+def select_certain_points(
+    points_cam: Float[np.ndarray, "n 3"],
+    sigma_z: Float[np.ndarray, " n"],
+    camera: Camera,
+    sigmas_px: Float[np.ndarray, " n"],
+    max_relative_sigma: float = 0.3,
+) -> MetricPoints:
+    """Return the points with their covariances, without points of uncertain depth.
+
+    Args:
+        sigma_z: standard deviations of the depths, metres.
+        sigmas_px: standard deviations of the key points.
+        max_relative_sigma: points whose depth has a larger standard deviation than this fraction of
+            it are dropped.
+    """
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(points_cam).all(axis=1) & (
-            sigma_z < config.max_relative_sigma * points_cam[:, 2]
+            sigma_z < max_relative_sigma * points_cam[:, 2]
         )
-    sigma_px = keypoint_sigmas(features, config)
-    covariances = np.full((len(features), 3, 3), np.nan)
+    covariances = np.full((len(points_cam), 3, 3), np.nan)
     covariances[valid] = ray_covariances(
-        points_cam[valid], sigma_z[valid], view.camera, sigma_px[valid]
+        points_cam[valid], sigma_z[valid], camera, sigmas_px[valid]
     )
     return MetricPoints(np.where(valid[:, None], points_cam, np.nan), covariances, valid)
 
 
-def keypoint_sigmas(features: Features, config: MetricPointsConfig) -> Float[np.ndarray, " n"]:
+def keypoint_sigmas(features: Features) -> Float[np.ndarray, " n"]:
     """Return the standard deviation (pixels) of each key point's position. It grows with the key
     point's scale."""
-    return np.maximum(
-        config.sigma_scale * SCALES_PER_SIZE * features.sizes_px.astype(np.float64), 0.3
-    )
+    sigma_scale = 0.4  # standard deviation of a key point's position, in units of its scale
+    return np.maximum(sigma_scale * SCALES_PER_SIZE * features.sizes_px.astype(np.float64), 0.3)
 
 
 def _points_from_stereo(
-    features: Features, view: PreparedFrame, config: MetricPointsConfig
+    features: Features, view: PreparedFrame
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    half_px = 5  # half side of the window that is correlated along the row
+    min_correlation = 0.8  # minimum normalised correlation of the two images
+    # A point is ambiguous if a second place on the row reaches this fraction of the
+    # best correlation.
+    max_second_correlation = 0.97
+    # Standard deviation that calibration and interpolation leave even at perfect
+    # correlation.
+    min_sigma_px = 0.12
     assert view.right_grey is not None
     assert view.rig is not None
     # Points with a disparity above a quarter of the image width are too near to be visible well in
@@ -116,10 +114,10 @@ def _points_from_stereo(
     disparity, sigma = np.empty(num, np.float32), np.empty(num, np.float32)
     match_in_ranges(
         view.grey.astype(np.float32), view.right_grey.astype(np.float32), features.points_img, np.zeros(num, np.int64),  # noqa: E501
-        np.full(num, max_disparity + 1), config.correlation_half_px, config.min_correlation, config.max_second_correlation,  # noqa: E501
+        np.full(num, max_disparity + 1), half_px, min_correlation, max_second_correlation,
         disparity, sigma,
     )  # fmt: skip
-    sigma = np.hypot(sigma.astype(np.float64), config.min_sigma_disparity_px)
+    sigma = np.hypot(sigma.astype(np.float64), min_sigma_px)
     points_cam = points_from_disparity(
         features.points_img.astype(np.float64), disparity.astype(np.float64), view.rig
     )
@@ -127,19 +125,20 @@ def _points_from_stereo(
 
 
 def _points_from_depth(
-    features: Features, view: PreparedFrame, config: MetricPointsConfig
+    features: Features, view: PreparedFrame
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     assert view.depth is not None
-    depth = smooth_depth(view.depth, features.points_img, config.max_depth_step)
+    depth = smooth_depth(view.depth, features.points_img)
     points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)
     return points_cam, depth_sigmas(points_cam[:, 2])
 
 
 def smooth_depth(
-    depth: np.ndarray, points_img: np.ndarray, max_step: float
+    depth: np.ndarray, points_img: np.ndarray, max_step: float = 0.05
 ) -> Float[np.ndarray, " n"]:
-    """Return the mean depth of the 5x5 neighbourhood of each pixel. It is NaN at depth edges, and
-    if half of the neighbourhood is unknown."""
+    """Return the mean depth of the 5x5 neighbourhood of each pixel. It is NaN at depth edges, where
+    the neighbourhood spreads by more than `max_step` (fraction of depth), and if half of the
+    neighbourhood is unknown."""
     height, width = depth.shape
     columns = np.rint(points_img[:, 0]).astype(np.int64)[:, None] + np.tile(np.arange(-2, 3), 5)
     rows = np.rint(points_img[:, 1]).astype(np.int64)[:, None] + np.repeat(np.arange(-2, 3), 5)

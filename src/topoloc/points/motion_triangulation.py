@@ -9,38 +9,17 @@ line by chance, so depths from several other images must agree.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.features import Features
 from topoloc.features.matching import MatchingConfig, match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.stereo import points_from_depth, ray_covariances
-from topoloc.points.metric_points import MetricPoints
-
-
-@dataclass(frozen=True)
-class MotionTriangulationConfig:
-    """Hold the settings of triangulation from single images with known poses."""
-
-    steps: Annotated[tuple[float, ...], Above(0)] = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
-    """Distances of the other images, in units of the median distance of consecutive images."""
-    max_turn: Annotated[float, Between(0, 3.2)] = 0.6
-    """Maximum angle between the viewing directions of two images, radians. Beyond it hardly any
-    feature matches."""
-    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
-    gate: Annotated[float, Above(0)] = 3.0
-    """Maximum distance of a match from its epipolar line, and of two depths from each other, in
-    standard deviations."""
-    pose_sigma_px: Annotated[float, AtLeast(0)] = 0.5
-    """Standard deviation that pose errors add to that of a key point, pixels."""
-    min_pictures: Annotated[int, Between(1, 100)] = 2
-    """Minimum number of other images whose depths of a point agree."""
+from topoloc.geometry.stereo import points_from_depth
+from topoloc.points.metric_points import MetricPoints, select_certain_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,37 +38,35 @@ def triangulate_from_motion(
     sigmas_px: Float[np.ndarray, " n"],
     camera: Camera,
     others: Sequence[SourceImage],
-    max_relative_sigma: float,
-    config: MotionTriangulationConfig,
+    pose_sigma_px: float = 0.5,
 ) -> MetricPoints:
     """Return the 3-D positions (camera frame, metres) of the features of an image taken by
     `camera`. `sigmas_px` are their standard deviations.
 
-    Points whose depth has a larger standard deviation than `max_relative_sigma` times the depth are
-    dropped.
+    Args:
+        pose_sigma_px: standard deviation that pose errors add to that of a key point.
     """
+    # Maximum distance of a match from its epipolar line, and of two depths from each other, in
+    # standard deviations.
+    gate = 3.0
     normalized = camera.normalized_from_img(features.points_img.astype(np.float64))
     own_sigma = sigmas_px / camera.fx
     seen = [
-        _estimate_inverse_depths(features, normalized, own_sigma, other, config) for other in others
+        _estimate_inverse_depths(features, normalized, own_sigma, other, gate, pose_sigma_px)
+        for other in others
     ]
     inverse, sigma, per_sigma = (
         np.stack([row[k] for row in seen]) if seen else np.zeros((0, len(features)))
         for k in range(3)
     )
     joined, sigma_joined = _fuse_depths(
-        inverse, sigma, own_sigma * _column_minimum(per_sigma), config
+        inverse, sigma, own_sigma * _column_minimum(per_sigma), gate
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = 1.0 / joined
         sigma_z = depth**2 * sigma_joined
         points_cam = points_from_depth(features.points_img.astype(np.float64), depth, camera)
-        valid = np.isfinite(points_cam).all(axis=1) & (sigma_z < max_relative_sigma * depth)
-    covariances = np.full((len(features), 3, 3), np.nan)
-    covariances[valid] = ray_covariances(
-        points_cam[valid], sigma_z[valid], camera, sigmas_px[valid]
-    )
-    return MetricPoints(np.where(valid[:, None], points_cam, np.nan), covariances, valid)
+    return select_certain_points(points_cam, sigma_z, camera, sigmas_px)
 
 
 def _estimate_inverse_depths(
@@ -97,7 +74,8 @@ def _estimate_inverse_depths(
     normalized: Float[np.ndarray, "n 2"],
     own_sigma: Float[np.ndarray, " n"],
     other: SourceImage,
-    config: MotionTriangulationConfig,
+    gate: float,
+    pose_sigma_px: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return each feature's inverse depth (1/m) from one other image, and two parts of its
     uncertainty.
@@ -107,7 +85,9 @@ def _estimate_inverse_depths(
     it. All are NaN without a match on the epipolar line.
     """
     inverse, sigma, per_sigma = (np.full(len(features), np.nan) for _ in range(3))
-    matches = match_features(features.descriptors, other.features.descriptors, config.matching)
+    matches = match_features(
+        features.descriptors, other.features.descriptors, MatchingConfig(ratio=0.85)
+    )
     rows, columns = matches.query_idx.astype(np.int64), matches.train_idx
     found = other.camera.normalized_from_img(other.features.points_img[columns].astype(np.float64))
     rays = np.column_stack([normalized[rows], np.ones(len(rows))]) @ other.other_from_cam.rotation.T
@@ -120,12 +100,12 @@ def _estimate_inverse_depths(
         depth_ratio = rays[:, 2] + w * t[2]
         projected = (rays[:, :2] + w[:, None] * t[:2]) / depth_ratio[:, None]
         slope = np.linalg.norm(t[:2] - projected * t[2], axis=1) / np.abs(depth_ratio)
-        noise = np.hypot(other.sigmas_px[columns], config.pose_sigma_px) / other.camera.fx
+        noise = np.hypot(other.sigmas_px[columns], pose_sigma_px) / other.camera.fx
         off_line = np.linalg.norm(projected - found, axis=1)
         good = (
             (w > 0.0)
             & (depth_ratio > 0.0)
-            & (off_line < config.gate * np.hypot(noise, own_sigma[rows]))
+            & (off_line < gate * np.hypot(noise, own_sigma[rows]))
             & (slope > 0.0)
         )
         inverse[rows[good]] = w[good]
@@ -138,7 +118,7 @@ def _fuse_depths(
     inverse: Float[np.ndarray, "k n"],
     sigma: Float[np.ndarray, "k n"],
     own_sigma: Float[np.ndarray, " n"],
-    config: MotionTriangulationConfig,
+    gate: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return one inverse depth per feature with its standard deviation. It is fused from the
     largest set of agreeing depths, or NaN if the set is too small.
@@ -146,10 +126,11 @@ def _fuse_depths(
     The uncertainty of the feature's own position (`own_sigma`) is common to all depths, so fusion
     does not reduce it.
     """
+    min_pictures = 2  # minimum number of other images whose depths of a point agree
     num, columns = len(inverse), np.arange(inverse.shape[1])
-    if num < config.min_pictures:
+    if num < min_pictures:
         return np.full(len(columns), np.nan), np.full(len(columns), np.nan)
-    spread = config.gate * np.sqrt(sigma[:, None] ** 2 + sigma[None] ** 2 + own_sigma**2)
+    spread = gate * np.sqrt(sigma[:, None] ** 2 + sigma[None] ** 2 + own_sigma**2)
     with np.errstate(invalid="ignore"):
         agrees = (
             np.abs(inverse[:, None] - inverse[None]) <= spread
@@ -159,7 +140,7 @@ def _fuse_depths(
     chosen = agrees[best, :, columns].T
     weights = np.where(chosen, 1.0 / np.where(chosen, sigma, 1.0) ** 2, 0.0)
     total = weights.sum(axis=0)
-    enough = support[best, columns] >= config.min_pictures
+    enough = support[best, columns] >= min_pictures
     with np.errstate(divide="ignore", invalid="ignore"):
         joined = (weights * np.where(chosen, inverse, 0.0)).sum(axis=0) / total
         sigma_joined = np.sqrt(1.0 / total + own_sigma**2)
@@ -172,23 +153,24 @@ def _column_minimum(values: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]
     return np.where(np.isfinite(least), least, 0.0)
 
 
-def select_source_images(
-    world_from_cams: Sequence[Rigid3], index: int, step: float, config: MotionTriangulationConfig
-) -> list[int]:
+def select_source_images(world_from_cams: Sequence[Rigid3], index: int, step: float) -> list[int]:
     """Return the images that locate the features of image `index`: at several distances, with
     similar viewing directions.
 
     Args:
         step: typical distance between consecutive images, metres.
     """
+    # Maximum angle between the viewing directions of two images, radians. Beyond it hardly
+    # any feature matches.
+    max_turn = 0.6
+    # Distances of the other images, in units of the median distance of consecutive images.
+    steps = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
     centres = np.array([pose.translation for pose in world_from_cams])
     axes = np.array([pose.rotation[:, 2] for pose in world_from_cams])
     distances = np.linalg.norm(centres - centres[index], axis=1)
-    usable = np.flatnonzero(
-        (axes @ axes[index] > np.cos(config.max_turn)) & (distances > 0.5 * step)
-    )
+    usable = np.flatnonzero((axes @ axes[index] > np.cos(max_turn)) & (distances > 0.5 * step))
     chosen: list[int] = []
-    for factor in config.steps:
+    for factor in steps:
         order = usable[np.argsort(np.abs(distances[usable] - factor * step), kind="stable")]
         off = next((int(k) for k in order if k not in chosen), None)
         if off is not None and abs(distances[off] - factor * step) <= 0.5 * factor * step:

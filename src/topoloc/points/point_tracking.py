@@ -9,37 +9,13 @@ of many such steps. It also checks that the point is still the same.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.points.point_tracking_kernels import refine_tracks, select_cell_corners
-
-
-@dataclass(frozen=True)
-class TrackingConfig:
-    """Hold the settings of point tracking."""
-
-    num_corners: Annotated[int, Between(1, 100_000)] = 450
-    """Number of grid cells. Each cell holds at most one new corner."""
-    min_quality: Annotated[float, Between(0, 1)] = 0.002
-    """Minimum corner strength (smaller eigenvalue), as a fraction of the strongest in the image."""
-    min_eigenvalue: Annotated[float, AtLeast(0)] = 2e-4
-    """Absolute minimum corner strength. Weaker corners are noise."""
-    window_px: Annotated[int, Between(3, 101)] = 15
-    """Side of the window of optical flow (Lucas and Kanade)."""
-    levels: Annotated[int, Between(0, 10)] = 3
-    """Number of pyramid levels above the full image for optical flow."""
-    patch_half_px: Annotated[int, Between(1, 50)] = 5
-    """Half side of the patch that is compared with the point's first appearance."""
-    min_correlation: Annotated[float, Between(-1, 1)] = 0.7
-    """Minimum normalised correlation of the two patches."""
-    max_shift_px: Annotated[float, Above(0)] = 2.5
-    """A point is lost if the alignment of its patch moves it farther than this."""
 
 
 def track_points(
@@ -47,17 +23,18 @@ def track_points(
     current: UInt8[np.ndarray, "h w"],
     points_img: Float32[np.ndarray, "n 2"],
     guesses_img: Float32[np.ndarray, "n 2"],
-    config: TrackingConfig,
 ) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
     """Return the positions of the previous image's points in the current one, searched from
     `guesses_img`, and which points were found."""
+    window_px = 15  # side of the window of optical flow (Lucas and Kanade)
+    levels = 3  # number of pyramid levels above the full image for optical flow
     if len(points_img) == 0:
         return guesses_img.copy(), np.zeros(0, np.bool_)
-    window = (config.window_px, config.window_px)
+    window = (window_px, window_px)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.03)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         previous, current, points_img[:, None], guesses_img[:, None].copy(),
-        winSize=window, maxLevel=config.levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,  # noqa: E501
+        winSize=window, maxLevel=levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # pyright: ignore[reportCallIssue, reportArgumentType]  # fmt: skip
     found = np.ascontiguousarray(found[:, 0], np.float32)
     return found, (status[:, 0] > 0) & np.isfinite(found).all(axis=1)
@@ -79,10 +56,18 @@ def align_with_reference(
     points_ref: Float32[np.ndarray, "n 2"],
     points_img: Float32[np.ndarray, "n 2"],
     scales: Float32[np.ndarray, " n"],
-    config: TrackingConfig,
+    *,
+    patch_half_px: int = 5,
+    max_shift_px: float = 2.5,
 ) -> AlignedPoints:
     """Return the points of `image` moved to the best match with `points_ref` of the reference. The
-    reference patches are enlarged by `scales`."""
+    reference patches are enlarged by `scales`.
+
+    Args:
+        patch_half_px: half side of the compared patches.
+        max_shift_px: a point that moves farther than this does not match.
+    """
+    min_correlation = 0.7  # minimum normalised correlation of the two patches
     refined, (scores, sigmas) = (
         np.empty_like(points_img),
         np.empty((2, len(points_img)), np.float32),
@@ -90,33 +75,44 @@ def align_with_reference(
 
     def run(first: int, last: int) -> None:
         refine_tracks(
-            reference, image, points_ref, points_img, scales, config.patch_half_px, 8, config.max_shift_px, first, last,  # noqa: E501
+            reference, image, points_ref, points_img, scales, patch_half_px, 8, max_shift_px, first, last,  # noqa: E501
             refined, scores, sigmas,
         )  # fmt: skip
 
     parallel_for_rows(run, len(points_img))
-    return AlignedPoints(refined, scores >= config.min_correlation, sigmas)
+    return AlignedPoints(refined, scores >= min_correlation, sigmas)
 
 
 def find_corners(
     grey: UInt8[np.ndarray, "h w"],
     existing_img: Float[np.ndarray, "n 2"] | Float32[np.ndarray, "n 2"],
-    config: TrackingConfig,
+    *,
+    num_corners: int = 450,
+    patch_half_px: int = 5,
 ) -> Float32[np.ndarray, "m 2"]:
     """Return the strongest corner (Shi and Tomasi, 1994) of each grid cell without an existing
-    point, row by row."""
+    point, row by row.
+
+    Args:
+        num_corners: number of grid cells.
+        patch_half_px: that of `align_with_reference`. Corners closer to the border are left out.
+    """
+    # Minimum corner strength (smaller eigenvalue), as a fraction of the strongest in the
+    # image.
+    min_quality = 0.002
+    min_eigenvalue = 2e-4  # absolute minimum corner strength. Weaker corners are noise
     height, width = grey.shape
-    side = max(8, round(np.sqrt(height * width / config.num_corners)))
+    side = max(8, round(np.sqrt(height * width / num_corners)))
     rows, columns = height // side, width // side
     strength = cv2.cornerMinEigenVal(grey, 3)
-    threshold = max(config.min_quality * float(strength.max()), config.min_eigenvalue)
+    threshold = max(min_quality * float(strength.max()), min_eigenvalue)
     top, left = (height - rows * side) // 2, (width - columns * side) // 2
     cell_of = np.floor((existing_img - [left, top]) / side).astype(np.int64)
     inside = ((cell_of >= 0) & (cell_of < [columns, rows])).all(axis=1)
     is_free = np.ones((rows, columns), np.bool_)
     is_free[cell_of[inside, 1], cell_of[inside, 0]] = False
     corners = np.empty((rows * columns, 2), np.float32)
-    border = config.patch_half_px + 3
+    border = patch_half_px + 3
     return corners[
         : select_cell_corners(
             strength, is_free, side, top, left, border, np.float32(threshold), corners

@@ -22,6 +22,7 @@ from jaxtyping import Float32, Int
 from topoloc.bounds import AtLeast, Between, parse_settings
 from topoloc.errors import MapError
 from topoloc.features.features import Features
+from topoloc.removed_settings import drop_removed_settings
 from topoloc.retrieval.cell_grid import CellGrid
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array
 from topoloc.retrieval.descriptor_index import DescriptorIndex, learn_visual_words, learn_whitening
@@ -45,8 +46,6 @@ class VladConfig:
     positions. Unset: the default of the feature type."""
     dimension: Annotated[int, Between(1, 65_536)] = 128
     """Maximum length of a global descriptor after PCA."""
-    max_training_descriptors: Annotated[int, AtLeast(1)] = 100_000
-    """Maximum number of descriptors from which the vocabulary is learned."""
     seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Seed of the vocabulary."""
 
@@ -216,7 +215,8 @@ class SurfVlad:
     def from_model(model: CoarseModel) -> SurfVlad:
         """Create the localizer from `to_model`. Raises MapError if the arrays are inconsistent,
         because the kernels do not check them, and ConfigError."""
-        config = parse_settings(VladConfig, {"position_weight": 0.0, **model.settings}, "settings")
+        settings = drop_removed_settings(model.settings, "build.vlad")
+        config = parse_settings(VladConfig, {"position_weight": 0.0, **settings}, "settings")
         words = model_array(model, "words", "f", (None, None)).astype(np.float32, copy=False)
         projection = model_array(model, "projection", "f", (None, words.size)).astype(np.float32)
         mean = model_array(model, "mean", "f", (words.size,)).astype(np.float32, copy=False)
@@ -270,21 +270,23 @@ def learn_words(
 
 
 def learn_words_from_parts(
-    num_rows: Sequence[int], part: Callable[[int], Float32[np.ndarray, "_ d"]], config: VladConfig
+    num_rows: Sequence[int],
+    part: Callable[[int], Float32[np.ndarray, "_ d"]],
+    config: VladConfig,
+    max_descriptors: int = 100_000,
 ) -> Float32[np.ndarray, "k d"]:
     """Learn the words of `learn_words` from several parts, with one part in memory at a time.
 
     Args:
         num_rows: number of descriptors in each part.
         part: function that returns a part by its number.
+        max_descriptors: maximum number of descriptors from which the words are learned.
     """
     ends = np.cumsum(num_rows)
     chosen, total = np.arange(ends[-1]), int(ends[-1])
-    if total > config.max_training_descriptors:
+    if total > max_descriptors:
         chosen = np.sort(
-            np.random.default_rng(config.seed).choice(
-                total, config.max_training_descriptors, replace=False
-            )
+            np.random.default_rng(config.seed).choice(total, max_descriptors, replace=False)
         )
     rows_by_part = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
     rows = [

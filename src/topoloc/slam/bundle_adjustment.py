@@ -11,12 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.block_system import BlockPattern, solve_blocks
 from topoloc.slam.bundle_kernels import (
@@ -29,24 +27,6 @@ from topoloc.slam.bundle_kernels import (
 )
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
 from topoloc.slam.observation_chunks import ObservationChunk, ObservationChunks
-
-
-@dataclass(frozen=True)
-class BundleConfig:
-    """Configure the optimisation. Residuals are in standard deviations of the measurements."""
-
-    max_steps: Annotated[int, Between(0, 1000)] = 6
-    """Maximum number of Levenberg-Marquardt steps."""
-    cauchy_scale: Annotated[float, Above(0)] = 2.0
-    """Scale of Cauchy's loss. Larger residuals have less and less weight."""
-    min_decrease: Annotated[float, Between(0, 1)] = 1e-3
-    """The optimisation ends when a step lowers the cost by less than this share."""
-    outlier_square: Annotated[float, Above(0)] = 25.0
-    """Squared residual, summed over x, y and disparity, above which an observation is
-    deactivated."""
-    part_observations: Annotated[int, AtLeast(1)] = 100_000
-    """Approximate number of observations in a chunk. Longer trajectories are processed in several
-    chunks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,22 +109,35 @@ def adjust_bundle(
     free: Sequence[KeyFrame],
     fixed: Sequence[KeyFrame],
     landmarks: Landmarks,
-    config: BundleConfig,
     pose_priors: Sequence[PosePrior] = (),
+    *,
+    max_steps: int = 6,
+    min_decrease: float = 1e-3,
+    cauchy_scale: float = 2.0,
+    chunk_size: int = 100_000,
 ) -> None:
     """Optimise the poses of `free` and the landmarks that they see.
 
     `fixed` key frames see some of these landmarks too and do not move. Without fixed key frames and
     pose priors, the first of `free` is fixed. Outlier observations become inactive in all of these
-    key frames.
+    key frames. Residuals are in standard deviations of the measurements.
+
+    Args:
+        max_steps: maximum number of Levenberg-Marquardt steps.
+        min_decrease: the optimisation ends when a step lowers the cost by less than this share.
+        cauchy_scale: scale of Cauchy's loss. Larger residuals have less and less weight.
+        chunk_size: approximate number of observations that are processed at once.
     """
+    # Squared residual, summed over x, y and disparity, above which an observation is
+    # deactivated.
+    outlier_square = 25.0
     if not fixed and not pose_priors:
         free, fixed = free[1:], free[:1]
     if not free:
         return
     keyframes = [*free, *fixed]
     ids = _collect_landmark_ids(free if len(free) > 1 else keyframes)
-    chunks = ObservationChunks(keyframes, ids, config.part_observations)
+    chunks = ObservationChunks(keyframes, ids, chunk_size)
     if chunks.num_observations == 0:
         return
     number_of = {id(keyframe): k for k, keyframe in enumerate(keyframes)}
@@ -160,18 +153,34 @@ def adjust_bundle(
         cameras=np.array([_to_camera_row(k) for k in keyframes]),
         points=landmarks.positions[ids],
     )
-    state = _optimize(problem, state, config)
+    state = _optimize(problem, state, max_steps, min_decrease, cauchy_scale)
     for k, keyframe in enumerate(free):
         keyframe.cam_from_world = Rigid3(state.rotations[k].copy(), state.translations[k].copy())
     landmarks.positions[ids] = state.points
     for bias, k in problem.find_bias_keyframes():
         bias.value_px = float(state.cameras[k, 5])
     for chunk in chunks:
-        wrong = np.flatnonzero(state.squares(chunk) > config.outlier_square)
+        wrong = np.flatnonzero(state.squares(chunk) > outlier_square)
         for k, row in zip(
             chunk.keyframe_idx[wrong].tolist(), chunk.sources[wrong].tolist(), strict=True
         ):
             keyframes[k].observations.active[row] = False
+
+
+def adjust_window(
+    keyframes: list[KeyFrame],
+    landmarks: Landmarks,
+    num_free: int,
+    num_fixed: int,
+    max_steps: int,
+) -> None:
+    """Adjust the last `num_free` key frames, with up to `num_fixed` fixed ones before them.
+
+    Earlier key frames are removed from the list.
+    """
+    del keyframes[: -(num_free + num_fixed)]
+    free, fixed = keyframes[-num_free:], keyframes[:-num_free]
+    adjust_bundle(free, fixed, landmarks, max_steps=max_steps)
 
 
 def _collect_landmark_ids(keyframes: Sequence[KeyFrame]) -> Int[np.ndarray, " n"]:
@@ -216,19 +225,21 @@ def _build_problem(
     return _Problem(chunks, pattern, slots, columns, biases, pose_priors)
 
 
-def _optimize(problem: _Problem, state: _State, config: BundleConfig) -> _State:
-    scale = config.cauchy_scale**2
+def _optimize(
+    problem: _Problem, state: _State, max_steps: int, min_decrease: float, cauchy_scale: float
+) -> _State:
+    scale = cauchy_scale**2
     cost = problem.prior_cost(state, scale) + sum(
         float(robust_cost(state.squares(chunk), scale)) for chunk in problem.chunks
     )
     damping = 1e-4
-    for _ in range(config.max_steps):
+    for _ in range(max_steps):
         steps, bias_steps = _solve_steps(problem, state, scale, damping)
         moved, new_cost = _apply_steps(problem, state, (steps, bias_steps), scale, damping)
         if not new_cost < cost:
             damping *= 10.0
             continue
-        state, finished = moved, cost - new_cost < config.min_decrease * cost
+        state, finished = moved, cost - new_cost < min_decrease * cost
         cost, damping = new_cost, max(damping / 5.0, 1e-7)
         if finished:
             break

@@ -4,46 +4,19 @@ bundle."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Int
 
-from topoloc.bounds import Above
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.bundle_adjustment import BundleConfig, adjust_bundle
+from topoloc.slam.bundle_adjustment import adjust_bundle
 from topoloc.slam.keyframes import KeyFrame, Landmarks, Observations
 from topoloc.slam.loop_closure import Link
 from topoloc.slam.pose_graph import (
     Edge,
-    PoseGraphConfig,
     compute_normalized_residuals,
     optimize_pose_graph,
 )
-
-
-@dataclass(frozen=True)
-class GlobalMapConfig:
-    """Configure the optimisation of the whole map."""
-
-    graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
-    bundle: BundleConfig = field(
-        default_factory=lambda: BundleConfig(max_steps=12, min_decrease=1e-4)
-    )
-    motion_sigma: Annotated[float, Above(0)] = 0.004
-    """Sigma of a motion between two key frames, as a share of its length."""
-    motion_sigma_deg: Annotated[float, Above(0)] = 0.02
-    """Sigma of a motion between two key frames, degrees, in addition to that of tracking."""
-    link_sigma: Annotated[float, Above(0)] = 0.01
-    """Sigma of a link, metres, in addition to that of PnP."""
-    link_sigma_deg: Annotated[float, Above(0)] = 0.1
-    """Sigma of a link, degrees, in addition to that of PnP."""
-    link_covariance_scale: Annotated[float, Above(0)] = 4.0
-    """Factor of the PnP covariance of a link, because matched features of one view have correlated
-    errors."""
-    sigma_feature_px: Annotated[float, Above(0)] = 0.8
-    """Standard deviation of a feature's pixel in the global bundle adjustment."""
 
 
 def join_submaps(
@@ -97,7 +70,6 @@ def close_loops(
     keyframes: Sequence[KeyFrame],
     links: Sequence[Link],
     landmarks: Landmarks,
-    config: GlobalMapConfig,
 ) -> list[Link]:
     """Optimise the pose graph of joined key frames, and move the landmarks with them.
 
@@ -105,23 +77,18 @@ def close_loops(
     """
     if not links:
         return []
+    max_residual = 8.0  # of a link that is kept, in standard deviations
     index = {id(keyframe): i for i, keyframe in enumerate(keyframes)}
     motions = [
-        _motion_edge(keyframe, index, config)
-        for keyframe in keyframes
-        if keyframe.motion is not None
+        _motion_edge(keyframe, index) for keyframe in keyframes if keyframe.motion is not None
     ]
     kept, poses = list(links), [keyframe.cam_from_world for keyframe in keyframes]
     for _ in range(2):  # the second round omits the links that the first rejected
-        edges = motions + [_link_edge(link, config) for link in kept]
-        poses = optimize_pose_graph(
-            [keyframe.cam_from_world for keyframe in keyframes], edges, config.graph
-        )
+        edges = motions + [_link_edge(link) for link in kept]
+        poses = optimize_pose_graph([keyframe.cam_from_world for keyframe in keyframes], edges)
         lengths = compute_normalized_residuals(poses, edges)[len(motions) :]
         agreeing = [
-            link
-            for link, length in zip(kept, lengths, strict=True)
-            if length <= config.graph.max_residual
+            link for link, length in zip(kept, lengths, strict=True) if length <= max_residual
         ]
         if len(agreeing) == len(kept):
             break
@@ -130,19 +97,25 @@ def close_loops(
     return kept
 
 
-def _motion_edge(keyframe: KeyFrame, index: dict[int, int], config: GlobalMapConfig) -> Edge:
+def _motion_edge(keyframe: KeyFrame, index: dict[int, int]) -> Edge:
+    sigma_share = 0.004  # sigma of a motion between two key frames, as a share of its length
+    # Sigma of a motion between two key frames, degrees, in addition to that of tracking.
+    sigma_deg = 0.02
     assert keyframe.motion is not None
     source = keyframe.motion.source
     motion = keyframe.cam_from_world @ source.cam_from_world.inverse()
-    metres = config.motion_sigma * float(np.linalg.norm(motion.translation)) + 1e-3
-    covariance = keyframe.motion.covariance + _diagonal_covariance(metres, config.motion_sigma_deg)
+    metres = sigma_share * float(np.linalg.norm(motion.translation)) + 1e-3
+    covariance = keyframe.motion.covariance + _diagonal_covariance(metres, sigma_deg)
     return Edge(index[id(source)], index[id(keyframe)], motion, covariance, is_loop=False)
 
 
-def _link_edge(link: Link, config: GlobalMapConfig) -> Edge:
-    covariance = config.link_covariance_scale * link.match.covariance + _diagonal_covariance(
-        config.link_sigma, config.link_sigma_deg
-    )
+def _link_edge(link: Link) -> Edge:
+    # Factor of the PnP covariance of a link, because matched features of one view have
+    # correlated errors.
+    covariance_scale = 4.0
+    sigma = 0.01  # sigma of a link, metres, in addition to that of PnP
+    sigma_deg = 0.1  # sigma of a link, degrees, in addition to that of PnP
+    covariance = covariance_scale * link.match.covariance + _diagonal_covariance(sigma, sigma_deg)
     return Edge(link.source, link.target, link.match.target_from_source, covariance, is_loop=True)
 
 
@@ -169,14 +142,13 @@ def adjust_global_bundle(
     keyframes: Sequence[KeyFrame],
     links: Sequence[Link],
     landmarks: Landmarks,
-    config: GlobalMapConfig,
 ) -> None:
     """Adjust all key frames and landmarks. Matches of links become landmarks seen by both key
     frames."""
     landmark_of: dict[tuple[int, int], int] = {}
     for link in links:
-        _add_link_landmarks(link, keyframes, landmarks, landmark_of, config)
-    adjust_bundle(keyframes, [], landmarks, config.bundle)
+        _add_link_landmarks(link, keyframes, landmarks, landmark_of)
+    adjust_bundle(keyframes, [], landmarks, max_steps=12, min_decrease=1e-4)
 
 
 def _add_link_landmarks(
@@ -184,7 +156,6 @@ def _add_link_landmarks(
     keyframes: Sequence[KeyFrame],
     landmarks: Landmarks,
     landmark_of: dict[tuple[int, int], int],
-    config: GlobalMapConfig,
 ) -> None:
     source = keyframes[link.source]
     place = source.place
@@ -197,22 +168,21 @@ def _add_link_landmarks(
             point = source.cam_from_world.inverse().apply(place.points.points_cam[source_row][None])
             known = int(landmarks.add(point)[0])
             landmark_of[link.source, source_row] = known
-            source.observations.append(_feature_observation(source, source_row, known, config))
+            source.observations.append(_feature_observation(source, source_row, known))
         if (link.target, target_row) not in landmark_of:
             landmark_of[link.target, target_row] = known
             keyframes[link.target].observations.append(
-                _feature_observation(keyframes[link.target], target_row, known, config)
+                _feature_observation(keyframes[link.target], target_row, known)
             )
 
 
-def _feature_observation(
-    keyframe: KeyFrame, row: int, landmark_id: int, config: GlobalMapConfig
-) -> Observations:
+def _feature_observation(keyframe: KeyFrame, row: int, landmark_id: int) -> Observations:
     """Return a local feature as an observation: its pixel, and its disparity if it has a depth."""
+    sigma_px = 0.8  # standard deviation of a feature's pixel in the global bundle adjustment
     place, stereo = keyframe.place, keyframe.stereo
     assert place is not None
     measured = np.array([[*place.features.points_img[row].astype(np.float64), np.nan]])
-    weights = np.full((1, 3), 1.0 / config.sigma_feature_px)
+    weights = np.full((1, 3), 1.0 / sigma_px)
     weights[0, 2] = 0.0
     if place.points.valid[row]:
         depth = place.points.points_cam[row, 2]

@@ -9,54 +9,19 @@ second link nearby must agree with it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.disk_list import DiskList
 from topoloc.features.features import Features
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words_from_parts, vlad
 from topoloc.slam.keyframes import KeyFrame
-from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_places
+from topoloc.slam.place_matching import PlaceMatch, match_places
 
 _MAX_VLAD_BYTES = 4_000_000  # in memory: each is read once or twice, in order
-
-
-@dataclass(frozen=True)
-class LoopConfig:
-    """Configure the comparison of places and the acceptance of links."""
-
-    vlad: VladConfig = field(default_factory=lambda: VladConfig(num_words=32, position_weight=0.0))
-    matching: PlaceMatchingConfig = field(default_factory=PlaceMatchingConfig)
-    num_candidates: Annotated[int, Between(0, 1000)] = 4
-    """Number of most similar places that each place is compared with."""
-    min_places_between: Annotated[int, AtLeast(0)] = 12
-    """Minimum number of places between the ends of a loop within a sub-map."""
-    support_places: Annotated[int, AtLeast(0)] = 5
-    """A link supports another one if its ends are within this many places."""
-    max_disagreement: Annotated[float, Above(0)] = 0.05
-    """Maximum difference between two supporting links, metres, plus this share of the distance
-    between their ends."""
-    max_disagreement_deg: Annotated[float, Above(0)] = 2.0
-    """Maximum rotation difference between two supporting links, degrees."""
-    rival_share: Annotated[float, Between(0, 1)] = 0.5
-    """A link is rejected if another link of the same place has this share of its matches and
-    contradicts it."""
-    rival_places: Annotated[int, AtLeast(0)] = 15
-    """Number of places before and after the link's own that are searched for contradicting
-    links."""
-    max_drift: Annotated[float, AtLeast(0)] = 0.05
-    """Maximum drift of the odometry, as a share of the travelled distance, in addition to half a
-    metre."""
-    max_drift_deg: Annotated[float, AtLeast(0)] = 15.0
-    """Maximum rotation drift of the odometry, degrees, for any distance."""
-    max_speedup: Annotated[float, Above(0)] = 2.0
-    """Maximum speed between two sub-maps of a recording, relative to the maximum speed within them,
-    in addition to half a metre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,71 +35,68 @@ class Link:
 
 def find_links(
     keyframes: Sequence[KeyFrame],
-    config: LoopConfig,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> list[Link]:
     """Return all links that pass the checks, in the order of their targets."""
     places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
     if len(places) < 2:
         return []
-    proposals = _propose_pairs(keyframes, places, config)
+    proposals = _propose_pairs(keyframes, places)
     links = []
     for done, link in enumerate(
-        parallel_map(lambda pair: _match_keyframes(pair[1], pair[0], keyframes, config), proposals)
+        parallel_map(lambda pair: _match_keyframes(pair[1], pair[0], keyframes), proposals)
     ):
         if link is not None:
             links.append(link)
         progress("loops", done + 1, len(proposals))
     rank = {keyframe: place for place, keyframe in enumerate(places)}
-    plausible = [link for link in links if _is_within_drift(link, keyframes, config)]
+    plausible = [link for link in links if _is_within_drift(link, keyframes)]
     clear = [
         link
         for link in plausible
-        if not any(_is_contradicting(other, link, keyframes, config) for other in plausible)
+        if not any(_is_contradicting(other, link, keyframes) for other in plausible)
     ]
     supported = [
         link
         for link in clear
-        if any(_is_supporting(other, link, keyframes, rank, config) for other in clear)
+        if any(_is_supporting(other, link, keyframes, rank) for other in clear)
     ]
-    are_rivalled = parallel_map(lambda link: _has_rival(link, keyframes, places, config), supported)
+    are_rivalled = parallel_map(lambda link: _has_rival(link, keyframes, places), supported)
     sure = [
         link for link, is_rivalled in zip(supported, are_rivalled, strict=True) if not is_rivalled
     ]
     return [
-        link
-        for link in sure
-        if any(_is_supporting(other, link, keyframes, rank, config) for other in sure)
+        link for link in sure if any(_is_supporting(other, link, keyframes, rank) for other in sure)
     ]
 
 
-def _propose_pairs(
-    keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig
-) -> list[tuple[int, int]]:
+def _propose_pairs(keyframes: Sequence[KeyFrame], places: list[int]) -> list[tuple[int, int]]:
     """Return (target, source) of similar pairs. The source is the earlier one."""
+    min_places_between = 12  # minimum number of places between two places of one sub-map
+
+    def is_candidate(a: int, b: int) -> bool:
+        same = keyframes[places[a]].submap == keyframes[places[b]].submap
+        return a != b and (not same or abs(a - b) >= min_places_between)
+
+    num_candidates = 4  # number of most similar places that each place is compared with
     pairs, num = (
         set(),
-        config.num_candidates + 2 * config.min_places_between,
+        num_candidates + 2 * min_places_between,
     )  # itself and its neighbours may come first
-    for number, ranked in enumerate(rank_places([keyframes[i] for i in places], config.vlad, num)):
-        others = (
-            other
-            for other in ranked
-            if _is_loop_candidate(keyframes, places, other, number, config)
-        )
-        for _, other in zip(range(config.num_candidates), others, strict=False):
+    for number, ranked in enumerate(rank_places([keyframes[i] for i in places], num)):
+        others = (other for other in ranked if is_candidate(other, number))
+        for _, other in zip(range(num_candidates), others, strict=False):
             pairs.add((places[max(number, other)], places[min(number, other)]))
     return sorted(pairs)
 
 
-def rank_places(
-    keyframes: Sequence[KeyFrame], config: VladConfig, num: int | None = None
-) -> Iterator[list[int]]:
+def rank_places(keyframes: Sequence[KeyFrame], num: int | None = None) -> Iterator[list[int]]:
     """Generate, for each key frame, the rows of the `num` most similar ones (default: all), in
     order.
 
     Each key frame must have place features. Nothing is generated if there are no features at all.
     """
+    config = VladConfig(num_words=32, position_weight=0.0)
 
     def features(row: int) -> Features:
         place = keyframes[row].place
@@ -158,31 +120,26 @@ def rank_places(
         ]
 
 
-def _is_loop_candidate(
-    keyframes: Sequence[KeyFrame], places: list[int], a: int, b: int, config: LoopConfig
-) -> bool:
-    same = keyframes[places[a]].submap == keyframes[places[b]].submap
-    return a != b and (not same or abs(a - b) >= config.min_places_between)
-
-
-def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
+def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
+    max_drift_deg = 15.0  # maximum rotation drift of the odometry, degrees, for any distance
     source, target = keyframes[link.source], keyframes[link.target]
     if source.submap != target.submap:
-        return source.recording != target.recording or is_reachable(link, keyframes, config)
-    way = _path_length(keyframes, link.source, link.target)
+        return source.recording != target.recording or is_reachable(link, keyframes)
+    max_drift = _max_drift(keyframes, link.source, link.target)
     drift = _pose_difference(
         link.match.target_from_source, target.cam_from_world @ source.cam_from_world.inverse()
     )
-    return bool(
-        drift[0] < 0.5 + config.max_drift * way and drift[1] < np.deg2rad(config.max_drift_deg)
-    )
+    return bool(drift[0] < 0.5 + max_drift and drift[1] < np.deg2rad(max_drift_deg))
 
 
-def is_reachable(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) -> bool:
+def is_reachable(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
     """Return whether a link is possible at the camera's maximum speed.
 
     The camera must travel from the end of the earlier sub-map to the start of the later one.
     """
+    # Maximum speed between two sub-maps of a recording, relative to the maximum speed within
+    # them, in addition to half a metre.
+    max_speedup = 2.0
     source, target, target_from_source = (
         keyframes[link.source],
         keyframes[link.target],
@@ -195,7 +152,7 @@ def is_reachable(link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig) 
     start_in_target = target.cam_from_world @ after[0].cam_from_world.inverse()
     start_in_source = target_from_source.inverse() @ start_in_target
     seconds = 1e-9 * (after[0].t_ns - before[-1].t_ns)
-    reach = 0.5 + config.max_speedup * max(_max_speed(before), _max_speed(after)) * seconds
+    reach = 0.5 + max_speedup * max(_max_speed(before), _max_speed(after)) * seconds
     return bool(np.linalg.norm(end_in_source.translation - start_in_source.translation) < reach)
 
 
@@ -211,89 +168,94 @@ def _max_speed(submap: Sequence[KeyFrame]) -> float:
     )
 
 
-def _path_length(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
-    """Return the travelled distance (metres) between two key frames of the same sub-map."""
+def _max_drift(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
+    """Return the maximum drift (metres) of the odometry between two key frames of a sub-map."""
+    drift_share = 0.05  # of the travelled distance
     submap, (first, last) = keyframes[first].submap, sorted((first, last))
     between = [
         k.cam_from_world.inverse().translation
         for k in keyframes[first : last + 1]
         if k.submap == submap
     ]
-    return float(np.linalg.norm(np.diff(between, axis=0), axis=1).sum())
+    return drift_share * float(np.linalg.norm(np.diff(between, axis=0), axis=1).sum())
 
 
-def _is_contradicting(
-    other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig
-) -> bool:
+def _is_contradicting(other: Link, link: Link, keyframes: Sequence[KeyFrame]) -> bool:
     """Return whether another link of the same key frame contradicts this one with nearly as many
     matches."""
+    # A link is rejected if another link of the same place has this share of its matches and
+    # contradicts it.
+    rival_share = 0.5
     if (other.target == link.target) == (other.source == link.source):
         return False
-    if len(other.match.source_rows) < config.rival_share * len(link.match.source_rows):
+    if len(other.match.source_rows) < rival_share * len(link.match.source_rows):
         return False
     ends = (
         (link.source, other.source) if other.target == link.target else (link.target, other.target)
     )
-    drift = config.max_drift * _path_length(keyframes, min(ends), max(ends))
-    return _are_consistent(other, link, keyframes, config, drift) is False
+    drift = _max_drift(keyframes, min(ends), max(ends))
+    return _are_consistent(other, link, keyframes, drift) is False
 
 
-def _has_rival(
-    link: Link, keyframes: Sequence[KeyFrame], places: list[int], config: LoopConfig
-) -> bool:
+def _has_rival(link: Link, keyframes: Sequence[KeyFrame], places: list[int]) -> bool:
     """Return whether the target also matches a neighbour of the source, at another relative
     pose."""
+    # Number of places before and after the link's own that are searched for contradicting
+    # links.
+    rival_places = 15
     at = places.index(link.source)
-    around = places[max(at - config.rival_places, 0) : at + config.rival_places + 1]
+    around = places[max(at - rival_places, 0) : at + rival_places + 1]
     for source in (
         i
         for i in around
         if i not in (link.source, link.target)
         and keyframes[i].submap == keyframes[link.source].submap
     ):
-        match = _match_keyframes(source, link.target, keyframes, config)
+        match = _match_keyframes(source, link.target, keyframes)
         if (
             match is not None
-            and _is_within_drift(match, keyframes, config)
-            and _is_contradicting(match, link, keyframes, config)
+            and _is_within_drift(match, keyframes)
+            and _is_contradicting(match, link, keyframes)
         ):
             return True
     return False
 
 
-def _match_keyframes(
-    source: int, target: int, keyframes: Sequence[KeyFrame], config: LoopConfig
-) -> Link | None:
+def _match_keyframes(source: int, target: int, keyframes: Sequence[KeyFrame]) -> Link | None:
     a, b = keyframes[source].place, keyframes[target].place
     assert a is not None
     assert b is not None
-    match = match_places(a, b, keyframes[target].stereo, config.matching)
+    match = match_places(a, b, keyframes[target].stereo)
     return None if match is None else Link(source, target, match)
 
 
 def _is_supporting(
-    other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int], config: LoopConfig
+    other: Link, link: Link, keyframes: Sequence[KeyFrame], rank: dict[int, int]
 ) -> bool:
     """Return whether a link of other key frames nearby agrees."""
+    near = 5  # A link supports another one if its ends are within this many places
     if other is link or other.target == link.target:
         return False
-    near = config.support_places
     if (
         abs(rank[other.target] - rank[link.target]) > near
         or abs(rank[other.source] - rank[link.source]) > near
     ):
         return False
-    return _are_consistent(other, link, keyframes, config) is True
+    return _are_consistent(other, link, keyframes) is True
 
 
 def _are_consistent(
-    other: Link, link: Link, keyframes: Sequence[KeyFrame], config: LoopConfig, drift: float = 0.0
+    other: Link, link: Link, keyframes: Sequence[KeyFrame], drift: float = 0.0
 ) -> bool | None:
     """Return whether a round trip over both links ends near its start. None across sub-maps.
 
     Args:
         drift: allowed error of the odometry between them, metres.
     """
+    # Maximum difference between two supporting links, metres, plus this share of the distance
+    # between their ends.
+    max_disagreement = 0.05
+    max_disagreement_deg = 2.0  # maximum rotation difference between two supporting links, degrees
     a, b, c, d = (keyframes[i] for i in (link.source, link.target, other.source, other.target))
     if a.submap != c.submap or b.submap != d.submap:
         return None
@@ -309,8 +271,8 @@ def _are_consistent(
     )
     metres, radians = _pose_difference(link.match.target_from_source, expected)
     return bool(
-        metres < config.max_disagreement * (1.0 + way) + drift
-        and radians < np.deg2rad(config.max_disagreement_deg)
+        metres < max_disagreement * (1.0 + way) + drift
+        and radians < np.deg2rad(max_disagreement_deg)
     )
 
 

@@ -5,12 +5,10 @@ A trajectory can be compared with these steps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
 
-from topoloc.bounds import AtLeast, Between
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
@@ -20,26 +18,10 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.metric_points import MetricPoints, MetricPointsConfig, locate_points
+from topoloc.points.metric_points import MetricPoints, locate_points
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import read_left_frame
-
-
-@dataclass(frozen=True)
-class MeasuredStepsConfig:
-    """Configure the selection of image pairs and the acceptance of a measurement."""
-
-    num_steps: Annotated[int, Between(1, 1000)] = 16
-    """Number of first images of steps, spread over the recording."""
-    gaps: tuple[int, ...] = (12, 5, 2, 1)
-    """Numbers of frames between the two images of a step, tried in order until one has enough
-    matches."""
-    min_inliers: Annotated[int, AtLeast(6)] = 40
-    """Minimum number of points of the first image that match in the last."""
-    pose: AbsolutePoseConfig = field(default_factory=AbsolutePoseConfig)
-    features: FeatureConfig = field(default_factory=FeatureConfig)
-    points: MetricPointsConfig = field(default_factory=MetricPointsConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +40,7 @@ class MeasuredStep:
 
 
 def measure_steps(
-    sequence: StereoSequence, usable_idx: list[int], config: MeasuredStepsConfig
+    sequence: StereoSequence, usable_idx: list[int], num_steps: int = 16
 ) -> list[MeasuredStep]:
     """Measure steps spread over the frames `usable_idx` (rows, ascending).
 
@@ -66,10 +48,15 @@ def measure_steps(
     camera. Steps with too few matches are skipped. All steps with one gap are measured before those
     with the next, so that the recording is read in order.
 
+    Args:
+        num_steps: number of first images of steps, spread over the recording.
+
     Raises:
         RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
     """
-    starts = np.unique(np.linspace(0, len(usable_idx) - 1, config.num_steps).astype(int)).tolist()
+    # Numbers of frames between the two images of a step, tried until one has enough matches.
+    gaps = (12, 5, 2, 1)
+    starts = np.unique(np.linspace(0, len(usable_idx) - 1, num_steps).astype(int)).tolist()
     firsts: dict[int, _ViewFeatures] = {}
     steps: dict[int, MeasuredStep] = {}
 
@@ -77,10 +64,8 @@ def measure_steps(
         pair: tuple[int, int, StereoFrame | None, StereoFrame],
     ) -> tuple[int, _ViewFeatures, MeasuredStep | None]:
         start, other, frame, other_frame = pair
-        first = firsts[start] if frame is None else _extract_view(frame, config, is_first=True)
-        motion = _estimate_motion(
-            first, last := _extract_view(other_frame, config, is_first=False), config
-        )
+        first = firsts[start] if frame is None else _extract_view(frame, is_first=True)
+        motion = _estimate_motion(first, last := _extract_view(other_frame, is_first=False))
         if motion is None:
             return start, first, None
         first_from_last = first.view_from_cam.inverse() @ motion[0].inverse() @ last.view_from_cam
@@ -96,7 +81,7 @@ def measure_steps(
             ),
         )
 
-    for gap in config.gaps:  # backwards at the end of the recording
+    for gap in gaps:  # backwards at the end of the recording
         pairs = (
             (start, start + gap if start + gap < len(usable_idx) else start - gap)
             for start in starts
@@ -127,44 +112,43 @@ class _ViewFeatures:
     points: MetricPoints | None
 
 
-def _extract_view(frame: StereoFrame, config: MeasuredStepsConfig, is_first: bool) -> _ViewFeatures:
+def _extract_view(frame: StereoFrame, is_first: bool) -> _ViewFeatures:
     has_depth = is_first and (frame.right is not None or frame.depth is not None)
     view = prepare_frame(frame, with_depth=has_depth)
-    features = extract_features(view.grey, config.features)
+    features = extract_features(view.grey, FeatureConfig())
     if not has_depth:
         return _ViewFeatures(view.camera, view.view_from_cam, features, None)
-    located = locate_points(features, view, config.points)
+    located = locate_points(features, view)
     rows = np.flatnonzero(located.valid)
     points = MetricPoints(located.points_cam[rows], located.covariances[rows], located.valid[rows])
     return _ViewFeatures(view.camera, view.view_from_cam, features.select(rows), points)
 
 
-def _estimate_motion(
-    first: _ViewFeatures, last: _ViewFeatures, config: MeasuredStepsConfig
-) -> tuple[Rigid3, float] | None:
+def _estimate_motion(first: _ViewFeatures, last: _ViewFeatures) -> tuple[Rigid3, float] | None:
     """Estimate last_from_first of the views, and the median depth of the inliers.
 
     For a single camera the depth is 0 and the translation has length 1. None if too few points
     match.
     """
+    min_inliers = 40  # minimum number of points of the first image that match in the last
     matches = match_features(
         last.features.descriptors, first.features.descriptors, MatchingConfig()
     )
-    if len(matches) < config.min_inliers:
+    if len(matches) < min_inliers:
         return None
     points_img = last.features.points_img[matches.query_idx].astype(np.float64)
     if first.points is None:
         first_img = first.features.points_img[matches.train_idx].astype(np.float64)
         moved = estimate_relative_pose(first_img, first.camera, points_img, last.camera)
-        is_seen = moved is not None and np.count_nonzero(moved.inliers) >= config.min_inliers
+        is_seen = moved is not None and np.count_nonzero(moved.inliers) >= min_inliers
         return (moved.second_from_first, 0.0) if is_seen and moved is not None else None
     points, covariances = (
         first.points.points_cam[matches.train_idx],
         first.points.covariances[matches.train_idx],
     )
     pose = estimate_absolute_pose(
-        points_img, points, last.camera, config.pose, point_covariances=covariances
+        points_img, points, last.camera, AbsolutePoseConfig(), point_covariances=covariances
     )
-    if pose is None or np.count_nonzero(pose.inliers) < config.min_inliers:
+    if pose is None or np.count_nonzero(pose.inliers) < min_inliers:
         return None
     return pose.cam_from_world, float(np.median(points[pose.inliers, 2]))

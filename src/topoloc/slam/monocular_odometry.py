@@ -21,7 +21,7 @@ from topoloc.points.disparity import MeasuredView, StereoCamera
 from topoloc.points.point_tracking import find_corners, track_points
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.frame_preparation import undistort_frame
-from topoloc.slam.bundle_adjustment import adjust_bundle
+from topoloc.slam.bundle_adjustment import adjust_bundle, adjust_window
 from topoloc.slam.keyframes import (
     DisparityBias,
     FramePose,
@@ -30,12 +30,11 @@ from topoloc.slam.keyframes import (
     Motion,
     Observations,
 )
-from topoloc.slam.monocular_config import MonocularOdometryConfig
 from topoloc.slam.motion_prediction import MotionHistory
-from topoloc.slam.step_estimation import LastFrame, Step, StepEstimator, Tracks
+from topoloc.slam.step_estimation import LastFrame, Step, StepEstimator, Tracks, is_keyframe_due
 from topoloc.slam.triangulation import is_well_triangulated, triangulate_points
 
-_SIGMA_SCALE_RANGE = 0.5, 10.0
+_PATCH_HALF_PX = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +67,9 @@ class _Initialization:
 class MonocularOdometry:
     """Hold the state of one recording's odometry. `submaps` holds the sub-maps so far."""
 
-    def __init__(self, config: MonocularOdometryConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._landmarks, self._bias = Landmarks(), DisparityBias()
-        self._history = MotionHistory(config.odometry.prediction)
+        self._history = MotionHistory()
         self.submaps: list[MonocularSubmap] = []
         self._initialization: _Initialization | None = None
         self._reference: KeyFrame | None = None
@@ -83,37 +81,47 @@ class MonocularOdometry:
 
     def process(self, frame_idx: int, frame: StereoFrame) -> None:
         """Process the next frame."""
-        measured = _make_view(frame, self._config.max_side_px)
+        max_side_px = 800  # images are reduced to this width or height for point tracking
+        # Number of frames after a loss into which the last tracked points are still
+        # tracked.
+        max_lost_tracked = 3
+        measured = _make_view(frame, max_side_px)
         if self._reference is None:
             self._initialize(frame_idx, frame, measured)
         elif self._track_frame(frame_idx, frame, measured):
             self._num_lost = 0
         else:
             self._num_lost += 1
-            if self._num_lost > self._config.odometry.max_lost_tracked:
+            if self._num_lost > max_lost_tracked:
                 self._reference, self._last_frame, self._num_lost = None, None, 0
                 self._history.reset()
                 self._initialize(frame_idx, frame, measured)
 
     def _initialize(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> None:
         """Track the corners of a first image until two images show enough motion."""
+        # If fewer than this share of its points are left, the first image is replaced by
+        # a later one.
+        min_share = 0.2
+        # The first image is also replaced after this many frames, because a camera at
+        # rest gives no depth.
+        max_frames = 60
+        # Minimum median displacement of the points to start a sub-map, as a share of the
+        # image width.
+        min_motion = 0.03
         if self._initialization is not None:
             tracks = self._track_bidirectional(self._initialization, measured)
             left = len(tracks.landmark_ids) / max(len(self._initialization.tracks.landmark_ids), 1)
             self._initialization.frames.append((frame_idx, frame, measured, tracks))
-            if (
-                left >= self._config.start_share
-                and len(self._initialization.frames) <= self._config.max_beginning
-            ):
+            if left >= min_share and len(self._initialization.frames) <= max_frames:
                 moved = (
                     np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
                     if len(tracks.landmark_ids)
                     else 0.0
                 )
-                if moved > self._config.start_motion * measured.view.camera.width:
+                if moved > min_motion * measured.view.camera.width:
                     self._start_submap(self._initialization)
                 return
-        corners = find_corners(measured.view.grey, np.zeros((0, 2)), self._config.odometry.tracking)
+        corners = _find_corners(measured, np.zeros((0, 2)))
         tracks = Tracks.from_points(np.arange(len(corners)), corners)
         self._initialization = _Initialization([(frame_idx, frame, measured, tracks)], tracks)
 
@@ -121,31 +129,27 @@ class MonocularOdometry:
         self, initialization: _Initialization, measured: MeasuredView
     ) -> Tracks:
         """Return the points found in the next image that are tracked back to their start."""
+        max_error_px = 0.7  # maximum error of a point tracked forwards and backwards, pixels
         _, _, before, tracks = initialization.frames[-1]
-        config = self._config.odometry.tracking
         found, there = track_points(
-            before.view.grey, measured.view.grey, tracks.points_img, tracks.points_img, config
+            before.view.grey, measured.view.grey, tracks.points_img, tracks.points_img
         )
-        back, again = track_points(
-            measured.view.grey, before.view.grey, found, tracks.points_img, config
-        )
-        returned = np.linalg.norm(back - tracks.points_img, axis=1) < self._config.max_return_px
+        back, again = track_points(measured.view.grey, before.view.grey, found, tracks.points_img)
+        returned = np.linalg.norm(back - tracks.points_img, axis=1) < max_error_px
         return replace(tracks, points_img=found).select(np.flatnonzero(there & again & returned))
 
     def _start_submap(self, initialization: _Initialization) -> None:
         """Start a sub-map if the relative pose of the first and the last image can be estimated."""
-        config, (_, _, first, all_tracks), (_, _, last, tracks) = (
-            self._config,
-            initialization.frames[0],
-            initialization.frames[-1],
-        )
+        min_points = 50  # minimum number of triangulated points to start a sub-map
+        _, _, first, all_tracks = initialization.frames[0]
+        _, _, last, tracks = initialization.frames[-1]
         motion = estimate_relative_pose(
             tracks.points_ref.astype(np.float64),
             first.view.camera,
             tracks.points_img.astype(np.float64),
             last.view.camera,
         )
-        if motion is None or np.count_nonzero(motion.inliers) < config.start_points:
+        if motion is None or np.count_nonzero(motion.inliers) < min_points:
             return
         self._recent_keyframes, self._landmarks = [], Landmarks()
         self._landmarks.add(np.full((len(all_tracks.landmark_ids), 3), np.nan))
@@ -161,10 +165,10 @@ class MonocularOdometry:
                 self._make_keyframe(frame_idx, frame.t_ns, measured, cam_from_world, seen)
             )
         known = self._triangulate_tracks(agreeing.landmark_ids, 2)
-        if len(known) < config.start_points:
+        if len(known) < min_points:
             self._recent_keyframes = []
             return
-        adjust_bundle(self._recent_keyframes, [], self._landmarks, config.odometry.bundle)
+        adjust_bundle(self._recent_keyframes, [], self._landmarks, max_steps=12)
         self.submaps.append(
             MonocularSubmap(self._landmarks, keyframes=list(self._recent_keyframes))
         )
@@ -225,7 +229,7 @@ class MonocularOdometry:
         ).track_points(step.cam_from_world)
         self._tracks, self._untriangulated = step.tracks, untriangulated
         self._update_last_frame(frame.t_ns, measured, step.cam_from_world)
-        if self._is_keyframe_due(measured):
+        if is_keyframe_due(self._tracks, self._reference, measured):
             self._add_keyframe(frame_idx, frame, measured, step)
         relative = self._last_frame.cam_from_world @ self._reference.cam_from_world.inverse()
         self.submaps[-1].frames.append(
@@ -257,7 +261,8 @@ class MonocularOdometry:
             tracks,
             self._landmarks,
             measured,
-            self._config.odometry,
+            min_tracked=15,
+            patch_half_px=_PATCH_HALF_PX,
         )
 
     def _update_last_frame(self, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3) -> None:
@@ -269,16 +274,6 @@ class MonocularOdometry:
         self._history.add_pose(t_ns, cam_from_world, moved)
         self._last_frame = LastFrame(measured, cam_from_world)
 
-    def _is_keyframe_due(self, measured: MeasuredView) -> bool:
-        assert self._reference is not None
-        tracks, config = self._tracks, self._config.odometry
-        if len(tracks.landmark_ids) < config.keyframe_share * np.count_nonzero(
-            self._reference.observations.active
-        ):
-            return True
-        motion = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
-        return bool(motion > config.keyframe_motion * measured.view.camera.width)
-
     def _add_keyframe(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, step: Step
     ) -> None:
@@ -287,9 +282,10 @@ class MonocularOdometry:
         Triangulated points become landmarks, new corners are added as untriangulated points, and
         the window is adjusted.
         """
-        config, tracks, untriangulated = self._config.odometry, self._tracks, self._untriangulated
+        min_rays = 2  # minimum number of key frames that see a landmark
+        tracks, untriangulated = self._tracks, self._untriangulated
         occupied = np.concatenate([tracks.points_img, untriangulated.points_img])
-        corners = find_corners(measured.view.grey, occupied, config.tracking)
+        corners = _find_corners(measured, occupied)
         fresh = Tracks.from_points(
             self._landmarks.add(self._predict_positions(corners, measured, step.cam_from_world)),
             corners,
@@ -303,15 +299,9 @@ class MonocularOdometry:
         )
         self._recent_keyframes.append(keyframe)
         self.submaps[-1].keyframes.append(keyframe)
-        known = self._triangulate_tracks(
-            np.sort(untriangulated.landmark_ids), self._config.min_rays
-        )
-        free, held = (
-            self._recent_keyframes[-config.window :],
-            self._recent_keyframes[: -config.window][-config.held :],
-        )
-        adjust_bundle(free, held, self._landmarks, config.bundle)
-        del self._recent_keyframes[: -(config.window + config.held)]
+        known = self._triangulate_tracks(np.sort(untriangulated.landmark_ids), min_rays)
+        # The window is longer than that of stereo odometry, because it alone preserves the scale.
+        adjust_window(self._recent_keyframes, self._landmarks, 20, 10, max_steps=12)
         still = untriangulated.select(~np.isin(untriangulated.landmark_ids, known))
         still = still.select(
             np.flatnonzero(np.isfinite(self._landmarks.positions[still.landmark_ids]).all(axis=1))
@@ -325,17 +315,18 @@ class MonocularOdometry:
 
         The positions of points whose rays do not meet are set to NaN.
         """
+        min_parallax_deg = 1.0  # minimum angle between the rays of a landmark, degrees
+        # Maximum reprojection error of a new landmark in all its key frames, pixels.
+        max_error_px = 1.5
         if len(ids) == 0:
             return ids
-        config, found = self._config, triangulate_points(self._recent_keyframes, ids)
-        clear = is_well_triangulated(
-            found, min_rays, np.deg2rad(config.min_parallax_deg), config.max_triangulation_px
-        )
+        found = triangulate_points(self._recent_keyframes, ids)
+        clear = is_well_triangulated(found, min_rays, np.deg2rad(min_parallax_deg), max_error_px)
         self._landmarks.positions[ids[clear]] = found.points[clear]
         with np.errstate(invalid="ignore"):
             wrong = (
                 (found.num_rays >= min_rays)
-                & (found.parallax >= np.deg2rad(config.min_parallax_deg))
+                & (found.parallax >= np.deg2rad(min_parallax_deg))
                 & ~clear
             )
         self._landmarks.positions[ids[wrong]] = np.nan
@@ -370,11 +361,18 @@ class MonocularOdometry:
 
     def _compute_sigmas(self, tracks: Tracks) -> Float[np.ndarray, " n"]:
         """Return the standard deviations (pixels). A newly tracked point has the default."""
+        # Tracking uncertainty (pixels, from the appearance difference taken as noise) at
+        # which a point has an error of `sigma_px`. Otherwise the error scales with the
+        # square of the ratio, because points that slide along an edge differ more than
+        # noise suggests.
+        clear_px = 0.05
+        sigma_px = 0.3  # standard deviation of a tracked point, pixels
         unclear = np.clip(
-            (tracks.sigmas_px.astype(np.float64) / self._config.clear_px) ** 2,
-            *_SIGMA_SCALE_RANGE,
+            (tracks.sigmas_px.astype(np.float64) / clear_px) ** 2,
+            0.5,
+            10.0,
         )
-        return self._config.odometry.sigma_px * np.where(tracks.sigmas_px > 0.0, unclear, 1.0)
+        return sigma_px * np.where(tracks.sigmas_px > 0.0, unclear, 1.0)
 
     def _make_keyframe(
         self,
@@ -418,6 +416,14 @@ def _make_view(frame: StereoFrame, max_side_px: int) -> MeasuredView:
     view = undistort_frame(frame, max_side_px)
     return MeasuredView(
         view, StereoCamera(view.camera, view.camera.fx), view.grey.astype(np.float32), None
+    )
+
+
+def _find_corners(measured: MeasuredView, existing_img: np.ndarray) -> Float32[np.ndarray, "m 2"]:
+    """Return new corners: more than with a stereo camera, because few of them survive until they
+    are triangulated."""
+    return find_corners(
+        measured.view.grey, existing_img, num_corners=1500, patch_half_px=_PATCH_HALF_PX
     )
 
 

@@ -10,35 +10,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
-
-
-@dataclass(frozen=True)
-class PredictionConfig:
-    """Configure the uncertainty and the limits of a prediction."""
-
-    gap: Annotated[float, AtLeast(1)] = 1.5
-    """A frame follows a gap if it comes later than this many median intervals."""
-    max_intervals: Annotated[float, AtLeast(0)] = 10.0
-    """Maximum number of intervals over which a motion is extrapolated."""
-    remembered: Annotated[int, Between(1, 10_000)] = 20
-    """Number of recent steps from which the acceleration is estimated."""
-    min_remembered: Annotated[int, AtLeast(1)] = 3
-    """Minimum number of steps for this estimate."""
-    way_share: Annotated[float, AtLeast(0)] = 0.1
-    """Minimum sigma of a prediction after a gap, as a share of its translation and rotation."""
-    stop_share: Annotated[float, AtLeast(0)] = 0.7
-    """The same share for the very next frame, because a camera may stop or turn back."""
-    max_sigmas: Annotated[float, Above(0)] = 3.0
-    """Maximum distance of an expected step from the prediction, in sigma."""
-    clear_sigmas: Annotated[float, Above(0)] = 3.5
-    """Minimum margin of an expected step over another one: the root of the difference of their
-    squared distances, in sigma."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +21,7 @@ class Prediction:
     """Hold a predicted cam_from_world with the sigma of its position (metres) and direction
     (radians).
 
-    Both are infinite if the motion is unknown.
+    Both are infinite if the motion is unknown. An expected pose is less than `max_sigmas` away.
     """
 
     cam_from_world: Rigid3
@@ -54,6 +29,7 @@ class Prediction:
     sigma: float
     sigma_rad: float
     is_gap: bool
+    max_sigmas: float = 3.0
 
     def distance(self, cam_from_world: Rigid3) -> float:
         """Return the distance of a pose from the prediction, in sigma."""
@@ -63,22 +39,23 @@ class Prediction:
         )
 
 
-def select_expected_pose(
-    prediction: Prediction | None, poses: Sequence[Rigid3], config: PredictionConfig
-) -> Rigid3 | None:
+def select_expected_pose(prediction: Prediction | None, poses: Sequence[Rigid3]) -> Rigid3 | None:
     """Select the pose (cam_from_world) that the motion supports: it is near the prediction, all
     others far.
 
     None if there is no such pose.
     """
+    # Minimum margin of an expected step over another one: the root of the difference of their
+    # squared distances, in sigma.
+    clear_sigmas = 3.5
     if len(poses) == 1:
         return poses[0]
     if prediction is None or not poses:
         return None
     distances = np.array([prediction.distance(pose) for pose in poses])
     nearest, next_one = np.argsort(distances, kind="stable")[:2]
-    clear = distances[nearest] < config.max_sigmas and distances[next_one] > np.hypot(
-        distances[nearest], config.clear_sigmas
+    clear = distances[nearest] < prediction.max_sigmas and distances[next_one] > np.hypot(
+        distances[nearest], clear_sigmas
     )
     return poses[int(nearest)] if clear else None
 
@@ -86,10 +63,10 @@ def select_expected_pose(
 class MotionHistory:
     """Hold the velocity of the last step, and the accelerations before it."""
 
-    def __init__(self, config: PredictionConfig) -> None:
-        self._config = config
-        self._squared_accelerations: deque[tuple[float, float]] = deque(maxlen=config.remembered)
-        self._intervals: deque[float] = deque(maxlen=config.remembered)
+    def __init__(self) -> None:
+        num_remembered = 20  # number of recent steps from which the acceleration is estimated
+        self._squared_accelerations: deque[tuple[float, float]] = deque(maxlen=num_remembered)
+        self._intervals: deque[float] = deque(maxlen=num_remembered)
         self._velocity: np.ndarray | None = None  # twist, left of cam_from_world, per second
         self._t_ns: int | None = None
         self._cam_from_world: Rigid3 | None = None
@@ -124,21 +101,29 @@ class MotionHistory:
 
     def predict(self, t_ns: int) -> Prediction | None:
         """Predict the pose at a time after the last frame. None if there is no last frame."""
+        max_intervals = 10.0  # maximum number of intervals over which a motion is extrapolated
+        gap = 1.5  # A frame follows a gap if it comes later than this many median intervals
+        min_remembered = 3  # minimum number of steps for this estimate
+        # Minimum sigma of a prediction after a gap, as a share of its translation and
+        # rotation.
+        way_share = 0.1
+        # The same share for the very next frame, because a camera may stop or turn back.
+        stop_share = 0.7
         if self._t_ns is None or self._cam_from_world is None:
             return None
         time = max(1e-9 * (t_ns - self._t_ns), 0.0)
         if self._velocity is None or not self._intervals:
             return Prediction(self._cam_from_world, Rigid3.identity(), np.inf, np.inf, False)
-        config, last = self._config, self._intervals[-1]
-        step = self._velocity * min(time, config.max_intervals * last)
+        last = self._intervals[-1]
+        step = self._velocity * min(time, max_intervals * last)
         way, turn = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:]))
-        is_gap = time > config.gap * float(np.median(self._intervals))
+        is_gap = time > gap * float(np.median(self._intervals))
         motion = Rigid3.exp(step)
-        if len(self._squared_accelerations) < config.min_remembered:
+        if len(self._squared_accelerations) < min_remembered:
             return Prediction(motion @ self._cam_from_world, motion, np.inf, np.inf, is_gap)
         growth = 0.5 * time * (time + last)
         acceleration, turning = np.sqrt(np.mean(np.array(self._squared_accelerations), axis=0))
-        share = config.way_share if is_gap else config.stop_share
+        share = way_share if is_gap else stop_share
         sigma = max(float(acceleration) * growth, share * way, 1e-3)
         sigma_rad = max(float(turning) * growth, share * turn, 1e-3)
         return Prediction(motion @ self._cam_from_world, motion, sigma, sigma_rad, is_gap)

@@ -23,7 +23,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import MeasuredView, measure_disparities, measured_view
 from topoloc.points.point_tracking import find_corners
 from topoloc.recordings.frame import StereoFrame
-from topoloc.slam.bundle_adjustment import adjust_bundle
+from topoloc.slam.bundle_adjustment import adjust_window
 from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import (
     DisparityBias,
@@ -36,7 +36,7 @@ from topoloc.slam.keyframes import (
 )
 from topoloc.slam.motion_prediction import MotionHistory, select_expected_pose
 from topoloc.slam.place_matching import extract_place_features, match_places
-from topoloc.slam.step_estimation import LastFrame, OdometryConfig, Step, StepEstimator, Tracks
+from topoloc.slam.step_estimation import LastFrame, Step, StepEstimator, Tracks, is_keyframe_due
 
 # bytes of about 80 places in memory, because matching two takes ten times as long as reading one
 _MAX_PLACE_BYTES = 16_000_000
@@ -54,10 +54,9 @@ class Odometry:
         keyframes: list[KeyFrame],
         landmarks: Landmarks,
         checks: InputChecks,
-        config: OdometryConfig,
     ):
         self._recording, self._keyframes, self._landmarks = recording, keyframes, landmarks
-        self._checks, self._config = checks, config
+        self._checks = checks
         self._last_frame: LastFrame | None = None
         self._reference: KeyFrame | None = None
         self._reference_image: np.ndarray = np.zeros((0, 0), np.float32)
@@ -67,7 +66,7 @@ class Odometry:
         self._lost_frames: list[
             tuple[int, StereoFrame]
         ] = []  # frames since the camera was lost, which may start a sub-map
-        self._history = MotionHistory(config.prediction)
+        self._history = MotionHistory()
         self._repeated_motions: list[Rigid3] = []  # of the last frame before the camera was lost
         self._bias = DisparityBias()
         self._place_features = DiskList[PlaceFeatures](max_bytes=_MAX_PLACE_BYTES)
@@ -93,8 +92,10 @@ class Odometry:
         return poses
 
     def _enable_bias_estimation(self, measured: MeasuredView) -> None:
+        # Prior standard deviation of the common disparity bias of a recording, pixels.
+        sigma_bias_px = 1.0
         if measured.right is not None:
-            self._bias.information = 1.0 / self._config.sigma_bias_px**2
+            self._bias.information = 1.0 / sigma_bias_px**2
 
     def _track_frame(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
@@ -108,7 +109,7 @@ class Odometry:
         self._update_last_frame(frame, measured, step.cam_from_world)
         assert self._reference is not None
         cam_from_keyframe = step.cam_from_world @ self._reference.cam_from_world.inverse()
-        if self._is_keyframe_due(measured):
+        if is_keyframe_due(self._tracks, self._reference, measured):
             self._add_keyframe(
                 frame,
                 frame_idx,
@@ -124,6 +125,8 @@ class Odometry:
 
         None if there is none, or the motion cannot select one of several.
         """
+        # Minimum share of the points found again for an unexpected step after a gap.
+        min_gap_share = 0.5
         prediction = self._history.predict(frame.t_ns)
         if self._last_frame is None or self._reference is None or prediction is None:
             return None
@@ -134,25 +137,23 @@ class Odometry:
             self._tracks,
             self._landmarks,
             measured,
-            self._config,
         )
         step = step_estimator.estimate_step(
             prediction.cam_from_world
         ) or step_estimator.estimate_step(self._last_frame.cam_from_world)
-        trusted = self._config.prediction
         is_expected = (
-            step is not None and prediction.distance(step.cam_from_world) < trusted.max_sigmas
+            step is not None and prediction.distance(step.cam_from_world) < prediction.max_sigmas
         )
         if is_expected and not prediction.is_gap:
             return step
         if self._num_lost == 0:
             self._repeated_motions = step_estimator.find_repeated_motions(prediction)
         if step is None or (
-            prediction.is_gap and not is_expected and step.inlier_ratio < self._config.min_gap_share
+            prediction.is_gap and not is_expected and step.inlier_ratio < min_gap_share
         ):
             return None
         expected = select_expected_pose(
-            prediction, self._collect_repeated_poses(step.cam_from_world), trusted
+            prediction, self._collect_repeated_poses(step.cam_from_world)
         )
         if expected is not None and not step_estimator.is_close(expected, step.cam_from_world):
             step = step_estimator.estimate_step(expected)
@@ -180,16 +181,6 @@ class Odometry:
         self._history.add_pose(frame.t_ns, cam_from_world, moved)
         self._last_frame = LastFrame(measured, cam_from_world)
 
-    def _is_keyframe_due(self, measured: MeasuredView) -> bool:
-        assert self._reference is not None
-        tracks, config = self._tracks, self._config
-        if len(tracks.landmark_ids) < config.keyframe_share * np.count_nonzero(
-            self._reference.observations.active
-        ):
-            return True
-        motion = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
-        return bool(motion > config.keyframe_motion * measured.view.camera.width)
-
     def _add_keyframe(
         self,
         frame: StereoFrame,
@@ -203,22 +194,18 @@ class Odometry:
         Disparities are measured, landmarks are added and the window is adjusted. Tracking then
         continues from this frame.
         """
-        config = self._config
+        min_disparity_px = 0.5  # minimum disparity of a new landmark, pixels
         points, landmark_ids = self._tracks.points_img, self._tracks.landmark_ids
-        corners = find_corners(measured.view.grey, points, self._config.tracking)
+        corners = find_corners(measured.view.grey, points)
         guesses = measured.stereo.project(
             cam_from_world.apply(self._landmarks.positions[landmark_ids])
         )[:, 2]
         all_points = np.concatenate([points, corners])
         bias = self._bias.value_px
         guesses = np.concatenate([guesses, np.full(len(corners), np.nan)]) + bias
-        disparities, sigmas = measure_disparities(
-            measured, all_points, guesses, self._config.disparity
-        )
+        disparities, sigmas = measure_disparities(measured, all_points, guesses)
         values = np.column_stack([all_points.astype(np.float64), disparities])
-        fresh = np.flatnonzero((disparities - bias)[len(points) :] > config.min_disparity_px) + len(
-            points
-        )
+        fresh = np.flatnonzero((disparities - bias)[len(points) :] > min_disparity_px) + len(points)
         unbiased = values[fresh] - [0.0, 0.0, bias]
         new_points = cam_from_world.inverse().apply(measured.stereo.points_cam(unbiased))
         rows = np.concatenate([np.arange(len(points)), fresh])
@@ -238,7 +225,7 @@ class Odometry:
         )
         self._keyframes.append(keyframe)
         self._recent_keyframes.append(keyframe)
-        self._adjust_window()
+        adjust_window(self._recent_keyframes, self._landmarks, 8, 5, max_steps=6)
         self._set_reference_keyframe(keyframe, measured)
         self._checks.check_keyframe(keyframe, self._landmarks, measured)
         if self._is_new_place(keyframe):
@@ -247,19 +234,13 @@ class Odometry:
     def _make_observations(
         self, ids: np.ndarray, values: np.ndarray, sigmas: np.ndarray
     ) -> Observations:
-        weights = np.full((len(ids), 3), 1.0 / self._config.sigma_px)
+        sigma_px = 0.3  # standard deviation of a tracked point, pixels
+        weights = np.full((len(ids), 3), 1.0 / sigma_px)
         weights[:, 2] = np.where(np.isfinite(sigmas), 1.0 / sigmas, 0.0)
         return Observations(ids, values, weights, np.ones(len(ids), np.bool_))
 
     def _next_submap(self) -> int:
         return self._keyframes[-1].submap + 1 if self._keyframes else 0
-
-    def _adjust_window(self) -> None:
-        config = self._config
-        free = self._recent_keyframes[-config.window :]
-        held = self._recent_keyframes[: -config.window][-config.held :]
-        adjust_bundle(free, held, self._landmarks, config.bundle)
-        del self._recent_keyframes[: -(config.window + config.held)]
 
     def _set_reference_keyframe(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
         seen = keyframe.observations
@@ -271,6 +252,11 @@ class Odometry:
             self._history.update_last_pose(keyframe.cam_from_world)
 
     def _is_new_place(self, keyframe: KeyFrame) -> bool:
+        # Minimum distance between key frames with place features (for loops), as a share
+        # of the median depth.
+        min_distance = 0.1
+        # The rotation (degrees) after which a key frame also gets place features.
+        min_angle_deg = 8.0
         last = self._last_places(1)
         if not last:
             return True
@@ -279,8 +265,8 @@ class Odometry:
         depth = keyframe.cam_from_world.apply(
             self._landmarks.positions[seen.landmark_ids[seen.active]]
         )[:, 2]
-        far = np.linalg.norm(motion.translation) > self._config.place_distance * np.median(depth)
-        return bool(far or motion.angle() > np.deg2rad(self._config.place_angle_deg))
+        far = np.linalg.norm(motion.translation) > min_distance * np.median(depth)
+        return bool(far or motion.angle() > np.deg2rad(min_angle_deg))
 
     def _submit_place_extraction(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
         """Extract the place features of a key frame in a background thread.
@@ -289,9 +275,7 @@ class Odometry:
         """
         if self._pending_keyframe is not None:
             assert self._pending_keyframe.place is not None  # waits
-        keyframe.pending_place = self._place_executor.submit(
-            extract_place_features, measured.view, self._config.places
-        )
+        keyframe.pending_place = self._place_executor.submit(extract_place_features, measured.view)
         self._pending_keyframe = keyframe
 
     def _last_places(self, num: int) -> list[KeyFrame]:
@@ -309,11 +293,17 @@ class Odometry:
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
     ) -> list[FramePose]:
         """Relocalize the camera in the last places, or start a new sub-map after a while."""
+        # Number of frames after a loss into which the last tracked points are still
+        # tracked.
+        max_lost_tracked = 3
+        # Number of lost frames after which a new sub-map starts. It begins at the first
+        # of them that the others follow.
+        max_lost_frames = 10
         self._num_lost += 1
         self._lost_frames.append((frame_idx, frame))
-        if self._num_lost > self._config.max_lost_tracked:
+        if self._num_lost > max_lost_tracked:
             self._last_frame = None
-        if self._reference is not None and self._num_lost <= self._config.max_lost_frames:
+        if self._reference is not None and self._num_lost <= max_lost_frames:
             found = self._relocalize(frame, measured)
             if found is not None:
                 return [self._start_tracking(frame_idx, frame, measured, *found)]
@@ -340,8 +330,8 @@ class Odometry:
                 poses, self._reference = [], None
                 del self._keyframes[num_keyframes:]
                 self._landmarks.num = num_landmarks
-                corners = find_corners(measured.view.grey, np.zeros((0, 2)), self._config.tracking)
-                if self._checks.can_start(frame, measured, corners, self._config.disparity):
+                corners = find_corners(measured.view.grey, np.zeros((0, 2)))
+                if self._checks.can_start(frame, measured, corners):
                     pose = self._start_tracking(frame_idx, frame, measured, Rigid3.identity(), None)
             if pose is not None:
                 poses.append(pose)
@@ -373,17 +363,18 @@ class Odometry:
 
         If the place is repetitive and the motion cannot select a pose, the search ends.
         """
-        here = extract_place_features(measured.view, self._config.places)
+        num_places = 6  # number of last places in which a lost camera is relocalized
+        here = extract_place_features(measured.view)
         prediction = self._history.predict(frame.t_ns)
-        for keyframe in self._last_places(self._config.places_asked):
+        for keyframe in self._last_places(num_places):
             place = keyframe.place
             assert place is not None
-            match = match_places(place, here, measured.stereo, self._config.places)
+            match = match_places(place, here, measured.stereo)
             if match is None:
                 continue
             cam_from_world = match.target_from_source @ keyframe.cam_from_world
             expected = select_expected_pose(
-                prediction, self._collect_repeated_poses(cam_from_world), self._config.prediction
+                prediction, self._collect_repeated_poses(cam_from_world)
             )
             if expected is cam_from_world:
                 return cam_from_world, Motion(keyframe, match.covariance)

@@ -34,7 +34,7 @@ from topoloc.geometry.pose_conventions import (
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.trajectory import Trajectory, interpolate_poses
-from topoloc.slam.measured_steps import MeasuredStep, MeasuredStepsConfig, measure_steps
+from topoloc.slam.measured_steps import MeasuredStep, measure_steps
 
 _MIN_INFORMATIVE_STEPS = 5
 _MIN_ACCEPTED_RATIO, _MIN_CONVENTION_RATIO = (
@@ -122,7 +122,7 @@ def check_pose_coverage(sequence: StereoSequence) -> None:
         )
 
 
-def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = None) -> None:
+def check_poses(sequence: StereoSequence) -> None:
     """Check that the poses of a recording fit its images. For a single camera the scale is not
     checked.
 
@@ -137,7 +137,7 @@ def check_poses(sequence: StereoSequence, config: MeasuredStepsConfig | None = N
     if sequence[posed[0]].camera is None:
         return
     verdict = evaluate_poses(
-        measure_steps(sequence, posed, config or MeasuredStepsConfig()),
+        measure_steps(sequence, posed),
         sequence.poses,
         sequence.t_ns,
     )

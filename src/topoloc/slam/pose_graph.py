@@ -8,28 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3
 from topoloc.slam.block_system import BlockPattern, solve_blocks
-
-
-@dataclass(frozen=True)
-class PoseGraphConfig:
-    """Configure the weights of the edges and the length of the optimisation."""
-
-    max_steps: Annotated[int, Between(0, 1000)] = 15
-    """Maximum number of steps."""
-    min_step: Annotated[float, AtLeast(0)] = 1e-5
-    """The optimisation ends at a step smaller than this, metres and radians."""
-    cauchy_scale: Annotated[float, Above(0)] = 3.0
-    """Scale of Cauchy's loss on loops, in sigma. Larger residuals have less and less weight."""
-    max_residual: Annotated[float, Above(0)] = 8.0
-    """Maximum residual of a loop after the optimisation, in sigma. Loops beyond it are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +31,25 @@ class Edge:
 
 
 def optimize_pose_graph(
-    cam_from_worlds: Sequence[Rigid3], edges: Sequence[Edge], config: PoseGraphConfig
+    cam_from_worlds: Sequence[Rigid3],
+    edges: Sequence[Edge],
+    max_steps: int = 15,
+    min_step: float = 1e-5,
 ) -> list[Rigid3]:
-    """Return the optimised poses. The first one stays fixed."""
+    """Return the optimised poses. The first one stays fixed.
+
+    Args:
+        max_steps: maximum number of steps.
+        min_step: the optimisation ends at a step smaller than this, metres and radians.
+    """
+    # Scale of Cauchy's loss on loops, in sigma. Larger residuals have less and less weight.
+    cauchy_scale = 3.0
     poses = list(cam_from_worlds)
     informations = [np.linalg.inv(edge.covariance) for edge in edges]
     pattern = BlockPattern.from_pairs(len(poses), [(edge.first, edge.second) for edge in edges])
     places = [pattern.block_idx(edge.first, edge.second) for edge in edges]
     elimination_idx = pattern.elimination_idx
-    for _ in range(config.max_steps):
+    for _ in range(max_steps):
         blocks, right = pattern.empty(), np.zeros((len(poses), 6))
         blocks[pattern.diagonal] = 1e-6 * np.eye(6)
         blocks[pattern.diagonal[elimination_idx[0]]] += 1e12 * np.eye(6)
@@ -66,7 +60,7 @@ def optimize_pose_graph(
             residual = (predicted @ edge.second_from_first.inverse()).log()
             if edge.is_loop:
                 information = information / (
-                    1.0 + residual @ information @ residual / config.cauchy_scale**2
+                    1.0 + residual @ information @ residual / cauchy_scale**2
                 )
             adjoint = predicted.adjoint()
             weighted = adjoint.T @ information
@@ -77,7 +71,7 @@ def optimize_pose_graph(
             right[elimination_idx[edge.first]] += weighted @ residual
         steps = solve_blocks(pattern, blocks, right[None])[0][elimination_idx]
         poses = [Rigid3.exp(step) @ pose for step, pose in zip(steps, poses, strict=True)]
-        if np.abs(steps).max() < config.min_step:
+        if np.abs(steps).max() < min_step:
             break
     return poses
 

@@ -12,12 +12,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.bounds import check_bounds
 from topoloc.errors import RecordingError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import MeasuredView, measured_view
@@ -25,32 +24,19 @@ from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import SequenceView
 from topoloc.slam.global_optimization import (
-    GlobalMapConfig,
     adjust_global_bundle,
     close_loops,
     join_submaps,
 )
-from topoloc.slam.input_checks import InputCheckConfig, InputChecks
+from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceFeatures
-from topoloc.slam.loop_closure import Link, LoopConfig, find_links
+from topoloc.slam.loop_closure import Link, find_links
 from topoloc.slam.odometry import Odometry
 from topoloc.slam.place_matching import extract_place_features
-from topoloc.slam.step_estimation import OdometryConfig
-from topoloc.slam.submap_joins import JoinConfig, find_joins, group_submaps
+from topoloc.slam.submap_joins import find_joins, group_submaps
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the steps done and the total steps."""
-
-
-@dataclass(frozen=True)
-class SlamConfig:
-    """Configure all steps of SLAM."""
-
-    checks: InputCheckConfig = field(default_factory=InputCheckConfig)
-    odometry: OdometryConfig = field(default_factory=OdometryConfig)
-    loops: LoopConfig = field(default_factory=LoopConfig)
-    joins: JoinConfig = field(default_factory=JoinConfig)
-    globally: GlobalMapConfig = field(default_factory=GlobalMapConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +86,6 @@ class SlamResult:
 
 def run_slam(
     sequences: StereoSequence | Sequence[StereoSequence],
-    config: SlamConfig | None = None,
     progress: Progress | None = None,
 ) -> SlamResult:
     """Run SLAM on one or several recordings of one place.
@@ -109,14 +94,11 @@ def run_slam(
     byte-identical poses.
 
     Raises:
-        ConfigError: a value of `config` is out of bounds.
         RecordingError: no frame could be tracked, left and right are swapped or no pairs, or there
             are only single images.
         CalibrationError: there is no calibration, or the baseline cannot be in metres.
         UnreadableImageError: an image cannot be read.
     """
-    config = config or SlamConfig()
-    check_bounds(config)
     progress = progress or (lambda stage, done, total: None)
     sequences = [sequences] if isinstance(sequences, StereoSequence) else list(sequences)
     keyframes: list[KeyFrame] = []
@@ -124,22 +106,20 @@ def run_slam(
     tracked: list[list[FramePose | None]] = []
     residuals: list[np.ndarray] = []
     for number, sequence in enumerate(sequences):
-        checks = InputChecks(sequence.name, config.checks)
-        odometry = Odometry(number, keyframes, landmarks, checks, config.odometry)
+        checks = InputChecks(sequence.name)
+        odometry = Odometry(number, keyframes, landmarks, checks)
         tracked.append(_track_recording(sequence, odometry, checks, progress))
         residuals += checks.right_residuals_px
-    links = find_links(keyframes, config.loops, progress)
+    links = find_links(keyframes, progress)
     links += find_joins(
         keyframes,
         links,
-        lambda keyframe: _read_place_features(keyframe, sequences, config),
-        config.joins,
-        config.loops,
+        lambda keyframe: _read_place_features(keyframe, sequences),
     )
     joined = join_submaps(
         keyframes, links, landmarks, _find_largest_submap(keyframes, links, tracked[0])
     )
-    links = _optimize_map(keyframes, links, joined, landmarks, config, progress)
+    links = _optimize_map(keyframes, links, joined, landmarks, progress)
     return SlamResult(
         poses=_to_world_poses(tracked, joined),
         apart=[_collect_separate_poses(of_recording, joined) for of_recording in tracked],
@@ -155,7 +135,6 @@ def run_slam(
 
 def estimate_slam_poses(
     sequences: Sequence[StereoSequence],
-    config: SlamConfig | None = None,
     progress: Progress | None = None,
 ) -> list[StereoSequence]:
     """Return the recordings with the poses of `run_slam`.
@@ -164,7 +143,7 @@ def estimate_slam_poses(
         RecordingError: a recording has no place in common with the others, or an error of
             `run_slam`.
     """
-    return run_slam(sequences, config, progress).apply(sequences)
+    return run_slam(sequences, progress).apply(sequences)
 
 
 def _track_recording(
@@ -216,13 +195,9 @@ def _find_largest_submap(
     ).most_common(1)[0][0]
 
 
-def _read_place_features(
-    keyframe: KeyFrame, sequences: Sequence[StereoSequence], config: SlamConfig
-) -> PlaceFeatures:
+def _read_place_features(keyframe: KeyFrame, sequences: Sequence[StereoSequence]) -> PlaceFeatures:
     """Extract the place features of a key frame without them, by reading its image again."""
-    return extract_place_features(
-        prepare_frame(sequences[keyframe.recording][keyframe.frame_idx]), config.odometry.places
-    )
+    return extract_place_features(prepare_frame(sequences[keyframe.recording][keyframe.frame_idx]))
 
 
 def _optimize_map(
@@ -230,7 +205,6 @@ def _optimize_map(
     links: list,
     joined: list[int],
     landmarks: Landmarks,
-    config: SlamConfig,
     progress: Progress,
 ) -> list:
     """Optimise the joined key frames, and return the links that agree with the result."""
@@ -243,9 +217,9 @@ def _optimize_map(
     ]
     ours = [keyframes[i] for i in chosen]
     progress("optimising", 0, 2)
-    kept = close_loops(ours, of_joined, landmarks, config.globally)
+    kept = close_loops(ours, of_joined, landmarks)
     progress("optimising", 1, 2)
-    adjust_global_bundle(ours, kept, landmarks, config.globally)
+    adjust_global_bundle(ours, kept, landmarks)
     progress("optimising", 2, 2)
     return kept
 

@@ -13,74 +13,29 @@ different place hardly any do. Images of repetitive structures are not used.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from itertools import product
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.transform_consensus import (
-    ConsensusConfig,
-    DriftConfig,
     TransformConsensus,
     diagonal_covariance,
     find_consensus,
     propagate_estimate,
 )
 from topoloc.slam.keyframes import KeyFrame, PlaceFeatures
-from topoloc.slam.loop_closure import Link, LoopConfig, is_reachable, rank_places
-from topoloc.slam.place_matching import PlaceMatchingConfig, count_repeated_features, match_places
+from topoloc.slam.loop_closure import Link, is_reachable, rank_places
+from topoloc.slam.place_matching import count_repeated_features, match_places
 
-_MIN_LOOSE_INLIERS = 6  # matches that agree on a known pose
+_MIN_INLIERS = 12  # matches of a pair that agree on a pose
 _MIN_ROTATION_TRACE = 1.0  # of a rotation by 90 degrees, beyond which images hardly overlap
 _CANDIDATE_FACTOR = 10  # candidate pairs per checked pair
 
 PlaceExtractor = Callable[[KeyFrame], PlaceFeatures]
 """A function that extracts the place features of a key frame from its recording."""
-
-
-@dataclass(frozen=True)
-class JoinConfig:
-    """Configure the comparison of two sub-maps and the conditions to join them."""
-
-    matching: PlaceMatchingConfig = field(
-        default_factory=lambda: PlaceMatchingConfig(min_inliers=12, min_inlier_share=0.3)
-    )
-    consensus: ConsensusConfig = field(default_factory=lambda: ConsensusConfig(min_independent=3))
-    num_candidates: Annotated[int, Between(0, 1000)] = 4
-    """Number of most similar places in each other sub-map that a place is compared with."""
-    num_seeds: Annotated[int, Between(0, 1000)] = 6
-    """Number of best matching pairs whose neighbours are compared, too."""
-    neighbours: Annotated[int, Between(0, 100)] = 2
-    """Number of key frames before and after each end of these pairs that are compared."""
-    sigma: Annotated[float, Above(0)] = 0.03
-    """Sigma of a match, metres, in addition to that of PnP."""
-    sigma_deg: Annotated[float, Above(0)] = 1.0
-    """Sigma of a match, degrees, in addition to that of PnP."""
-    covariance_scale: Annotated[float, Above(0)] = 4.0
-    """Factor of the PnP covariance, because matched features of one view have correlated errors."""
-    drift: Annotated[float, AtLeast(0)] = 0.02
-    """Drift between two images of a sub-map (one sigma), as a share of their distance."""
-    drift_deg: Annotated[float, AtLeast(0)] = 0.3
-    """Rotation drift between two images of a sub-map (one sigma), degrees per metre."""
-    num_checked: Annotated[int, Between(0, 1000)] = 20
-    """Number of most similar views that are compared to verify a join."""
-    alike_deg: Annotated[float, Between(0, 90)] = 15.0
-    """Maximum angle between two directions from which a point looks the same, degrees."""
-    alike_ratio: Annotated[float, AtLeast(1)] = 1.3
-    """Maximum ratio of two distances from which a point looks the same."""
-    min_seen_points: Annotated[int, AtLeast(1)] = 100
-    """Minimum number of points that must look the same, over all compared views."""
-    min_seen_again: Annotated[float, Between(0, 1)] = 0.08
-    """Minimum share of these points that are matched consistently with the join."""
-    min_covered: Annotated[float, Between(0, 1)] = 0.55
-    """Minimum share of these points in image cells with a match, because the same board may hang in
-    two rooms."""
-    cells: Annotated[int, Between(1, 100)] = 4
-    """Number of such cells across and down an image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,55 +53,48 @@ def find_joins(
     keyframes: Sequence[KeyFrame],
     links: Sequence[Link],
     extract_place: PlaceExtractor,
-    config: JoinConfig,
-    loops: LoopConfig,
 ) -> list[Link]:
     """Return links that join sub-maps which `links` leaves apart.
 
     Compared key frames get place features.
     """
+    num_seeds = 6  # number of best matching pairs whose neighbours are compared, too
     groups = group_submaps(keyframes, links)
     places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
     if len(set(groups.values())) < 2 or len(places) < 2:
         return []
     joins: list[Link] = []
     repeated: dict[int, int] = {}
-    for pairs in _find_similar_places(keyframes, places, groups, config, loops).values():
-        found = _match_pairs(pairs, keyframes, config, loops)
-        seeds = sorted(found, key=lambda link: -len(link.match.source_rows))[: config.num_seeds]
-        around = _find_neighbour_pairs(seeds, keyframes, config) - set(pairs)
+    for pairs in _find_similar_places(keyframes, places, groups).values():
+        found = _match_pairs(pairs, keyframes)
+        seeds = sorted(found, key=lambda link: -len(link.match.source_rows))[:num_seeds]
+        around = _find_neighbour_pairs(seeds, keyframes) - set(pairs)
         for i in sorted({i for pair in around for i in pair}):
             if not keyframes[i].has_place:
                 keyframes[i].place = extract_place(keyframes[i])
-        found += _match_pairs(sorted(around), keyframes, config, loops)
+        found += _match_pairs(sorted(around), keyframes)
         joins += _select_consistent(
-            [link for link in found if _is_distinct(link, keyframes, repeated, config)],
+            [link for link in found if _is_distinct(link, keyframes, repeated)],
             keyframes,
-            config,
         )
     return joins
 
 
-def _is_distinct(
-    link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, int], config: JoinConfig
-) -> bool:
+def _is_distinct(link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, int]) -> bool:
     """Return whether a match exceeds the repetitions within each of the two images.
 
     `repeated` caches the counts by key frame.
     """
+    max_repeated_share = 0.5  # of the matches
     for end in (link.source, link.target):
         place = keyframes[end].place
         if end not in repeated and place is not None:
-            repeated[end] = count_repeated_features(place, keyframes[end].stereo, config.matching)
+            repeated[end] = count_repeated_features(place, keyframes[end].stereo, _MIN_INLIERS)
     rivals = max(repeated[link.source], repeated[link.target])
-    return rivals < max(
-        config.consensus.rival_share * len(link.match.source_rows), config.matching.min_inliers
-    )
+    return rivals < max(max_repeated_share * len(link.match.source_rows), _MIN_INLIERS)
 
 
-def _select_consistent(
-    links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig
-) -> list[Link]:
+def _select_consistent(links: Sequence[Link], keyframes: Sequence[KeyFrame]) -> list[Link]:
     """Return the agreeing links between two sub-maps.
 
     The list is empty if too few agree, or other images contradict them.
@@ -155,10 +103,10 @@ def _select_consistent(
         return []
     best = max(links, key=lambda link: len(link.match.source_rows))
     ends = _KeyFramePair(*(keyframes[i] for i in _order_ends(best, keyframes)))
-    estimates, covariances = _compute_estimates(links, keyframes, ends, config)
+    estimates, covariances = _compute_estimates(links, keyframes, ends)
     pictures = np.array([_order_ends(link, keyframes) for link in links])
-    consensus = find_consensus(estimates, covariances, config.consensus, pictures)
-    if consensus is None or not _is_join_verified(consensus, keyframes, ends, config):
+    consensus = find_consensus(estimates, covariances, pictures)
+    if consensus is None or not _is_join_verified(consensus, keyframes, ends):
         return []
     return [link for link, is_inlier in zip(links, consensus.is_inlier, strict=True) if is_inlier]
 
@@ -179,18 +127,18 @@ def _find_similar_places(
     keyframes: Sequence[KeyFrame],
     places: list[int],
     groups: dict[int, int],
-    config: JoinConfig,
-    loops: LoopConfig,
 ) -> dict[tuple[int, int], list[tuple[int, int]]]:
     """Return the similar pairs (earlier, later) of each two sub-maps that are apart."""
+    # Number of most similar places in each other sub-map that a place is compared with.
+    num_candidates = 4
     pairs: dict[tuple[int, int], set[tuple[int, int]]] = {}
-    for number, ranked in enumerate(rank_places([keyframes[i] for i in places], loops.vlad)):
+    for number, ranked in enumerate(rank_places([keyframes[i] for i in places])):
         own = keyframes[places[number]].submap
         num_of: dict[int, int] = {}
         for other in ranked:
             submap = keyframes[places[other]].submap
             num_of[submap] = num_of.get(submap, 0) + 1
-            if groups[submap] != groups[own] and num_of[submap] <= config.num_candidates:
+            if groups[submap] != groups[own] and num_of[submap] <= num_candidates:
                 ends = (
                     (places[number], places[other])
                     if own < submap
@@ -201,14 +149,15 @@ def _find_similar_places(
 
 
 def _find_neighbour_pairs(
-    links: Sequence[Link], keyframes: Sequence[KeyFrame], config: JoinConfig
+    links: Sequence[Link], keyframes: Sequence[KeyFrame]
 ) -> set[tuple[int, int]]:
     """Return the pairs (earlier, later) of key frames around those of the links."""
+    # Number of key frames before and after each end of these pairs that are compared.
+    num_around = 2
     pairs: set[tuple[int, int]] = set()
     for link in links:
         one, other = (
-            _find_neighbours(end, keyframes, config.neighbours)
-            for end in _order_ends(link, keyframes)
+            _find_neighbours(end, keyframes, num_around) for end in _order_ends(link, keyframes)
         )
         pairs |= set(product(one, other))
     return pairs
@@ -224,8 +173,6 @@ def _find_neighbours(row: int, keyframes: Sequence[KeyFrame], num: int) -> list[
 def _match_pairs(
     pairs: Sequence[tuple[int, int]],
     keyframes: Sequence[KeyFrame],
-    config: JoinConfig,
-    loops: LoopConfig,
 ) -> list[Link]:
     """Match each pair in both directions.
 
@@ -235,14 +182,14 @@ def _match_pairs(
     for source, target in (ends for pair in pairs for ends in (pair, pair[::-1])):
         a, b = keyframes[source].place, keyframes[target].place
         match = (
-            match_places(a, b, keyframes[target].stereo, config.matching)
+            match_places(a, b, keyframes[target].stereo, _MIN_INLIERS, min_inlier_share=0.3)
             if a is not None and b is not None
             else None
         )
         if match is not None:
             link = Link(source, target, match)
             if keyframes[source].recording != keyframes[target].recording or is_reachable(
-                link, keyframes, loops
+                link, keyframes
             ):
                 links.append(link)
     return links
@@ -254,25 +201,30 @@ def _order_ends(link: Link, keyframes: Sequence[KeyFrame]) -> list[int]:
 
 
 def _compute_estimates(
-    links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _KeyFramePair, config: JoinConfig
+    links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _KeyFramePair
 ) -> tuple[list[Rigid3], Float[np.ndarray, "n 6 6"]]:
     """Return first_from_second of each link, and the covariances.
 
     The covariance grows with the distance along the sub-maps.
     """
-    estimates, covariances, along = [], [], DriftConfig(config.drift, config.drift_deg)
+    # Factor of the PnP covariance, because matched features of one view have correlated
+    # errors.
+    covariance_scale = 4.0
+    sigma = 0.03  # sigma of a match, metres, in addition to that of PnP
+    sigma_deg = 1.0  # sigma of a match, degrees, in addition to that of PnP
+    estimates, covariances = [], []
     for link in links:
         a, b = _order_ends(link, keyframes)
         first_from_a = ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse()
         b_from_second = keyframes[b].cam_from_world @ ends.second.cam_from_world.inverse()
         a_from_b = link.match.target_from_source
-        covariance = config.covariance_scale * link.match.covariance + diagonal_covariance(
-            config.sigma, config.sigma_deg
+        covariance = covariance_scale * link.match.covariance + diagonal_covariance(
+            sigma, sigma_deg
         )
         if link.source == a:
             a_from_b, covariance = a_from_b.inverse(), inverse_covariance(a_from_b, covariance)
         estimate, carried_covariance = propagate_estimate(
-            first_from_a, a_from_b, covariance, b_from_second, along
+            first_from_a, a_from_b, covariance, b_from_second
         )
         estimates.append(estimate)
         covariances.append(carried_covariance)
@@ -283,28 +235,33 @@ def _is_join_verified(
     consensus: TransformConsensus,
     keyframes: Sequence[KeyFrame],
     ends: _KeyFramePair,
-    config: JoinConfig,
 ) -> bool:
     """Return whether enough of the points that must look the same are matched.
 
     The matches must also be spread over the images.
     """
-    loosely = replace(config.matching, min_inliers=_MIN_LOOSE_INLIERS, min_inlier_share=0.0)
+    # Minimum share of these points that are matched consistently with the join.
+    min_seen_again = 0.08
+    # Minimum share of these points in image cells with a match, because the same board may
+    # hang in two rooms.
+    min_covered = 0.55
+    # Minimum number of points that must look the same, over all compared views.
+    min_seen_points = 100
+    min_known_pose = 6  # matches that agree on a known pose
+    num_cells = 4  # across and down an image
     num_seen, num_found, num_covered = 0, 0, 0
-    for source, target, rows in _find_overlapping_views(
-        consensus.a_from_b, keyframes, ends, config
-    ):
+    for source, target, rows in _find_overlapping_views(consensus.a_from_b, keyframes, ends):
         a, b = keyframes[source].place, keyframes[target].place
         assert a is not None
         assert b is not None
-        cells = _compute_cells(a, keyframes[source], config)
+        cells = _compute_cells(a, keyframes[source], num_cells)
         seen, found = (
-            np.bincount(cells[rows], minlength=config.cells**2),
-            np.zeros(config.cells**2, np.int64),
+            np.bincount(cells[rows], minlength=num_cells**2),
+            np.zeros(num_cells**2, np.int64),
         )
-        match = match_places(a, b, keyframes[target].stereo, loosely)
+        match = match_places(a, b, keyframes[target].stereo, min_known_pose, min_inlier_share=0.0)
         if match is not None and _is_link_consistent(
-            Link(source, target, match), consensus, keyframes, ends, config
+            Link(source, target, match), consensus, keyframes, ends
         ):
             found = np.bincount(cells[np.intersect1d(match.source_rows, rows)], minlength=len(seen))
         num_seen, num_found, num_covered = (
@@ -312,22 +269,19 @@ def _is_join_verified(
             num_found + found.sum(),
             num_covered + seen[found > 0].sum(),
         )
-    enough = (
-        num_found >= config.min_seen_again * num_seen
-        and num_covered >= config.min_covered * num_seen
-    )
-    return bool(num_seen >= config.min_seen_points and enough)
+    enough = num_found >= min_seen_again * num_seen and num_covered >= min_covered * num_seen
+    return bool(num_seen >= min_seen_points and enough)
 
 
 def _compute_cells(
-    place: PlaceFeatures, keyframe: KeyFrame, config: JoinConfig
+    place: PlaceFeatures, keyframe: KeyFrame, num_cells: int
 ) -> Int[np.ndarray, " n"]:
     """Return the grid cell of each feature in its image."""
     camera = keyframe.stereo.camera
     columns_rows = np.floor(
-        config.cells * place.features.points_img / [camera.width, camera.height]
+        num_cells * place.features.points_img / [camera.width, camera.height]
     ).astype(np.int64)
-    return np.clip(columns_rows, 0, config.cells - 1) @ [1, config.cells]
+    return np.clip(columns_rows, 0, num_cells - 1) @ [1, num_cells]
 
 
 def _is_link_consistent(
@@ -335,22 +289,19 @@ def _is_link_consistent(
     consensus: TransformConsensus,
     keyframes: Sequence[KeyFrame],
     ends: _KeyFramePair,
-    config: JoinConfig,
 ) -> bool:
-    estimates, covariances = _compute_estimates([link], keyframes, ends, config)
-    residual = (estimates[0] @ consensus.a_from_b.inverse()).log()
-    square = residual @ np.linalg.solve(covariances[0] + consensus.covariance, residual)
-    return bool(square <= config.consensus.max_sigmas**2)
+    estimates, covariances = _compute_estimates([link], keyframes, ends)
+    return consensus.is_consistent(estimates[0], covariances[0])
 
 
 def _find_overlapping_views(
     first_from_second: Rigid3,
     keyframes: Sequence[KeyFrame],
     ends: _KeyFramePair,
-    config: JoinConfig,
 ) -> list[tuple[int, int, Int[np.ndarray, " n"]]]:
     """Return source, target and covisible features of the most overlapping pairs, in both
     directions."""
+    num_checked = 20  # number of most similar views that are compared to verify a join
     ones, others = (
         [i for i, k in enumerate(keyframes) if k.submap == end.submap and k.has_place]
         for end in (ends.first, ends.second)
@@ -376,22 +327,23 @@ def _find_overlapping_views(
     apart = np.linalg.norm(places[:, None] - other_places, axis=2)
     nearest = np.argsort(
         np.where(turned > _MIN_ROTATION_TRACE, apart, np.inf), axis=None, kind="stable"
-    )[: _CANDIDATE_FACTOR * config.num_checked]
+    )[: _CANDIDATE_FACTOR * num_checked]
     views = []
     for a, b in np.column_stack(np.unravel_index(nearest, apart.shape)).tolist():
         b_from_a = first_from_others[b].inverse() @ first_from_ones[a]
         one, other = keyframes[ones[a]], keyframes[others[b]]
-        views += [(ones[a], others[b], _find_covisible_features(one, other, b_from_a, config))]
-        views += [
-            (others[b], ones[a], _find_covisible_features(other, one, b_from_a.inverse(), config))
-        ]
-    return sorted(views, key=lambda view: -len(view[2]))[: config.num_checked]
+        views += [(ones[a], others[b], _find_covisible_features(one, other, b_from_a))]
+        views += [(others[b], ones[a], _find_covisible_features(other, one, b_from_a.inverse()))]
+    return sorted(views, key=lambda view: -len(view[2]))[:num_checked]
 
 
 def _find_covisible_features(
-    source: KeyFrame, target: KeyFrame, target_from_source: Rigid3, config: JoinConfig
+    source: KeyFrame, target: KeyFrame, target_from_source: Rigid3
 ) -> Int[np.ndarray, " n"]:
     """Return the features of `source` in view of `target` from a similar direction and distance."""
+    # Maximum angle between two directions from which a point looks the same, degrees.
+    max_angle_deg = 15.0
+    max_ratio = 1.3  # maximum ratio of two distances from which a point looks the same
     place = source.place
     assert place is not None
     valid = np.flatnonzero(place.points.valid)
@@ -404,7 +356,7 @@ def _find_covisible_features(
     rays = points - target_from_source.translation
     lengths, others = np.linalg.norm(points, axis=1), np.linalg.norm(rays, axis=1)
     is_from_side = (
-        np.sum(points * rays, axis=1) > np.cos(np.deg2rad(config.alike_deg)) * lengths * others
+        np.sum(points * rays, axis=1) > np.cos(np.deg2rad(max_angle_deg)) * lengths * others
     )
-    is_as_far = (lengths < config.alike_ratio * others) & (others < config.alike_ratio * lengths)
+    is_as_far = (lengths < max_ratio * others) & (others < max_ratio * lengths)
     return valid[is_inside & is_from_side & is_as_far]

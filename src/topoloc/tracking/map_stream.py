@@ -63,12 +63,10 @@ class MapStream:
     def __init__(self, localizer: Localizer, config: TrackerConfig) -> None:
         self.localizer, self.config = localizer, config
         self._hypotheses, self._window = (
-            PoseHypotheses(self.config.hypotheses),
-            PoseWindow(self.config.window),
+            PoseHypotheses(self.config.hypotheses.motion),
+            PoseWindow(),
         )
-        self._stream_localizer = StreamLocalizer(
-            localizer, self._hypotheses, self.config.floor_share
-        )
+        self._stream_localizer = StreamLocalizer(localizer, self._hypotheses)
         self._answer: StreamedPose | None = None
         self._reference: ReferenceImage | None = None
         self._last_attempt_ns = 0
@@ -77,10 +75,11 @@ class MapStream:
         self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None
     ) -> StreamedPose:
         """Localize the next image of the stream, see `Tracker.process`."""
+        max_side_px = 800  # images are reduced to this width or height for point tracking
         if self.config.mode == "paper":
             answer = self._process_paper_mode(image, camera, t_ns)
         else:
-            grey = downscale_image(to_grey(image), camera, self.config.max_side_px)
+            grey = downscale_image(to_grey(image), camera, max_side_px)
             answer = self._process_motion_mode(
                 StreamFrame(image, camera, t_ns, odom_from_cam, *grey)
             )
@@ -194,7 +193,7 @@ class MapStream:
         if tracked_motion is None:
             return None
         world_from_cam = self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse()
-        floor = noise_floor(reference.errors.depth, self.config.floor_share)
+        floor = noise_floor(reference.errors.depth)
         return (
             tracked_motion
             if self._hypotheses.is_consistent(
@@ -205,17 +204,26 @@ class MapStream:
 
     def _is_localization_due(self, tracked_motion: TrackedMotion, frame: StreamFrame) -> bool:
         """Return whether the image must be localized in full."""
-        config, reference = self.config, self._reference
+        # Minimum seconds between two full localizations while the points are tracked.
+        retry_interval = 0.1
+        interval = 0.25  # interval of full localizations, seconds
+        # An image is also localized in full if the share of points still tracked is below
+        # this.
+        min_share_left = 0.6
+        # An image is also localized in full if the points moved by more than this share
+        # of the image width.
+        max_shift = 0.04
+        reference = self._reference
         assert reference is not None
         if not self._hypotheses.is_unambiguous:
             return True
-        if frame.t_ns - self._last_attempt_ns < config.retry_after * 1e9:
+        if frame.t_ns - self._last_attempt_ns < retry_interval * 1e9:
             return False
-        is_old = frame.t_ns - reference.t_ns >= config.localize_every * 1e9
+        is_old = frame.t_ns - reference.t_ns >= interval * 1e9
         return (
             is_old
-            or tracked_motion.tracked_ratio < config.min_share_left
-            or tracked_motion.shift_px > config.max_shift * frame.grey_camera.width
+            or tracked_motion.tracked_ratio < min_share_left
+            or tracked_motion.shift_px > max_shift * frame.grey_camera.width
         )
 
     def _predict_pose(
@@ -225,22 +233,22 @@ class MapStream:
 
         The error of a tracked pose includes those of its reference image and of wrong depths.
         """
+        # Maximum direction uncertainty of the prediction (three sigma, radians). Above
+        # it, coarse retrieval is used.
+        max_doubt = 0.3
         reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
         if reference is None or predicted is None:
             return None
         if tracked_motion is None:
-            is_known = (
-                compute_direction_uncertainty(predicted, reference.errors.depth)
-                <= self.config.max_doubt
-            )
+            is_known = compute_direction_uncertainty(predicted, reference.errors.depth) <= max_doubt
             return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
         motion, scale = (
             tracked_motion.cam_from_ref.adjoint(),
-            self.config.hypotheses.prediction_scale**2,
+            self._hypotheses.prediction_scale**2,
         )
         pose_covariance = (
             motion @ reference.errors.total @ motion.T
-            + scale * compute_motion_covariance(tracked_motion, self.config.followed_share)
+            + scale * compute_motion_covariance(tracked_motion)
         )
         near = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
         return ExpectedPose(
@@ -268,9 +276,7 @@ class MapStream:
             )
         else:
             motion, motion_covariance = self._compute_motion(predicted, tracked_motion)
-            motion_covariance = motion_covariance + compute_correlated_change(
-                errors, motion, self.config.reach
-            )
+            motion_covariance = motion_covariance + compute_correlated_change(errors, motion)
             before = (
                 self._compute_smoothed_pose(tracked_motion, t_ns)
                 if tracked_motion is not None
@@ -289,9 +295,7 @@ class MapStream:
                 frame.odom_from_cam,
             )
         points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
-        follower = PointTracker(
-            frame.grey, points, cam_from_world, frame.grey_camera, self.config.following
-        )
+        follower = PointTracker(frame.grey, points, cam_from_world, frame.grey_camera)
         self._reference = ReferenceImage(
             t_ns,
             found.result,
@@ -323,7 +327,10 @@ class MapStream:
         )
 
     def _fade_offset(self, offset: Rigid3, seconds: float) -> Rigid3:
-        return Rigid3.exp(np.exp(-seconds / self.config.blend_time) * offset.log())
+        # Time constant (to 1/e, seconds) of the correction of the smoothed pose by a new
+        # localization. It prevents jumps.
+        blend_time = 0.2
+        return Rigid3.exp(np.exp(-seconds / blend_time) * offset.log())
 
     def _compute_motion(
         self, predicted: MotionState, tracked_motion: TrackedMotion | None
@@ -332,9 +339,7 @@ class MapStream:
         perturbation."""
         assert self._reference is not None
         if tracked_motion is not None:
-            return tracked_motion.cam_from_ref, compute_motion_covariance(
-                tracked_motion, self.config.followed_share
-            )
+            return tracked_motion.cam_from_ref, compute_motion_covariance(tracked_motion)
         return (
             predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(),
             predicted.pose_covariance,

@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.bounds import Above, AtLeast
+from topoloc.bounds import Above
 from topoloc.geometry.rigid import Rigid3
 
 
@@ -26,17 +26,6 @@ class MotionConfig:
     """Standard deviation of the unknown acceleration, m/s^2."""
     sigma_angular_acceleration: Annotated[float, Above(0)] = 12.0
     """Standard deviation of the unknown angular acceleration, rad/s^2."""
-    sigma_velocity: Annotated[float, Above(0)] = 8.0
-    """Standard deviation of the initial velocity, m/s. The camera may be on a car."""
-    sigma_angular_velocity: Annotated[float, Above(0)] = 2.0
-    """Standard deviation of the initial angular velocity, rad/s."""
-    max_step: Annotated[float, Above(0)] = 1.0
-    """Seconds for which the velocity is extrapolated. The predicted camera stands still after
-    that."""
-    odometry_share: Annotated[float, AtLeast(0)] = 0.05
-    """Standard deviation of external odometry, as a share of the translation and the rotation."""
-    odometry_sigma: Annotated[float, Above(0)] = 0.002
-    """Standard deviation of external odometry that is added to this share, metres and radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +51,16 @@ class MotionState:
 
 
 def start_motion(
-    t_ns: int, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"], config: MotionConfig
+    t_ns: int, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> MotionState:
     """Return the state of a camera measured once, with unknown velocity.
 
     `covariance` is that of the right perturbation of the pose.
     """
-    variances = np.repeat([config.sigma_velocity**2, config.sigma_angular_velocity**2], 3)
+    # Standard deviation of the initial velocity, m/s. The camera may be on a car.
+    sigma_velocity = 8.0
+    sigma_angular_velocity = 2.0  # standard deviation of the initial angular velocity, rad/s
+    variances = np.repeat([sigma_velocity**2, sigma_angular_velocity**2], 3)
     both = np.zeros((12, 12))
     both[:6, :6], both[6:, 6:] = covariance, np.diag(variances)
     return MotionState(t_ns, world_from_cam, np.zeros(6), both)
@@ -82,9 +74,16 @@ def predict_motion(
     External odometry replaces the velocity if it is given. `before_from_cam` is its motion since
     the state.
     """
+    # Seconds for which the velocity is extrapolated. The predicted camera stands still after
+    # that.
+    max_step = 1.0
+    # Standard deviation of external odometry, as a share of the translation and the rotation.
+    odometry_share = 0.05
+    # Standard deviation of external odometry that is added to this share, metres and radians.
+    odometry_sigma = 0.002
     seconds = (t_ns - state.t_ns) / 1e9
     step = (
-        Rigid3.exp(min(seconds, config.max_step) * state.velocity)
+        Rigid3.exp(min(seconds, max_step) * state.velocity)
         if before_from_cam is None
         else before_from_cam
     )
@@ -99,16 +98,13 @@ def predict_motion(
     noise = np.zeros((12, 12))
     noise[6:, 6:] = 0.75 * seconds**2 * acceleration
     if before_from_cam is None:
-        transition[:6, 6:] = min(seconds, config.max_step) * np.eye(6)
+        transition[:6, 6:] = min(seconds, max_step) * np.eye(6)
         noise[:6, :6] = seconds**4 / 4.0 * acceleration
         noise[:6, 6:] = noise[6:, :6] = seconds**3 * 3.0 / 8.0 * acceleration
         velocity = state.velocity
     else:
         way, turn = float(np.linalg.norm(step.translation)), step.angle()
-        sigmas = (
-            np.repeat([config.odometry_share * way, config.odometry_share * turn], 3)
-            + config.odometry_sigma
-        )
+        sigmas = np.repeat([odometry_share * way, odometry_share * turn], 3) + odometry_sigma
         noise[:6, :6] = np.diag(sigmas**2)
         velocity = step.log() / seconds if seconds > 0 else state.velocity
     covariance = transition @ state.covariance @ transition.T + noise

@@ -9,40 +9,20 @@ wrong depths affect the motion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from topoloc.bounds import AtLeast, Between
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.stereo import ray_covariances
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.points.point_tracking import TrackingConfig, align_with_reference, track_points
+from topoloc.points.point_tracking import align_with_reference, track_points
 
 # Position noise across the ray. The pixel defines the ray, so this only regularises the covariance.
 _RAY_SIGMA_PX = 0.1
-
-
-@dataclass(frozen=True)
-class PointTrackerConfig:
-    """Configure the selection of tracked points and the conditions to stop."""
-
-    max_points: Annotated[int, Between(4, 100_000)] = 320
-    """Maximum number of tracked points, spread over the image. More cost time and add little."""
-    min_points: Annotated[int, AtLeast(4)] = 20
-    """Minimum number of points that agree on a pose."""
-    min_agreeing: Annotated[float, Between(0, 1)] = 0.6
-    """Minimum share of the tracked points that agree on a pose."""
-    tracking: TrackingConfig = field(default_factory=lambda: TrackingConfig(max_shift_px=4.0))
-    pose: AbsolutePoseConfig = field(
-        default_factory=lambda: AbsolutePoseConfig(
-            max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20
-        )
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +51,13 @@ class PointTracker:
         inlier_points: PointObservations,
         cam_from_world: Rigid3,
         camera: Camera,
-        config: PointTrackerConfig,
     ):
-        self._config, self._camera, self._cam_from_world = config, camera, cam_from_world
+        # Maximum number of tracked points, spread over the image. More cost time and add
+        # little.
+        max_points = 320
+        self._camera, self._cam_from_world = camera, cam_from_world
         inlier_points = _move_onto_rays(
-            _select_spread_points(inlier_points, camera, config.max_points), cam_from_world, camera
+            _select_spread_points(inlier_points, camera, max_points), cam_from_world, camera
         )
         self._inlier_points = inlier_points
         self._reference = grey.astype(np.float32)
@@ -140,9 +122,7 @@ class PointTracker:
         guesses = (
             self._last_points_img + np.clip(np.nan_to_num(after - before), -limit, limit)
         ).astype(np.float32)
-        found, is_found = track_points(
-            self._last_grey, grey, self._last_points_img, guesses, self._config.tracking
-        )
+        found, is_found = track_points(self._last_grey, grey, self._last_points_img, guesses)
         rows, found = self._rows[is_found], found[is_found]
         depths = [
             pose.apply(self._inlier_points.points_world[rows])[:, 2]
@@ -156,7 +136,7 @@ class PointTracker:
             points_ref,
             found,
             scales,
-            self._config.tracking,
+            max_shift_px=4.0,
         )
         return rows[aligned.is_matched], aligned.points_img[aligned.is_matched]
 
@@ -167,15 +147,19 @@ class PointTracker:
 
         A refinement may not converge from an inaccurate prediction.
         """
-        config = self._config
-        if len(rows) < config.min_points:
+        min_points = 20  # minimum number of points that agree on a pose
+        min_agreeing = 0.6  # minimum share of the tracked points that agree on a pose
+        if len(rows) < min_points:
             return None
         pose = estimate_absolute_pose(
             points_img.astype(np.float64), self._inlier_points.points_world[rows],
-            self._camera, config.pose,
+            self._camera,
+            AbsolutePoseConfig(
+                max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20
+            ),
             point_covariances=self._inlier_points.covariances[rows],
         )  # fmt: skip
-        enough = max(config.min_points, config.min_agreeing * len(rows))
+        enough = max(min_points, min_agreeing * len(rows))
         return pose if pose is not None and np.count_nonzero(pose.inliers) >= enough else None
 
 

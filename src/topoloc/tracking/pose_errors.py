@@ -37,7 +37,9 @@ class PoseErrors:
         return self.noise + self.correlated
 
 
-def compute_pose_errors(found: Localization, depth: float, floor_share: float) -> PoseErrors:
+def compute_pose_errors(
+    found: Localization, depth: float, floor_share: float = 0.001
+) -> PoseErrors:
     """Return both parts for points at this depth (metres). `noise_floor` is added to the noise."""
     noise = found.noise_share * found.camera_covariance
     return PoseErrors(
@@ -45,7 +47,7 @@ def compute_pose_errors(found: Localization, depth: float, floor_share: float) -
     )
 
 
-def noise_floor(depth: float, share: float) -> Float[np.ndarray, "6 6"]:
+def noise_floor(depth: float, share: float = 0.001) -> Float[np.ndarray, "6 6"]:
     """Return the noise that remains with any number of points.
 
     Its sigma is `share` of their depth (metres), and `share` radians.
@@ -54,12 +56,15 @@ def noise_floor(depth: float, share: float) -> Float[np.ndarray, "6 6"]:
 
 
 def compute_correlated_change(
-    errors: PoseErrors, cam_from_before: Rigid3, reach: float
+    errors: PoseErrors, cam_from_before: Rigid3
 ) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of the change of the correlated part between two images.
 
     `cam_from_before` is the motion between them.
     """
+    # Motion over which map errors are correlated (to 1/e): the distance in depths of the points,
+    # plus the rotation in radians.
+    reach = 2.0
     moved = (
         float(np.linalg.norm(cam_from_before.translation)) / errors.depth + cam_from_before.angle()
     )

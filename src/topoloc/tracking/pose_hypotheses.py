@@ -17,12 +17,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative
@@ -41,39 +39,6 @@ class HypothesesConfig:
     """Configure the gating, the weights and the extent of predictions."""
 
     motion: MotionConfig = field(default_factory=MotionConfig)
-    max_surprise: Annotated[float, Above(0)] = 33.0
-    """Maximum squared Mahalanobis distance of a consistent pose from the prediction (chi^2 with 6
-    degrees of freedom: 1 in 100,000)."""
-    prediction_scale: Annotated[float, Above(0)] = 2.5
-    """Factor on the sigma of the prediction, because hands jerk and wheels hit kerbs."""
-    min_probability: Annotated[float, Between(0.5, 1)] = 0.9
-    """Minimum weight of a hypothesis to be reported as the pose. Otherwise the result is
-    `ambiguous`."""
-    miss: Annotated[float, Between(1e-6, 0.5)] = 0.01
-    """Probability that a localization is wrong."""
-    miss_ambiguous: Annotated[float, Between(1e-6, 0.5)] = 0.1
-    """Minimum probability that the true pose is not among the alternatives."""
-    renewal: Annotated[float, Above(0)] = 1.0
-    """Motion after which the evidence of alternatives is new except for 1/e. It is the distance in
-    depths of the points, plus the rotation in radians."""
-    renewal_alone: Annotated[float, Above(0)] = 0.1
-    """The same motion for a single pose that is less certain than a localization can be."""
-    refused: Annotated[float, Between(0.01, 1)] = 0.6
-    """Share of its weight that a hypothesis keeps, relative to "elsewhere", after an image without
-    a pose."""
-    elsewhere: Annotated[float, Between(1e-9, 0.5)] = 0.0005
-    """Minimum probability that the camera is at none of the hypotheses, because it was carried or
-    all are wrong."""
-    max_number: Annotated[int, Between(1, 1000)] = 24
-    """Maximum number of hypotheses, those with the highest weights."""
-    min_weight: Annotated[float, Between(0, 0.1)] = 0.002
-    """Minimum weight of a hypothesis."""
-    max_asked: Annotated[int, AtLeast(0)] = 8
-    """Number of hypotheses around which an image is localized again if its result omits them."""
-    max_predicted: Annotated[float, AtLeast(0)] = 1.0
-    """Seconds without a measured pose after which a hypothesis is dropped."""
-    max_predicted_with_odometry: Annotated[float, AtLeast(0)] = 20.0
-    """The same with external odometry, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +81,25 @@ class PoseHypotheses:
     from it.
     """
 
-    def __init__(self, config: HypothesesConfig) -> None:
-        self.config = config
+    def __init__(
+        self,
+        motion: MotionConfig,
+        *,
+        max_number: int = 24,
+        miss: float = 0.01,
+        prediction_scale: float = 2.5,
+    ) -> None:
+        """Start without a hypothesis.
+
+        Args:
+            motion: the motion model.
+            max_number: maximum number of hypotheses, those with the highest weights.
+            miss: probability that a localization is wrong.
+            prediction_scale: factor on the sigma of the prediction, because hands jerk and wheels
+                hit kerbs.
+        """
+        self.motion, self.miss, self.prediction_scale = motion, miss, prediction_scale
+        self._max_number = max_number
         self.clear()
 
     def clear(self) -> None:
@@ -138,7 +120,10 @@ class PoseHypotheses:
     @property
     def is_unambiguous(self) -> bool:
         """Return whether one pose has enough weight, or there is no hypothesis."""
-        return not self._ranked or self.alternatives()[0].probability >= self.config.min_probability
+        # Minimum weight of a hypothesis to be reported as the pose. Otherwise the result
+        # is `ambiguous`.
+        min_probability = 0.9
+        return not self._ranked or self.alternatives()[0].probability >= min_probability
 
     def alternatives(self) -> tuple[Alternative, ...]:
         """Return the poses at the current image, likeliest first.
@@ -169,19 +154,17 @@ class PoseHypotheses:
 
         Those without a measurement for too long are dropped.
         """
-        config, before, alive = self.config, self._ranked, list[_Hypothesis]()
+        max_seconds = 1.0  # seconds without a measured pose after which a hypothesis is dropped
+        max_seconds_with_odometry = 20.0  # the same with external odometry
+        before, alive = self._ranked, list[_Hypothesis]()
         for one in before:
             before_from_cam = _relative_odometry(one.odom_from_cam, odom_from_cam)
-            limit = (
-                config.max_predicted
-                if before_from_cam is None
-                else config.max_predicted_with_odometry
-            )
+            limit = max_seconds if before_from_cam is None else max_seconds_with_odometry
             if t_ns - one.state.t_ns <= limit * 1e9:
                 alive.append(
                     replace(
                         one,
-                        current=predict_motion(one.state, t_ns, config.motion, before_from_cam),
+                        current=predict_motion(one.state, t_ns, self.motion, before_from_cam),
                         candidate_idx=None,
                     )
                 )
@@ -196,15 +179,15 @@ class PoseHypotheses:
         self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
     ) -> bool:
         """Return whether this pose is consistent with a prediction."""
-        return (
-            self._compute_gated_distance(predicted, world_from_cam, covariance)
-            <= self.config.max_surprise
-        )
+        # Maximum squared Mahalanobis distance of a consistent pose from the prediction
+        # (chi^2 with 6 degrees of freedom: 1 in 100,000).
+        max_surprise = 33.0
+        return self._compute_gated_distance(predicted, world_from_cam, covariance) <= max_surprise
 
     def _compute_gated_distance(
         self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
     ) -> float:
-        slack = (self.config.prediction_scale**2 - 1.0) * predicted.pose_covariance
+        slack = (self.prediction_scale**2 - 1.0) * predicted.pose_covariance
         return squared_mahalanobis(predicted, world_from_cam, covariance + slack)
 
     def apply_motion(
@@ -238,15 +221,19 @@ class PoseHypotheses:
         Args:
             new_evidence_ratio: share of the evidence that is new since the preceding images.
         """
+        # Share of its weight that a hypothesis keeps, relative to "elsewhere", after an
+        # image without a pose.
+        kept_share = 0.6
+        miss_ambiguous = 0.1  # minimum probability that the true pose is not among the alternatives
         if not candidates:
             self._prune(
-                [replace(one, weight=self.config.refused * one.weight) for one in self._ranked],
+                [replace(one, weight=kept_share * one.weight) for one in self._ranked],
                 self._null_weight,
             )
             return
         before, miss = (
             self.best,
-            self.config.miss if len(candidates) == 1 else self.config.miss_ambiguous,
+            self.miss if len(candidates) == 1 else miss_ambiguous,
         )
         none = max(miss, 1.0 - sum(one.probability for one in candidates))
         new = (
@@ -280,9 +267,7 @@ class PoseHypotheses:
             if heaviest is not None and heaviest.weight >= weight:
                 new[new.index(heaviest)] = replace(heaviest, weight=heaviest.weight + weight)
             else:
-                state = start_motion(
-                    t_ns, candidate.world_from_cam, candidate.covariance, self.config.motion
-                )
+                state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance)
                 new.append(
                     _Hypothesis(
                         state,
@@ -359,11 +344,14 @@ class PoseHypotheses:
 
     def _prune(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:
         """Keep the hypotheses with the highest weights and normalise the weights."""
-        config = self.config
+        min_weight = 0.002  # minimum weight of a hypothesis
+        # Minimum probability that the camera is at none of the hypotheses, because it was
+        # carried or all are wrong.
+        min_elsewhere = 0.0005
         whole = sum(one.weight for one in hypotheses) + elsewhere
-        heaviest = sorted(hypotheses, key=lambda one: -one.weight)[: config.max_number]
-        kept = [one for one in heaviest if one.weight >= config.min_weight * whole] or heaviest[:1]
-        self._null_weight = max(elsewhere / whole, config.elsewhere) if kept else 1.0
+        heaviest = sorted(hypotheses, key=lambda one: -one.weight)[: self._max_number]
+        kept = [one for one in heaviest if one.weight >= min_weight * whole] or heaviest[:1]
+        self._null_weight = max(elsewhere / whole, min_elsewhere) if kept else 1.0
         share = (1.0 - self._null_weight) / max(sum(one.weight for one in kept), 1e-300)
         self._ranked = [replace(one, weight=share * one.weight) for one in kept]
 

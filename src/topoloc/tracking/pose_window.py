@@ -8,26 +8,13 @@ loss limits the influence of a wrong localization.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.bounds import Between
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.pose_graph import Edge, PoseGraphConfig, optimize_pose_graph
-
-
-@dataclass(frozen=True)
-class PoseWindowConfig:
-    """Configure the size and the weights of the window."""
-
-    size: Annotated[int, Between(1, 1000)] = 10
-    """Number of localized images that are adjusted together."""
-    graph: PoseGraphConfig = field(
-        default_factory=lambda: PoseGraphConfig(max_steps=5, min_step=1e-4)
-    )
+from topoloc.slam.pose_graph import Edge, optimize_pose_graph
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +31,11 @@ class _Entry:
 
 
 class PoseWindow:
-    """Hold the last few localized images."""
+    """Hold the last `size` localized images, which are adjusted together."""
 
-    def __init__(self, config: PoseWindowConfig) -> None:
-        self._config = config
-        self._entries: deque[_Entry] = deque(maxlen=config.size)
-        self._smoothed: deque[Rigid3] = deque(maxlen=config.size)
+    def __init__(self, size: int = 10) -> None:
+        self._entries: deque[_Entry] = deque(maxlen=size)
+        self._smoothed: deque[Rigid3] = deque(maxlen=size)
         self._covariance = np.zeros((6, 6))  # of the last one of these
 
     def clear(self) -> None:
@@ -93,6 +79,8 @@ class PoseWindow:
             for k, entry in enumerate(self._entries, start=1)
             if k > 1
         ]
-        poses = optimize_pose_graph([Rigid3.identity(), *self._smoothed], edges, self._config.graph)
-        self._smoothed = deque(poses[1:], maxlen=self._config.size)
+        poses = optimize_pose_graph(
+            [Rigid3.identity(), *self._smoothed], edges, max_steps=5, min_step=1e-4
+        )
+        self._smoothed = deque(poses[1:], maxlen=self._smoothed.maxlen)
         return self._smoothed[-1], self._covariance

@@ -49,10 +49,8 @@ class LocalizedPose:
 class StreamLocalizer:
     """Run the localizer and update the hypotheses with its result."""
 
-    def __init__(
-        self, localizer: Localizer, hypotheses: PoseHypotheses, floor_share: float
-    ) -> None:
-        self._localizer, self._hypotheses, self._floor_share = localizer, hypotheses, floor_share
+    def __init__(self, localizer: Localizer, hypotheses: PoseHypotheses) -> None:
+        self._localizer, self._hypotheses = localizer, hypotheses
         self._last_ambiguous_pose: Rigid3 | None = None  # pose of the last ambiguous image
 
     def localize(
@@ -90,12 +88,14 @@ class StreamLocalizer:
 
     def _compute_new_evidence(self, found: list[LocalizedPose]) -> float:
         """Return the share of new evidence in an uncertain result since the last uncertain one."""
-        best, before, config = (
-            self._hypotheses.best,
-            self._last_ambiguous_pose,
-            self._hypotheses.config,
-        )
-        if not found or best is None or found[0].probability >= 1.0 - config.miss:
+        # Motion after which the evidence of alternatives is new except for 1/e. It is the
+        # distance in depths of the points, plus the rotation in radians.
+        renewal = 1.0
+        # The same motion for a single pose that is less certain than a localization can
+        # be.
+        renewal_alone = 0.1
+        best, before = self._hypotheses.best, self._last_ambiguous_pose
+        if not found or best is None or found[0].probability >= 1.0 - self._hypotheses.miss:
             return 1.0
         self._last_ambiguous_pose = best.world_from_cam
         if before is None or not self._hypotheses.is_track_continued:
@@ -103,7 +103,7 @@ class StreamLocalizer:
         moved = before.inverse() @ best.world_from_cam
         depth = float(np.median([one.errors.depth for one in found]))
         way = float(np.linalg.norm(moved.translation)) / depth + moved.angle()
-        return 1.0 - math.exp(-way / (config.renewal if len(found) > 1 else config.renewal_alone))
+        return 1.0 - math.exp(-way / (renewal if len(found) > 1 else renewal_alone))
 
     def _localize_globally(
         self, frame: StreamFrame
@@ -114,11 +114,14 @@ class StreamLocalizer:
         it. A search returns only some of many similar poses. A missing pose is at most as likely as
         the average of the others.
         """
+        # Number of hypotheses around which an image is localized again if its result
+        # omits them.
+        max_queries = 8
         refusal, found = self._query_localizer(frame, None)
         if refusal is None:
             return refusal, found
         missed: list[LocalizedPose] = []
-        for hypothesis in self._hypotheses.alternatives()[: self._hypotheses.config.max_asked]:
+        for hypothesis in self._hypotheses.alternatives()[:max_queries]:
             if not _is_known_pose(hypothesis.world_from_cam, [*found, *missed]):
                 around = self._query_localizer(frame, hypothesis.world_from_cam)[1]
                 missed += [
@@ -153,7 +156,7 @@ class StreamLocalizer:
             ]
         return None, [
             self._to_localized_pose(
-                one, inlier_points, min(_place_probability(one), 1.0 - self._hypotheses.config.miss)
+                one, inlier_points, min(_place_probability(one), 1.0 - self._hypotheses.miss)
             )
             for one, inlier_points in named
         ]
@@ -167,7 +170,7 @@ class StreamLocalizer:
         return LocalizedPose(
             result,
             inlier_points,
-            compute_pose_errors(result, depth, self._floor_share),
+            compute_pose_errors(result, depth),
             probability,
         )
 

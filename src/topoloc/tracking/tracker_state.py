@@ -58,7 +58,7 @@ def compute_direction_uncertainty(predicted: MotionState, depth: float) -> float
 
 
 def compute_motion_covariance(
-    tracked_motion: TrackedMotion, share: float
+    tracked_motion: TrackedMotion, share: float = 0.05
 ) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of a tracked motion: the noise of the points, and `share` of the motion
     for wrong depths."""

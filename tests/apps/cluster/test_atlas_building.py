@@ -26,7 +26,6 @@ from topoloc.apps.cluster.tasks import JobProgress
 from topoloc.apps.cluster.tiles import Outcome, TileJob
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.mapping.build import BuildConfig
-from topoloc.slam.slam import SlamConfig
 
 Complaint = Callable[..., str]
 
@@ -103,7 +102,7 @@ def test_a_ray_of_another_version(
 def _jobs(walks: list[Path], log: Path, seconds: float) -> list[TileJob]:
     def maker(walk: Path) -> LoggingMaker:
         return LoggingMaker(
-            MapJob((str(walk),), PoseOptions(), BuildConfig(), SlamConfig()),
+            MapJob((str(walk),), PoseOptions(), BuildConfig()),
             str(log),
             walk.name,
             seconds,

@@ -18,7 +18,6 @@ from topoloc.apps.cli.output import UsageError
 from topoloc.atlas.atlas import Atlas
 from topoloc.geometry.alignment import translation_error
 from topoloc.mapping.build import BuildConfig
-from topoloc.slam.slam import SlamConfig
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def long_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _making(recording: Path, *trajectory: str) -> MapJob:
-    return MapJob((str(recording),), PoseOptions(tuple(trajectory)), BuildConfig(), SlamConfig())
+    return MapJob((str(recording),), PoseOptions(tuple(trajectory)), BuildConfig())
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from built_corridor import WIDE, back, built_corridor, seen_on_the_way_back
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import SURF, FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.virtual_views import VirtualViewConfig, make_virtual_views
+from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
@@ -48,7 +48,7 @@ def _centres_and_axes() -> tuple[np.ndarray, np.ndarray]:
 def _seen() -> list[QueryVirtualView]:
     """Both sides of the picture, left first."""
     seen = []
-    for view in make_virtual_views(WIDE, VirtualViewConfig()):
+    for view in make_virtual_views(WIDE):
         features = view.select_inside(extract_features(view.picture(PICTURE), FeatureConfig()))
         seen.append(QueryVirtualView(view, features, view.to_image_pixels(features, WIDE)))
     return seen
@@ -69,7 +69,7 @@ def _around() -> list[tuple[QueryVirtualView, LocalMap]]:
 @pytest.mark.parametrize("y", [4.0, 5.0, 6.5])
 def test_the_side_nodes_around_a_pose_show_the_wall_that_it_sees_whoever_stood_where(y: float):
     centres, axes = _centres_and_axes()
-    for view in make_virtual_views(WIDE, VirtualViewConfig()):
+    for view in make_virtual_views(WIDE):
         side_ids = select_nearest_virtual_nodes(view, back(y).inverse(), centres, axes, 3)
         assert 1 <= len(side_ids) <= 3
         to_the_right = (back(y) @ view.cam_from_virtual).rotation[0, 2]
@@ -83,7 +83,7 @@ def test_the_side_nodes_around_a_pose_show_the_wall_that_it_sees_whoever_stood_w
 
 def test_no_side_node_is_near_a_pose_elsewhere():
     centres, axes = _centres_and_axes()
-    for view in make_virtual_views(WIDE, VirtualViewConfig()):
+    for view in make_virtual_views(WIDE):
         assert select_nearest_virtual_nodes(view, back(60.0).inverse(), centres, axes, 4) == []
         assert (
             select_nearest_virtual_nodes(

@@ -20,6 +20,7 @@ from topoloc.apps.cli import PLUGIN_PACKAGES, all_commands, load_plugins
 from topoloc.apps.cli.output import UsageError
 from topoloc.plugin import (
     describe_range,
+    drop_removed_settings,
     field_annotations,
     find_violation,
     parse_settings,
@@ -45,12 +46,6 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ("localize", "evaluate", "explain", "serve", "follow", "update"),
     ),
     "track": ("topoloc.tracking.config", "TrackerConfig", ("localize", "serve", "follow")),
-    "slam": ("topoloc.slam.slam", "SlamConfig", ("slam", "build", "update")),
-    "update": ("topoloc.lifelong.update", "UpdateConfig", ("update", "merge")),
-    "tile_choice": ("topoloc.lifelong.tile_selection", "TileSelectionConfig", ("update",)),
-    "against_itself": ("topoloc.lifelong.weak_regions", "WeakRegionsConfig", ("evaluate",)),
-    "join": ("topoloc.lifelong.tile_comparison", "TileJoinConfig", ("atlas", "build", "merge")),
-    "prune": ("topoloc.lifelong.prune", "PruneConfig", ("prune",)),
     "serve": ("topoloc.apps.service.config", "ServiceConfig", ("serve",)),
     "cluster": (
         "topoloc.apps.cluster.config",
@@ -86,7 +81,7 @@ def read_settings(path: str | None) -> Settings:
         return Settings({})
     try:
         configs = []
-        for name, table in _parse_file(path).items():
+        for name, table in drop_removed_settings(_parse_file(path), source=f"{path}: ").items():
             if name not in all_tables():
                 is_missing = name in PLUGIN_PACKAGES and name not in all_commands()
                 unknown = f"no such table{suggest_name(name, all_tables())}"

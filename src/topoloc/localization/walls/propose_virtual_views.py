@@ -82,9 +82,9 @@ class VirtualViewSearch:
         """Extract both side views of the query image and select the candidate places."""
         query, seen, named = search.query, list[QueryVirtualView](), list[CandidatePlaces]()
         assert isinstance(query.input_camera, Camera)
-        for view in make_virtual_views(query.input_camera, index.view_config):
+        for view in make_virtual_views(query.input_camera):
             picture = view.picture(query.grey)
-            seen_by = (view.name, index.view_config, index.feature_config)
+            seen_by = (view.name, index.feature_config)
             features = query.shared.get_or_extract(
                 query, seen_by, partial(_extract_view_features, index.feature_config, view, picture)
             )

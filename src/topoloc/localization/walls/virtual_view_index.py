@@ -32,10 +32,7 @@ class VirtualViewIndex:
             [summary.world_from_cam.translation for summary in sides.summaries]
         )
         self.middles = np.einsum("nji,nj->ni", self.rotations, self.centres - self.positions)
-        self.view_config, self.feature_config = (
-            topomap.config.sides.views,
-            topomap.config.feature_config_for(sides.kind),
-        )
+        self.feature_config = topomap.config.feature_config_for(sides.kind)
         self.local_map = CachedNodes(lambda row: _load_local_map(sides, row))
 
     @property

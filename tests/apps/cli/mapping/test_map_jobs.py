@@ -13,12 +13,11 @@ from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cli.output import UsageError
 from topoloc.errors import RecordingError
 from topoloc.mapping.build import BuildConfig
-from topoloc.slam.slam import SlamConfig
 
 
 @pytest.fixture
 def making(recording: Path) -> MapJob:
-    return MapJob((str(recording),), PoseOptions(), BuildConfig(), SlamConfig())
+    return MapJob((str(recording),), PoseOptions(), BuildConfig())
 
 
 def test_it_stays_where_it_is_sent(making: MapJob):

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from topoloc.errors import RecordingError
-from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_virtual_views
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.image_io import to_grey
@@ -143,7 +143,7 @@ def _pairs_of(
 def _kept_views(frame: StereoFrame, recording: str, pictures: Path) -> list[_Shown]:
     assert frame.camera is not None
     grey, kept = to_grey(frame.image), list[_Shown]()
-    for view in make_virtual_views(frame.camera, VirtualViewConfig()):
+    for view in make_virtual_views(frame.camera):
         picture = view.picture(grey)
         # the farthest columns are cut off, where there are too many
         column = 0 if view.name == "left" else max(0, picture.shape[1] - WIDTH)

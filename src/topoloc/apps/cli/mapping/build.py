@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from topoloc import BuildConfig, SlamConfig
+from topoloc import BuildConfig
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
 from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cli.mapping.recording_pieces import Pieces, SplitOptions, split_recording
@@ -160,7 +160,6 @@ class Command:
             tuple(recordings),
             PoseOptions(self.trajectory, self.poses, self.scale, self.allow_gaps),
             select_build_features(config, self.features),
-            settings.of(SlamConfig),
             self.format,
             self.camera,
             self.images,

@@ -19,7 +19,6 @@ from topoloc import (
     PoseConventions,
     RecordingError,
     SkippedChecks,
-    SlamConfig,
     StereoSequence,
     TopoMetricMap,
     align_to_trajectory,
@@ -56,7 +55,6 @@ class MapJob:
     recordings: tuple[str, ...]
     asked: PoseOptions
     build: BuildConfig
-    slam: SlamConfig
     format: str | None = None
     camera: str | None = None
     images: str | None = None
@@ -72,7 +70,7 @@ class MapJob:
         """
         sequences, poses_from = self._open()
         if poses_from[0] == "slam":
-            result = run_slam(sequences, self.slam, progress)
+            result = run_slam(sequences, progress)
             sequences = result.apply(sequences)
             apart = result.num_submaps - result.num_joined
             if apart:

@@ -13,7 +13,6 @@ import tyro
 
 from topoloc import (
     Rigid3,
-    SlamConfig,
     SlamResult,
     StereoSequence,
     Trajectory,
@@ -33,7 +32,6 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.cli.settings_file import read_settings
 
 
 @dataclass(frozen=True)
@@ -55,16 +53,13 @@ class Command:
     """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     json: File = None
     """Write what is printed to this file, too (- for standard output)."""
-    config: File = None
-    """All other settings: a TOML file, as `topoloc config slam` prints it."""
 
     def run(self) -> int:
-        check_outputs([self.out, self.json], inputs=[self.config] if self.config else [])
-        config = read_settings(self.config).of(SlamConfig)
+        check_outputs([self.out, self.json])
         sequence = open_recording(self.sequence, self.format, self.camera, self.topics)
         start = time.perf_counter()
         with progress_bar() as progress:
-            result = run_slam(sequence, config, progress)
+            result = run_slam(sequence, progress)
         seconds = time.perf_counter() - start
         known = [
             (t_ns, pose)

@@ -62,7 +62,7 @@ class Command:
     json: File = None
     """Write what the atlas holds afterwards as JSON to this file (- for standard output)."""
     config: File = None
-    """Settings of `join`: a TOML file, as `topoloc config atlas` prints it."""
+    """Settings of the cluster of `join`: a TOML file, as `topoloc config atlas` prints it."""
 
     def run(self) -> int:
         self._check_usage()
@@ -128,7 +128,7 @@ class Command:
                 "--join belongs to create and add; `topoloc atlas join` joins what is there"
             )
         if self.config is not None and self.action != "join" and not self.join:
-            raise UsageError("--config sets how tiles are joined")
+            raise UsageError("--config sets the cluster on which tiles are joined")
         if self.ray is not None and self.action != "join" and not self.join:
             raise UsageError("--ray is of tiles that are joined")
         if self.check and self.action != "info":

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from topoloc import Atlas, LocalizerConfig, UpdateConfig, is_atlas, merge
+from topoloc import Atlas, LocalizerConfig, is_atlas, merge
 from topoloc.apps.cli.maps.atlas import describe, print_atlas
 from topoloc.apps.cli.maps.session_update import describe_outdated_models
 from topoloc.apps.cli.maps.tile_joining import join_overlapping_tiles
@@ -53,7 +53,6 @@ class Command:
                 self.first,
                 self.second,
                 self.out,
-                settings.of(UpdateConfig),
                 settings.of(LocalizerConfig),
                 progress,
             )

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc import Atlas, PruneConfig, is_atlas, prune
+from topoloc import Atlas, is_atlas, prune
 from topoloc.apps.cli.output import File, UsageError, check_outputs, print_waiting, write_json
-from topoloc.apps.cli.settings_file import read_settings
 from topoloc.apps.cli.tile_option import (
     TileOption,
     check_tile_option,
@@ -32,30 +31,21 @@ class Command:
     ] = None
     """Megabytes that the file may have, of an atlas that of each tile: every node keeps the
     landmarks that add most, and nodes that others hold go before it keeps few."""
-    descriptors: Annotated[
-        Literal["fine", "coarse"] | None,
-        tyro.conf.arg(help_behavior_hint="(default: as [prune] says, fine)"),
-    ] = None
+    descriptors: Literal["fine", "coarse"] = "fine"
     """With `coarse` descriptors are rounded, to a third of their bytes, before anything goes that
     may be there."""
     tile: TileOption = None
     """Of an atlas: only this tile is pruned."""
     json: File = None
     """Write what was dropped to this file (- for standard output)."""
-    config: File = None
-    """All other settings: a TOML file, as `topoloc config prune` prints it."""
 
     def run(self) -> int:
         if self.max_mb is not None and not 0.0 < self.max_mb < 1e6:
             raise UsageError(f"--max-mb must be megabytes, not {self.max_mb:g}")
-        check_outputs([self.json], inputs=[path for path in (self.map, self.config) if path])
+        check_outputs([self.json], inputs=[self.map])
         check_tile_option(self.map, self.tile)
-        config = read_settings(self.config).of(PruneConfig)
-        config = (
-            config if self.descriptors is None else replace(config, descriptors=self.descriptors)
-        )
         if not is_atlas(self.map):
-            changes = self._prune_map(Path(self.map), config, self.map)
+            changes = self._prune_map(Path(self.map), self.map)
             write_json(self.json, {"map": self.map} | changes)
             return 0
         atlas = Atlas.open(self.map)
@@ -66,15 +56,15 @@ class Command:
             lambda name: edit_map_or_tile(
                 self.map,
                 name,
-                lambda path: self._prune_map(path, config, f"{self.map}, tile {name}"),
+                lambda path: self._prune_map(path, f"{self.map}, tile {name}"),
             ),
         )
         write_json(self.json, {"atlas": self.map, "tiles": tiles})
         return 0 if are_all_pruned else 1
 
-    def _prune_map(self, path: Path, config: PruneConfig, name: str) -> dict[str, Any]:
+    def _prune_map(self, path: Path, name: str) -> dict[str, Any]:
         """What was dropped from a map file, which is said of it by its name."""
-        pruned = prune(path, self.max_mb, config, print_waiting)
+        pruned = prune(path, self.max_mb, self.descriptors, print_waiting)
         changes = pruned.changes
         if self.json != "-":
             print(f"{name}: {describe_prune(changes, pruned.length_m / 1e3)}")

@@ -14,9 +14,7 @@ from topoloc import (
     LocalizerConfig,
     MapUpdate,
     PoseConventions,
-    SlamConfig,
     StereoSequence,
-    UpdateConfig,
     run_slam,
     update,
     with_pose_conventions,
@@ -32,9 +30,7 @@ class SessionUpdateOptions:
     may be sent to another machine."""
 
     recording: str
-    update: UpdateConfig
     localize: LocalizerConfig
-    slam: SlamConfig
     trajectory: str | None = None
     poses: str | None = None
     format: str | None = None
@@ -77,7 +73,6 @@ class OpenSessionUpdate:
             self.sequence,
             one.trajectory,
             find_poses,
-            one.update,
             one.localize,
             one.light,
             "unchecked" not in (one.poses or "").split(","),
@@ -94,7 +89,7 @@ class OpenSessionUpdate:
         if poses_from == "map":
             return self.sequence
         if poses_from == "slam":
-            return run_slam([self.sequence], self.options.slam, progress).apply([self.sequence])[0]
+            return run_slam([self.sequence], progress).apply([self.sequence])[0]
         conventions = (self.options.poses or "").split(",")
         reading = PoseConventions.of(",".join(name for name in conventions if name != "unchecked"))
         if poses_from == "truth":

@@ -38,14 +38,14 @@ def join_overlapping_tiles(
     Raises:
         TopolocError: as of `join_tiles` and `run_on_ray`.
     """
-    from topoloc import TileJoinConfig, join_tiles
+    from topoloc import join_tiles
 
     def report_pair(one: PairResult) -> None:
         if is_verbose and one.problem is None:
             print(f"{one.first} and {one.second}: {one}", file=sys.stderr)
 
     run_jobs = None if ray is None else _run_jobs_on(ray, settings, report_pair)
-    done = join_tiles(where, tile_ids, settings.of(TileJoinConfig), report_pair, pairs, run_jobs)
+    done = join_tiles(where, tile_ids, report_pair, pairs, run_jobs)
     lost = [
         f"{one.first} and {one.second}: {one.problem}"
         for one in done.pair_results

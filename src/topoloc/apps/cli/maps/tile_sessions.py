@@ -17,7 +17,6 @@ from topoloc import (
     AtlasConfig,
     DuplicateSessionError,
     Tile,
-    TileSelectionConfig,
     edit_tile,
     find_tile_of_recording,
 )
@@ -39,7 +38,6 @@ class TileSelectionJob:
     options: SessionUpdateOptions
     atlas: str
     atlas_config: AtlasConfig
-    config: TileSelectionConfig
 
     @property
     def name(self) -> str:
@@ -51,9 +49,7 @@ class TileSelectionJob:
                 sequence = self.options.open_session().sequence
                 atlas = Atlas.open(self.atlas)
                 localizer = open_localizer(atlas, self.options.localize, None, self.atlas_config)
-                return "recognised", find_tile_of_recording(
-                    atlas, localizer, sequence, self.config, progress
-                )
+                return "recognised", find_tile_of_recording(atlas, localizer, sequence, progress)
 
         return run_tile_work(self.options.recording, "", find_tile)
 
@@ -105,7 +101,6 @@ class AtlasUpdate:
     tile_id: str | None = None
     ray: str | None = None
     atlas_config: AtlasConfig = field(default_factory=AtlasConfig)
-    choice: TileSelectionConfig = field(default_factory=TileSelectionConfig)
     cluster: ClusterConfig = field(default_factory=ClusterConfig)
 
     def outcomes(self) -> list[Outcome]:
@@ -151,10 +146,7 @@ class AtlasUpdate:
                 show(number, state)
 
         return self._run(
-            [
-                TileSelectionJob(one, where, self.atlas_config, self.choice)
-                for one in self.update_options
-            ],
+            [TileSelectionJob(one, where, self.atlas_config) for one in self.update_options],
             show_failures,
             is_live,
         )

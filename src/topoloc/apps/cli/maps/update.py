@@ -11,10 +11,7 @@ import tyro
 from topoloc import (
     AtlasConfig,
     LocalizerConfig,
-    SlamConfig,
-    TileSelectionConfig,
     Trajectory,
-    UpdateConfig,
     is_atlas,
     write_tum,
 )
@@ -110,10 +107,9 @@ class Command:
         )
 
     def _session_options(self, path: str, settings: Settings) -> SessionUpdateOptions:
-        configs = settings.of(UpdateConfig), settings.of(LocalizerConfig), settings.of(SlamConfig)
         return SessionUpdateOptions(
             path,
-            *configs,
+            settings.of(LocalizerConfig),
             self.trajectory,
             self.poses,
             self.format,
@@ -150,11 +146,7 @@ class Command:
         """Each recording joins the tile that it is of; status 1 where one could not."""
         from topoloc.apps.cli.maps.tile_sessions import AtlasUpdate
 
-        configs = (
-            settings.of(AtlasConfig),
-            settings.of(TileSelectionConfig),
-            settings.of(ClusterConfig),
-        )
+        configs = settings.of(AtlasConfig), settings.of(ClusterConfig)
         outcomes = AtlasUpdate(update_options, target, self.tile, self.ray, *configs).outcomes()
         counts = {
             state: sum(outcome.state == state for outcome in outcomes)

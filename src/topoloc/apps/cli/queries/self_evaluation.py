@@ -9,7 +9,6 @@ from topoloc import (
     LocalizerConfig,
     MissingExtraError,
     WeakRegions,
-    WeakRegionsConfig,
     find_weak_regions,
 )
 from topoloc.apps.cli.features_option import open_localizer
@@ -38,18 +37,18 @@ def evaluate_map_itself(
         TopolocError: from reading the map, asking it, and writing.
     """
     check_outputs(list(outputs.values()), [one for one in (path, config) if one])
-    settings = read_settings(config)
-    queried_nodes = with_option(settings.of(LocalizerConfig), "coarse", coarse, "--coarse")
+    localizer_config = read_settings(config).of(LocalizerConfig)
+    localizer_config = with_option(localizer_config, "coarse", coarse, "--coarse")
     json, report = outputs["json"], outputs["report"]
     write_page = _import_page_writer() if report else None
-    localizer = open_localizer(path, queried_nodes, features)
+    localizer = open_localizer(path, localizer_config, features)
     if len(localizer.tile_ids) > 1:
         raise UsageError("--against-itself evaluates one map: name the file of the tile")
     with localizer.in_tile() as in_tile:
         topomap = in_tile.topomap
         info = topomap.describe(path)
         with progress_bar() as progress:
-            weak = find_weak_regions(in_tile, settings.of(WeakRegionsConfig), progress)
+            weak = find_weak_regions(in_tile, progress)
         if json != "-":
             _print(weak)
         write_json(json, {"map": info, "against_itself": weak.to_json()})
