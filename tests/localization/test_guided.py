@@ -133,7 +133,8 @@ def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
             node.features, descriptors=same, angles=np.zeros_like(node.features.angles)
         ),
     )
-    config = GuidedConfig(min_margin=0.0, max_scale=4.0, radius_px=40.0).resolved(SURF)
+    config = GuidedConfig(radius_px=40.0).resolved(SURF)
+    config = replace(config, min_margin=0.0, max_scale=4.0)
     found = len(
         match_guided(_seen(alike, POSES[0]), LocalMap.of_node(alike), POSES[0], CAMERA, config)
     )
@@ -145,7 +146,7 @@ def test_chance_finds_as_much_as_the_pose_where_all_descriptors_are_alike():
 
 def test_a_kind_without_scale_and_angle_is_matched_however_large_and_turned():
     node = _node(np.random.default_rng(6))
-    plain = GuidedConfig(max_scale=1.1).resolved(replace(SURF, has_scale=False, has_angle=False))
+    plain = GuidedConfig().resolved(replace(SURF, has_scale=False, has_angle=False))
     cam_from_world = POSES[1] @ POSES[0]
     seen = _seen(node, cam_from_world)
     constant = replace(

@@ -76,10 +76,7 @@ def test_its_own_thresholds_are_used_unless_others_are_set(path: Path):
         CORNER_PATCHES.ratio,
         CORNER_PATCHES.sigma_px,
     )
-    own = LocalizerConfig(
-        matching=replace(LocalizerConfig().matching, ratio=0.7),
-        guided=replace(LocalizerConfig().guided, max_turn=0.1),
-    )
+    own = LocalizerConfig(matching=replace(LocalizerConfig().matching, ratio=0.7))
     config = Localizer(topomap, own).context.first.config
     assert config.matching.ratio == 0.7
     assert config.guided.max_turn == np.inf  # it has no angles to look at

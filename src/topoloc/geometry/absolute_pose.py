@@ -55,10 +55,6 @@ class AbsolutePoseConfig:
     """Maximum number of RANSAC iterations."""
     min_iterations: Annotated[int, Between(0, 1_000_000)] = 50
     """Minimum number of RANSAC iterations."""
-    confidence: Annotated[float, Between(0, 1)] = 0.999
-    """RANSAC stops at this probability that no better pose is left."""
-    max_refinement_steps: Annotated[int, Between(0, 1000)] = 10
-    """Maximum number of least-squares steps on the inliers."""
     seed: Annotated[int, Between(0, 1_000_000_000)] = 0
     """Seed of RANSAC's samples."""
 
@@ -217,7 +213,7 @@ def estimate_pose_ransac(
         "max_reproj_error": config.max_reprojection_error_px,
         "max_iterations": config.max_iterations,
         "min_iterations": config.min_iterations,
-        "success_prob": config.confidence,
+        "success_prob": 0.999,  # that no better pose is left
         # PoseLib's default of 3 triples the time without more poses, thanks to local optimisation
         "dyn_num_trials_mult": 1.0,
         "progressive_sampling": is_sorted,
@@ -243,14 +239,15 @@ def _refine_on_inliers(
         inliers = select_inliers(cam_from_world, matches, camera, config)
         if not is_non_collinear(matches.points_world[inliers]):
             return None
-        cam_from_world = refine_pose(cam_from_world, matches, inliers, config.max_refinement_steps)
+        cam_from_world = refine_pose(cam_from_world, matches, inliers)
     return cam_from_world
 
 
 def refine_pose(
-    cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"], max_steps: int
+    cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"], max_steps: int = 10
 ) -> Rigid3:
-    """Return the pose that fits the active matches best, starting from a nearby pose."""
+    """Return the pose that fits the active matches best, starting from a nearby pose, in at most
+    `max_steps` steps."""
     rotation, translation = refine(
         *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, max_steps
     )
@@ -270,7 +267,7 @@ def _solve_with_opencv(
             None,
             iterationsCount=min(config.max_iterations, _OPENCV_MAX_ITERATIONS),
             reprojectionError=config.max_reprojection_error_px,
-            confidence=min(config.confidence, _OPENCV_CONFIDENCE),
+            confidence=_OPENCV_CONFIDENCE,
             flags=cv2.SOLVEPNP_EPNP,
         )
         if not found or idx is None or len(idx) < _MIN_POINTS:

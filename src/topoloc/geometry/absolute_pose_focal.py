@@ -139,7 +139,7 @@ def _search_focal_lengths(
             uncalibrated.min_focal
             * (uncalibrated.max_focal / uncalibrated.min_focal) ** float(exponent)
         )
-        enough = _num_ransac_iterations(most / len(points_img), config.confidence)
+        enough = _num_ransac_iterations(most / len(points_img))
         quick = replace(
             config,
             max_iterations=min(config.max_iterations, _MAX_ITERATIONS, enough),
@@ -157,7 +157,7 @@ def _search_focal_lengths(
     return [(cam_from_world, camera) for _, cam_from_world, camera in found[:_MAX_STARTS]]
 
 
-def _num_ransac_iterations(share: float, confidence: float) -> int:
+def _num_ransac_iterations(share: float, confidence: float = 0.999) -> int:
     """Return the number of samples of three after which one contains only right matches, at this
     confidence. `share` is the inlier ratio."""
     return max(
@@ -181,7 +181,7 @@ def _refine_pose_and_focal(
         num_inliers = int(np.count_nonzero(inliers))
         if not is_non_collinear(matches.points_world[inliers]):
             return None
-        cam_from_world = refine_pose(cam_from_world, matches, inliers, config.max_refinement_steps)
+        cam_from_world = refine_pose(cam_from_world, matches, inliers)
         information, gradient = _normal_equations(
             cam_from_world, matches, inliers, camera, uncalibrated
         )

@@ -23,12 +23,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.bounds import Above, AtLeast, Between
+from topoloc.bounds import AtLeast, Between
 from topoloc.json_data import Count, Finite
 from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, RivalWeights
 
@@ -77,16 +77,11 @@ class Evidence:
 class EvidenceConfig:
     """Configure the tolerance of a right pose and the conditions for reporting one."""
 
-    max_translation: Annotated[float, Above(0)] = 0.25
+    max_translation: ClassVar[float] = 0.25
     """Maximum position error of a right pose, metres. `depth_share` of the distance of the seen
     points replaces it if that is less."""
-    depth_share: Annotated[float, Above(0)] = 0.05
-    """Maximum position error as a share of the median distance of the seen points."""
-    max_rotation_deg: Annotated[float, Between(0.001, 180)] = 2.0
+    max_rotation_deg: ClassVar[float] = 2.0
     """Maximum rotation error of a right pose, degrees."""
-    agreement_px: Annotated[float, Above(0)] = 4.0
-    """Maximum distance of an unguided match from the final pose's projection, in pixels of an image
-    whose longer side is 640. Scales with the image size."""
     min_inliers: Annotated[int, AtLeast(4)] = 5
     """Minimum number of inliers of a pose proposal. Proposals with fewer are not tested."""
     min_found: Annotated[int, AtLeast(4)] = 12
@@ -98,7 +93,9 @@ class EvidenceConfig:
 def compute_translation_tolerance(median_depth: float, config: EvidenceConfig) -> float:
     """Return the maximum position error (metres) of a right pose for points `median_depth` (metres)
     away."""
-    return min(config.max_translation, config.depth_share * median_depth)
+    # Maximum position error as a share of the median distance of the seen points.
+    depth_share = 0.05
+    return min(config.max_translation, depth_share * median_depth)
 
 
 def compute_normalized_uncertainty(

@@ -8,13 +8,13 @@ nearest nodes measured their points from nearly the same place.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
-from topoloc.bounds import AtLeast, Between
+from topoloc.bounds import Between
 from topoloc.features.feature_types import FeatureType, GuidedThresholds
 from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
@@ -29,8 +29,7 @@ from topoloc.localization.local_map import LocalMap
 
 @dataclass(frozen=True)
 class GuidedConfig:
-    """Configure guided matching. Unset thresholds come from the feature type
-    (`features/feature_types.py`)."""
+    """Configure guided matching. `resolved` adds the thresholds of the feature type."""
 
     num_nodes: Annotated[int, Between(0, 1000)] = 3
     """Number of nodes nearest to the pose proposal (Eq. 1) whose points are searched. 0 keeps the
@@ -38,34 +37,34 @@ class GuidedConfig:
     radius_px: Annotated[float, Between(0, 1000)] = 10.0
     """Search radius around the projection of a map point, in pixels of an image whose longer side
     is 640. Scales with the image size."""
-    max_scale: Annotated[float | None, AtLeast(1)] = None
-    """Maximum ratio between the measured and the predicted key point size, in either direction.
-    Unset: the default of the feature type."""
-    max_turn: Annotated[float | None, AtLeast(0)] = None
-    """Maximum difference between the measured and the predicted orientation, radians. Unset: the
-    default of the feature type."""
-    min_similarity: Annotated[float | None, Between(-1, 1)] = None
-    """Minimum scalar product of the two descriptors. Unset: the default of the feature type."""
-    min_margin: Annotated[float | None, Between(0, 2)] = None
-    """Minimum difference in similarity between the best and the second key point within the radius.
-    Unset: the default of the feature type."""
 
     def resolved(
         self, kind: FeatureType, thresholds: GuidedThresholds | None = None
-    ) -> GuidedConfig:
-        """Return the settings with unset thresholds filled in for a feature type.
+    ) -> ResolvedGuidedConfig:
+        """Return the settings with the thresholds of a feature type.
 
         `thresholds` replaces those of the type for nearby key points. Sizes and angles are not
         compared if the feature type does not measure them.
         """
-        unset = {
-            name: value
-            for name, value in asdict(thresholds or kind.guided).items()
-            if getattr(self, name) is None
-        }
-        unset |= {} if kind.has_scale else {"max_scale": math.inf}
-        unset |= {} if kind.has_angle else {"max_turn": math.inf}
-        return replace(self, **unset)
+        limits = asdict(thresholds or kind.guided)
+        limits |= {} if kind.has_scale else {"max_scale": math.inf}
+        limits |= {} if kind.has_angle else {"max_turn": math.inf}
+        return ResolvedGuidedConfig(self.num_nodes, self.radius_px, **limits)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResolvedGuidedConfig(GuidedConfig):
+    """Hold the settings of guided matching for a feature type."""
+
+    max_scale: float
+    """Maximum ratio between the measured and the predicted key point size, in either direction."""
+    max_turn: float
+    """Maximum difference between the measured and the predicted orientation, radians."""
+    min_similarity: float
+    """Minimum scalar product of the two descriptors."""
+    min_margin: float
+    """Minimum difference in similarity between the best and the second key point within the
+    radius."""
 
 
 def match_guided(
@@ -127,10 +126,7 @@ def _match_predictions(
     config: GuidedConfig,
 ) -> tuple[Int32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
     """Return the most similar key point near each prediction (-1 for none) and its similarity."""
-    thresholds = (config.max_scale, config.max_turn, config.min_similarity, config.min_margin)
-    numbers = [threshold for threshold in thresholds if threshold is not None]
-    assert len(numbers) == 4, "resolve the configuration first"
-    max_scale, max_turn, min_similarity, min_margin = numbers
+    assert isinstance(config, ResolvedGuidedConfig), "resolve the configuration first"
     key_points = np.column_stack(
         [features.points_img, features.sizes_px, np.cos(features.angles), np.sin(features.angles)]
     )
@@ -142,10 +138,10 @@ def _match_predictions(
         float(camera.width),
         float(camera.height),
         float(config.radius_px * max(max(camera.width, camera.height) / 640.0, 0.5)),
-        np.float32(max_scale),
-        np.float32(np.cos(max_turn) if max_turn < math.pi else -math.inf),
-        np.float32(min_similarity),
-        np.float32(min_margin),
+        np.float32(config.max_scale),
+        np.float32(np.cos(config.max_turn) if config.max_turn < math.pi else -math.inf),
+        np.float32(config.min_similarity),
+        np.float32(config.min_margin),
     )
 
 

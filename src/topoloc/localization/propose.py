@@ -103,7 +103,7 @@ def _rank_nodes(search: Search) -> list[int]:
     """Rank the nodes with the coarse localizer and return the rows of the candidates."""
     features = search.query.features
     with search.query.clock.stage("coarse"):
-        num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
+        num_ranked = max(search.config.num_candidates, 48)
         search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
     return [candidate.node_id for candidate in search.candidates]
 
@@ -175,13 +175,19 @@ def _propose_similar_places(search: Search) -> Iterator[Proposal]:
 
     They are groups of nodes with nearly the best coarse score.
     """
+    # Minimum score of a similar place, as a share of the best score: if the pose is clear,
+    # and if it is not.
+    min_score_share = (0.85, 0.4)
+    # Nodes within this many D_thresh of a pose (Eq. 1) belong to its place. Similar places
+    # are farther away.
+    num_d_thresh = 5.0
     config, best, nodes = search.config.look_alikes, search.best, search.map.node_poses
     if not search.ranked or not config.max_groups:
         return
-    least = config.min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
+    least = min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
     left = [candidate.node_id for candidate in search.ranked if candidate.score >= least]
     queried = {candidate.node_id for candidate in search.candidates}
-    reach = config.reach * search.map.d_thresh
+    reach = num_d_thresh * search.map.d_thresh
     if best is not None and best.probability >= search.config.evidence.min_probability:
         far = search.map.distances(best.world_from_cam) > reach
         left = [row for row in left if far[row]]
@@ -204,14 +210,15 @@ def min_rival_inliers(search: Search) -> float:
 
     It is more than chance and a share of the inliers of the best pose.
     """
+    # Minimum inliers of a similar place, as a share of the best pose's inliers. A place with
+    # fewer, from the image's strongest features, is not refined.
+    min_share = 0.25
     best, config, least = search.best, search.config, float(search.config.num_chance_inliers)
     if best is None or best.probability < config.evidence.min_probability:
         return least
     found = best.fit.inlier_query_idx
     share_of_strongest = np.count_nonzero(found < config.num_first_features) / max(len(found), 1)
-    return max(
-        least, config.look_alikes.min_inlier_share * best.evidence.num_inliers * share_of_strongest
-    )
+    return max(least, min_share * best.evidence.num_inliers * share_of_strongest)
 
 
 def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
@@ -220,6 +227,18 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     Each node predicts its own points at its own pose. Nodes with consistent displacements are
     fitted.
     """
+    # Maximum difference between the displacements of consistent matches, in pixels of an
+    # image whose longer side is 640. Scales with the image size.
+    shift_px = 12.0
+    # A node is accepted if at least this many matches are consistent, plus `chance_share` of
+    # its matches.
+    min_alike = 8
+    chance_share = 0.09  # share of a node's matches that is added to `min_alike`
+    max_iterations = 500  # RANSAC iterations for each fit
+    # Number of accepted nodes, those with the most consistent matches, for which a pose is
+    # fitted.
+    max_fits = 6
+    max_poses = 4  # number of fitted poses, those with the most inliers, that become proposals
     config, query = search.config.viewpoints, search.query
     found = []
     with query.clock.stage("matching"):
@@ -233,18 +252,18 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
                 query.features, local_map, predicted, query.camera, config.matching
             )
             num_alike = count_consistent_displacements(
-                query.features, matches, predicted, query.camera, config.shift_px
+                query.features, matches, predicted, query.camera, shift_px
             )
-            if num_alike >= config.min_alike + config.chance_share * len(matches):
+            if num_alike >= min_alike + chance_share * len(matches):
                 found.append((num_alike, local_map, matches))
     found.sort(key=lambda one: -one[0])
-    quick = replace(search.config.pose, max_iterations=config.max_iterations)
+    quick = replace(search.config.pose, max_iterations=max_iterations)
     # in a repetitive place many nodes see the same, and the right one is no better than the others
     more = 3 if found and len(search.map.repeats(search.ranked[0].node_id)) else 1
     with query.clock.stage("pnp"):
         fits = [
             fit_pose(query.features, query.input_camera, local_map, matches, quick)
-            for _, local_map, matches in found[: more * config.max_fits]
+            for _, local_map, matches in found[: more * max_fits]
         ]
     kept: list[PoseFit] = []
     for fit in sorted(fits, key=lambda fit: -fit.num_inliers):
@@ -253,7 +272,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
         ):
             kept.append(fit)
             yield Proposal("viewpoints", fit, is_guided=True)
-        if len(kept) == more * config.max_poses:
+        if len(kept) == more * max_poses:
             return
 
 

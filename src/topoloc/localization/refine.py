@@ -320,9 +320,9 @@ def _with_unguided(
 ) -> Evidence:
     """Return the evidence with the counts of these unguided matches."""
     # points with correlated errors differ from node to node, so true matches agree less well
-    agreement_px = search.config.evidence.agreement_px * math.sqrt(
-        1.0 + search.correlated_error_share
-    )
+    # Maximum distance of an unguided match from the final pose's projection, 4 pixels in an image
+    # whose longer side is 640.
+    agreement_px = 4.0 * math.sqrt(1.0 + search.correlated_error_share)
     num_agreeing = _count_agreeing_matches(
         unguided,
         final.cam_from_world,

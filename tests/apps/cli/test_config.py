@@ -40,11 +40,10 @@ def test_a_command_can_be_named(capsys: pytest.CaptureFixture[str]):
     assert list(tomllib.loads(capsys.readouterr().out)) == [
         "localize",
         "atlas",
-        "against_itself",
         "cluster",
     ]
     assert main(["config", "build"]) == 0
-    assert list(tomllib.loads(capsys.readouterr().out)) == ["build", "slam", "join", "cluster"]
+    assert list(tomllib.loads(capsys.readouterr().out)) == ["build", "cluster"]
     assert main(["config", "train"]) == 0
     assert list(tomllib.loads(capsys.readouterr().out)) == ["train"]
 
@@ -91,16 +90,15 @@ def test_options_and_file_reach_the_map_and_options_win(
 ):
     path, info = tmp_path / "room.topo", tmp_path / "info.json"
     content = (
-        "[build]\nmax_node_points = 60\nsides.spacing = 0\nnodes = {d_thresh = 9, lambda_rot ="
+        "[build]\nvlad.num_words = 8\nsides.spacing = 0\nnodes = {d_thresh = 9, lambda_rot ="
         " 0.5}\n[localize]\nnum_candidates = 1"
     )
     options = ["--config", file_of(content), "--lambda", "0.25", "--json", str(info)]
     assert main(["build", f"{tiny_recording}@0:6", str(path), *options]) == 0
     config = json.loads(info.read_text())["config"]
     assert config["nodes"] == {"d_thresh": 9.0, "lambda_rot": 0.25}
-    assert (config["max_node_points"], config["sides"]["spacing"]) == (60, 0.0)
+    assert (config["vlad"]["num_words"], config["sides"]["spacing"]) == (8, 0.0)
     topomap = TopoMetricMap.load(path)
-    assert 0 < topomap.summaries[0].num_points <= 60
     assert topomap.sides is None
 
 
@@ -162,23 +160,25 @@ def test_bad_settings_are_one_line_before_the_work(
         "localize.num_candidate: no such setting; did you mean localize.num_candidates?"
         in refused("localize.num_candidate = 1", "evaluate", room_map, queries)
     )
-    assert "slam.odometry.window: a whole number" in refused(
-        "slam.odometry.window = 1.5", "slam", tiny_recording, tmp_path / "a.tum"
-    )
+    assert "slam: no such table" in refused("slam.odometry.windows = 15", *build)
     assert "train.cnn_fc.training.held_out: must be " in refused(
         "train.cnn_fc.training.held_out = 1", "train", room_map, "--coarse", "cnn-fc"
     )
-    assert "slam.checks.max_baseline: must be " in refused("slam.checks.max_baseline = -1", *build)
     (tmp_path / "my.toml").write_text("")
     assert "named for something else" in complaint(
-        "slam", tiny_recording, tmp_path / "my.toml", "--config", tmp_path / "my.toml"
+        "build", tiny_recording, tmp_path / "my.toml", "--config", tmp_path / "my.toml"
     )
 
 
-def test_build_finds_its_way_by_the_settings_of_slam(
-    tiny_recording: Path, tmp_path: Path, file_of: FileOf, complaint: Complaint
+def test_removed_settings_are_named_in_one_line(
+    tiny_recording: Path, tmp_path: Path, file_of: FileOf, capsys: pytest.CaptureFixture[str]
 ):
-    refusing = file_of("[slam]\nchecks.min_start_points = 100000")
-    path = tmp_path / "a.topo"
-    said = complaint("build", tiny_recording, path, "--trajectory", "slam", "--config", refusing)
-    assert "none of the 14 frames could be tracked" in said
+    old = file_of(
+        "[build]\nmax_node_points = 800\nmin_node_points = 30\n[slam.loops]\nmax_drift = 1"
+    )
+    assert main(["build", f"{tiny_recording}@0:6", str(tmp_path / "a.topo"), "--config", old]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "no longer" in line]
+    assert lines == [
+        f"warning: {old}: no longer settings, without effect: build.min_node_points,"
+        " slam.loops.max_drift"
+    ]

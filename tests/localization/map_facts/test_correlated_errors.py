@@ -19,12 +19,11 @@ from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts import correlated_errors
 from topoloc.localization.map_facts.correlated_errors import (
-    CorrelatedErrorsConfig,
     covariance_inflation,
 )
 from topoloc.mapping.topomap import TopoMetricMap
 
-CONFIG, WEIGHTS = CorrelatedErrorsConfig(min_nodes=3), load_fitted_weights("surf").shared_errors
+WEIGHTS = load_fitted_weights("surf").shared_errors
 
 
 def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMetricMap:
@@ -43,12 +42,13 @@ def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMet
 
 
 def _rho(topomap: TopoMetricMap) -> float:
-    return Localizer(
-        topomap, LocalizerConfig(correlated_errors=CONFIG)
-    ).context.first.correlated_errors
+    return Localizer(topomap).context.first.correlated_errors
 
 
-def test_nodes_out_of_place_have_correlated_errors_and_nodes_in_place_do_not(tiny_recording: Path):
+def test_nodes_out_of_place_have_correlated_errors_and_nodes_in_place_do_not(
+    tiny_recording: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(correlated_errors._SETTINGS, "min_nodes", 3)
     topomap = built_room(tiny_recording)
     exact = _rho(topomap)
     assert exact < 0.03
@@ -85,11 +85,10 @@ def test_a_map_knows_what_was_measured_when_it_was_built(
 @pytest.mark.parametrize(
     "config",
     [
-        LocalizerConfig(correlated_errors=CorrelatedErrorsConfig(percentile=50.0)),
         LocalizerConfig(guided=GuidedConfig(radius_px=7.0)),
         LocalizerConfig(pose=AbsolutePoseConfig(max_reprojection_error_px=5.0)),
     ],
-    ids=["correlated errors", "guided", "pose"],
+    ids=["guided", "pose"],
 )
 def test_with_other_settings_it_is_measured_anew(
     config: LocalizerConfig, room_map: Path, measurings: list[TopoMetricMap]

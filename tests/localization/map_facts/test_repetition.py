@@ -166,12 +166,12 @@ class _OnlyTheFirstRoom:
 
 @pytest.mark.parametrize("max_repetitions", [LocalizerConfig().max_repetitions, 0])
 def test_a_copy_that_retrieval_does_not_name_is_found_by_the_map(
-    room: TopoMetricMap, max_repetitions: int
+    room: TopoMetricMap, max_repetitions: int, monkeypatch: pytest.MonkeyPatch
 ):
     """Without repetitions one of the two is believed, and half of the time wrongly."""
+    monkeypatch.setattr(LocalizerConfig, "max_repetitions", max_repetitions)
     localizer = Localizer(
         twice(room),
-        LocalizerConfig(max_repetitions=max_repetitions),
         coarse=_OnlyTheFirstRoom(len(room.nodes)),
     )
     results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]

@@ -301,17 +301,19 @@ def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_
     assert propose_walls_module._compare_again(again).num_agreeing >= again.num_agreeing
 
 
-def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes():
+def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(VirtualViewSearchConfig, "min_distance", 0.0)
     picture, truth = seen_ahead()[1]
     assert not any(
-        _is_pose(one.world_from_cam, truth)
-        for one in _by_the_walls(
-            built_corridor(), picture, VirtualViewSearchConfig(min_distance=0.0)
-        )
+        _is_pose(one.world_from_cam, truth) for one in _by_the_walls(built_corridor(), picture)
     )
+    monkeypatch.undo()
     picture, truth = seen_on_the_way_back()[2]
     assert _is_pose(_by_the_walls(built_corridor(), picture)[0].world_from_cam, truth)
-    assert _by_the_walls(built_corridor(), picture, VirtualViewSearchConfig(min_distance=1e3)) == []
+    monkeypatch.setattr(VirtualViewSearchConfig, "min_distance", 1e3)
+    assert _by_the_walls(built_corridor(), picture) == []
 
 
 def test_walls_that_look_alike_elsewhere_have_less_for_them():

@@ -11,6 +11,7 @@ import errno
 import importlib
 import os
 import sys
+import warnings
 from typing import Any, TextIO
 
 # Before NumPy is loaded, which reads it then. BLAS's own threads wait for each other by spinning:
@@ -215,7 +216,8 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
             description=summary[0].upper() + summary[1:],
         )
         try:
-            with interruptible():
+            with warnings.catch_warnings(), interruptible():
+                warnings.showwarning = _print_warning
                 return command.run()
         except UsageError as error:
             _print_error(f"{error}; `topoloc {name} --help` says more")
@@ -245,6 +247,10 @@ def _check_address_space() -> None:
             f"too little memory: ulimit -v leaves {limit // 10**6} MB of address space, at least"
             f" {least} are needed"
         )
+
+
+def _print_warning(message: Warning | str, *_place: object, **_line: object) -> None:
+    _print_line(f"warning: {message}")
 
 
 def _print_error(text: str) -> None:

@@ -15,14 +15,13 @@ measured again.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
-from typing import Annotated
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from msgspec import to_builtins
 
-from topoloc.bounds import AtLeast, Between
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.localization.fitted_weights import CorrelatedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
@@ -34,24 +33,23 @@ _MEDIAN_CHI_SQUARE_6 = 5.348
 _METHOD = 1  # part of the digest: increase if the same settings give another rho
 
 
-@dataclass(frozen=True)
-class CorrelatedErrorsConfig:
-    """Configure the measurement of rho."""
-
-    num_nodes: Annotated[int, Between(0, 1000)] = 20
-    """Number of nodes, evenly spaced in the map, that are localized with other nodes."""
-    min_distances: Annotated[tuple[float, ...], AtLeast(0)] = (3.0, 1.0)
-    """Minimum distance, in D_thresh (Eq. 1), of nodes used to localize a node. Nearer nodes were
-    refined with its image. The second value is used if the first leaves too few nodes."""
-    num_helpers: Annotated[int, Between(1, 100)] = 3
-    """Number of nearest allowed nodes whose points are used."""
-    min_inliers: Annotated[int, AtLeast(4)] = 20
-    """Minimum number of inliers. Nodes localized with fewer are not compared."""
-    min_nodes: Annotated[int, AtLeast(1)] = 5
-    """Minimum number of compared nodes. With fewer, rho is set to the value for unknown maps."""
-    percentile: Annotated[float, Between(0, 100)] = 75.0
-    """Percentile of rho over the nodes. It is above the median, because some parts of a map are
-    worse."""
+_SETTINGS: dict[str, Any] = {
+    # nodes, evenly spaced in the map, that are localized with other nodes
+    "num_nodes": 20,
+    # Minimum distance, in D_thresh (Eq. 1), of nodes used to localize a node. Nearer nodes were
+    # refined with its image. The second value is used if the first leaves too few nodes.
+    "min_distances": (3.0, 1.0),
+    # nearest allowed nodes whose points are used
+    "num_helpers": 3,
+    # Nodes localized with fewer inliers are not compared.
+    "min_inliers": 20,
+    # With fewer compared nodes, rho is set to the value for unknown maps.
+    "min_nodes": 5,
+    # Percentile of rho over the nodes. It is above the median, because some parts of a map are
+    # worse.
+    "percentile": 75.0,
+}
+"""Settings of the measurement, part of the digest."""
 
 
 def covariance_inflation(num_inliers: int, rho: float) -> float:
@@ -63,7 +61,6 @@ def find_correlated_error_share(
     topomap: TopoMetricMap,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
-    config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> float:
     """Return rho of the map, from its file if the digest matches, and measured otherwise.
@@ -72,51 +69,54 @@ def find_correlated_error_share(
         guided, pose: settings of query matching and pose estimation.
     """
     known = topomap.shared_errors
-    if known is not None and known.digest == _digest(topomap, guided, pose, config, weights):
+    if known is not None and known.digest == _digest(topomap, guided, pose, weights):
         return known.rho
-    return measure_correlated_error_share(topomap, guided, pose, config, weights)
+    return measure_correlated_error_share(topomap, guided, pose, weights)
 
 
 def measure_stored_error_share(
     topomap: TopoMetricMap,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
-    config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> CorrelatedErrors:
     """Measure rho and return it with its digest, to be stored in the map."""
-    rho = measure_correlated_error_share(topomap, guided, pose, config, weights)
-    return CorrelatedErrors(rho, _digest(topomap, guided, pose, config, weights))
+    rho = measure_correlated_error_share(topomap, guided, pose, weights)
+    return CorrelatedErrors(rho, _digest(topomap, guided, pose, weights))
 
 
 def measure_correlated_error_share(
     topomap: TopoMetricMap,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
-    config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> float:
     """Measure rho of the map (see the module docstring)."""
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
     node_ids = np.unique(
-        np.linspace(0, len(topomap.summaries) - 1, config.num_nodes).round().astype(int)
+        np.linspace(0, len(topomap.summaries) - 1, _SETTINGS["num_nodes"]).round().astype(int)
     )
-    for min_distance in config.min_distances:
+    num_helpers, min_inliers = _SETTINGS["num_helpers"], _SETTINGS["min_inliers"]
+    for min_distance in _SETTINGS["min_distances"]:
         rhos = []
         for node_id in node_ids:
             node = topomap.nodes[int(node_id)]
             distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
             order = np.argsort(distances, kind="stable")
-            helpers = order[distances[order] > min_distance * d_thresh][: config.num_helpers]
+            helpers = order[distances[order] > min_distance * d_thresh][:num_helpers]
             rho = _error_share_of_node(
-                node, [topomap.nodes[int(k)] for k in helpers], guided, pose, config.min_inliers
+                node,
+                [topomap.nodes[int(k)] for k in helpers],
+                guided,
+                pose,
+                min_inliers,
             )
             if rho is not None:
                 rhos.append(rho)
-        if len(rhos) >= config.min_nodes:
+        if len(rhos) >= _SETTINGS["min_nodes"]:
             return max(
-                weights.factor * float(np.percentile(rhos, config.percentile)), weights.least
+                weights.factor * float(np.percentile(rhos, _SETTINGS["percentile"])), weights.least
             )
     return weights.unknown
 
@@ -125,14 +125,13 @@ def _digest(
     topomap: TopoMetricMap,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
-    config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> str:
     """Return a digest of all inputs of rho."""
     settings = {
         "guided": asdict(guided),
-        "pose": asdict(pose),
-        "config": asdict(config) | to_builtins(weights),
+        "pose": asdict(pose) | {"confidence": 0.999, "max_refinement_steps": 10},
+        "config": _SETTINGS | to_builtins(weights),
         "nodes": asdict(topomap.config.nodes),
     }
     return compute_nodes_digest(

@@ -102,7 +102,6 @@ def _measure_error_share(topomap: TopoMetricMap) -> CorrelatedErrors:
         topomap,
         config_of_type.guided,
         config_of_type.pose,
-        config_of_type.correlated_errors,
         load_fitted_weights(topomap.kind).shared_errors,
     )
 

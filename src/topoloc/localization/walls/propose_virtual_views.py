@@ -80,6 +80,7 @@ class VirtualViewSearch:
     @staticmethod
     def of(search: Search, index: VirtualViewIndex) -> VirtualViewSearch:
         """Extract both side views of the query image and select the candidate places."""
+        num_d_thresh = 2.0  # minimum distance between these places, in D_thresh
         query, seen, named = search.query, list[QueryVirtualView](), list[CandidatePlaces]()
         assert isinstance(query.input_camera, Camera)
         for view in make_virtual_views(query.input_camera):
@@ -92,7 +93,7 @@ class VirtualViewSearch:
                 QueryVirtualView(view, features, view.to_image_pixels(features, query.input_camera))
             )
             named.append(CandidatePlaces.of(view, index, index.similarity(picture, features)))
-        apart = search.config.walls.apart * search.map.d_thresh
+        apart = num_d_thresh * search.map.d_thresh
         return VirtualViewSearch(
             search,
             index,
@@ -107,12 +108,15 @@ class VirtualViewSearch:
 
     def virtual_nodes_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[int]:
         """Return the virtual views of the map that show the content of a side view at a pose."""
+        # Number of virtual views around a pose whose points are searched in each side
+        # view.
+        num_nodes = 4
         return select_nearest_virtual_nodes(
             side.view,
             cam_from_world,
             self.index.centres,
             self.index.axes,
-            self.search.config.walls.num_nodes,
+            num_nodes,
         )
 
     @cached_property
@@ -138,11 +142,12 @@ def _extract_view_features(
 
 def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     """Generate the proposals with the most agreeing matches."""
+    clear_log_odds = 2.5  # virtual views are skipped if a pose of the nodes has higher log-odds
     config, best = search.config.walls, search.best
     is_settled = (
         best is not None
         and best.probability >= search.config.evidence.min_probability
-        and best.log_odds > config.clear_log_odds
+        and best.log_odds > clear_log_odds
     )
     if (
         is_settled
@@ -165,10 +170,11 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
 
 def _select_best(found: list[VirtualViewProposal]) -> list[VirtualViewProposal]:
     """Return the proposals with the most agreeing matches, at distinct places."""
+    num_hypotheses = 6  # maximum number of pose proposals that are refined
     kept: list[VirtualViewProposal] = []
     for proposal in sorted(found, key=lambda one: -one.num_agreeing):
         search = proposal.walls.search
-        if len(kept) == search.config.walls.num_hypotheses:
+        if len(kept) == num_hypotheses:
             break
         if not any(
             _are_near(search, proposal.cam_from_world, other.cam_from_world) for other in kept
@@ -188,6 +194,9 @@ def _compare_again(proposal: VirtualViewProposal) -> VirtualViewProposal:
 
 def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewProposal | None:
     """Match both views with their predicted content at a place and fit an upright pose."""
+    # Minimum number of matches, over both views, that must agree on one pose to recognise a
+    # place.
+    min_agreeing = 8
     config, cam_from_place = walls.search.config.walls, place.inverse()
     sides = _views_around(walls, cam_from_place)
     matches = [
@@ -205,7 +214,7 @@ def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewPropos
     agreeing = estimate_upright_pose(
         seen, cam_from_place.apply(found.local_map.points_world[found.matches.train_idx])
     )
-    if agreeing is None or agreeing[0] < config.min_agreeing:
+    if agreeing is None or agreeing[0] < min_agreeing:
         return None
     fit = PointMatches(found.features, walls.camera, walls.camera, found.local_map, found.matches)
     return VirtualViewProposal(
@@ -240,8 +249,9 @@ def refine_virtual_view_pose(proposal: VirtualViewProposal) -> PoseFit | None:
 
 def score_virtual_view_pose(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis | None:
     """Score the refined pose and return it as a hypothesis. None if too few points were found."""
+    min_found = 20  # minimum number of map points found at their predicted pixels
     walls, search, pose, camera = proposal.walls, proposal.walls.search, final.pose, final.camera
-    if final.num_inliers < search.config.walls.min_found:
+    if final.num_inliers < min_found:
         return None
     counts = count_virtual_views(
         _views_around(walls, pose.cam_from_world),
