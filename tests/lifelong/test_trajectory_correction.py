@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.trajectory_correction import correct_trajectory
+from topoloc.lifelong.trajectory_adjustment import correct_trajectory
 from topoloc.localization.result import Localization
 
 D_THRESH = 0.3

@@ -28,8 +28,7 @@ from topoloc.lifelong.session_poses import (
     SessionPoses,
     align_motion_to_map,
 )
-from topoloc.lifelong.trajectory_adjustment import adjust_trajectory
-from topoloc.lifelong.trajectory_correction import correct_trajectory
+from topoloc.lifelong.trajectory_adjustment import adjust_trajectory, correct_trajectory
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import select_node_frames

@@ -10,11 +10,6 @@ from jaxtyping import Float, Int
 from topoloc.mapping.entries import NodeSummary
 from topoloc.mapping.sessions import Illumination, Session
 
-_MAX_SAME_DISTANCE = 0.1
-"""Sessions closer than this have the same illumination. Two walks of one path by day differ by
-0.02, two of a lab by 0.04, floors of a tower by up to 0.06. Day and night of that path differ by
-0.17."""
-
 
 def compute_illumination_distance(a: Illumination, b: Illumination) -> float:
     """Return the distance between two illuminations: grey level, contrast, shares of dark and
@@ -62,10 +57,14 @@ def _has_illumination(session: Session) -> bool:
 def _is_same_illumination(a: Session, b: Session) -> bool:
     if a.light_name is not None and b.light_name is not None:
         return a.light_name == b.light_name
+    # Sessions closer than this have the same illumination. Two walks of one path by day
+    # differ by 0.02, two of a lab by 0.04, floors of a tower by up to 0.06. Day and night of
+    # that path differ by 0.17.
+    max_distance = 0.1
     return (
         a.light is not None
         and b.light is not None
-        and compute_illumination_distance(a.light, b.light) < _MAX_SAME_DISTANCE
+        and compute_illumination_distance(a.light, b.light) < max_distance
     )
 
 

@@ -86,12 +86,8 @@ def measure_disparities(
     search_px = 4  # search range on either side of a disparity guess
     half_px = 5  # half side of the window that is correlated along the row
     min_correlation = 0.8  # minimum normalised correlation of the two images
-    # A point is ambiguous if a second place on the row reaches this fraction of the best
-    # correlation.
-    max_second_correlation = 0.95
-    # Standard deviation that calibration and interpolation leave even at perfect
-    # correlation.
-    min_sigma_px = 0.15
+    max_second_correlation = 0.95  # at another place, of the best: else the point is ambiguous
+    min_sigma_px = 0.15  # that calibration and interpolation leave at perfect correlation
     max_sigma_px = 1.0  # disparities with a larger standard deviation are not used
     if measured.right is None:
         return _disparities_from_depth(measured, points_img)
@@ -106,10 +102,7 @@ def measure_disparities(
         .astype(np.int64)
     )
     range_lengths = np.where(known, 2 * search_px + 2, largest + 1)
-    disparities, sigmas = (
-        np.empty(len(points_img), np.float32),
-        np.empty(len(points_img), np.float32),
-    )
+    disparities, sigmas = np.empty((2, len(points_img)), np.float32)
     # Distribute the long searches evenly over the threads.
     order = np.argsort(range_lengths, kind="stable")
     order = np.concatenate([order[0::2], order[1::2]])
