@@ -264,10 +264,16 @@ def test_what_lies_far_apart_on_earth_is_not_even_compared(parts: dict[str, Path
 
 
 def test_the_command_line(
-    own: Path, parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    own: Path,
+    parts: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    settings = tmp_path / "few.toml"
-    settings.write_text("[join]\nnum_probed = 4\nnum_asked = 6\nmin_near = 8\nmax_pairs = 1\n")
+    monkeypatch.setattr(
+        "topoloc.lifelong.tile_joining.find_candidate_pairs",
+        lambda *of: find_candidate_pairs(*of)[:1],
+    )
     remove_tiles(str(own), ["other", "middle"])
     shutil.copy(parts["middle"], tmp_path / "centre.topo")
     assert (
@@ -278,8 +284,6 @@ def test_the_command_line(
                 str(own),
                 str(tmp_path / "centre.topo"),
                 "--join",
-                "--config",
-                str(settings),
                 "--json",
                 "-",
             ]
@@ -298,10 +302,10 @@ def test_the_command_line(
     assert [(one["first"], one["second"], one["joined"]) for one in facts["tried"]] == [
         ("centre", "right", True)
     ]
-    settings.write_text("[join]\nmin_near = 1000\nnum_probed = 4\nnum_asked = 6\nmax_pairs = 1\n")
+    monkeypatch.setattr("topoloc.lifelong.tile_joining.compare_tiles", partial(FEW, min_near=1000))
     remove_tiles(str(own), ["right", "centre"])
     add_tiles(str(own), new_tiles([str(parts["middle"])]))
-    assert main(["atlas", "join", str(own), "middle", "--config", str(settings)]) == 0
+    assert main(["atlas", "join", str(own), "middle"]) == 0
     printed = capsys.readouterr()
     assert "nodes stand near one of the other tile" in printed.err
     assert "world" not in printed.out
@@ -310,7 +314,7 @@ def test_the_command_line(
 def test_what_cannot_be_meant_is_said(own: Path, complaint: Callable[..., str]):
     assert "has no tile 'attic'" in complaint("atlas", "join", own, "attic")
     assert "--join belongs to create and add" in complaint("atlas", "info", own, "--join", status=2)
-    assert "--config sets how tiles are joined" in complaint(
+    assert "--config sets the cluster on which" in complaint(
         "atlas", "info", own, "--config", "few.toml", status=2
     )
 
