@@ -18,10 +18,9 @@ from topoloc.localization.evidence import Evidence
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.provenance import Provenance
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import CandidateNode, Localization, NotLocalized
 from topoloc.localization.tiles.atlas_tiles import AtlasTiles
 from topoloc.localization.tiles.tile_results import TileResult, merge_tile_results
-from topoloc.retrieval.coarse import NodeScore
 
 STRONG = Evidence(200, 150, 400, 500, 20, 0.9, 0.05, 0.7)
 FAIR = Evidence(100, 30, 80, 400, 20, 0.5, 0.15, 0.15)
@@ -42,7 +41,7 @@ def _pose(evidence: Evidence, x: float = 0.0, probability: float = 0.95) -> Loca
         np.eye(6) * 1e-6,
         probability,
         3,
-        [NodeScore(3, 0.5)],
+        [CandidateNode(3, 0.5)],
         9,
         8,
         evidence=evidence,

@@ -78,7 +78,7 @@ def _asked(model: SurfVlad, vector: np.ndarray, words: np.ndarray) -> list[int]:
         responses=np.ones(1, np.float32),
         descriptors=(words + vector).astype(np.float32),
     )
-    return [score.node_id for score in model.rank(np.zeros((10, 10), np.uint8), features, 3)]
+    return [score.row for score in model.rank(np.zeros((10, 10), np.uint8), features, 3)]
 
 
 def test_a_night_of_half_the_way_does_not_draw_the_other_half_to_itself():

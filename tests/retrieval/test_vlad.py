@@ -127,8 +127,8 @@ def test_a_place_seen_again_comes_first(dimension: int):
     assert isinstance(localizer, CoarseLocalizer)
     for k, image_rows in enumerate(rows):
         ranking = localizer.rank(NO_IMAGE, feature_config_for(image_rows[::2]), 5)
-        assert ranking[0].node_id == k // 2
-        assert len({score.node_id for score in ranking}) == 5
+        assert ranking[0].row == k // 2
+        assert len({score.row for score in ranking}) == 5
         assert sorted((score.score for score in ranking), reverse=True) == [
             score.score for score in ranking
         ]
@@ -153,8 +153,7 @@ def test_the_same_things_elsewhere_in_the_picture_are_another_place(weight: floa
     again = SurfVlad.from_model(localizer.to_model())
     picture = np.zeros((100, 200), np.uint8)
     named = [
-        again.rank(picture, things(order).select(np.arange(3, 60)), 1)[0].node_id
-        for order in orders
+        again.rank(picture, things(order).select(np.arange(3, 60)), 1)[0].row for order in orders
     ]
     num_right = sum(node_id == k for k, node_id in enumerate(named))
     assert num_right == 12 if weight > 0.0 else num_right < 6
@@ -183,13 +182,13 @@ def test_maps_without_places_in_their_words_are_read():
         model,
         settings={key: value for key, value in model.settings.items() if key != "position_weight"},
     )
-    assert SurfVlad.from_model(old).rank(NO_IMAGE, feature_config_for(rows[3]), 1)[0].node_id == 1
+    assert SurfVlad.from_model(old).rank(NO_IMAGE, feature_config_for(rows[3]), 1)[0].row == 1
 
 
 def test_more_images_than_dimensions():
     localizer, rows = fitted(150, images_a_node=10, num_words=2)
     assert len(rows) > 2 * 64
-    assert localizer.rank(NO_IMAGE, feature_config_for(rows[37][::2]), 1)[0].node_id == 3
+    assert localizer.rank(NO_IMAGE, feature_config_for(rows[37][::2]), 1)[0].row == 3
 
 
 @pytest.mark.parametrize("num_images", [1, 2])
@@ -197,7 +196,7 @@ def test_maps_of_one_or_two_images(num_images: int):
     localizer, rows = fitted(num_images, images_a_node=1)
     ranking = localizer.rank(NO_IMAGE, feature_config_for(rows[-1]), 5)
     assert len(ranking) == num_images
-    assert ranking[0].node_id == num_images - 1
+    assert ranking[0].row == num_images - 1
     assert ranking[0].score == pytest.approx(1.0, abs=1e-4)
 
 
@@ -206,7 +205,7 @@ def test_images_all_alike_are_ranked_all_the_same():
     words = learn_words(rows, config)
     localizer = SurfVlad.fit(words, np.tile(vlad(rows, words), (5, 1)), np.arange(5), config)
     ranking = localizer.rank(NO_IMAGE, feature_config_for(rows), 5)
-    assert [score.node_id for score in ranking] == [0, 1, 2, 3, 4]
+    assert [score.row for score in ranking] == [0, 1, 2, 3, 4]
     assert [score.score for score in ranking] == pytest.approx([1.0] * 5, abs=1e-5)
 
 
@@ -226,7 +225,7 @@ def test_the_stored_model_ranks_alike():
         one, other = (
             c.rank(NO_IMAGE, feature_config_for(image_rows[:60]), 3) for c in (localizer, reopened)
         )
-        assert one[0].node_id == other[0].node_id
+        assert one[0].row == other[0].row
         np.testing.assert_allclose([s.score for s in one], [s.score for s in other], atol=5e-3)
 
 
@@ -240,7 +239,7 @@ def share_of_near_candidates(map_part: str, query_part: str, config: BuildConfig
     for frame, pose in zip((queries[k] for k in range(len(queries))), queries.poses, strict=True):
         assert pose is not None
         features = extract_features(to_grey(frame.image), FeatureConfig())
-        candidates = [score.node_id for score in coarse.rank(frame.image, features, 5)]
+        candidates = [score.row for score in coarse.rank(frame.image, features, 5)]
         distances = node_distances(pose, nodes, topomap.config.lambda_rot)
         near.append(distances[candidates].min() <= 2 * topomap.config.d_thresh)
     return float(np.mean(near))

@@ -67,7 +67,7 @@ def _right(model: CoarseModel, grown: TopoMetricMap) -> np.ndarray:
     """Of each mapping picture, whether its node is named first."""
     localizer = open_coarse_localizer(model)
     ranked = [
-        localizer.rank(decode_stored_image(image.jpeg), NO_FEATURES, 1)[0].node_id
+        localizer.rank(decode_stored_image(image.jpeg), NO_FEATURES, 1)[0].row
         for image in grown.place_images
     ]
     return np.array(ranked) == [image.node_id for image in grown.place_images]

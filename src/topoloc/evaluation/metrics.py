@@ -12,6 +12,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image
 
 # A query is recalled if its pose error is within both (metres, degrees). Recall counts all queries.
@@ -40,11 +41,11 @@ class EvaluatedQuery:
     query: str
     result: Localization | NotLocalized
     world_from_cam: Rigid3 | None
-    nearest_node_id: int | None = None
+    nearest_node_id: NodeId | None = None
     recording: str = ""
     read_image: Callable[[], Image] | None = None
     camera: Camera | None = None
-    neighbour_ids: frozenset[int] = frozenset()
+    neighbour_ids: frozenset[NodeId] = frozenset()
     is_in_other_world: bool = False
 
     MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION

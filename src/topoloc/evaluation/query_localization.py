@@ -15,6 +15,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 
 # A node within this many D_thresh counts as a neighbour of the query.
@@ -129,7 +130,7 @@ def create_image_reader(sequence: StereoSequence, index: int) -> Callable[[], Im
 
 def find_neighbour_ids(
     topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]
-) -> frozenset[int]:
+) -> frozenset[NodeId]:
     """Return the ids of nodes connected to the nearest node by an edge, and of nodes within 1.5
     D_thresh. `distances` holds D_total to each node (metres, Eq. 1)."""
     nearest = topomap.summaries[int(np.argmin(distances))].node_id

@@ -13,6 +13,7 @@ import numpy as np
 from topoloc.errors import MissingExtraError
 from topoloc.features.features import Features
 from topoloc.mapping.topomap import PlaceImage, TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseModel, ExtendableLocalizer, open_coarse_localizer
 from topoloc.retrieval.network_images import decode_stored_image
 from topoloc.retrieval.vlad import SurfVlad
@@ -25,7 +26,7 @@ class PlaceFeatures:
     features: Features
     width: int
     height: int
-    node_id: int
+    node_id: NodeId
 
 
 @dataclass(frozen=True, eq=False)

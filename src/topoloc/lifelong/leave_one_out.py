@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Int
 
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer
@@ -19,6 +19,9 @@ from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import Row, as_rows
+
+T = TypeVar("T")
 
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 """Count a result as wrong if it is further off than this (metres, degrees)."""
@@ -34,7 +37,7 @@ class LeaveOneOutResult:
     num_inliers: int
 
 
-def sample_evenly(rows: Sequence[int], max_count: int) -> list[int]:
+def sample_evenly(rows: Sequence[T], max_count: int) -> list[T]:
     """Return at most `max_count` of `rows`, evenly spaced and in their order."""
     if len(rows) <= max_count:
         return list(rows)
@@ -44,9 +47,7 @@ def sample_evenly(rows: Sequence[int], max_count: int) -> list[int]:
     ]
 
 
-def beside(
-    topomap: TopoMetricMap, row: int, num_d_thresh: float, poses: NodePoses
-) -> Int[np.ndarray, " k"]:
+def beside(topomap: TopoMetricMap, row: Row, num_d_thresh: float, poses: NodePoses) -> list[Row]:
     """Return the rows of a node and of the near nodes of its session.
 
     A node is near if its distance by Eq. 1 is at most `num_d_thresh` times D_thresh.
@@ -56,21 +57,17 @@ def beside(
         node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
         <= num_d_thresh * topomap.config.d_thresh
     )
-    same = [
-        int(other)
-        for other in near
-        if topomap.summaries[int(other)].session_id == summary.session_id
-    ]
-    return np.array(sorted({row, *same}), np.int64)
+    same = (k for k in as_rows(near) if topomap.summaries[k].session_id == summary.session_id)
+    return sorted({row, *same})
 
 
 def localize_left_out(
     localizer: Localizer,
     stored: TopoMetricMap,
-    rows: Sequence[int],
+    rows: Sequence[Row],
     num_d_thresh: float,
     progress: Callable[[int, int], None] | None = None,
-) -> dict[int, LeaveOneOutResult]:
+) -> dict[Row, LeaveOneOutResult]:
     """Localize nodes of `stored` in the localizer's map while the nodes themselves are hidden.
 
     Args:
@@ -85,11 +82,11 @@ def localize_left_out(
     """
     known = {summary.node_id for summary in localizer.topomap.summaries}
     poses = NodePoses.of([summary.world_from_cam for summary in stored.summaries])
-    answers = dict[int, LeaveOneOutResult]()
+    answers = dict[Row, LeaveOneOutResult]()
     for done, row in enumerate(rows):
         node = stored.nodes_of(stored.kind)[row]
         features = {kind: stored.nodes_of(kind)[row].features for kind in stored.kinds}
-        near = [stored.summaries[int(k)].node_id for k in beside(stored, row, num_d_thresh, poses)]
+        near = [stored.summaries[k].node_id for k in beside(stored, row, num_d_thresh, poses)]
         hidden = [node_id for node_id in near if node_id in known]
         is_all = len(hidden) == len(localizer.topomap.summaries)
         result = (

@@ -20,6 +20,7 @@ from topoloc.lifelong.node_observation import observe_node
 from topoloc.mapping.nodes import NearestNodeSearch, NodePoses
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes
+from topoloc.node_ids import NodeId, Row
 from topoloc.retrieval.coarse import CoarseModel
 
 _PER_VECTOR_ARRAYS = ("vectors", "centres", "cell_vectors")
@@ -68,8 +69,7 @@ def compute_node_support(topomap: TopoMetricMap, num_compared: int) -> NodeSuppo
                 for k in others
             ]
             landmarks[row] = np.maximum(landmarks[row], seen)
-    row_of = {summary.node_id: row for row, summary in enumerate(topomap.summaries)}
-    owners = [row_of[image.node_id] for image in topomap.place_images]
+    owners = [topomap.row_of(image.node_id) for image in topomap.place_images]
     return NodeSupport(
         supporters, landmarks, np.maximum(np.bincount(owners, minlength=len(supporters)), 1)
     )
@@ -86,7 +86,7 @@ def _count_recognised_landmarks(node: TopoNode, view: TopoNode, topomap: TopoMet
 
 def iterate_node_removals(
     support: NodeSupport, min_held: int
-) -> Iterable[tuple[int, Int[np.ndarray, " nodes"]]]:
+) -> Iterable[tuple[Row, Int[np.ndarray, " nodes"]]]:
     """Yield the rows of nodes in the order of removal, each with the current supporter of every
     node.
 
@@ -106,7 +106,7 @@ def iterate_node_removals(
         loss_of_supporter = np.bincount(supporter, losses, minlength=num)
         loss_of_supporter[supporter[(remaining < min_held) | (first == second)]] = np.inf
         loss_of_supporter[~is_kept] = np.inf
-        row = int(loss_of_supporter.argmin())
+        row = Row(int(loss_of_supporter.argmin()))
         if not np.isfinite(loss_of_supporter[row]):
             return
         is_kept[row] = False
@@ -114,7 +114,7 @@ def iterate_node_removals(
 
 
 def remove_nodes(
-    topomap: TopoMetricMap, removed: Sequence[int], supporter: Int[np.ndarray, " nodes"]
+    topomap: TopoMetricMap, removed: Sequence[Row], supporter: Int[np.ndarray, " nodes"]
 ) -> TopoMetricMap:
     """Return the map without the nodes `removed`.
 
@@ -127,7 +127,7 @@ def remove_nodes(
         supporter: the row of the supporting node, for each node.
     """
     gone = set(removed)
-    kept = [row for row in range(len(topomap.summaries)) if row not in gone]
+    kept = [row for row in topomap.rows if row not in gone]
     ids = [summary.node_id for summary in topomap.summaries]
     new_id = {ids[row]: ids[int(supporter[row])] for row in gone}
     nodes = {kind: SelectedSequence(topomap.nodes_of(kind), kept) for kind in topomap.kinds}
@@ -150,10 +150,12 @@ def remove_nodes(
     )
 
 
-def _reassign_images(images: Sequence[PlaceImage], new_id: Mapping[int, int]) -> list[PlaceImage]:
+def _reassign_images(
+    images: Sequence[PlaceImage], new_id: Mapping[NodeId, NodeId]
+) -> list[PlaceImage]:
     """Return the images of the kept nodes and the first image of each removed node, which passes to
     its supporter."""
-    kept, seen = list[PlaceImage](), set[int]()
+    kept, seen = list[PlaceImage](), set[NodeId]()
     for image in images:
         if image.node_id not in new_id:
             kept.append(image)
@@ -163,7 +165,7 @@ def _reassign_images(images: Sequence[PlaceImage], new_id: Mapping[int, int]) ->
     return kept
 
 
-def _reassign_descriptors(model: CoarseModel, new_id: Mapping[int, int]) -> CoarseModel:
+def _reassign_descriptors(model: CoarseModel, new_id: Mapping[NodeId, NodeId]) -> CoarseModel:
     """Return a coarse localizer with the global descriptors of removed nodes reduced to one each.
     The descriptor nearest to the node's mean is kept and passes to the supporter."""
     vectors, of_node = model.arrays.get("vectors"), model.arrays.get("node_ids")
@@ -186,7 +188,9 @@ def _reassign_descriptors(model: CoarseModel, new_id: Mapping[int, int]) -> Coar
     return replace(model, arrays=arrays | {"node_ids": ids[is_kept]})
 
 
-def _remove_virtual_nodes(topomap: TopoMetricMap, new_id: Mapping[int, int]) -> VirtualNodes | None:
+def _remove_virtual_nodes(
+    topomap: TopoMetricMap, new_id: Mapping[NodeId, NodeId]
+) -> VirtualNodes | None:
     """Return the virtual nodes of the nodes that stay."""
     sides = topomap.sides
     if sides is None or not any(summary.of_node in new_id for summary in sides.summaries):
@@ -199,14 +203,14 @@ def _remove_virtual_nodes(topomap: TopoMetricMap, new_id: Mapping[int, int]) -> 
 
 
 def select_removed_nodes(
-    support: NodeSupport, min_held: int, is_enough: Callable[[list[int]], bool]
-) -> tuple[list[int], Int[np.ndarray, " nodes"]] | None:
+    support: NodeSupport, min_held: int, is_enough: Callable[[list[Row]], bool]
+) -> tuple[list[Row], Int[np.ndarray, " nodes"]] | None:
     """Return the nodes to remove and the final supporter of every node.
 
     Removal ends when `is_enough` returns true or no further node can be removed. Returns None if no
     node can be removed.
     """
-    removed, last = list[int](), None
+    removed, last = list[Row](), None
     for row, supporter in iterate_node_removals(support, min_held):
         removed.append(row)
         last = supporter

@@ -37,6 +37,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import Row, as_rows
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class OpenTile:
         assert nodes.lambda_rot is not None, "a map's own configuration is resolved"
         return nodes.d_thresh, nodes.lambda_rot
 
-    def world_from_node(self, row: int) -> Rigid3:
+    def world_from_node(self, row: Row) -> Rigid3:
         """Return the pose of the node of a row."""
         return self.topomap.summaries[row].world_from_cam
 
@@ -142,8 +143,8 @@ class _Answer:
     """Hold the localization of node `queried` of one map in the other map, whose nearest match is
     node `matched_row`."""
 
-    queried: int
-    matched_row: int
+    queried: Row
+    matched_row: Row
     result: Localization
 
 
@@ -178,7 +179,7 @@ class _Comparison:
 
     def __init__(self, first: OpenTile, second: OpenTile, config: TileJoinConfig) -> None:
         self._tiles, self._config = (first, second), config
-        self._answers: tuple[dict[int, Localization | None], ...] = (
+        self._answers: tuple[dict[Row, Localization | None], ...] = (
             {},
             {},
         )  # nodes of the second tile in the first, and nodes of the first in the second
@@ -232,15 +233,15 @@ class _Comparison:
             )
         return found
 
-    def _rank_nodes_by_similarity(self) -> list[list[int]]:
+    def _rank_nodes_by_similarity(self) -> list[list[Row]]:
         """Return the rows of the second tile's nodes, and of the first's, by similarity to the
         other tile's most similar node."""
         first, second = (tile.vectors for tile in self._tiles)
         kind = [kind for kind in first if kind in second][-1]
         alike = first[kind] @ second[kind].T
-        return [np.argsort(-alike.max(axis=side), kind="stable").tolist() for side in (0, 1)]
+        return [as_rows(np.argsort(-alike.max(axis=side), kind="stable")) for side in (0, 1)]
 
-    def _localize_nodes(self, rows: Sequence[Sequence[int]]) -> None:
+    def _localize_nodes(self, rows: Sequence[Sequence[Row]]) -> None:
         """Localize nodes of the second tile in the first, and nodes of the first in the second, if
         not done before."""
         for queried, of, known, wanted in zip(
@@ -266,7 +267,7 @@ class _Comparison:
         ]
         return found if any(found) else []
 
-    def _find_consensus(self) -> tuple[TransformConsensus, tuple[int, int]] | NotJoined:
+    def _find_consensus(self) -> tuple[TransformConsensus, tuple[Row, Row]] | NotJoined:
         """Return the transform between two nodes, one of each tile, and the rows of these nodes."""
         by_first, by_second = self._localized_nodes()
         answers = [*by_first, *by_second]
@@ -291,7 +292,7 @@ class _Comparison:
         )
 
     def _estimate_transform(
-        self, one: _Answer, ends: tuple[int, int], is_from_second: bool
+        self, one: _Answer, ends: tuple[Row, Row], is_from_second: bool
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """Return the transform between the nodes `ends` according to one localization:
         first_from_second."""
@@ -315,7 +316,7 @@ class _Comparison:
         from_second = second.world_from_node(b).inverse() @ second.world_from_node(ends[1])
         return propagate_estimate(to_first, by_from_asked, covariance, from_second, config.along)
 
-    def _find_nearby_nodes(self, first_from_second: Rigid3) -> list[list[int]]:
+    def _find_nearby_nodes(self, first_from_second: Rigid3) -> list[list[Row]]:
         """Return nodes of the second tile, and of the first, that the transform puts near a node of
         the other. At most `num_asked` of each tile are chosen, evenly spaced."""
         rows = []
@@ -336,11 +337,11 @@ class _Comparison:
                 .round()
                 .astype(int)
             )
-            rows.append(near[chosen].tolist() if len(near) else [])
+            rows.append(as_rows(near[chosen]) if len(near) else [])
         return rows
 
     def _verify(
-        self, first_from_second: Rigid3, near: Sequence[Sequence[int]]
+        self, first_from_second: Rigid3, near: Sequence[Sequence[Row]]
     ) -> tuple[int, int, float]:
         """Return the number of tested nodes, the number localized at their expected pose, and the
         lower quartile of the share of agreeing matches."""

@@ -50,6 +50,7 @@ from topoloc.mapping.node_drafts import NodeDraft, create_node_draft, finish_nod
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.sessions import Illumination, Session, average_illumination, find_source_path
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import SequenceView
@@ -276,6 +277,7 @@ def _create_session_content(
     new = NodePoses.of([draft.image.world_from_cam for draft in drafts]) if drafts else None
     drafted = {draft.frame: draft.image for draft in drafts}
     first_id = topomap.free_ids.node
+    new_ids = [NodeId(first_id + k) for k in range(len(drafts))]
     for done, frame in enumerate(frames):
         to_old = node_distances(frame.world_from_cam, old, lambda_rot)
         to_new = (
@@ -293,16 +295,15 @@ def _create_session_content(
                 )
             if is_of_new:
                 _observe_new_nodes(drafts, frame, image, np.argsort(to_new, kind="stable"), topomap)
-                _add_place_image(content, frame, image, first_id + int(to_new.argmin()))
+                _add_place_image(content, frame, image, new_ids[int(to_new.argmin())])
         progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
     for kind in topomap.kinds:
         content.nodes[kind] = [
-            finish_node(first_id + k, draft, kind, map_config) for k, draft in enumerate(drafts)
+            finish_node(*one, kind, map_config) for one in zip(new_ids, drafts, strict=True)
         ]
-    for k, draft in enumerate(drafts):
+    for node_id, draft in zip(new_ids, drafts, strict=True):
         content.sides.extend(
-            replace(side, summary=replace(side.summary, of_node=first_id + k))
-            for side in draft.sides
+            replace(side, summary=replace(side.summary, of_node=node_id)) for side in draft.sides
         )
     return content
 
@@ -347,7 +348,7 @@ def _observe_map_nodes(
 
 
 def _add_place_image(
-    content: _SessionContent, frame: MappingFrame, image: MappingImage, node_id: int
+    content: _SessionContent, frame: MappingFrame, image: MappingImage, node_id: NodeId
 ) -> None:
     content.images.append(
         PlaceImage(

@@ -21,6 +21,7 @@ from topoloc.lifelong.leave_one_out import LeaveOneOutResult, localize_left_out,
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.node_ids import NodeId, Row
 
 Reason = Literal["not_held", "few_landmarks", "one_direction", "single_session"]
 REASONS: tuple[Reason, ...] = get_args(Reason)
@@ -62,7 +63,7 @@ class NodeQuality:
     """Hold the quality of a node. `answer` is None if the node was not localized in the rest of the
     map. `seen_share` is the share of its landmarks that other sessions saw."""
 
-    node_id: int
+    node_id: NodeId
     name: str
     session_id: int
     world_from_cam: Rigid3
@@ -220,7 +221,7 @@ def find_weak_regions(
     check_bounds(config)
     topomap, rows = (
         localizer.topomap,
-        sample_evenly(range(len(localizer.topomap.summaries)), config.max_asked),
+        sample_evenly(localizer.topomap.rows, config.max_asked),
     )
 
     def report_progress(done: int, total: int) -> None:
@@ -234,7 +235,7 @@ def find_weak_regions(
     )
     nodes = [
         _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), poses, config)
-        for row in range(len(topomap.summaries))
+        for row in topomap.rows
     ]
     names = {session.session_id: session.name for session in topomap.sessions}
     names |= {
@@ -247,7 +248,7 @@ def find_weak_regions(
 
 def _assess_node(
     topomap: TopoMetricMap,
-    row: int,
+    row: Row,
     answer: LeaveOneOutResult | None,
     has_opposite_view: bool,
     poses: NodePoses,
@@ -287,7 +288,7 @@ def _seen_share(node: TopoNode) -> float:
 
 
 def _has_other_session(
-    topomap: TopoMetricMap, row: int, poses: NodePoses, num_d_thresh: float
+    topomap: TopoMetricMap, row: Row, poses: NodePoses, num_d_thresh: float
 ) -> bool:
     """Return whether a node of another session is within `num_d_thresh` times D_thresh."""
     summary = topomap.summaries[row]

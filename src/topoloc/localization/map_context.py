@@ -24,6 +24,7 @@ from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseLocalizer
 
 
@@ -115,7 +116,7 @@ class MapContext:
         """Return the feature type of the first search."""
         return self.types[0]
 
-    def without(self, node_ids: Iterable[int]) -> MapContext:
+    def without(self, node_ids: Iterable[NodeId]) -> MapContext:
         """Return the map without these nodes. See `Localizer.without`."""
         rows = [self.topomap.row_of(node_id) for node_id in node_ids]
         types = tuple(replace(one, map=one.map.without(rows)) for one in self.types)

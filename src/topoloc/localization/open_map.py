@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from topoloc.errors import EmptyMapError
 from topoloc.features.feature_types import find_feature_type
@@ -30,6 +30,7 @@ from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
 from topoloc.mapping.node_cache import CachedNodes
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode, open_map_coarse_localizer
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
 
@@ -76,9 +77,9 @@ class OpenMap:
         self._predicted_at_nodes: tuple[Camera, CachedNodes[Float32[np.ndarray, "n 5"]]] | None = (
             None
         )
-        self._masked_rows = list[int]()
+        self._masked_rows = list[Row]()
 
-    def without(self, rows: Iterable[int]) -> OpenMap:
+    def without(self, rows: Iterable[Row]) -> OpenMap:
         """Return the same map without these nodes. The other rows keep their numbers.
 
         Loaded nodes are shared. Virtual views are not used.
@@ -99,22 +100,15 @@ class OpenMap:
             else None
         )
 
-    def with_node_ids(self, candidates: list[NodeScore]) -> list[NodeScore]:
-        """Return candidates with node ids. Internally, `node_id` of a candidate is the row of its
-        node."""
-        return [
-            NodeScore(self.node_ids[candidate.node_id], candidate.score) for candidate in candidates
-        ]
-
-    def cam_from_world(self, row: int) -> Rigid3:
+    def cam_from_world(self, row: Row) -> Rigid3:
         """Return cam_from_world of a node."""
         return self.topomap.summaries[row].world_from_cam.inverse()
 
-    def local_map(self, rows: Sequence[int] | Int[np.ndarray, " n"]) -> LocalMap:
+    def local_map(self, rows: Sequence[Row]) -> LocalMap:
         """Return the points of these nodes, pooled."""
-        return LocalMap.concatenate([self._local_map(int(row)) for row in rows])
+        return LocalMap.concatenate([self._local_map(row) for row in rows])
 
-    def predict_at_node(self, row: int, camera: Camera) -> Float32[np.ndarray, "n 5"]:
+    def predict_at_node(self, row: Row, camera: Camera) -> Float32[np.ndarray, "n 5"]:
         """Return `predict_key_points` of a node's points for a camera at the node's pose.
 
         The predictions are cached for one camera.
@@ -129,7 +123,7 @@ class OpenMap:
             self._predicted_at_nodes = kept = (camera, read)
         return kept[1](row)
 
-    def repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
+    def repeats(self, row: Row) -> Float[np.ndarray, "k 3"]:
         """Return the repetition shifts (metres, world) of a node: its moves without rotation.
 
         See `repetition.py`.
@@ -137,7 +131,7 @@ class OpenMap:
         moves = self.moves(row)
         return moves[(moves[:, :3, :3] == np.eye(3)).all(axis=(1, 2)), :3, 3]
 
-    def moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
+    def moves(self, row: Row) -> Float[np.ndarray, "k 4 4"]:
         """Return the transforms (world) that move a node's content onto copies of it in the map.
 
         They are read from the map if it stores them, and computed otherwise.
@@ -145,7 +139,7 @@ class OpenMap:
         known = self._stored_moves
         return self._moves(row) if known is None else known.get(self.node_ids[row], _NO_MOVES)
 
-    def _find_moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
+    def _find_moves(self, row: Row) -> Float[np.ndarray, "k 4 4"]:
         node = self.topomap.nodes[row]
         found = [Rigid3(np.eye(3), shift) for shift in self._find_shifts(row)]
         found += [
@@ -155,7 +149,7 @@ class OpenMap:
         ]
         return np.array([move.matrix() for move in found]).reshape(-1, 4, 4)
 
-    def _similar_distant_nodes(self, node: TopoNode) -> Iterator[list[int]]:
+    def _similar_distant_nodes(self, node: TopoNode) -> Iterator[list[Row]]:
         """Generate groups of rows of distant nodes that look like this one, most similar first.
 
         Each group holds up to three nodes near each other.
@@ -165,9 +159,9 @@ class OpenMap:
         blank = np.zeros((node.camera.height, node.camera.width), np.uint8)
         far = self.distances(node.summary.world_from_cam) > _GROUP_RADIUS * self.d_thresh
         left = [
-            found.node_id
+            found.row
             for found in self._appearance_ranker.rank(blank, node.features, _NUM_SIMILAR_NODES)
-            if far[found.node_id]
+            if far[found.row]
         ]
         for _ in range(_MAX_SIMILAR_GROUPS):
             if not left:
@@ -188,7 +182,7 @@ class OpenMap:
             else None
         )
 
-    def _find_shifts(self, row: int) -> Float[np.ndarray, "k 3"]:
+    def _find_shifts(self, row: Row) -> Float[np.ndarray, "k 3"]:
         node, poses = self._local_map(row), self.node_poses
         if not has_repetitions(node):
             return np.zeros((0, 3))
@@ -200,7 +194,7 @@ class OpenMap:
         )
         near = near[np.argsort(away[near], kind="stable")]
         spread = np.unique(np.linspace(0, len(near) - 1, NUM_NEIGHBOURS).round().astype(int))
-        return find_repetition_shifts(node, self.local_map(near[spread]))
+        return find_repetition_shifts(node, self.local_map(as_rows(near[spread])))
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll."""
@@ -208,28 +202,27 @@ class OpenMap:
         distances[self._masked_rows] = np.inf
         return distances
 
-    def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> Int[np.ndarray, " n"]:
+    def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> list[Row]:
         """Return the rows of the nodes nearest to a camera, nearest first."""
-        return np.argsort(self.distances(world_from_cam), kind="stable")[
-            : min(num_nodes, len(self.node_ids) - len(self._masked_rows))
-        ]
+        order = np.argsort(self.distances(world_from_cam), kind="stable")
+        return as_rows(order[: min(num_nodes, len(self.node_ids) - len(self._masked_rows))])
 
 
 class _MaskedCoarseLocalizer:
     """Rank nodes with another coarse localizer and leave out some rows."""
 
-    def __init__(self, coarse: CoarseLocalizer, masked_rows: frozenset[int]) -> None:
+    def __init__(self, coarse: CoarseLocalizer, masked_rows: frozenset[Row]) -> None:
         self._coarse, self._masked_rows = coarse, masked_rows
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """See `CoarseLocalizer.rank`."""
         ranked = self._coarse.rank(image, features, num_candidates + len(self._masked_rows))
-        return [candidate for candidate in ranked if candidate.node_id not in self._masked_rows][
+        return [candidate for candidate in ranked if candidate.row not in self._masked_rows][
             :num_candidates
         ]
 
 
-def _stored_moves(topomap: TopoMetricMap) -> Mapping[int, Float[np.ndarray, "k 4 4"]] | None:
+def _stored_moves(topomap: TopoMetricMap) -> Mapping[NodeId, Float[np.ndarray, "k 4 4"]] | None:
     """Return the map's stored moves by node id, None if they belong to other nodes."""
     known = topomap.repetitions
     return (

@@ -41,6 +41,7 @@ from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 from topoloc.mapping.nodes import node_distances
+from topoloc.node_ids import Row
 from topoloc.retrieval.coarse import NodeScore
 
 _MAX_SAME_POSE_ANGLE = 0.25  # radians
@@ -55,7 +56,7 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
     only retrieval is used.
     """
     if prior is not None:
-        rows = [candidate.node_id for candidate in _nearest_nodes(search, prior)]
+        rows = [candidate.row for candidate in _nearest_nodes(search, prior)]
         yield _propose_from_nodes(search, "prior", rows, float(search.config.num_chance_inliers))
         return
     rows = _rank_nodes(search)
@@ -99,13 +100,13 @@ def propose_quick(search: Search, least: float) -> Proposal | None:
     return quick_proposal if quick_proposal.fit.num_inliers >= least else None
 
 
-def _rank_nodes(search: Search) -> list[int]:
+def _rank_nodes(search: Search) -> list[Row]:
     """Rank the nodes with the coarse localizer and return the rows of the candidates."""
     features = search.query.features
     with search.query.clock.stage("coarse"):
         num_ranked = max(search.config.num_candidates, search.config.look_alikes.num_ranked)
         search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
-    return [candidate.node_id for candidate in search.candidates]
+    return [candidate.row for candidate in search.candidates]
 
 
 def _nearest_nodes(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
@@ -113,11 +114,11 @@ def _nearest_nodes(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
     1)."""
     distances = search.map.distances(world_from_cam)
     rows = search.map.nearest(world_from_cam, search.config.num_candidates)
-    search.ranked = [NodeScore(int(row), -float(distances[row])) for row in rows]
+    search.ranked = [NodeScore(row, -float(distances[row])) for row in rows]
     return search.ranked
 
 
-def _propose_from_nodes(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
+def _propose_from_nodes(search: Search, source: Source, rows: list[Row], least: float) -> Proposal:
     """Propose a pose from the pooled points of these nodes.
 
     The strongest features are matched first. All are matched if at least `least` of these agree but
@@ -131,7 +132,7 @@ def _propose_from_nodes(search: Search, source: Source, rows: list[int], least: 
     return proposal
 
 
-def _create_matcher(search: Search, rows: list[int]) -> tuple[LocalMap, Matcher]:
+def _create_matcher(search: Search, rows: list[Row]) -> tuple[LocalMap, Matcher]:
     """Return the points of these nodes and a matcher of the query's features with them."""
     points = search.map.local_map(rows)
     return points, Matcher(
@@ -179,8 +180,8 @@ def _propose_similar_places(search: Search) -> Iterator[Proposal]:
     if not search.ranked or not config.max_groups:
         return
     least = config.min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
-    left = [candidate.node_id for candidate in search.ranked if candidate.score >= least]
-    queried = {candidate.node_id for candidate in search.candidates}
+    left = [candidate.row for candidate in search.ranked if candidate.score >= least]
+    queried = {candidate.row for candidate in search.candidates}
     reach = config.reach * search.map.d_thresh
     if best is not None and best.probability >= search.config.evidence.min_probability:
         far = search.map.distances(best.world_from_cam) > reach
@@ -224,7 +225,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     found = []
     with query.clock.stage("matching"):
         for candidate in search.ranked[: config.num_nodes]:
-            row = candidate.node_id
+            row = candidate.row
             local_map, predicted = (
                 search.map.local_map([row]),
                 search.map.predict_at_node(row, query.camera),
@@ -240,7 +241,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     found.sort(key=lambda one: -one[0])
     quick = replace(search.config.pose, max_iterations=config.max_iterations)
     # in a repetitive place many nodes see the same, and the right one is no better than the others
-    more = 3 if found and len(search.map.repeats(search.ranked[0].node_id)) else 1
+    more = 3 if found and len(search.map.repeats(search.ranked[0].row)) else 1
     with query.clock.stage("pnp"):
         fits = [
             fit_pose(query.features, query.input_camera, local_map, matches, quick)

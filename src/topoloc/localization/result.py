@@ -22,11 +22,20 @@ from topoloc.geometry.rigid import PoseJson, Rigid3
 from topoloc.json_data import Count, Finite, Matrix66, NonNegative, decode_json
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.provenance import EMPTY_PROVENANCE, Provenance, ProvenanceJson
-from topoloc.retrieval.coarse import NodeScore
+from topoloc.node_ids import NodeId
 
 Reason = Literal[
     "too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"
 ]
+
+
+@dataclass(frozen=True)
+class CandidateNode:
+    """Hold a node that retrieval found and its score. Higher is better. Scores are comparable
+    within one coarse localizer only."""
+
+    node_id: NodeId
+    score: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +70,8 @@ class Localization:
     world_from_cam: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     probability: float
-    node_id: int
-    candidates: list[NodeScore]
+    node_id: NodeId
+    candidates: list[CandidateNode]
     num_matches: int
     num_inliers: int
     times_ms: dict[str, float] = field(default_factory=dict)
@@ -157,7 +166,7 @@ class Alternative:
 
     world_from_cam: Rigid3
     probability: float
-    node_id: int
+    node_id: NodeId
     geopose: GeoPose | None = None
     tile: str | None = None
 
@@ -180,7 +189,7 @@ class NotLocalized:
     """
 
     reason: Reason
-    candidates: list[NodeScore] = field(default_factory=list)
+    candidates: list[CandidateNode] = field(default_factory=list)
     num_matches: int = 0
     num_inliers: int = 0
     times_ms: dict[str, float] = field(default_factory=dict)
@@ -268,9 +277,9 @@ class _Line(ProvenanceJson, frozen=True, kw_only=True):
     times_ms: dict[str, Finite]
 
     @property
-    def scores(self) -> list[NodeScore]:
+    def scores(self) -> list[CandidateNode]:
         """Return the candidates."""
-        return [NodeScore(node_id, score) for node_id, score in self.candidates]
+        return [CandidateNode(NodeId(node), score) for node, score in self.candidates]
 
 
 class _LocalizedLine(_Line, frozen=True, kw_only=True):
@@ -299,7 +308,7 @@ class _LocalizedLine(_Line, frozen=True, kw_only=True):
             self.world_from_cam.rigid(),
             np.array(self.covariance),
             self.probability,
-            self.node,
+            NodeId(self.node),
             self.scores,
             self.num_matches,
             self.num_inliers,
@@ -325,7 +334,7 @@ class _AlternativeJson(Struct, frozen=True):
         """Return the alternative."""
         geopose = None if self.geopose is None else self.geopose.geopose()
         pose = self.world_from_cam.rigid()
-        return Alternative(pose, self.probability, self.node, geopose, self.tile)
+        return Alternative(pose, self.probability, NodeId(self.node), geopose, self.tile)
 
 
 class _RefusedLine(_Line, frozen=True, kw_only=True):

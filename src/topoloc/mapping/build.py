@@ -52,6 +52,7 @@ from topoloc.mapping.sessions import (
 )
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
@@ -250,7 +251,7 @@ def _process_mapping_images(
             vlads[kind].append(visit.vlads[kind])
             cells[kind].append(features.cells)
         of_image = (
-            visit.nearest,
+            NodeId(visit.nearest),
             image.world_from_cam,
             image.place_jpeg,
             frame.session_id,
@@ -284,8 +285,8 @@ class _ImageObservations:
     nodes by row, and its VLADs by feature type."""
 
     image: MappingImage
-    nearest: int
-    observed: dict[int, dict[str, Observations]]
+    nearest: Row
+    observed: dict[Row, dict[str, Observations]]
     vlads: dict[str, Float32[np.ndarray, " v"]]
 
 
@@ -304,7 +305,7 @@ def _observe_image(
         if read is None
         else extract_mapping_image(frame, prepare_view(read, with_depth=False), config)
     )
-    nearest = nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)).tolist()
+    nearest = as_rows(nodes.rows(image.world_from_cam, max(1, config.landmarks.nodes_per_image)))
     around = {row: drafts.disk_list[row] for row in nearest[: config.landmarks.nodes_per_image]}
     observed = {
         row: observe_draft(draft, image, frame.session_id, config)
@@ -344,21 +345,21 @@ def _finish_nodes(
     """Return the nodes by feature type and all virtual nodes. Each draft is read once."""
     of_kind, sides = {kind: DiskList[TopoNode]() for kind in config.kinds}, DiskList[TopoNode]()
 
-    def finish_nodes(node_id: int) -> tuple[list[TopoNode], list[TopoNode]]:
-        draft = drafts.disk_list[node_id]
-        return [finish_node(node_id, draft, kind, config) for kind in config.kinds], draft.sides
+    def finish_nodes(row: Row) -> tuple[list[TopoNode], list[TopoNode]]:
+        draft = drafts.disk_list[row]
+        return [finish_node(NodeId(row), draft, kind, config) for kind in config.kinds], draft.sides
 
-    for node_id, (nodes, of_node) in enumerate(
-        parallel_map(finish_nodes, range(len(drafts.disk_list)))
+    for row, (nodes, of_node) in enumerate(
+        parallel_map(finish_nodes, as_rows(range(len(drafts.disk_list))))
     ):
         for kind, node in zip(config.kinds, nodes, strict=True):
             of_kind[kind].append(node)
         for side in of_node:
-            sides.append(replace(side, summary=replace(side.summary, of_node=node_id)))
+            sides.append(replace(side, summary=replace(side.summary, of_node=NodeId(row))))
     return dict(of_kind), sides
 
 
-def _connect_nodes(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:
+def _connect_nodes(frames: list[MappingFrame], node_ids: list[NodeId]) -> list[Edge]:
     """Return an edge for each transition of a recording between two nodes."""
     steps = pairwise(zip(frames, node_ids, strict=True))
     edges = {

@@ -42,6 +42,7 @@ from topoloc.mapping.validation import (
     check_count,
     pose_from_bytes,
 )
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseModel
 
 T = TypeVar("T")
@@ -214,7 +215,7 @@ def _session_from_row(row: Mapping[str, Any]) -> Session:
 class _LazySequence(Sequence[T]):
     """Show rows of the map, numbered from 0, and read each when accessed."""
 
-    def __init__(self, length: Callable[[], int], read: Callable[[int], T]) -> None:
+    def __init__(self, length: Callable[[], int], read: Callable[[Row], T]) -> None:
         self._length, self._read = length, read
 
     def __len__(self) -> int:
@@ -222,11 +223,11 @@ class _LazySequence(Sequence[T]):
 
     def __getitem__(self, index):  # type: ignore[override]
         if isinstance(index, slice):
-            return [self._read(i) for i in range(*index.indices(len(self)))]
+            return [self._read(row) for row in as_rows(range(*index.indices(len(self))))]
         position = index + len(self) if index < 0 else index
         if not 0 <= position < len(self):
             raise IndexError(index)
-        return self._read(int(position))
+        return self._read(Row(int(position)))
 
 
 # No return types: a type check at run time would read an entry.
@@ -246,7 +247,7 @@ def _lazy_nodes(file: MapFile, kind: str, prefix: str = "", is_default: bool = T
     )
 
 
-def _read_summary(file: MapFile, prefix: str, row: int) -> NodeSummary:
+def _read_summary(file: MapFile, prefix: str, row: Row) -> NodeSummary:
     return _read_summaries(file, prefix)[row]
 
 
@@ -265,11 +266,11 @@ def _read_summaries(file: MapFile, prefix: str) -> list[NodeSummary]:
 
 
 def _summary_from_row(
-    row: Mapping[str, Any], file: MapFile, nodes: Mapping[int, NodeSummary] | None
+    row: Mapping[str, Any], file: MapFile, nodes: Mapping[NodeId, NodeSummary] | None
 ) -> NodeSummary:
     """Return the summary of a node. With `nodes` it is a virtual node, whose session is that of its
     node."""
-    node_id = check_count(row["node_id"], 0, MAX_ID, "a node's id")
+    node_id = NodeId(check_count(row["node_id"], 0, MAX_ID, "a node's id"))
     num_points = check_count(
         row["num_points"], 0, MAX_POINTS, f"the number of points of node {node_id}"
     )
@@ -289,7 +290,7 @@ def _summary_from_row(
     )
 
 
-def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: int) -> TopoNode:
+def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: Row) -> TopoNode:
     """Read the node of a row with its points of a feature type. With the prefix `VIRTUAL_PREFIX` it
     is a virtual node, which has no template. Raises MapError."""
     with file.read_connection():
@@ -323,7 +324,7 @@ def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: int
         )
 
 
-def _read_camera(file: MapFile, prefix: str, node_id: int) -> Camera:
+def _read_camera(file: MapFile, prefix: str, node_id: NodeId) -> Camera:
     rows = partial(file.rows, f"{prefix}nodes", ("node_id", "camera_id"))
     camera_id = file.cached(
         f"{prefix}camera_ids", lambda: {row["node_id"]: row["camera_id"] for row in rows()}
@@ -341,7 +342,7 @@ class _LazyStatistics:
     """Show each session's statistics of a node's points. Localization does not need them, so they
     are read when accessed."""
 
-    def __init__(self, file: MapFile, node_id: int, kind: str, num_points: int) -> None:
+    def __init__(self, file: MapFile, node_id: NodeId, kind: str, num_points: int) -> None:
         self._file, self._node_id, self._kind, self._num_points = file, node_id, kind, num_points
 
     def _list_session_ids(self) -> list[int]:

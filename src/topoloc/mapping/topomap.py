@@ -20,6 +20,7 @@ from typing import Any, ClassVar, no_type_check
 import numpy as np
 
 from topoloc.errors import FeatureTypeError, MapError
+from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.contents import MapContents, get_map_id
 from topoloc.mapping.entries import (
     CorrelatedErrors,
@@ -37,6 +38,7 @@ from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.session_illumination import find_node_illumination_groups
 from topoloc.mapping.sessions import Edit, Session
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import (
     CoarseLocalizer,
     CoarseModel,
@@ -84,16 +86,20 @@ class TopoMetricMap(MapContents):
         """The map's identifier, 16 hexadecimal digits, also of a map without a stored one."""
         return get_map_id(self)
 
-    def row_of(self, node_id: int) -> int:
+    def row_of(self, node_id: NodeId) -> Row:
         """Return the row of a node. Raises KeyError if the map has no node with this id."""
         return self._rows[node_id]
 
-    def find_neighbours(self, rows: Sequence[int], max_neighbours: int) -> list[list[int]]:
-        """Return for each of these nodes the nearest others of them, by the distance of Eq. 1.
+    @property
+    def rows(self) -> list[Row]:
+        """Return the rows of all nodes."""
+        return as_rows(range(len(self.summaries)))
 
-        Entries are positions in `rows`, the nearest first.
+    def find_neighbours(self, poses: list[Rigid3], max_neighbours: int) -> list[list[int]]:
+        """Return for each of these poses the nearest others of them, by the distance of Eq. 1.
+
+        Entries are positions in `poses`, the nearest first.
         """
-        poses = [self.summaries[row].world_from_cam for row in rows]
         stacked, neighbours = NodePoses.of(poses), list[list[int]]()
         for k, pose in enumerate(poses):
             distances = node_distances(pose, stacked, self.config.lambda_rot)
@@ -102,8 +108,8 @@ class TopoMetricMap(MapContents):
         return neighbours
 
     @cached_property
-    def _rows(self) -> dict[int, int]:
-        return {summary.node_id: row for row, summary in enumerate(self.summaries)}
+    def _rows(self) -> dict[NodeId, Row]:
+        return {summary.node_id: Row(row) for row, summary in enumerate(self.summaries)}
 
     def with_feature_type(self, kind: str) -> TopoMetricMap:
         """Return the map reduced to one of its feature types, including its virtual nodes. The
@@ -210,7 +216,7 @@ def open_map_coarse_localizer(topomap: TopoMetricMap, name: str) -> CoarseLocali
     )
 
 
-def node_ids_to_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
+def node_ids_to_rows(model: CoarseModel, ids: Sequence[NodeId]) -> CoarseModel:
     """Return a stored model with the ids of its nodes replaced by rows. Descriptors of other nodes
     are removed."""
     known = model.arrays.get("node_ids", _output_node_ids(model))
@@ -220,7 +226,7 @@ def node_ids_to_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
         len(known) == 0 or 0 <= known.min() <= known.max() < len(ids)
     ):
         return model
-    rows = {node_id: row for row, node_id in enumerate(ids)}
+    rows: dict[int, int] = {node_id: row for row, node_id in enumerate(ids)}
     of_known = np.array([rows.get(int(node_id), -1) for node_id in known], np.int64)
     if "vectors" not in model.arrays:  # one output per node
         return replace(model, arrays={**model.arrays, "node_ids": of_known})

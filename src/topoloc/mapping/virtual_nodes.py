@@ -24,6 +24,7 @@ from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.mapping.nodes import NodeConfig, select_node_frames
+from topoloc.node_ids import NodeId, Row
 from topoloc.points.metric_points import MetricPointsConfig, locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.retrieval.vlad import (
@@ -57,7 +58,7 @@ class VirtualNodesConfig:
 
 def select_virtual_view_nodes(
     world_from_nodes: list[Rigid3], node_config: NodeConfig, config: VirtualNodesConfig
-) -> set[int]:
+) -> set[Row]:
     """Return the rows of the poses that need virtual views. `node_config` (of the map) must be
     resolved."""
     if config.spacing == 0.0:
@@ -74,7 +75,7 @@ def select_virtual_view_nodes(
         return bool((near & (axes @ axes[k] < -0.7)).any())
 
     return {
-        int(k)
+        Row(int(k))
         for k in select_node_frames(world_from_nodes, spaced)
         if not has_opposite_node(int(k))
     }
@@ -103,7 +104,8 @@ def collect_virtual_nodes(
     if len(described) == 0:
         return None
     nodes = DiskList(
-        replace(node, summary=replace(node.summary, node_id=k)) for k, node in enumerate(described)
+        replace(node, summary=replace(node.summary, node_id=NodeId(k)))
+        for k, node in enumerate(described)
     )
     model = _fit_vlad(nodes, config.vlad).to_model()
     model = replace(

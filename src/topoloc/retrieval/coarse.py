@@ -17,6 +17,7 @@ from jaxtyping import Int, UInt8
 from topoloc.bounds import parse_value
 from topoloc.errors import ConfigError, MapError, MissingExtraError
 from topoloc.features.features import Features
+from topoloc.node_ids import Row
 
 CoarseName = Literal["surf-vlad", "cnn-fc", "cnn-nn", "vlad-nn"]
 COARSE_NAMES: tuple[CoarseName, ...] = get_args(CoarseName)
@@ -27,14 +28,10 @@ Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True)
 class NodeScore:
-    """Hold a candidate node and its score. Higher is better. Scores are comparable within one
-    localizer only.
+    """Hold the row of a candidate node in the open map and its score. Higher is better. Scores are
+    comparable within one localizer only."""
 
-    `node_id` is the node's id in results. Within a query it is the node's row in the open map
-    (`CoarseLocalizer.rank`).
-    """
-
-    node_id: int
+    row: Row
     score: float
 
 

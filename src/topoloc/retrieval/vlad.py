@@ -171,7 +171,7 @@ class SurfVlad:
         Groups of fewer than eight images are ignored, because their mean is too uncertain.
 
         Args:
-            group_of_node: the group of each node, indexed by the numbers in `node_ids`.
+            group_of_node: the group of each node, by row.
         """
         groups = group_of_node[self._node_ids]
         numbers, counts = np.unique(groups, return_counts=True)

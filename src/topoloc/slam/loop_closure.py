@@ -153,9 +153,7 @@ def rank_places(
         np.zeros((1, 1), np.uint8),
     )
     for row in range(len(keyframes)):
-        yield [
-            score.node_id for score in localizer.rank(blank, features(row), num or len(keyframes))
-        ]
+        yield [score.row for score in localizer.rank(blank, features(row), num or len(keyframes))]
 
 
 def _is_loop_candidate(

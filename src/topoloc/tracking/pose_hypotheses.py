@@ -26,6 +26,7 @@ from topoloc.bounds import Above, AtLeast, Between
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative
+from topoloc.node_ids import NodeId
 from topoloc.tracking.motion import (
     MotionConfig,
     MotionState,
@@ -86,7 +87,7 @@ class Candidate:
     world_from_cam: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     probability: float
-    node_id: int
+    node_id: NodeId
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ class _Hypothesis:
     odom_from_cam: Rigid3 | None
     current: MotionState
     weight: float
-    node_id: int
+    node_id: NodeId
     from_best: Rigid3
     candidate_idx: int | None
 

@@ -23,6 +23,7 @@ from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Contradiction:
     """Report that node `node_id` is `metres` and `degrees` off the pose found with node
     `other_id`."""
 
-    node_id: int
-    other_id: int
+    node_id: NodeId
+    other_id: NodeId
     metres: float
     degrees: float
 

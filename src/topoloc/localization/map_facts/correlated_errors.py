@@ -29,6 +29,7 @@ from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
 from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
 from topoloc.mapping.topomap import CorrelatedErrors, TopoMetricMap, TopoNode
+from topoloc.node_ids import as_rows
 
 _MEDIAN_CHI_SQUARE_6 = 5.348
 _METHOD = 1  # part of the digest: increase if the same settings give another rho
@@ -99,13 +100,13 @@ def measure_correlated_error_share(
     """Measure rho of the map (see the module docstring)."""
     poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
-    node_ids = np.unique(
+    rows = np.unique(
         np.linspace(0, len(topomap.summaries) - 1, config.num_nodes).round().astype(int)
     )
     for min_distance in config.min_distances:
         rhos = []
-        for node_id in node_ids:
-            node = topomap.nodes[int(node_id)]
+        for row in as_rows(rows):
+            node = topomap.nodes[row]
             distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
             order = np.argsort(distances, kind="stable")
             helpers = order[distances[order] > min_distance * d_thresh][: config.num_helpers]

@@ -18,6 +18,7 @@ from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
 from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.slam.pose_checks import check_pose_coverage, check_poses
@@ -111,8 +112,8 @@ def with_repetitions(
     topomap: TopoMetricMap, progress: build.Progress | None = None
 ) -> TopoMetricMap:
     """Return the map with the repetition moves of its nodes."""
-    opened, moves = OpenMap(topomap), dict[int, Float[np.ndarray, "k 4 4"]]()
-    for row, found in enumerate(parallel_map(opened.moves, range(len(opened.node_ids)))):
+    opened, moves = OpenMap(topomap), dict[NodeId, Float[np.ndarray, "k 4 4"]]()
+    for row, found in enumerate(parallel_map(opened.moves, topomap.rows)):
         if len(found):
             moves[opened.node_ids[row]] = found
         if progress is not None:

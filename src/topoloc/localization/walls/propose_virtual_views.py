@@ -54,6 +54,7 @@ from topoloc.localization.walls.virtual_view_matching import (
     merge_matches,
     select_nearest_virtual_nodes,
 )
+from topoloc.node_ids import Row
 
 _NEAREST_NEIGHBOR = MatchingConfig(ratio=0.0, mutual=False)
 
@@ -105,7 +106,7 @@ class VirtualViewSearch:
         """Return the camera of the query."""
         return self.search.query.camera
 
-    def virtual_nodes_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[int]:
+    def virtual_nodes_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[Row]:
         """Return the virtual views of the map that show the content of a side view at a pose."""
         return select_nearest_virtual_nodes(
             side.view,
