@@ -77,7 +77,7 @@ def main() -> None:
 
 def trained(topomap: TopoMetricMap, method: str, weights: str | None) -> CoarseLocalizer:
     if method == "surf-vlad":
-        return open_coarse_localizer(topomap.coarse_models[method])
+        return open_coarse_localizer(topomap.first_layer.coarse_models[method])
     name, _, backbone = method.partition(" ")
     if backbone == "compact":
         config = CoarseTrainingConfig(cnn_fc=CnnFcConfig(picture=COMPACT_PICTURE))

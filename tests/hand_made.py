@@ -11,7 +11,7 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.result import CandidateNode, Localization, NotLocalized
-from topoloc.mapping.topomap import Edge, NodeSummary, TopoMetricMap, TopoNode
+from topoloc.mapping.topomap import Edge, Layer, NodeSummary, TopoMetricMap, TopoNode
 
 TIMES_MS = {
     "patch_normalization": 2.0,
@@ -87,7 +87,7 @@ def two_nodes() -> TopoMetricMap:
     summaries = [NodeSummary(i, "walk", f"{i}.png", i, pose(float(i)), 0) for i in range(2)]
     nodes = [TopoNode(summary, camera, features, points, roots, jpeg) for summary in summaries]
     return TopoMetricMap(
-        summaries, nodes, [Edge(0, 1)], [], {}, {"nodes": {"lambda_rot": 1.0}}, 1.0
+        summaries, {"surf": Layer(nodes)}, [Edge(0, 1)], [], {"nodes": {"lambda_rot": 1.0}}, 1.0
     )
 
 

@@ -21,6 +21,7 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.contents import Layer
 from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.recordings.recording import SequenceView
 
@@ -100,9 +101,8 @@ def test_what_cannot_be_merged_is_named(
         "merge", first, tmp_path / "none.topo", tmp_path / "both.topo"
     )
     with TopoMetricMap.load(first) as topomap:
-        replace(topomap, other_kinds={"sift": topomap.nodes}, map_id="0123456789abcdef").save(
-            tmp_path / "two.topo"
-        )
+        layers = {**topomap.layers, "sift": Layer(topomap.nodes)}
+        replace(topomap, layers=layers, map_id="0123456789abcdef").save(tmp_path / "two.topo")
     assert "holds no features sift" in complaint(
         "merge", tmp_path / "two.topo", second, tmp_path / "both.topo"
     )

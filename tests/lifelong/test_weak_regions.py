@@ -84,8 +84,7 @@ def _changed(
     nodes = change(list(topomap.nodes))
     sessions = [replace(topomap.sessions[0], session_id=k, name=f"walk {k}") for k in range(2)]
     return replace(
-        topomap,
-        nodes=nodes,
+        topomap.with_first_layer(nodes=nodes),
         summaries=[node.summary for node in nodes],
         sessions=sessions,
         repetitions=None,

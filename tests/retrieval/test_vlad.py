@@ -233,7 +233,7 @@ def share_of_near_candidates(map_part: str, query_part: str, config: BuildConfig
     """Of the queries, those with a node within 2 D_thresh (Eq. 1) among the five best."""
     topomap = build_map(topoloc.open_sequence(map_part), config)
     nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    coarse = open_coarse_localizer(topomap.coarse_models["surf-vlad"])
+    coarse = open_coarse_localizer(topomap.first_layer.coarse_models["surf-vlad"])
     queries = topoloc.open_sequence(query_part)
     near = []
     for frame, pose in zip((queries[k] for k in range(len(queries))), queries.poses, strict=True):

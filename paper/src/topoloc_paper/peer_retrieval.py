@@ -24,7 +24,7 @@ class Retrieval:
     def __init__(self, topomap: TopoMetricMap) -> None:
         self._features = topomap.config.features
         self._world_from_nodes = [summary.world_from_cam for summary in topomap.summaries]
-        model = topomap.coarse_models["surf-vlad"]
+        model = topomap.first_layer.coarse_models["surf-vlad"]
         self._coarse = open_coarse_localizer(model)
         self.map_bytes = sum(array.nbytes for array in model.arrays.values())
 

@@ -13,7 +13,7 @@ from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
@@ -50,7 +50,7 @@ def localize_queries(
     """
     with localizer.in_tile(tile_id) as in_tile:
         topomap, tile_id = in_tile.topomap, in_tile.tile_ids[0]
-        nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+        nodes = topomap.node_poses
     frames = find_frames_with_truth(sequence) if frames is None else frames
     label = label or sequence.name
     answers = []

@@ -17,7 +17,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import Row, as_rows
 
@@ -47,14 +47,14 @@ def sample_evenly(rows: Sequence[T], max_count: int) -> list[T]:
     ]
 
 
-def beside(topomap: TopoMetricMap, row: Row, num_d_thresh: float, poses: NodePoses) -> list[Row]:
+def beside(topomap: TopoMetricMap, row: Row, num_d_thresh: float) -> list[Row]:
     """Return the rows of a node and of the near nodes of its session.
 
     A node is near if its distance by Eq. 1 is at most `num_d_thresh` times D_thresh.
     """
     summary = topomap.summaries[row]
     near = np.flatnonzero(
-        node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
+        node_distances(summary.world_from_cam, topomap.node_poses, topomap.config.lambda_rot)
         <= num_d_thresh * topomap.config.d_thresh
     )
     same = (k for k in as_rows(near) if topomap.summaries[k].session_id == summary.session_id)
@@ -81,12 +81,11 @@ def localize_left_out(
         The results by row. A node is not localized if all nodes of the map would be hidden.
     """
     known = {summary.node_id for summary in localizer.topomap.summaries}
-    poses = NodePoses.of([summary.world_from_cam for summary in stored.summaries])
     answers = dict[Row, LeaveOneOutResult]()
     for done, row in enumerate(rows):
-        node = stored.nodes_of(stored.kind)[row]
-        features = {kind: stored.nodes_of(kind)[row].features for kind in stored.kinds}
-        near = [stored.summaries[k].node_id for k in beside(stored, row, num_d_thresh, poses)]
+        node = stored.nodes[row]
+        features = {kind: layer.nodes[row].features for kind, layer in stored.layers.items()}
+        near = [stored.summaries[k].node_id for k in beside(stored, row, num_d_thresh)]
         hidden = [node_id for node_id in near if node_id in known]
         is_all = len(hidden) == len(localizer.topomap.summaries)
         result = (

@@ -25,7 +25,7 @@ from topoloc.lifelong.virtual_node_update import add_virtual_nodes
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
 
@@ -64,12 +64,10 @@ def merge_maps(
     if first.map_id is not None and first.map_id == second.map_id:
         raise MapError("they are one map in two versions; nothing is merged")
     aligned = _align_second_map(first, second, config, localizer_config, progress)
-    d_thresh = first.config.nodes.d_thresh
-    assert d_thresh is not None, "a map's own configuration is resolved"
     added = as_rows(
         row
         for row, answer in aligned.answers.items()
-        if not is_well_localized(answer, d_thresh, config)
+        if not is_well_localized(answer, first.config.d_thresh, config)
     )
     poses = {Row(row): pose for row, pose in enumerate(aligned.world_from_cams) if pose is not None}
     merged, not_updated = _add_nodes(first, second, added, poses)
@@ -103,10 +101,10 @@ def _align_second_map(
         lambda done: progress("comparing the maps", done, len(rows)),
     )
     odom = dict(enumerate(summary.world_from_cam for summary in second.summaries))
-    d_thresh = first.config.nodes.d_thresh
-    assert d_thresh is not None, "a map's own configuration is resolved"
     try:
-        return align_motion_to_map("the second map", odom, {**answers}, d_thresh, config.poses)
+        return align_motion_to_map(
+            "the second map", odom, {**answers}, first.config.d_thresh, config.poses
+        )
     except TrajectoryError as error:
         raise TrajectoryError(
             str(error).replace("the map stays as it is", "nothing is merged")
@@ -128,34 +126,32 @@ def _add_nodes(
     new_id = {row: NodeId(first_id + k) for k, row in enumerate(added)}
     nodes = {
         kind: [
-            _transform_node(second.nodes_of(kind)[row], new_id[row], poses[row], session_ids)
+            _transform_node(second.layers[kind].nodes[row], new_id[row], poses[row], session_ids)
             for row in added
         ]
         for kind in first.kinds
     }
     views = {kind: [_place_features(node) for node in of_kind] for kind, of_kind in nodes.items()}
     summaries = [*first.summaries, *(node.summary for node in nodes[first.kind])]
-    extended = {
-        kind: OverlaySequence(first.nodes_of(kind), {}, nodes[kind]) for kind in first.kinds
+    layers = {
+        kind: replace(layer, nodes=OverlaySequence(layer.nodes, {}, nodes[kind]))
+        for kind, layer in first.layers.items()
     }
     images = _select_images(second, new_id, poses, session_ids)
-    updated = update_coarse_models(first, views, images)
     merged = replace(
         first,
         summaries=summaries,
-        nodes=extended.pop(first.kind),
-        other_kinds=extended,
+        layers=layers,
         edges=sorted(
             {*first.edges, *_transfer_edges(first, second, new_id, poses)},
             key=lambda edge: (edge.source_id, edge.target_id),
         ),
         place_images=OverlaySequence(first.place_images, {}, images),
-        coarse_models=updated.models,
         length_m=first.length_m + second.length_m * len(added) / max(len(second.summaries), 1),
         sessions=[*first.sessions, *sessions.values()],
         sides=_transfer_virtual_nodes(first, second, new_id, poses, summaries),
     )
-    return merged, updated.not_updated
+    return update_coarse_models(merged, views, images)
 
 
 def _place_features(node: TopoNode) -> PlaceFeatures:
@@ -222,12 +218,11 @@ def _transfer_edges(
 ) -> set[Edge]:
     """Return the second map's edges. A skipped node is replaced by the nearest node of the first
     map."""
-    lambda_rot = first.config.nodes.lambda_rot
-    assert lambda_rot is not None, "a map's own configuration is resolved"
-    old = NodePoses.of([summary.world_from_cam for summary in first.summaries])
     ids = {}
     for row, summary in zip(second.rows, second.summaries, strict=True):
-        nearest = int(node_distances(poses[row], old, lambda_rot).argmin())
+        nearest = int(
+            node_distances(poses[row], first.node_poses, first.config.lambda_rot).argmin()
+        )
         ids[summary.node_id] = new_id.get(row, first.summaries[nearest].node_id)
     return {
         Edge(ids[e.source_id], ids[e.target_id])

@@ -31,7 +31,7 @@ def localize_nodes(
     answers: dict[Row, Localization | None] = {}
     for row in rows:
         features = {
-            kind: source_map.nodes_of(kind)[row].features for kind in localizer.topomap.kinds
+            kind: source_map.layers[kind].nodes[row].features for kind in localizer.topomap.kinds
         }
         result = localizer.localize_query(
             QueryImage.of_features(features, source_map.nodes[row].camera)

@@ -17,7 +17,7 @@ from jaxtyping import Int
 
 from topoloc.lifelong.lazy_sequences import SelectedSequence
 from topoloc.lifelong.node_observation import observe_node
-from topoloc.mapping.nodes import NearestNodeSearch, NodePoses
+from topoloc.mapping.nodes import NearestNodeSearch
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes
 from topoloc.node_ids import NodeId, Row
@@ -48,19 +48,14 @@ def compute_node_support(topomap: TopoMetricMap, num_compared: int) -> NodeSuppo
     Raises:
         MapError: a node cannot be read.
     """
-    config = topomap.config
-    lambda_rot = config.nodes.lambda_rot
-    assert lambda_rot is not None, "a map's own configuration is resolved"
-    nearest = NearestNodeSearch(
-        NodePoses.of([summary.world_from_cam for summary in topomap.summaries]), lambda_rot
-    )
+    nearest = NearestNodeSearch(topomap.node_poses, topomap.config.lambda_rot)
     count = min(num_compared + 1, len(topomap.summaries))
     supporters = np.array(
         [nearest.rows(summary.world_from_cam, count) for summary in topomap.summaries], np.int64
     )
     landmarks = np.zeros(supporters.shape, np.int64)
-    for kind in topomap.kinds:
-        nodes = topomap.nodes_of(kind)
+    for layer in topomap.layers.values():
+        nodes = layer.nodes
         for row, others in enumerate(supporters):
             seen = [
                 _count_recognised_landmarks(nodes[int(k)], nodes[row], topomap)
@@ -130,7 +125,13 @@ def remove_nodes(
     kept = [row for row in topomap.rows if row not in gone]
     ids = [summary.node_id for summary in topomap.summaries]
     new_id = {ids[row]: ids[int(supporter[row])] for row in gone}
-    nodes = {kind: SelectedSequence(topomap.nodes_of(kind), kept) for kind in topomap.kinds}
+    layers = {}
+    for kind, layer in topomap.layers.items():
+        models = layer.coarse_models.items()
+        reassigned = {name: _reassign_descriptors(model, new_id) for name, model in models}
+        layers[kind] = replace(
+            layer, nodes=SelectedSequence(layer.nodes, kept), coarse_models=reassigned
+        )
     edges = {
         tuple(new_id.get(one, one) for one in (edge.source_id, edge.target_id))
         for edge in topomap.edges
@@ -138,14 +139,9 @@ def remove_nodes(
     return replace(
         topomap,
         summaries=[topomap.summaries[row] for row in kept],
-        nodes=nodes.pop(topomap.kind),
-        other_kinds=nodes,
+        layers=layers,
         edges=[Edge(source, target) for source, target in sorted(edges) if source != target],
         place_images=_reassign_images(topomap.place_images, new_id),
-        coarse_models={
-            name: _reassign_descriptors(model, new_id)
-            for name, model in topomap.coarse_models.items()
-        },
         sides=_remove_virtual_nodes(topomap, new_id),
     )
 

@@ -130,8 +130,7 @@ def estimate_poses_by_motion(
         CalibrationError: the images contradict their calibration.
         UnreadableImageError, QueryError: an image cannot be read or localized.
     """
-    d_thresh = map_config.nodes.d_thresh
-    assert d_thresh is not None, "a map's own configuration is resolved"
+    d_thresh = map_config.d_thresh
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
     motions = [odom for poses in stretches if (odom := _known_poses(poses))]
     if not motions:

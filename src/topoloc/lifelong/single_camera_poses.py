@@ -85,8 +85,7 @@ def estimate_poses_by_map(
             f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures:"
             " too few to join"
         )
-    d_thresh = map_config.nodes.d_thresh
-    assert d_thresh is not None, "a map's own configuration is resolved"
+    d_thresh = map_config.d_thresh
     clear = {
         index
         for index, answer in localized.items()

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -35,7 +34,7 @@ from topoloc.lifelong.node_localization import localize_nodes
 from topoloc.lifelong.shared_images import estimate_by_shared_images
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import Row, as_rows
 
@@ -92,19 +91,6 @@ class OpenTile:
     def topomap(self) -> TopoMetricMap:
         """Return the tile's map."""
         return self.localizer.topomap
-
-    @cached_property
-    def poses(self) -> NodePoses:
-        """Return the poses of the tile's nodes."""
-        return NodePoses.of([summary.world_from_cam for summary in self.topomap.summaries])
-
-    @property
-    def apart(self) -> tuple[float, float]:
-        """Return D_thresh (metres) and lambda (metres per radian) of Eq. 1."""
-        nodes = self.topomap.config.nodes
-        assert nodes.d_thresh is not None, "a map's own configuration is resolved"
-        assert nodes.lambda_rot is not None, "a map's own configuration is resolved"
-        return nodes.d_thresh, nodes.lambda_rot
 
     def world_from_node(self, row: Row) -> Rigid3:
         """Return the pose of the node of a row."""
@@ -326,12 +312,12 @@ class _Comparison:
             (first_from_second, first_from_second.inverse()),
             strict=True,
         ):
-            d_thresh, lambda_rot = queried.apart
+            config, node_poses = queried.topomap.config, queried.topomap.node_poses
             apart = [
-                node_distances(pose @ summary.world_from_cam, queried.poses, lambda_rot).min()
+                node_distances(pose @ summary.world_from_cam, node_poses, config.lambda_rot).min()
                 for summary in of.topomap.summaries
             ]
-            near = np.flatnonzero(np.array(apart) <= self._config.near * d_thresh)
+            near = np.flatnonzero(np.array(apart) <= self._config.near * config.d_thresh)
             chosen = np.unique(
                 np.linspace(0, len(near) - 1, min(len(near), self._config.num_asked))
                 .round()
@@ -350,7 +336,7 @@ class _Comparison:
         for queried, of, known, rows, pose in zip(
             self._tiles, self._tiles[::-1], self._answers, near, poses, strict=True
         ):
-            d_thresh, _ = queried.apart
+            d_thresh = queried.topomap.config.d_thresh
             for row in rows:
                 if row not in known:
                     continue

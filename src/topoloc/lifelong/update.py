@@ -148,8 +148,8 @@ def update_map(
     frames = select_posed_frames(posed_sequence, session_id)
     content = _create_session_content(topomap, frames, session_poses, config, progress)
     session = _create_session(session_id, sequence, frames, content, poses_from)
-    updated = update_coarse_models(topomap, content.views, content.images)
-    changed = replace(_add_session(topomap, session, frames, content), coarse_models=updated.models)
+    changed = _add_session(topomap, session, frames, content)
+    changed, not_updated = update_coarse_models(changed, content.views, content.images)
     changes = {
         "session": session_id,
         "recording": sequence.name,
@@ -159,7 +159,7 @@ def update_map(
     changes |= (
         {"poses_from": poses_from}
         | _count_changes(session_poses, content, topomap.kind)
-        | {"not_taught": updated.not_updated}
+        | {"not_taught": not_updated}
     )
     changed = with_map_statistics(changed, progress)
     return MapUpdate(
@@ -243,9 +243,7 @@ def _create_session_content(
     progress: Progress,
 ) -> _SessionContent:
     map_config = topomap.config
-    d_thresh, lambda_rot = map_config.nodes.d_thresh, map_config.nodes.lambda_rot
-    assert d_thresh is not None
-    assert lambda_rot is not None
+    d_thresh, lambda_rot = map_config.d_thresh, map_config.lambda_rot
     locator = PointLocator(frames, map_config)
     by_index = {frame.index: frame for frame in frames}
     wanted = [
@@ -273,7 +271,7 @@ def _create_session_content(
         defaultdict(list),
         [],
     )
-    old = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    old = topomap.node_poses
     new = NodePoses.of([draft.image.world_from_cam for draft in drafts]) if drafts else None
     drafted = {draft.frame: draft.image for draft in drafts}
     first_id = topomap.free_ids.node
@@ -341,7 +339,7 @@ def _observe_map_nodes(
     for row in nearest[: config.landmarks.nodes_per_image].tolist():
         cam_from_node = image.world_from_cam.inverse() @ topomap.summaries[row].world_from_cam
         for kind, features in image.features.items():
-            node = topomap.nodes_of(kind)[row]
+            node = topomap.layers[kind].nodes[row]
             content.observations[kind, row].append(
                 observe_node(node, features, image.camera, cam_from_node, config, session_id)
             )
@@ -393,7 +391,10 @@ def _add_session(
     frames: Sequence[MappingFrame],
     content: _SessionContent,
 ) -> TopoMetricMap:
-    nodes = {kind: _merge_nodes(topomap, kind, content) for kind in topomap.kinds}
+    layers = {
+        kind: replace(layer, nodes=_merge_nodes(layer.nodes, kind, content))
+        for kind, layer in topomap.layers.items()
+    }
     summaries = [*topomap.summaries, *(node.summary for node in content.nodes[topomap.kind])]
     steps = [
         b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames)
@@ -401,8 +402,7 @@ def _add_session(
     return replace(
         topomap,
         summaries=summaries,
-        nodes=nodes.pop(topomap.kind),
-        other_kinds=nodes,
+        layers=layers,
         edges=sorted(
             {*topomap.edges, *_find_traversed_edges(topomap, summaries, frames)},
             key=lambda edge: (edge.source_id, edge.target_id),
@@ -415,11 +415,11 @@ def _add_session(
 
 
 def _merge_nodes(
-    topomap: TopoMetricMap, kind: str, content: _SessionContent
+    before: Sequence[TopoNode], kind: str, content: _SessionContent
 ) -> OverlaySequence[TopoNode]:
     """Return the existing nodes of a feature type with the session's statistics, followed by the
     new nodes."""
-    before, changed = topomap.nodes_of(kind), {}
+    changed = {}
     for (of_kind, row), observations in content.observations.items():
         if of_kind == kind:
             node = before[row]
@@ -438,11 +438,11 @@ def _find_traversed_edges(
     topomap: TopoMetricMap, summaries: Sequence[Any], frames: Sequence[MappingFrame]
 ) -> set[Edge]:
     """Return an edge for each transition of the session between two nodes."""
-    lambda_rot = topomap.config.nodes.lambda_rot
-    assert lambda_rot is not None
     poses = NodePoses.of([summary.world_from_cam for summary in summaries])
     nearest = [
-        summaries[int(node_distances(frame.world_from_cam, poses, lambda_rot).argmin())].node_id
+        summaries[
+            int(node_distances(frame.world_from_cam, poses, topomap.config.lambda_rot).argmin())
+        ].node_id
         for frame in frames
     ]
     return {Edge(source, target) for source, target in pairwise(nearest) if source != target}

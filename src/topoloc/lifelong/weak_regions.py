@@ -229,12 +229,11 @@ def find_weak_regions(
             progress("asking the map without the node", done, total)
 
     answers = localize_left_out(localizer, topomap, rows, config.beside, report_progress)
-    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
     has_opposite_view = _has_opposite_view(
-        poses, config.reach * topomap.config.d_thresh, config.min_turn_deg
+        topomap.node_poses, config.reach * topomap.config.d_thresh, config.min_turn_deg
     )
     nodes = [
-        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), poses, config)
+        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), config)
         for row in topomap.rows
     ]
     names = {session.session_id: session.name for session in topomap.sessions}
@@ -251,7 +250,6 @@ def _assess_node(
     row: Row,
     answer: LeaveOneOutResult | None,
     has_opposite_view: bool,
-    poses: NodePoses,
     config: WeakRegionsConfig,
 ) -> NodeQuality:
     node, summary = topomap.nodes[row], topomap.summaries[row]
@@ -262,9 +260,7 @@ def _assess_node(
         reasons.append("few_landmarks")
     if not has_opposite_view:
         reasons.append("one_direction")
-    if seen_share < config.min_seen_share and not _has_other_session(
-        topomap, row, poses, config.stood_by
-    ):
+    if seen_share < config.min_seen_share and not _has_other_session(topomap, row, config.stood_by):
         reasons.append("single_session")
     return NodeQuality(
         summary.node_id,
@@ -287,13 +283,11 @@ def _seen_share(node: TopoNode) -> float:
     return float(seen.mean()) if len(seen) else 0.0
 
 
-def _has_other_session(
-    topomap: TopoMetricMap, row: Row, poses: NodePoses, num_d_thresh: float
-) -> bool:
+def _has_other_session(topomap: TopoMetricMap, row: Row, num_d_thresh: float) -> bool:
     """Return whether a node of another session is within `num_d_thresh` times D_thresh."""
     summary = topomap.summaries[row]
     near = np.flatnonzero(
-        node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
+        node_distances(summary.world_from_cam, topomap.node_poses, topomap.config.lambda_rot)
         <= num_d_thresh * topomap.config.d_thresh
     )
     return any(topomap.summaries[int(other)].session_id != summary.session_id for other in near)

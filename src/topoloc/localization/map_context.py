@@ -45,28 +45,30 @@ class FeatureTypeContext:
     @staticmethod
     def of(
         topomap: TopoMetricMap,
+        kind: str,
         config: LocalizerConfig,
         coarse: CoarseLocalizer | None = None,
         weights: FittedWeights | None = None,
     ) -> FeatureTypeContext:
-        """Open a map for its first feature type.
+        """Open a map for a feature type.
 
         `weights` replaces the shipped weights. Raises the errors of `OpenMap`.
         """
-        opened = OpenMap(topomap, coarse or config.coarse)
+        opened = OpenMap(topomap, coarse or config.coarse, kind)
         c, weights = config.for_feature_type(opened.kind), weights or _select_weights(opened)
         rho = find_correlated_error_share(
-            topomap, c.guided, c.pose, c.correlated_errors, weights.shared_errors
+            topomap, kind, c.guided, c.pose, c.correlated_errors, weights.shared_errors
         )
         return FeatureTypeContext(opened, c, weights, rho)
 
 
 def _select_weights(opened: OpenMap) -> FittedWeights:
     """Return the shipped weights. Those of virtual views belong to their own feature type."""
-    weights, sides = load_fitted_weights(opened.kind.name), opened.topomap.sides
-    if sides is None or not sides.is_used_with(opened.kind.name):
-        return weights
-    return replace(weights, walls=load_fitted_weights(sides.kind).walls)
+    kind = opened.kind.name
+    weights, sides = load_fitted_weights(kind), opened.topomap.sides_for(kind)
+    return (
+        weights if sides is None else replace(weights, walls=load_fitted_weights(sides.kind).walls)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +99,7 @@ class MapContext:
         kinds, unavailable_types = select_feature_types(topomap, requested)
         types = tuple(
             FeatureTypeContext.of(
-                topomap.with_feature_type(kind),
-                config,
-                coarse,
-                weights if kind == kinds[0] else None,
+                topomap, kind, config, coarse, weights if kind == kinds[0] else None
             )
             for kind in kinds
         )

@@ -49,31 +49,39 @@ class OpenMap:
     Args:
         coarse: name of one of the map's coarse localizers, or any object with
             `CoarseLocalizer.rank`. None: the map's default.
+        kind: the feature type of the points that are used. None: the map's first.
 
     Raises:
         EmptyMapError: the map has no node.
+        FeatureTypeError: the map has no such feature type.
         MapError: the map has no such coarse localizer.
     """
 
-    def __init__(self, topomap: TopoMetricMap, coarse: str | CoarseLocalizer | None = None) -> None:
+    def __init__(
+        self,
+        topomap: TopoMetricMap,
+        coarse: str | CoarseLocalizer | None = None,
+        kind: str | None = None,
+    ) -> None:
         if len(topomap.summaries) == 0:
             raise EmptyMapError("the map has no nodes")
-        self.topomap = topomap
+        kind = kind or topomap.kind
+        self.topomap, self._nodes = topomap, topomap.find_layer(kind).nodes
         by_name = (
-            open_map_coarse_localizer(topomap, coarse or topomap.default_coarse)
+            open_map_coarse_localizer(topomap, coarse or topomap.default_coarse, kind)
             if coarse is None or isinstance(coarse, str)
             else None
         )
         self.coarse: CoarseLocalizer = coarse if by_name is None else by_name  # pyright: ignore[reportAttributeAccessIssue]
-        self.feature_config = topomap.config.features
-        self.kind = find_feature_type(self.feature_config.kind)
+        self.feature_config = topomap.config.feature_config_for(kind)
+        self.kind = find_feature_type(kind)
         self.node_ids = [summary.node_id for summary in topomap.summaries]
-        self.node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+        self.node_poses = topomap.node_poses
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
-        self._local_map = CachedNodes(lambda row: LocalMap.of_node(topomap.nodes[row]))
+        self._local_map = CachedNodes(lambda row: LocalMap.of_node(self._nodes[row]))
         self._moves = CachedNodes(self._find_moves)
         self._stored_moves = _stored_moves(topomap)
-        self.focal = _max_focal_length(topomap)
+        self.focal = self._max_focal_length()
         self._predicted_at_nodes: tuple[Camera, CachedNodes[Float32[np.ndarray, "n 5"]]] | None = (
             None
         )
@@ -93,12 +101,8 @@ class OpenMap:
     @cached_property
     def walls(self) -> VirtualViewIndex | None:
         """Return the map's virtual views, None if it has none for this feature type."""
-        sides = self.topomap.sides
-        return (
-            VirtualViewIndex(self.topomap, sides)
-            if sides is not None and sides.is_used_with(self.kind.name)
-            else None
-        )
+        sides = self.topomap.sides_for(self.kind.name)
+        return None if sides is None else VirtualViewIndex(self.topomap, sides)
 
     def cam_from_world(self, row: Row) -> Rigid3:
         """Return cam_from_world of a node."""
@@ -140,7 +144,7 @@ class OpenMap:
         return self._moves(row) if known is None else known.get(self.node_ids[row], _NO_MOVES)
 
     def _find_moves(self, row: Row) -> Float[np.ndarray, "k 4 4"]:
-        node = self.topomap.nodes[row]
+        node = self._nodes[row]
         found = [Rigid3(np.eye(3), shift) for shift in self._find_shifts(row)]
         found += [
             move
@@ -176,9 +180,10 @@ class OpenMap:
     @cached_property
     def _appearance_ranker(self) -> CoarseLocalizer | None:
         """Return the coarse localizer that needs features only, None if the map has none."""
+        kind = self.kind.name
         return (
-            open_map_coarse_localizer(self.topomap, SurfVlad.name)
-            if SurfVlad.name in self.topomap.coarse_models
+            open_map_coarse_localizer(self.topomap, SurfVlad.name, kind)
+            if SurfVlad.name in self.topomap.layers[kind].coarse_models
             else None
         )
 
@@ -195,6 +200,15 @@ class OpenMap:
         near = near[np.argsort(away[near], kind="stable")]
         spread = np.unique(np.linspace(0, len(near) - 1, NUM_NEIGHBOURS).round().astype(int))
         return find_repetition_shifts(node, self.local_map(as_rows(near[spread])))
+
+    def _max_focal_length(self) -> float:
+        """Return the focal length (pixels) of the finest mapping camera.
+
+        Each recording is assumed to have one camera.
+        """
+        summaries = self.topomap.summaries
+        first_rows = {summaries[row].session_id: row for row in reversed(range(len(summaries)))}
+        return max(self._nodes[row].camera.fx for row in first_rows.values())
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll."""
@@ -230,17 +244,6 @@ def _stored_moves(topomap: TopoMetricMap) -> Mapping[NodeId, Float[np.ndarray, "
         if known is not None and known.digest == digest_of(topomap.summaries)
         else None
     )
-
-
-def _max_focal_length(topomap: TopoMetricMap) -> float:
-    """Return the focal length (pixels) of the finest mapping camera.
-
-    Each recording is assumed to have one camera.
-    """
-    first_rows = {
-        topomap.summaries[row].session_id: row for row in reversed(range(len(topomap.summaries)))
-    }
-    return max(topomap.nodes[row].camera.fx for row in first_rows.values())
 
 
 QUARTER_TURN = Rigid3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))

@@ -22,6 +22,7 @@ from topoloc.features.feature_types import find_feature_type
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.mapping.config import MapConfig
+from topoloc.mapping.contents import Layer
 from topoloc.mapping.entries import Edge, PlaceImage, TopoNode
 from topoloc.mapping.landmarks import Observations
 from topoloc.mapping.mapping_frames import (
@@ -104,18 +105,19 @@ def build_map(
     locator = PointLocator(frames, config)
     node_config = _resolve_node_config(frames, locator, config)
     drafts = _draft_nodes(frames, locator, node_config, config, progress)
-    place_images, lights, coarse = _process_mapping_images(
+    place_images, lights, models = _process_mapping_images(
         frames, drafts, node_config, config, progress
     )
     of_kind, sides = _finish_nodes(drafts, config)
-    nodes = of_kind.pop(config.features.kind)
+    layers = {
+        kind: Layer(nodes, {models[kind].name: models[kind]}) for kind, nodes in of_kind.items()
+    }
     poses_from = poses_from or [find_pose_source(sequence) for sequence in sequences]
     return TopoMetricMap(
-        summaries=[node.summary for node in nodes],
-        nodes=nodes,
+        summaries=[node.summary for node in of_kind[config.features.kind]],
+        layers=layers,
         edges=_connect_nodes(frames, [image.node_id for image in place_images]),
         place_images=place_images,
-        coarse_models={model.name: model for model in coarse},
         config=replace(config, nodes=node_config),
         length_m=_compute_trajectory_length(frames),
         sides=collect_virtual_nodes(sides, config.virtual_view_type, config.sides),
@@ -124,7 +126,6 @@ def build_map(
             for k, sequence in enumerate(sequences)
         ],
         edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
-        other_kinds=of_kind,
     )
 
 
@@ -224,7 +225,7 @@ def _process_mapping_images(
     node_config: NodeConfig,
     config: BuildConfig,
     progress: Progress,
-) -> tuple[list[PlaceImage], list[Illumination], list[CoarseModel]]:
+) -> tuple[list[PlaceImage], list[Illumination], dict[str, CoarseModel]]:
     """Process every mapping image after the nodes are drafted.
 
     Each image is labelled with its nearest node and observes the points of near nodes. Its
@@ -265,18 +266,8 @@ def _process_mapping_images(
         kind: (words[kind], vlads[kind], node_ids, config.vlad_config_for(kind), cells[kind])
         for kind in config.kinds
     }
-    first, models = (
-        config.features.kind,
-        {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()},
-    )
-    return (
-        images,
-        lights,
-        [
-            model if kind == first else replace(model, name=f"{model.name}@{kind}")
-            for kind, model in models.items()
-        ],
-    )
+    models = {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()}
+    return images, lights, models
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,45 +39,56 @@ _MAP_ID = b"map id"
 
 @no_type_check  # a type check at run time would read entries from the file
 @dataclass(frozen=True, eq=False)
+class Layer:
+    """Hold the part of a map that belongs to one feature type.
+
+    - `nodes[i]` is the node of row i with its points of this type.
+    - `coarse_models` holds coarse localizers by name. Those that need no local features stand in
+      the first layer only.
+    - `shared_errors` is None if not measured.
+    """
+
+    nodes: Sequence[TopoNode]
+    coarse_models: Mapping[str, CoarseModel] = field(default_factory=dict)
+    shared_errors: CorrelatedErrors | None = None
+
+
+@no_type_check  # as for layers
+@dataclass(frozen=True, eq=False)
 class MapContents:
     """Hold all contents of a map.
 
-    - `summaries[i]` describes `nodes[i]`. Their ids increase.
+    - `summaries[i]` describes the node of row i. Their ids increase.
+    - `layers` holds the points of the nodes by feature type.
     - `config` is the resolved configuration of the build.
     - `length_m` is the mapped trajectory length in metres.
     - `default_coarse` names the default coarse localizer.
-    - `shared_errors` and `repetitions` are None if not measured.
+    - `repetitions` is None if not measured.
     - `sides` holds the virtual nodes. None if no mapping image is wide enough to show the walls
       beside the trajectory.
     - `edits` begins with the build.
     - `map_id` stays the same through all edits. None until the map is saved, and in older files.
     - `georeference` is the pose of the map's world on earth, if known.
-    - `other_kinds` holds the same nodes with points of further feature types, by name.
-    - `other_shared_errors` holds the shared errors of these types.
     """
 
     summaries: Sequence[NodeSummary]
-    nodes: Sequence[TopoNode]
+    layers: Mapping[str, Layer]
     edges: Sequence[Edge]
     place_images: Sequence[PlaceImage]
-    coarse_models: Mapping[str, CoarseModel]
     config: MapConfig = field(default_factory=MapConfig)
     length_m: float = 0.0
     default_coarse: str = "surf-vlad"
-    shared_errors: CorrelatedErrors | None = None
     repetitions: Repetitions | None = None
     sides: VirtualNodes | None = None
     sessions: Sequence[Session] = ()
     edits: Sequence[Edit] = ()
     next_ids: NextIds = NextIds()
-    other_kinds: Mapping[str, Sequence[TopoNode]] = field(default_factory=dict)
-    other_shared_errors: Mapping[str, CorrelatedErrors] = field(default_factory=dict)
     map_id: str | None = None
     georeference: Georeference | None = None
 
     @property
     def kind(self) -> str:
-        """Return the first feature type of the map, which its nodes and queries use."""
+        """Return the first feature type of the map, which queries use first."""
         return self.config.features.kind
 
     @property
@@ -102,15 +113,24 @@ class MapContents:
         """The map's id, 16 hexadecimal digits, see `get_map_id`."""
         return get_map_id(self)
 
-    def nodes_of(self, kind: str):  # no return type: a type check at run time would read an entry
-        """Return the nodes with their points of one feature type. Raises KeyError if the map has no
-        such type."""
-        return self.nodes if kind == self.kind else self.other_kinds[kind]
-
     @property
     def kinds(self) -> list[str]:
-        """Return all feature types of the map, that of the nodes first."""
-        return [self.kind, *sorted(self.other_kinds)]
+        """Return all feature types of the map, the first type first."""
+        return [self.kind, *sorted(self.layers.keys() - {self.kind})]
+
+    @property
+    def first_layer(self) -> Layer:
+        """Return the layer of the first feature type."""
+        return self.layers[self.kind]
+
+    @property
+    def nodes(self) -> Sequence[TopoNode]:
+        """Return the nodes with their points of the first feature type."""
+        return self.first_layer.nodes
+
+    def sides_for(self, kind: str) -> VirtualNodes | None:
+        """Return the virtual nodes that are queried with this feature type, if any."""
+        return self.sides if self.sides is not None and self.sides.is_used_with(kind) else None
 
 
 def get_map_id(contents: MapContents) -> str:

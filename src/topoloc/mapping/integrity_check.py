@@ -4,6 +4,7 @@ Also list its coarse localizers."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +65,8 @@ def _check_rows(file: MapFile) -> Iterator[str]:
 
 
 def _check_entries(topomap: TopoMetricMap) -> Iterator[str]:
-    yield from _check_each(topomap.nodes, _read_session_statistics)
-    for nodes in topomap.other_kinds.values():
-        yield from _check_each(nodes, _read_session_statistics)
+    for layer in topomap.layers.values():
+        yield from _check_each(layer.nodes, _read_session_statistics)
     yield from _check_each(topomap.place_images, lambda image: topomap.row_of(image.node_id))
     if topomap.repetitions is not None:
         moves = topomap.repetitions.moves
@@ -81,8 +81,9 @@ def _check_entries(topomap: TopoMetricMap) -> Iterator[str]:
                 f"an edge from node {edge.source_id} to node {edge.target_id}, one of which is"
                 " missing"
             )
-    for name in topomap.coarse_models:
-        yield from _try_read(lambda name=name: open_map_coarse_localizer(topomap, name))[1]
+    for kind, layer in topomap.layers.items():
+        for name in layer.coarse_models:
+            yield from _try_read(partial(open_map_coarse_localizer, topomap, name, kind))[1]
     if topomap.sides is not None:
         yield from _check_each(topomap.sides.nodes, lambda node: None)
         sides = topomap.sides.coarse_models

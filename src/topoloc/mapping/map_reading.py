@@ -19,7 +19,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.json_data import decode_json
 from topoloc.mapping.config import CONFIG_VERSION, MapConfig, config_from_text
-from topoloc.mapping.contents import MapContents, NextIds
+from topoloc.mapping.contents import Layer, MapContents, NextIds
 from topoloc.mapping.entries import (
     CorrelatedErrors,
     Edge,
@@ -32,7 +32,7 @@ from topoloc.mapping.entries import (
 from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
 from topoloc.mapping.map_file import MapFile
 from topoloc.mapping.point_encoding import points_from_row
-from topoloc.mapping.schema import SORT_COLUMNS, VIRTUAL_PREFIX
+from topoloc.mapping.schema import SORT_COLUMNS, VIRTUAL_PREFIX, layer_suffix, split_layer_name
 from topoloc.mapping.sessions import Edit, Session
 from topoloc.mapping.validation import (
     MAX_POINTS,
@@ -99,23 +99,16 @@ def _read_contents(file: MapFile) -> MapContents:
         )
     return MapContents(
         summaries=_lazy_summaries(file),
-        nodes=_lazy_nodes(file, config.features.kind),
+        layers={kind: _read_layer(file, kind, config.features.kind) for kind in kinds},
         edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
         place_images=_LazySequence(
             partial(file.count, "place_images"), partial(_read_place_image, file)
         ),
-        coarse_models=_LazyMapping(file, "coarse_models", _model_from_row),
         config=config,
         length_m=_read_length(facts["length_m"]),
         default_coarse=decode_json(
             facts.get("default_coarse", '"surf-vlad"'), str, CorruptDataError, "default_coarse"
         ),
-        shared_errors=_read_correlated_errors(facts, "shared_errors"),
-        other_shared_errors={
-            kind: found
-            for kind in kinds
-            if (found := _read_correlated_errors(facts, f"shared_errors@{kind}"))
-        },
         repetitions=(
             Repetitions(facts["repetitions"], _LazyMapping(file, "repetitions", _moves_from_row))
             if "repetitions" in facts
@@ -131,11 +124,6 @@ def _read_contents(file: MapFile) -> MapContents:
         georeference=(
             Georeference.from_json(facts["georeference"]) if "georeference" in facts else None
         ),
-        other_kinds={
-            kind: _lazy_nodes(file, kind, is_default=False)
-            for kind in kinds
-            if kind != config.features.kind
-        },
     )
 
 
@@ -164,6 +152,17 @@ def _read_feature_types(facts: Mapping[str, str], config: MapConfig) -> list[str
     for kind in kinds:
         find_feature_type(kind)
     return kinds
+
+
+# No return type, see below.
+def _read_layer(file: MapFile, kind: str, first: str):
+    """Return the layer of a feature type, given the map's first type."""
+    suffix = layer_suffix(kind, first)
+    return Layer(
+        _lazy_nodes(file, kind, is_default=kind == first),
+        _LazyMapping(file, "coarse_models", _model_from_row, suffix),
+        _read_correlated_errors(file.facts, f"shared_errors{suffix}"),
+    )
 
 
 def _read_map_id(facts: Mapping[str, str]) -> str | None:
@@ -398,17 +397,29 @@ def _read_place_image(file: MapFile, row: int) -> PlaceImage:
 
 
 class _LazyMapping(Mapping[K, V]):
-    """Show rows of a table by their key, and read each when accessed."""
+    """Show rows of a table by their key, or those of one layer by the names in it. Each is read
+    when accessed."""
 
-    def __init__(self, file: MapFile, table: str, read: Callable[[dict[str, Any]], V]) -> None:
-        self._file, self._table, self._read = file, table, read
+    def __init__(
+        self,
+        file: MapFile,
+        table: str,
+        read: Callable[[dict[str, Any]], V],
+        suffix: str | None = None,
+    ) -> None:
+        self._file, self._table, self._read, self._suffix = file, table, read, suffix
         self._key = SORT_COLUMNS[table]
 
-    def _keys(self) -> dict[K, None]:
-        return self._file.cached(
+    def _keys(self) -> dict[Any, Any]:
+        """Return the stored key of each key."""
+        stored = self._file.cached(
             self._table,
-            lambda: {row[self._key]: None for row in self._file.rows(self._table, (self._key,))},
+            lambda: [row[self._key] for row in self._file.rows(self._table, (self._key,))],
         )
+        if self._suffix is None:
+            return {key: key for key in stored}
+        named = ((*split_layer_name(key), key) for key in stored)
+        return {name: key for name, suffix, key in named if suffix == self._suffix}
 
     def __len__(self) -> int:
         return len(self._keys())
@@ -417,20 +428,17 @@ class _LazyMapping(Mapping[K, V]):
         return iter(self._keys())
 
     def __getitem__(self, key: K) -> V:
-        if key not in self._keys():
-            raise KeyError(key)
+        stored = self._keys()[key]
         with self._file.read_connection():
-            return self._read(
-                _require_row(
-                    self._file.row(self._table, **{self._key: key}), f"{self._table} {key}"
-                )
-            )
+            row = self._file.row(self._table, **{self._key: stored})
+            return self._read(_require_row(row, f"{self._table} {stored}"))
 
 
 def _model_from_row(row: dict[str, Any]) -> CoarseModel:
     name, what = row["name"], f"coarse localizer {row['name']}"
     settings = _decode_object(row["settings"], what)
-    return CoarseModel(name, settings, arrays_from_npz(row["arrays"], what))
+    arrays = arrays_from_npz(row["arrays"], what)
+    return CoarseModel(split_layer_name(name)[0], settings, arrays)
 
 
 def _moves_from_row(row: dict[str, Any]) -> np.ndarray:

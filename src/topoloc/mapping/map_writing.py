@@ -13,7 +13,7 @@ import os
 import sqlite3
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from topoloc.mapping.schema import (
     VIRTUAL_PREFIX,
     compute_checksum,
     create_table_statement,
+    layer_suffix,
 )
 from topoloc.mapping.sessions import Session, sessions_from_names
 from topoloc.recordings.atomic import atomic_write
@@ -114,8 +115,10 @@ class _Writer:
         for edge in sorted(topomap.edges, key=lambda edge: (edge.source_id, edge.target_id)):
             self._insert("edges", edge.source_id, edge.target_id)
         next_image = self._write_images(topomap, ids)
-        for model in sorted(topomap.coarse_models.values(), key=lambda model: model.name):
-            self._insert_model(model)
+        for kind, layer in topomap.layers.items():
+            for model in layer.coarse_models.values():
+                suffix = layer_suffix(kind, topomap.kind)
+                self._insert_model(replace(model, name=model.name + suffix))
         if topomap.sides is not None:
             virtual_view_type = topomap.sides.kind
             for (of_side,) in parallel_map(
@@ -133,10 +136,9 @@ class _Writer:
         self._database.execute("COMMIT")
 
     def _write_nodes(self, topomap: MapContents, session_ids: Mapping[str, int]) -> None:
-        others = sorted(topomap.other_kinds.items())
         read = (
-            [(node, topomap.kind), *((nodes[row], kind) for kind, nodes in others)]
-            for row, node in enumerate(topomap.nodes)
+            [(topomap.layers[kind].nodes[row], kind) for kind in topomap.kinds]
+            for row in range(len(topomap.nodes))
         )
         for (node, kind, blobs), *of_others in parallel_map(_encode_nodes, read):
             self._insert_node(node, kind, blobs, session_ids)
@@ -177,7 +179,7 @@ class _Writer:
         )
         facts = {
             "config": config_to_text(topomap.config),
-            "kinds": json.dumps([topomap.kind, *sorted(topomap.other_kinds)]),
+            "kinds": json.dumps(topomap.kinds),
             "length_m": json.dumps(topomap.length_m),
             "default_coarse": json.dumps(topomap.default_coarse),
             "next_ids": json.dumps(
@@ -199,10 +201,10 @@ class _Writer:
             facts["kind_of_sides"] = json.dumps(topomap.sides.kind)
         if topomap.georeference is not None:
             facts["georeference"] = json.dumps(topomap.georeference.to_json())
-        if topomap.shared_errors is not None:
-            facts["shared_errors"] = json.dumps(asdict(topomap.shared_errors))
-        for kind, errors in topomap.other_shared_errors.items():
-            facts[f"shared_errors@{kind}"] = json.dumps(asdict(errors))
+        for kind, layer in topomap.layers.items():
+            if layer.shared_errors is not None:
+                key = f"shared_errors{layer_suffix(kind, topomap.kind)}"
+                facts[key] = json.dumps(asdict(layer.shared_errors))
         if topomap.repetitions is not None:
             facts["repetitions"] = topomap.repetitions.digest
         for key, value in sorted(facts.items()):

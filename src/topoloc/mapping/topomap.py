@@ -21,7 +21,7 @@ import numpy as np
 
 from topoloc.errors import FeatureTypeError, MapError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.contents import MapContents, get_map_id
+from topoloc.mapping.contents import Layer, MapContents, get_map_id
 from topoloc.mapping.entries import (
     CorrelatedErrors,
     Edge,
@@ -50,6 +50,7 @@ __all__ = [
     "CorrelatedErrors",
     "Edge",
     "Edit",
+    "Layer",
     "NodeSummary",
     "PlaceImage",
     "Repetitions",
@@ -95,6 +96,11 @@ class TopoMetricMap(MapContents):
         """Return the rows of all nodes."""
         return as_rows(range(len(self.summaries)))
 
+    @cached_property
+    def node_poses(self) -> NodePoses:
+        """Return the poses of all nodes as arrays."""
+        return NodePoses.of([summary.world_from_cam for summary in self.summaries])
+
     def find_neighbours(self, poses: list[Rigid3], max_neighbours: int) -> list[list[int]]:
         """Return for each of these poses the nearest others of them, by the distance of Eq. 1.
 
@@ -111,30 +117,18 @@ class TopoMetricMap(MapContents):
     def _rows(self) -> dict[NodeId, Row]:
         return {summary.node_id: Row(row) for row, summary in enumerate(self.summaries)}
 
-    def with_feature_type(self, kind: str) -> TopoMetricMap:
-        """Return the map reduced to one of its feature types, including its virtual nodes. The
-        first type returns the map itself.
-
-        Raises:
-            FeatureTypeError: the map has no features of this type.
-        """
-        if kind == self.kind:
-            return self
-        if kind not in self.other_kinds:
+    def find_layer(self, kind: str) -> Layer:
+        """Return the layer of a feature type. Raises FeatureTypeError if the map has none."""
+        if kind not in self.layers:
             raise FeatureTypeError(
                 f"the map holds no features {kind} (it holds: {', '.join(self.kinds)})"
             )
-        return replace(
-            self,
-            nodes=self.other_kinds[kind],
-            config=replace(
-                self.config, features=self.config.feature_config_for(kind), other_kinds=()
-            ),
-            shared_errors=self.other_shared_errors.get(kind),
-            sides=self.sides if self.sides is not None and self.sides.is_used_with(kind) else None,
-            other_kinds={},
-            other_shared_errors={},
-        )
+        return self.layers[kind]
+
+    def with_first_layer(self, **changes: Any) -> TopoMetricMap:
+        """Return the map with fields of its first layer changed."""
+        first = replace(self.first_layer, **changes)
+        return replace(self, layers={**self.layers, self.kind: first})
 
     def save(self, path: str | Path) -> None:
         """Write the map file atomically. Raises MapError."""
@@ -185,8 +179,11 @@ def _wrap_contents(read: tuple[MapContents, MapFile]) -> TopoMetricMap:
     return topomap
 
 
-def open_map_coarse_localizer(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
-    """Open a map's coarse localizer, which identifies nodes by row.
+def open_map_coarse_localizer(
+    topomap: TopoMetricMap, name: str, kind: str | None = None
+) -> CoarseLocalizer:
+    """Open a map's coarse localizer for a feature type, by default the first. It identifies nodes
+    by row.
 
     If the sessions have several illuminations, descriptor localizers reduce the weight of
     differences between these.
@@ -194,15 +191,13 @@ def open_map_coarse_localizer(topomap: TopoMetricMap, name: str) -> CoarseLocali
     Raises:
         MapError: the map has no localizer of this name, or it is damaged.
     """
-    if (of_kind := f"{name}@{topomap.kind}") in topomap.coarse_models:
-        name = of_kind
-    if name not in topomap.coarse_models:
-        available = ", ".join(name for name in topomap.coarse_models if "@" not in name) or "none"
+    own, first = (topomap.layers[one].coarse_models for one in (kind or topomap.kind, topomap.kind))
+    model = own.get(name) or first.get(name)
+    if model is None:
+        available = ", ".join(first) or "none"
         raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
     coarse = open_coarse_localizer(
-        node_ids_to_rows(
-            topomap.coarse_models[name], [summary.node_id for summary in topomap.summaries]
-        )
+        node_ids_to_rows(model, [summary.node_id for summary in topomap.summaries])
     )
     lights = (
         find_node_illumination_groups(topomap.summaries, topomap.sessions)

@@ -116,14 +116,15 @@ def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
         MapError: the model is damaged, or this version does not support it.
         MissingExtraError: the model needs torch, which is not installed.
     """
-    name = model.name.partition("@")[0]  # the feature type may follow
-    if name not in COARSE_NAMES:
+    if model.name not in COARSE_NAMES:
         raise MapError(
             f"the map's coarse localizer {model.name!r} is not known to this version (known:"
             f" {', '.join(COARSE_NAMES)})"
         )
     try:
-        return importlib.import_module(f"topoloc.retrieval.{_MODULES[name]}").open_model(model)
+        return importlib.import_module(f"topoloc.retrieval.{_MODULES[model.name]}").open_model(
+            model
+        )
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise

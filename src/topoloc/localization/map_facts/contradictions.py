@@ -21,7 +21,7 @@ from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.integrity_check import find_map_damage
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
 
@@ -86,10 +86,11 @@ def find_contradictions(
         MapError: the map cannot be read.
     """
     config = config or ContradictionsConfig()
-    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    poses = topomap.node_poses
+    errors = topomap.first_layer.shared_errors
     rho = (
-        topomap.shared_errors.rho
-        if topomap.shared_errors is not None
+        errors.rho
+        if errors is not None
         else load_fitted_weights(topomap.kind).shared_errors.unknown
     )
     group, found = list(range(len(topomap.summaries))), []

@@ -27,7 +27,7 @@ from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, est
 from topoloc.localization.fitted_weights import CorrelatedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
-from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
+from topoloc.mapping.nodes import compute_nodes_digest, node_distances
 from topoloc.mapping.topomap import CorrelatedErrors, TopoMetricMap, TopoNode
 from topoloc.node_ids import as_rows
 
@@ -62,6 +62,7 @@ def covariance_inflation(num_inliers: int, rho: float) -> float:
 
 def find_correlated_error_share(
     topomap: TopoMetricMap,
+    kind: str,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     config: CorrelatedErrorsConfig,
@@ -70,48 +71,52 @@ def find_correlated_error_share(
     """Return rho of the map, from its file if the digest matches, and measured otherwise.
 
     Args:
+        kind: the feature type.
         guided, pose: settings of query matching and pose estimation.
     """
-    known = topomap.shared_errors
+    known = topomap.layers[kind].shared_errors
     if known is not None and known.digest == _digest(topomap, guided, pose, config, weights):
         return known.rho
-    return measure_correlated_error_share(topomap, guided, pose, config, weights)
+    return measure_correlated_error_share(topomap, kind, guided, pose, config, weights)
 
 
 def measure_stored_error_share(
     topomap: TopoMetricMap,
+    kind: str,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> CorrelatedErrors:
     """Measure rho and return it with its digest, to be stored in the map."""
-    rho = measure_correlated_error_share(topomap, guided, pose, config, weights)
+    rho = measure_correlated_error_share(topomap, kind, guided, pose, config, weights)
     return CorrelatedErrors(rho, _digest(topomap, guided, pose, config, weights))
 
 
 def measure_correlated_error_share(
     topomap: TopoMetricMap,
+    kind: str,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     config: CorrelatedErrorsConfig,
     weights: CorrelatedErrorWeights,
 ) -> float:
     """Measure rho of the map (see the module docstring)."""
-    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    poses = topomap.node_poses
     lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
+    nodes = topomap.layers[kind].nodes
     rows = np.unique(
         np.linspace(0, len(topomap.summaries) - 1, config.num_nodes).round().astype(int)
     )
     for min_distance in config.min_distances:
         rhos = []
         for row in as_rows(rows):
-            node = topomap.nodes[row]
+            node = nodes[row]
             distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
             order = np.argsort(distances, kind="stable")
             helpers = order[distances[order] > min_distance * d_thresh][: config.num_helpers]
             rho = _error_share_of_node(
-                node, [topomap.nodes[int(k)] for k in helpers], guided, pose, config.min_inliers
+                node, [nodes[int(k)] for k in helpers], guided, pose, config.min_inliers
             )
             if rho is not None:
                 rhos.append(rho)

@@ -90,21 +90,23 @@ def with_map_statistics(
 
     A localizer then reads them instead of measuring them.
     """
-    topomap = replace(topomap, shared_errors=None, other_shared_errors={}, repetitions=None)
-    errors = {kind: _measure_error_share(topomap.with_feature_type(kind)) for kind in topomap.kinds}
-    topomap = replace(topomap, shared_errors=errors.pop(topomap.kind), other_shared_errors=errors)
-    return with_repetitions(topomap, progress)
+    layers = {
+        kind: replace(layer, shared_errors=_measure_error_share(topomap, kind))
+        for kind, layer in topomap.layers.items()
+    }
+    return with_repetitions(replace(topomap, layers=layers, repetitions=None), progress)
 
 
-def _measure_error_share(topomap: TopoMetricMap) -> CorrelatedErrors:
-    """Measure rho of a map for its first feature type."""
-    config_of_type = LocalizerConfig().for_feature_type(find_feature_type(topomap.kind))
+def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
+    """Measure rho of a map for a feature type."""
+    config_of_type = LocalizerConfig().for_feature_type(find_feature_type(kind))
     return measure_stored_error_share(
         topomap,
+        kind,
         config_of_type.guided,
         config_of_type.pose,
         config_of_type.correlated_errors,
-        load_fitted_weights(topomap.kind).shared_errors,
+        load_fitted_weights(kind).shared_errors,
     )
 
 
