@@ -22,15 +22,17 @@ import cv2
 import numpy as np
 import tyro
 
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import match_features
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.config import MetricPointsConfig
+from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.recordings.open import open_sequence
 

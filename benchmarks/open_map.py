@@ -25,7 +25,8 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import Edge, Layer, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
-from topoloc.retrieval.vlad import SurfVlad, VladConfig
+from topoloc.retrieval.coarse import VladConfig
+from topoloc.retrieval.vlad import SurfVlad
 
 NUM_POINTS = 800
 IMAGES_A_NODE = 3

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tiny_world import LEVEL_FROM_CAM, Panel, render
+from topoloc.features.config import VirtualViewConfig
 from topoloc.features.features import Features
-from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_virtual_views
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 

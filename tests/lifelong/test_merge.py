@@ -21,8 +21,8 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
-from topoloc.mapping.contents import Layer
 from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.topomap import Layer
 from topoloc.recordings.recording import SequenceView
 
 OTHER_WORLD = Rigid3(exp_so3(np.array([0.1, 0.4, -0.8])), np.array([-4.0, 7.0, 1.0]))

@@ -15,7 +15,7 @@ import topoloc
 from topoloc.errors import EmptyMapError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.build import BuildConfig, build_map
-from topoloc.mapping.landmarks import LandmarkConfig
+from topoloc.mapping.config import LandmarkConfig
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.mapping.topomap import Edge, TopoMetricMap, TopoNode
 from topoloc.recordings.recording import read_left_frame

@@ -9,18 +9,14 @@ import numpy as np
 
 import topoloc
 from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.config import LandmarkConfig
 from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.landmark_statistics import (
     AccumulatedStatistics,
     LandmarkStatistics,
     merge_count_statistics,
 )
-from topoloc.mapping.landmarks import (
-    LandmarkConfig,
-    Observations,
-    compute_session_statistics,
-    refine_points,
-)
+from topoloc.mapping.landmarks import Observations, compute_session_statistics, refine_points
 from topoloc.mapping.topomap import TopoMetricMap
 
 

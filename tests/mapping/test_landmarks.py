@@ -12,7 +12,8 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.geometry.stereo import ray_covariances
-from topoloc.mapping.landmarks import LandmarkConfig, Observations, observe_points, refine_points
+from topoloc.mapping.config import LandmarkConfig
+from topoloc.mapping.landmarks import Observations, observe_points, refine_points
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
 CONFIG = LandmarkConfig()

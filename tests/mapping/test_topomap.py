@@ -18,9 +18,10 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
+from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.entries import Edge, VirtualNodes
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoMetricMap, node_ids_to_rows
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.recording import SequenceView
 from topoloc_training.coarse_training import in_ids
 

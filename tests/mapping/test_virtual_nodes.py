@@ -18,20 +18,20 @@ from hypothesis import strategies as st
 from built_corridor import WalkAhead, built_corridor, corridor
 from tiny_world import render
 from topoloc.errors import MapError
+from topoloc.features.config import VirtualViewConfig
 from topoloc.features.extraction import FeatureConfig
-from topoloc.features.virtual_views import VirtualViewConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.mapping.config import VirtualNodesConfig
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.mapping.topomap import NodeSummary, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.mapping.virtual_nodes import (
-    VirtualNodesConfig,
     collect_virtual_nodes,
     create_virtual_nodes,
     select_virtual_view_nodes,
 )
-from topoloc.points.metric_points import MetricPointsConfig
+from topoloc.points.config import MetricPointsConfig
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.retrieval.vlad import SurfVlad
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from topoloc.points.config import MetricPointsConfig
 from topoloc.points.epipolar_kernels import match_in_ranges
-from topoloc.points.metric_points import MetricPointsConfig
 
 WIDTH, HEIGHT = 320, 200
 

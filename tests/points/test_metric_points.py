@@ -13,12 +13,8 @@ from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.metric_points import (
-    MetricPoints,
-    MetricPointsConfig,
-    keypoint_sigmas,
-    locate_points,
-)
+from topoloc.points.config import MetricPointsConfig
+from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
 
 CONFIG = MetricPointsConfig()

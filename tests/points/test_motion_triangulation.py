@@ -13,9 +13,9 @@ from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.points.metric_points import MetricPoints, MetricPointsConfig, keypoint_sigmas
+from topoloc.points.config import MetricPointsConfig, MotionTriangulationConfig
+from topoloc.points.metric_points import MetricPoints, keypoint_sigmas
 from topoloc.points.motion_triangulation import (
-    MotionTriangulationConfig,
     SourceImage,
     compute_median_step,
     select_source_images,

@@ -13,14 +13,14 @@ from topoloc.errors import MapError
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
+from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.topomap import node_ids_to_rows
 from topoloc.recordings.image_io import read_image, to_grey
 from topoloc.retrieval import descriptor_index
 from topoloc.retrieval.cell_grid import CellGrid
-from topoloc.retrieval.coarse import open_coarse_localizer
+from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer
 from topoloc.retrieval.descriptor_kernels import max_shifted_products
-from topoloc.retrieval.vlad import SurfVlad, VladConfig, append_positions, learn_words, vlad
+from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words, vlad
 
 NO_IMAGE = np.zeros((6, 8), np.uint8)
 ROWS, COLUMNS, CHANNELS = 4, 6, 16

@@ -16,10 +16,9 @@ from topoloc.features.features import Features
 from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.recordings.image_io import to_grey
-from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse_localizer
+from topoloc.retrieval.coarse import CoarseLocalizer, VladConfig, open_coarse_localizer
 from topoloc.retrieval.vlad import (
     SurfVlad,
-    VladConfig,
     append_positions,
     learn_words,
     learn_words_from_parts,

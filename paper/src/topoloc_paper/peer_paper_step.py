@@ -24,7 +24,8 @@ from topoloc.features.patch_normalization import PatchNormalizationConfig, patch
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.config import MetricPointsConfig
+from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.image_io import to_grey

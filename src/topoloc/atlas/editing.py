@@ -22,7 +22,6 @@ from topoloc.atlas.manifest import TILES, Manifest, StoredFile, Tile, check_tile
 from topoloc.atlas.store import MANIFEST, Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.geometry.geodesy import Georeference
-from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.kept_files import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import temporary_file
@@ -286,7 +285,7 @@ def _describe_tile(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[s
         map=_UNKNOWN,
         places=_UNKNOWN,
         vocabularies=vocabularies,
-        map_id=get_map_id(topomap),
+        map_id=topomap.id,
         map_version=topomap.version,
         kinds=tuple(topomap.kinds),
         num_nodes=len(topomap.summaries),

@@ -11,34 +11,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from topoloc.bounds import Between
+from topoloc.features.config import VirtualViewConfig
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-
-
-@dataclass(frozen=True)
-class VirtualViewConfig:
-    """Hold the field of view of the virtual views. Tangents are of angles off the virtual camera's
-    axis: 1 is 45 degrees ahead."""
-
-    farthest: Annotated[float, Between(0.1, 10)] = 3.0
-    """Largest tangent ahead. Walls farther ahead are too slanted to be seen well."""
-    half_height: Annotated[float, Between(0.1, 10)] = 0.9
-    """Largest tangent up and down."""
-    nearest: Annotated[float, Between(0.1, 10)] = 1.5
-    """A camera whose field of view begins beyond this tangent is too narrow and has no virtual
-    views."""
-    max_side_px: Annotated[int, Between(64, 4096)] = 700
-    """Maximum length of the longer side of a virtual view."""
-    margin_px: Annotated[int, Between(0, 1000)] = 8
-    """Features nearer than this to the border of the rendered area are dropped."""
 
 
 @dataclass(frozen=True, eq=False)

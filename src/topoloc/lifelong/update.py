@@ -48,12 +48,12 @@ from topoloc.mapping.mapping_frames import (
 )
 from topoloc.mapping.node_drafts import NodeDraft, create_node_draft, finish_node, observe_draft
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.sessions import Illumination, Session, average_illumination, find_source_path
+from topoloc.mapping.sessions import Illumination, Session, average_illumination
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.recording import SequenceView, find_source_path
 from topoloc.tracking.tracker import Tracker
 
 _NUM_IMAGES_COMPARED = 3

@@ -22,7 +22,6 @@ from topoloc.localization.query_session import QuerySession
 from topoloc.localization.result import Localization, NotLocalized, R
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
-from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseLocalizer
@@ -108,7 +107,7 @@ class MapContext:
     @cached_property
     def map_id(self) -> str:
         """Return the map's id, 16 hexadecimal digits."""
-        return get_map_id(self.topomap)
+        return self.topomap.id
 
     @property
     def first(self) -> FeatureTypeContext:

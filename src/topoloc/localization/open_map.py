@@ -27,9 +27,10 @@ from topoloc.localization.map_facts.repetition import (
     has_repetitions,
 )
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
+from topoloc.mapping.coarse_models import open_map_coarse_localizer
 from topoloc.mapping.node_cache import CachedNodes
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoMetricMap, TopoNode, open_map_coarse_localizer
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad

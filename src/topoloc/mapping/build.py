@@ -22,7 +22,6 @@ from topoloc.features.feature_types import find_feature_type
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.contents import Layer
 from topoloc.mapping.entries import Edge, PlaceImage, TopoNode
 from topoloc.mapping.landmarks import Observations
 from topoloc.mapping.mapping_frames import (
@@ -42,19 +41,12 @@ from topoloc.mapping.node_drafts import (
 )
 from topoloc.mapping.nodes import NearestNodeSearch, NodeConfig, NodePoses, select_node_frames
 from topoloc.mapping.schema import SCHEMA_VERSION
-from topoloc.mapping.sessions import (
-    Edit,
-    Illumination,
-    Session,
-    average_illumination,
-    find_pose_source,
-    find_source_path,
-    today,
-)
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.sessions import Edit, Illumination, Session, average_illumination, today
+from topoloc.mapping.topomap import Layer, TopoMetricMap
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.recording import find_pose_source, find_source_path
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 

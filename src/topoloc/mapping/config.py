@@ -6,8 +6,9 @@ import json
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any
 
-from topoloc.bounds import Between, parse_settings
+from topoloc.bounds import Above, AtLeast, Between, parse_settings
 from topoloc.errors import ConfigError, MissingExtraError, WeightsError
+from topoloc.features.config import MatchingConfig, VirtualViewConfig
 from topoloc.features.feature_types import (
     SURF,
     FeatureConfig,
@@ -15,16 +16,54 @@ from topoloc.features.feature_types import (
     find_feature_type,
 )
 from topoloc.json_data import decode_json
-from topoloc.mapping.landmarks import LandmarkConfig
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.validation import CorruptDataError
-from topoloc.mapping.virtual_nodes import VirtualNodesConfig
-from topoloc.points.metric_points import MetricPointsConfig
-from topoloc.points.motion_triangulation import MotionTriangulationConfig
-from topoloc.retrieval.vlad import VladConfig
+from topoloc.points.config import MetricPointsConfig, MotionTriangulationConfig
+from topoloc.retrieval.coarse import VladConfig
 
 CONFIG_VERSION = 1
 """Version of the JSON in the map file. It increases if the meaning of a key changes."""
+
+
+@dataclass(frozen=True)
+class LandmarkConfig:
+    """Configure how points are observed and refined."""
+
+    nodes_per_image: Annotated[int, Between(0, 1000)] = 3
+    """Each mapping image is matched with this many nearest nodes. 0 keeps the first
+    measurements."""
+    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
+    gate: Annotated[float, Above(0)] = 4.0
+    """Maximum distance of an observation from the point's projection, in standard deviations of
+    both."""
+    pose_sigma_px: Annotated[float, AtLeast(0)] = 0.7
+    """Sigma in pixels added to a key point's own sigma, for errors of mapping poses and
+    rectification."""
+    num_iterations: Annotated[int, Between(0, 1000)] = 6
+    """Number of Gauss-Newton steps that refine a point."""
+    max_disagreement: Annotated[float, Above(0)] = 3.0
+    """Points are dropped if the root mean square of their refined residuals exceeds this, in
+    standard deviations."""
+
+
+@dataclass(frozen=True)
+class VirtualNodesConfig:
+    """Configure which nodes have virtual nodes, and their content."""
+
+    spacing: Annotated[float, AtLeast(0)] = 3.0
+    """Nodes are selected by Eq. 1 with this many times the map's D_thresh and half the weight of
+    rotation. 0 creates no virtual nodes."""
+    opposite: Annotated[float, AtLeast(0)] = 10.0
+    """A node needs no virtual nodes if another node within this many D_thresh looks in the opposite
+    direction."""
+    views: VirtualViewConfig = field(default_factory=VirtualViewConfig)
+    max_points: Annotated[int, Between(1, 100_000)] = 400
+    """Maximum number of features per virtual node. The strongest are kept."""
+    min_points: Annotated[int, Between(1, 100_000)] = 20
+    """A virtual view with fewer features becomes no virtual node."""
+    vlad: VladConfig = field(default_factory=lambda: VladConfig(position_weight=0.0))
+    """Positions in the image have no weight, because they depend on the camera's position along the
+    wall."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import EmptyMapError
-from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.integrity_check import list_coarse_models
 from topoloc.mapping.sessions import Session
 from topoloc.mapping.topomap import TopoMetricMap
@@ -27,7 +26,7 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
     return {
         "path": str(path),
-        "map": get_map_id(topomap),
+        "map": topomap.id,
         "version": topomap.version,
         "georeference": None if topomap.georeference is None else topomap.georeference.to_json(),
         "bytes": path.stat().st_size,

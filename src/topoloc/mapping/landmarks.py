@@ -9,41 +9,19 @@ Each session's contribution is kept as sums (`landmark_statistics.py`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.features import Features
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.config import LandmarkConfig
 from topoloc.mapping.landmark_kernels import add_observations
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
 
 _CAUCHY_SCALE = 2.385  # in standard deviations of a residual
-
-
-@dataclass(frozen=True)
-class LandmarkConfig:
-    """Configure how points are observed and refined."""
-
-    nodes_per_image: Annotated[int, Between(0, 1000)] = 3
-    """Each mapping image is matched with this many nearest nodes. 0 keeps the first
-    measurements."""
-    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
-    gate: Annotated[float, Above(0)] = 4.0
-    """Maximum distance of an observation from the point's projection, in standard deviations of
-    both."""
-    pose_sigma_px: Annotated[float, AtLeast(0)] = 0.7
-    """Sigma in pixels added to a key point's own sigma, for errors of mapping poses and
-    rectification."""
-    num_iterations: Annotated[int, Between(0, 1000)] = 6
-    """Number of Gauss-Newton steps that refine a point."""
-    max_disagreement: Annotated[float, Above(0)] = 3.0
-    """Points are dropped if the root mean square of their refined residuals exceeds this, in
-    standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)

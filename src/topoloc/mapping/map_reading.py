@@ -19,7 +19,6 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.json_data import decode_json
 from topoloc.mapping.config import CONFIG_VERSION, MapConfig, config_from_text
-from topoloc.mapping.contents import Layer, MapContents, NextIds
 from topoloc.mapping.entries import (
     CorrelatedErrors,
     Edge,
@@ -34,6 +33,7 @@ from topoloc.mapping.map_file import MapFile
 from topoloc.mapping.point_encoding import points_from_row
 from topoloc.mapping.schema import SORT_COLUMNS, VIRTUAL_PREFIX, layer_suffix, split_layer_name
 from topoloc.mapping.sessions import Edit, Session
+from topoloc.mapping.topomap import Layer, NextIds, TopoMetricMap
 from topoloc.mapping.validation import (
     MAX_POINTS,
     CorruptDataError,
@@ -52,7 +52,7 @@ MAX_ID = 2**53
 _MAX_MOVES = 1000
 
 
-def open_map(path: Path, digest: str | None = None) -> tuple[MapContents, MapFile]:
+def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
     """Open a map file without reading its nodes. It stays open.
 
     Args:
@@ -68,13 +68,15 @@ def open_map(path: Path, digest: str | None = None) -> tuple[MapContents, MapFil
         if digest is not None and file.digest != digest:
             raise MapError(f"map {path} is not the one that was pickled: it was replaced since")
         with file.read_connection():
-            return _read_contents(file), file
+            topomap = _read_contents(file)
+            topomap.__dict__["_opened"] = file  # not a field, so that a changed copy has no file
+            return topomap
     except BaseException:
         file.close()
         raise
 
 
-def _read_contents(file: MapFile) -> MapContents:
+def _read_contents(file: MapFile) -> TopoMetricMap:
     facts = file.facts
     missing = [key for key in ("config", "length_m") if key not in facts]
     if missing:
@@ -97,7 +99,7 @@ def _read_contents(file: MapFile) -> MapContents:
             models,
             kind,
         )
-    return MapContents(
+    return TopoMetricMap(
         summaries=_lazy_summaries(file),
         layers={kind: _read_layer(file, kind, config.features.kind) for kind in kinds},
         edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],

@@ -24,7 +24,6 @@ from topoloc.errors import MapError
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import config_to_text
-from topoloc.mapping.contents import MapContents, NextIds, get_map_id
 from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.landmark_statistics import encode_statistics
 from topoloc.mapping.point_encoding import compress_array, node_to_arrays
@@ -39,6 +38,7 @@ from topoloc.mapping.schema import (
     layer_suffix,
 )
 from topoloc.mapping.sessions import Session, sessions_from_names
+from topoloc.mapping.topomap import NextIds, TopoMetricMap
 from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.coarse import CoarseModel
 
@@ -47,7 +47,7 @@ _PAGE_BYTES = 1024
 pages cost 1 to 5 kB more per node."""
 
 
-def save_map(topomap: MapContents, path: Path) -> None:
+def save_map(topomap: TopoMetricMap, path: Path) -> None:
     """Write the map to `path` atomically. A reader sees the old map or the new one.
 
     Raises:
@@ -67,7 +67,7 @@ def save_map(topomap: MapContents, path: Path) -> None:
         raise MapError(f"cannot write map {path}: {error}") from error
 
 
-def write_map(topomap: MapContents, path: Path) -> None:
+def write_map(topomap: TopoMetricMap, path: Path) -> None:
     """Write the map to the empty file `path`. Raises MapError if the disk is full."""
     try:
         # an empty name creates a private temporary database, removed at closing
@@ -93,7 +93,7 @@ class _Writer:
         }
         self._camera_ids: dict[str, int] = {}
 
-    def write(self, topomap: MapContents) -> None:
+    def write(self, topomap: TopoMetricMap) -> None:
         """Write all tables of the map in one transaction."""
         self._database.execute("PRAGMA journal_mode = OFF")
         self._database.execute("BEGIN")
@@ -135,7 +135,7 @@ class _Writer:
         self._write_metadata(topomap, sessions, next_image)
         self._database.execute("COMMIT")
 
-    def _write_nodes(self, topomap: MapContents, session_ids: Mapping[str, int]) -> None:
+    def _write_nodes(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> None:
         read = (
             [(topomap.layers[kind].nodes[row], kind) for kind in topomap.kinds]
             for row in range(len(topomap.nodes))
@@ -146,7 +146,7 @@ class _Writer:
             for of_other in of_others:
                 self._insert_points(*of_other)
 
-    def _write_images(self, topomap: MapContents, session_ids: Mapping[str, int]) -> int:
+    def _write_images(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> int:
         """Write the images. Images without an id receive the next ones. Return the id after the
         last."""
         next_id = max(topomap.next_ids.place_image, 1)
@@ -166,7 +166,7 @@ class _Writer:
         return next_id
 
     def _write_metadata(
-        self, topomap: MapContents, sessions: Sequence[Session], next_image: int
+        self, topomap: TopoMetricMap, sessions: Sequence[Session], next_image: int
     ) -> None:
         used = NextIds(
             session=max((session.session_id + 1 for session in sessions), default=0),
@@ -192,7 +192,7 @@ class _Writer:
                 {table: len(rows) for table, rows in self._checksums.items() if table != "map"}
             ),
         }
-        facts["map_id"] = get_map_id(topomap)
+        facts["map_id"] = topomap.id
         if changes := {
             str(edit.edit_id): dict(edit.changes) for edit in topomap.edits if edit.changes
         }:

@@ -11,49 +11,24 @@ gives a pose (`localization/walls/`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from topoloc.bounds import AtLeast, Between
 from topoloc.disk_list import DiskList
 from topoloc.features.extraction import FeatureConfig, extract_features
-from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_virtual_views
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.config import VirtualNodesConfig
 from topoloc.mapping.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.mapping.nodes import NodeConfig, select_node_frames
 from topoloc.node_ids import NodeId, Row
-from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.config import MetricPointsConfig
+from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
-from topoloc.retrieval.vlad import (
-    SurfVlad,
-    VladConfig,
-    append_positions,
-    learn_words_from_parts,
-    vlad,
-)
-
-
-@dataclass(frozen=True)
-class VirtualNodesConfig:
-    """Configure which nodes have virtual nodes, and their content."""
-
-    spacing: Annotated[float, AtLeast(0)] = 3.0
-    """Nodes are selected by Eq. 1 with this many times the map's D_thresh and half the weight of
-    rotation. 0 creates no virtual nodes."""
-    opposite: Annotated[float, AtLeast(0)] = 10.0
-    """A node needs no virtual nodes if another node within this many D_thresh looks in the opposite
-    direction."""
-    views: VirtualViewConfig = field(default_factory=VirtualViewConfig)
-    max_points: Annotated[int, Between(1, 100_000)] = 400
-    """Maximum number of features per virtual node. The strongest are kept."""
-    min_points: Annotated[int, Between(1, 100_000)] = 20
-    """A virtual view with fewer features becomes no virtual node."""
-    vlad: VladConfig = field(default_factory=lambda: VladConfig(position_weight=0.0))
-    """Positions in the image have no weight, because they depend on the camera's position along the
-    wall."""
+from topoloc.retrieval.coarse import VladConfig
+from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
 
 def select_virtual_view_nodes(

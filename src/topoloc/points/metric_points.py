@@ -14,12 +14,10 @@ These points are dropped:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from topoloc.bounds import Above, Between
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
 from topoloc.geometry.stereo import (
@@ -29,35 +27,13 @@ from topoloc.geometry.stereo import (
     points_from_disparity,
     ray_covariances,
 )
+from topoloc.points.config import MetricPointsConfig
 from topoloc.points.epipolar_kernels import match_in_ranges
 from topoloc.recordings.frame_preparation import PreparedFrame
 
 # SURF and SIFT describe a neighbourhood of 20 s and 12 sigma; both report sizes of about 7.5 scales
 # across.
 SCALES_PER_SIZE = 1.2 / 9.0
-
-
-@dataclass(frozen=True)
-class MetricPointsConfig:
-    """Hold the settings for the 3-D positions of features."""
-
-    max_relative_sigma: Annotated[float, Above(0)] = 0.3
-    """Points whose depth has a larger standard deviation than this fraction of it are dropped."""
-    correlation_half_px: Annotated[int, Between(1, 50)] = 5
-    """Stereo: half side of the window that is correlated along the row."""
-    min_correlation: Annotated[float, Between(-1, 1)] = 0.8
-    """Stereo: minimum normalised correlation of the two images."""
-    max_second_correlation: Annotated[float, Between(0, 1)] = 0.97
-    """Stereo: a point is ambiguous if a second place on the row reaches this fraction of the best
-    correlation."""
-    min_sigma_disparity_px: Annotated[float, Above(0)] = 0.12
-    """Stereo: standard deviation that calibration and interpolation leave even at perfect
-    correlation."""
-    max_depth_step: Annotated[float, Between(0, 1)] = 0.05
-    """RGB-D: maximum spread of depth over the 5x5 neighbourhood, as a fraction of depth. A larger
-    spread is a depth edge."""
-    sigma_scale: Annotated[float, Above(0)] = 0.4
-    """Standard deviation of a key point's position, in units of its scale."""
 
 
 @dataclass(frozen=True, eq=False)

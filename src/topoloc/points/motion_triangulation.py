@@ -9,38 +9,18 @@ line by chance, so depths from several other images must agree.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.features import Features
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.stereo import points_from_depth, ray_covariances
+from topoloc.points.config import MotionTriangulationConfig
 from topoloc.points.metric_points import MetricPoints
-
-
-@dataclass(frozen=True)
-class MotionTriangulationConfig:
-    """Hold the settings of triangulation from single images with known poses."""
-
-    steps: Annotated[tuple[float, ...], Above(0)] = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
-    """Distances of the other images, in units of the median distance of consecutive images."""
-    max_turn: Annotated[float, Between(0, 3.2)] = 0.6
-    """Maximum angle between the viewing directions of two images, radians. Beyond it hardly any
-    feature matches."""
-    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(ratio=0.85))
-    gate: Annotated[float, Above(0)] = 3.0
-    """Maximum distance of a match from its epipolar line, and of two depths from each other, in
-    standard deviations."""
-    pose_sigma_px: Annotated[float, AtLeast(0)] = 0.5
-    """Standard deviation that pose errors add to that of a key point, pixels."""
-    min_pictures: Annotated[int, Between(1, 100)] = 2
-    """Minimum number of other images whose depths of a point agree."""
 
 
 @dataclass(frozen=True, eq=False)

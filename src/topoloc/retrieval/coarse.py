@@ -9,12 +9,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from topoloc.bounds import parse_value
+from topoloc.bounds import AtLeast, Between, parse_value
 from topoloc.errors import ConfigError, MapError, MissingExtraError
 from topoloc.features.features import Features
 from topoloc.node_ids import Row
@@ -24,6 +24,23 @@ COARSE_NAMES: tuple[CoarseName, ...] = get_args(CoarseName)
 _MODULES = {"surf-vlad": "vlad", "cnn-fc": "cnn_fc", "cnn-nn": "cnn_nn", "vlad-nn": "vlad_nn"}
 
 Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class VladConfig:
+    """Hold the settings of surf-vlad."""
+
+    num_words: Annotated[int, Between(1, 65_536)] = 64
+    """Visual words of the vocabulary."""
+    position_weight: Annotated[float | None, AtLeast(0)] = None
+    """Distance that opposite image borders add between two descriptors (of length 1). 0 ignores
+    positions. Unset: the default of the feature type."""
+    dimension: Annotated[int, Between(1, 65_536)] = 128
+    """Maximum length of a global descriptor after PCA."""
+    max_training_descriptors: Annotated[int, AtLeast(1)] = 100_000
+    """Maximum number of descriptors from which the vocabulary is learned."""
+    seed: Annotated[int, Between(0, 1_000_000_000)] = 0
+    """Seed of the vocabulary."""
 
 
 @dataclass(frozen=True)

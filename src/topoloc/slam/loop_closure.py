@@ -19,7 +19,8 @@ from topoloc.disk_list import DiskList
 from topoloc.features.features import Features
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
-from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words_from_parts, vlad
+from topoloc.retrieval.coarse import VladConfig
+from topoloc.retrieval.vlad import SurfVlad, learn_words_from_parts, vlad
 from topoloc.slam.keyframes import KeyFrame
 from topoloc.slam.place_matching import PlaceMatch, PlaceMatchingConfig, match_places
 

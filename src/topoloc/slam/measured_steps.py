@@ -11,16 +11,18 @@ from typing import Annotated
 import numpy as np
 
 from topoloc.bounds import AtLeast, Between
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import match_features
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.metric_points import MetricPoints, MetricPointsConfig, locate_points
+from topoloc.points.config import MetricPointsConfig
+from topoloc.points.metric_points import MetricPoints, locate_points
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import read_left_frame

@@ -12,13 +12,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast, Between
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig, find_feature_type
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
+from topoloc.points.config import MetricPointsConfig
 from topoloc.points.disparity import StereoCamera
-from topoloc.points.metric_points import MetricPointsConfig, locate_points
+from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.slam.keyframes import PlaceFeatures
 

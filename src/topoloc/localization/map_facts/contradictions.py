@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.config import MatchingConfig
+from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.local_map import LocalMap

@@ -20,10 +20,11 @@ from functools import cached_property, partial
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import extract_from_normalized, normalize_image
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.matching import MatchingConfig, match_features, match_pooled
+from topoloc.features.matching import match_features, match_pooled
 from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
 from topoloc.geometry.camera import Camera

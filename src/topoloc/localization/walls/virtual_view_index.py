@@ -9,8 +9,9 @@ from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.walls.virtual_view_matching import with_node_id
+from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.node_cache import CachedNodes
-from topoloc.mapping.topomap import TopoMetricMap, VirtualNodes, node_ids_to_rows
+from topoloc.mapping.topomap import TopoMetricMap, VirtualNodes
 from topoloc.node_ids import Row
 from topoloc.retrieval.coarse import Image
 from topoloc.retrieval.vlad import SurfVlad

@@ -15,7 +15,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from topoloc.errors import RecordingError
-from topoloc.features.virtual_views import VirtualView, VirtualViewConfig, make_virtual_views
+from topoloc.features.config import VirtualViewConfig
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.image_io import to_grey
