@@ -79,8 +79,7 @@ SUSPECTED = replace(
         300.0,
         np.array([320.0, 200.5]),
         np.array([320.0, 190.0]),
-        True,
-        False,
+        ["focal_length"],
         np.arange(6.0),
     ),
 )
