@@ -158,7 +158,7 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_feature
         seen, _ = check_image_calibration(search, fit)
         shift = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         doubt = CalibrationMismatch(
-            200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), ("focal_length",), shift
+            200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), ["focal_length"], shift
         )
         return seen, doubt if search.query.feature_config.kind == "sift" else None
 
