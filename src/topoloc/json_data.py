@@ -62,13 +62,16 @@ def encode_json(value: Any) -> Any:
 
 
 def _decode_custom(kind: Any, value: Any) -> Any:
-    """Decode a value of a class with `from_json`, or an array. jaxtyping checks the shape."""
+    """Decode a value of a class with `from_json`, or a jaxtyping array of its shape."""
+    if isinstance(value, str):  # `from_json` would decode it once more
+        raise ValueError(f"Expected `{kind.__name__}`, got `str`")
     if hasattr(kind, "from_json"):
         try:
             return kind.from_json(value)
         except TopolocError as error:
             raise ValueError(str(error)) from None
     array = np.array(value)
-    if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-        raise ValueError("finite numbers are expected")
-    return array.astype(np.float64)
+    is_finite = array.dtype.kind in "iuf" and np.isfinite(array).all()
+    if not is_finite or not isinstance(array := array.astype(np.float64), kind):
+        raise ValueError(f"finite numbers of shape ({kind.dim_str}) are expected")
+    return array

@@ -213,7 +213,7 @@ def _matrix(value: Any) -> Callable[[dict[str, Any]], None]:
             "transform_matrix: not a pose: NaN or infinite entries",
         ),
         (_matrix([[1, 2], [3]]), RecordingError, "not a 3x4 or 4x4 matrix of numbers"),
-        (_matrix("eye"), RecordingError, "transform_matrix: pose: not JSON"),
+        (_matrix("eye"), RecordingError, "transform_matrix: Expected `Rigid3`, got `str`"),
         (_matrix((2 * np.eye(4)).tolist()), RecordingError, "its last row is not 0 0 0 1"),
         (_matrix(np.diag([2, 2, 2, 1]).tolist()), RecordingError, "no rotation"),
         (_matrix((pose(1).matrix().T).tolist()), RecordingError, "is it transposed"),
