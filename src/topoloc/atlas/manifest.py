@@ -234,12 +234,13 @@ class Manifest:
         """
         fault = f"{where} is no manifest of an atlas, or a damaged one"
         whole = decode_json(data, dict[str, Any], AtlasError, fault)
-        written = decode_json(whole, _Header, AtlasError, fault).version
-        if written != FORMAT_VERSION:
+        version = whole.get("version")
+        if whole.get("format") == FORMAT and version != FORMAT_VERSION:
             raise AtlasError(
-                f"{fault}: version {written} of the format; this topoloc reads version"
+                f"{fault}: version {str(version)[:20]} of the format; this topoloc reads version"
                 f" {FORMAT_VERSION}"
             )
+        decode_json(whole, _Header, AtlasError, fault)
         read = decode_json(whole, Manifest, AtlasError, fault)
         return replace(read, tiles=tuple(sorted(read.tiles, key=lambda tile: tile.tile_id)))
 
