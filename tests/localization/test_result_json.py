@@ -79,8 +79,7 @@ SUSPECTED = replace(
         300.0,
         np.array([320.0, 200.5]),
         np.array([320.0, 190.0]),
-        True,
-        False,
+        ["focal_length"],
         np.arange(6.0),
     ),
 )
@@ -219,6 +218,7 @@ def test_a_geopose_leads_back_to_the_pose():
             **LOCALIZED.to_json(""),
             "world_from_cam": {"translation": [0, 0, 10**400], "quat_wxyz": [1, 0, 0, 0]},
         },
+        {**LOCALIZED.to_json(""), "world_from_cam": json.dumps(POSE.to_json())},
         {**LOCALIZED.to_json(""), "probability": 1.5},
         {**LOCALIZED.to_json(""), "node": True},
         {**LOCALIZED.to_json(""), "camera": {"model": "PINHOLE"}},

@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from msgspec import structs
+
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features.feature_types import check_available, select_stored_types
 from topoloc.geometry.camera import Camera
@@ -159,7 +161,7 @@ class MapContext:
             alternatives = result.alternatives
             if georeference:
                 alternatives = tuple(
-                    replace(one, geopose=georeference.geopose(one.world_from_cam))
+                    structs.replace(one, geopose=georeference.geopose(one.world_from_cam))
                     for one in alternatives
                 )
             return replace(result, provenance=provenance, alternatives=alternatives)

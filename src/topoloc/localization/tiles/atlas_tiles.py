@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import structs
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.config import AtlasConfig
@@ -148,7 +149,7 @@ class AtlasTiles:
         tile = self.atlas.tile(tile_id)
         if isinstance(result, NotLocalized):
             alternatives = [
-                replace(
+                structs.replace(
                     one,
                     tile=one.tile or tile_id,
                     geopose=one.geopose or self._geopose(one.tile or tile_id, one.world_from_cam),
