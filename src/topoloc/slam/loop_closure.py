@@ -18,7 +18,6 @@ from topoloc.bounds import Above, AtLeast, Between
 from topoloc.disk_list import DiskList
 from topoloc.features.features import Features
 from topoloc.features.parallel import parallel_map
-from topoloc.geometry.rigid import Rigid3
 from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.vlad import SurfVlad, learn_words_from_parts, vlad
 from topoloc.slam.keyframes import KeyFrame
@@ -169,11 +168,10 @@ def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConf
     if source.submap != target.submap:
         return source.recording != target.recording or is_reachable(link, keyframes, config)
     way = _path_length(keyframes, link.source, link.target)
-    drift = _pose_difference(
-        link.match.target_from_source, target.cam_from_world @ source.cam_from_world.inverse()
-    )
-    return bool(
-        drift[0] < 0.5 + config.max_drift * way and drift[1] < np.deg2rad(config.max_drift_deg)
+    return link.match.target_from_source.is_same(
+        target.cam_from_world @ source.cam_from_world.inverse(),
+        0.5 + config.max_drift * way,
+        np.deg2rad(config.max_drift_deg),
     )
 
 
@@ -306,13 +304,8 @@ def _are_consistent(
         + np.linalg.norm(targets.translation)
         + np.linalg.norm(expected.translation)
     )
-    metres, radians = _pose_difference(link.match.target_from_source, expected)
-    return bool(
-        metres < config.max_disagreement * (1.0 + way) + drift
-        and radians < np.deg2rad(config.max_disagreement_deg)
+    return link.match.target_from_source.is_same(
+        expected,
+        config.max_disagreement * (1.0 + way) + drift,
+        np.deg2rad(config.max_disagreement_deg),
     )
-
-
-def _pose_difference(a: Rigid3, b: Rigid3) -> tuple[float, float]:
-    """Return the difference in metres and radians."""
-    return float(np.linalg.norm(a.translation - b.translation)), (a @ b.inverse()).angle()

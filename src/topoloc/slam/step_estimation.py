@@ -223,11 +223,8 @@ class StepEstimator:
 
     def is_close(self, a: Rigid3, b: Rigid3) -> bool:
         """Return whether two cam_from_world are the same within `same_step`."""
-        away = a @ b.inverse()
-        return bool(
-            np.linalg.norm(away.translation) < self.config.same_step * self._median_depth()
-            and away.angle() < self.config.same_step
-        )
+        same_step = self.config.same_step
+        return a.inverse().is_same(b.inverse(), same_step * self._median_depth(), same_step)
 
     def _is_in_image(self, cam_from_world: Rigid3) -> np.ndarray:
         camera = self.measured.stereo.camera

@@ -338,9 +338,15 @@ def _is_link_consistent(
     config: JoinConfig,
 ) -> bool:
     estimates, covariances = _compute_estimates([link], keyframes, ends, config)
-    residual = (estimates[0] @ consensus.a_from_b.inverse()).log()
-    square = residual @ np.linalg.solve(covariances[0] + consensus.covariance, residual)
-    return bool(square <= config.consensus.max_sigmas**2)
+    return (
+        estimates[0]
+        .inverse()
+        .is_same(
+            consensus.a_from_b.inverse(),
+            covariance=covariances[0] + consensus.covariance,
+            max_square=config.consensus.max_sigmas**2,
+        )
+    )
 
 
 def _find_overlapping_views(
