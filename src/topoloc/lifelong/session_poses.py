@@ -134,7 +134,6 @@ def estimate_poses_by_motion(
         CalibrationError: the images contradict their calibration.
         UnreadableImageError, QueryError: an image cannot be read or localized.
     """
-    d_thresh = map_config.d_thresh
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
     motions = [odom for poses in stretches if (odom := _known_poses(poses))]
     if not motions:
@@ -162,7 +161,7 @@ def estimate_poses_by_motion(
         sequence.name,
         motions,
         [{index: answers[index] for index in of_motion} for of_motion in queried],
-        d_thresh,
+        map_config.d_thresh,
         config,
     )
 

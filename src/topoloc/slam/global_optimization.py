@@ -185,7 +185,6 @@ def _add_link_landmarks(
 ) -> None:
     source = keyframes[link.source]
     place = source.place
-    assert place is not None
     for source_row, target_row in zip(
         link.match.source_rows.tolist(), link.match.target_rows.tolist(), strict=True
     ):
@@ -207,7 +206,6 @@ def _feature_observation(
 ) -> Observations:
     """Return a local feature as an observation: its pixel, and its disparity if it has a depth."""
     place, stereo = keyframe.place, keyframe.stereo
-    assert place is not None
     measured = np.array([[*place.features.points_img[row].astype(np.float64), np.nan]])
     weights = np.full((1, 3), 1.0 / config.sigma_feature_px)
     weights[0, 2] = 0.0

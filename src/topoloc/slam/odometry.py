@@ -279,8 +279,9 @@ class Odometry:
         depth = keyframe.cam_from_world.apply(
             self._landmarks.positions[seen.landmark_ids[seen.active]]
         )[:, 2]
-        far = np.linalg.norm(motion.translation) > self._config.place_distance * np.median(depth)
-        return bool(far or motion.angle() > np.deg2rad(self._config.place_angle_deg))
+        metres = self._config.place_distance * float(np.median(depth))
+        radians = np.deg2rad(self._config.place_angle_deg)
+        return not motion.is_same(Rigid3.identity(), metres, radians)
 
     def _submit_place_extraction(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
         """Extract the place features of a key frame in a background thread.
@@ -288,7 +289,7 @@ class Odometry:
         Only one extraction is pending, so that few images are in memory.
         """
         if self._pending_keyframe is not None:
-            assert self._pending_keyframe.place is not None  # waits
+            _ = self._pending_keyframe.place  # waits
         keyframe.pending_place = self._place_executor.submit(
             extract_place_features, measured.view, self._config.places
         )
@@ -376,9 +377,7 @@ class Odometry:
         here = extract_place_features(measured.view, self._config.places)
         prediction = self._history.predict(frame.t_ns)
         for keyframe in self._last_places(self._config.places_asked):
-            place = keyframe.place
-            assert place is not None
-            match = match_places(place, here, measured.stereo, self._config.places)
+            match = match_places(keyframe.place, here, measured.stereo, self._config.places)
             if match is None:
                 continue
             cam_from_world = match.target_from_source @ keyframe.cam_from_world

@@ -206,12 +206,9 @@ def evaluate_poses(
 
 
 def _is_informative(step: MeasuredStep) -> bool:
-    way = float(np.linalg.norm(step.first_from_last.translation))
-    return (
-        not step.has_scale
-        or way
-        > _MIN_TRANSLATION_RATIO * (_TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * step.median_depth)
-        or step.first_from_last.angle() > _MIN_ROTATION
+    tolerance = _TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * step.median_depth
+    return not step.has_scale or not step.first_from_last.is_same(
+        Rigid3.identity(), _MIN_TRANSLATION_RATIO * tolerance, _MIN_ROTATION
     )
 
 
