@@ -80,8 +80,8 @@ class EvaluatedQuery:
             return False
         if self.world_from_cam is None or self.is_in_other_world:
             return True
-        return (
-            self.translation_m > self.MAX_TRANSLATION or self.rotation_deg > self.MAX_ROTATION_DEG
+        return not self.world_from_cam.is_same(
+            self.result.world_from_cam, self.MAX_TRANSLATION, np.deg2rad(self.MAX_ROTATION_DEG)
         )
 
     def to_json(self) -> dict[str, Any]:
