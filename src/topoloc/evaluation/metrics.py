@@ -34,8 +34,8 @@ class EvaluatedQuery:
       transform. The pose then counts as false.
     """
 
-    max_translation_m: ClassVar[float] = MAX_TRANSLATION
-    max_rotation_deg: ClassVar[float] = MAX_ROTATION_DEG
+    MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
+    MAX_ROTATION_DEG: ClassVar[float] = MAX_ROTATION_DEG
     """A pose that is further off than either is a false accept."""
 
     query: str
@@ -47,9 +47,6 @@ class EvaluatedQuery:
     camera: Camera | None = None
     neighbour_ids: frozenset[NodeId] = frozenset()
     is_in_other_world: bool = False
-
-    MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
-    MAX_ROTATION_DEG: ClassVar[float] = MAX_ROTATION_DEG
 
     @property
     def translation_m(self) -> float:
@@ -83,8 +80,8 @@ class EvaluatedQuery:
             return False
         if self.world_from_cam is None or self.is_in_other_world:
             return True
-        return (
-            self.translation_m > self.MAX_TRANSLATION or self.rotation_deg > self.MAX_ROTATION_DEG
+        return not self.world_from_cam.is_same(
+            self.result.world_from_cam, self.MAX_TRANSLATION, np.deg2rad(self.MAX_ROTATION_DEG)
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -214,6 +214,39 @@ class Rigid3:
         """Return the rotation angle in radians, in [0, pi]."""
         return float(np.linalg.norm(log_so3(self.rotation)))
 
+    def is_same(
+        self,
+        other: Rigid3,
+        metres: float = 0.0,
+        radians: float = 0.0,
+        covariance: Float[np.ndarray, "6 6"] | None = None,
+        max_square: float = 0.0,
+    ) -> bool:
+        """Return whether two world_from_cam are the same pose.
+
+        They are if their translations differ by less than `metres` and their rotations by less than
+        `radians`. With a covariance they also are if `squared_distance` is less than `max_square`.
+        """
+        shift = other.translation - self.translation
+        square = float(shift @ shift)
+        if square < metres**2 and (self.inverse() @ other).angle() < radians:
+            return True
+        if covariance is None:
+            return False
+        limit = max_square * float(np.trace(covariance))
+        if square > limit or (self.inverse() @ other).angle() ** 2 > limit:
+            return False  # the difference is longer than the largest that the covariance allows
+        return self.squared_distance(other, covariance) < max_square
+
+    def squared_distance(self, other: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> float:
+        """Return the squared Mahalanobis distance between two world_from_cam.
+
+        `covariance` is the sum of those of their right perturbations (m, rad), which are the left
+        ones of cam_from_world. The distance follows chi^2 with 6 degrees of freedom.
+        """
+        difference = (self.inverse() @ other).log()
+        return float(difference @ np.linalg.solve(covariance, difference))
+
     def interpolate(self, other: Rigid3, fraction: float) -> Rigid3:
         """Return the pose between this one (fraction 0) and `other` (fraction 1). The position is
         linear, the rotation follows the geodesic."""

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
@@ -23,6 +23,7 @@ from topoloc.node_ids import Row, as_rows
 
 T = TypeVar("T")
 
+T = TypeVar("T")
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 """Count a result as wrong if it is further off than this (metres, degrees)."""
 
@@ -105,8 +106,8 @@ def localize_left_out(
     return answers
 
 
-def _evaluate_result(result: Localization, world_from_cam) -> LeaveOneOutResult:
-    metres = translation_error(world_from_cam, result.world_from_cam)
-    degrees = np.degrees(rotation_error(world_from_cam, result.world_from_cam))
-    is_wrong = bool(metres > MAX_TRANSLATION or degrees > MAX_ROTATION_DEG)
+def _evaluate_result(result: Localization, world_from_cam: Rigid3) -> LeaveOneOutResult:
+    is_wrong = not world_from_cam.is_same(
+        result.world_from_cam, MAX_TRANSLATION, np.radians(MAX_ROTATION_DEG)
+    )
     return LeaveOneOutResult(not is_wrong, is_wrong, 0 if is_wrong else result.num_inliers)

@@ -15,14 +15,18 @@ from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
 from topoloc.lifelong.noise_scale import LocalizedStep, NoiseScale, estimate_noise_scale
-from topoloc.lifelong.scale_estimation import ScaleConfig
+from topoloc.lifelong.scale_estimation import (
+    MotionTolerance,
+    ScaleConfig,
+    find_motion_consensus,
+)
 from topoloc.lifelong.trajectory_correction import CorrectionConfig
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
@@ -130,7 +134,6 @@ def estimate_poses_by_motion(
         CalibrationError: the images contradict their calibration.
         UnreadableImageError, QueryError: an image cannot be read or localized.
     """
-    d_thresh = map_config.d_thresh
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
     motions = [odom for poses in stretches if (odom := _known_poses(poses))]
     if not motions:
@@ -158,7 +161,7 @@ def estimate_poses_by_motion(
         sequence.name,
         motions,
         [{index: answers[index] for index in of_motion} for of_motion in queried],
-        d_thresh,
+        map_config.d_thresh,
         config,
     )
 
@@ -254,41 +257,16 @@ def _find_consensus(
             " place, or changed; the map stays as it is"
         )
     _check_scale(name, odom, localized, config)
-    path_lengths, slack_m = _path_lengths(odom), config.slack * d_thresh
-    agrees = np.array(
-        [_find_inliers(k, odom, localized, path_lengths, slack_m, config) for k in indices]
+    tolerance = MotionTolerance(
+        config.slack * d_thresh, config.slack_deg, config.max_drift, config.max_turn_drift_deg
     )
-    best = agrees[int(np.argmax(agrees.sum(axis=1)))]
-    if best.sum() < max(config.min_agreeing, config.min_share * len(indices)):
+    inlier_idx = find_motion_consensus(odom, localized, tolerance)
+    if len(inlier_idx) < max(config.min_agreeing, config.min_share * len(indices)):
         raise TrajectoryError(
-            f"{name}: of {len(indices)} pictures that the map localizes {int(best.sum())} agree"
+            f"{name}: of {len(indices)} pictures that the map localizes {len(inlier_idx)} agree"
             " with its poses; the map stays as it is"
         )
-    return [index for index, is_in in zip(indices, best, strict=True) if is_in]
-
-
-def _find_inliers(
-    k: int,
-    odom: Mapping[int, Rigid3],
-    localized: Mapping[int, Localization],
-    path_lengths: Mapping[int, float],
-    slack_m: float,
-    config: SessionPosesConfig,
-) -> Bool[np.ndarray, " n"]:
-    """Return the mask of localizations that agree with the transform defined by localization
-    `k`."""
-    world_from_odom = localized[k].world_from_cam @ odom[k].inverse()
-    agrees = []
-    for index, answer in localized.items():
-        off = answer.world_from_cam.inverse() @ world_from_odom @ odom[index]
-        path_length = abs(path_lengths[index] - path_lengths[k])
-        near = float(np.linalg.norm(off.translation)) <= slack_m + config.max_drift * path_length
-        agrees.append(
-            near
-            and np.degrees(off.angle())
-            <= config.slack_deg + config.max_turn_drift_deg * path_length
-        )
-    return np.array(agrees)
+    return inlier_idx
 
 
 def _too_few_message(num_queried: int, config: SessionPosesConfig) -> str:
@@ -327,13 +305,6 @@ def _check_scale(
         raise TrajectoryError(
             f"{name}: a metre of its poses is {scale:.3g} m of the map; the map stays as it is"
         )
-
-
-def _path_lengths(odom: Mapping[int, Rigid3]) -> dict[int, float]:
-    """Return the metres travelled up to each frame."""
-    positions = np.array([pose.translation for pose in odom.values()])
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return dict(zip(odom, np.concatenate([[0.0], np.cumsum(steps)]).tolist(), strict=True))
 
 
 def _optimize_motion(

@@ -15,11 +15,11 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import (
     ConsensusConfig,
     DriftConfig,
-    TransformConsensus,
     diagonal_covariance,
     find_consensus,
     propagate_estimate,
 )
+from topoloc.lifelong.leave_one_out import sample_evenly
 from topoloc.mapping.topomap import TopoMetricMap
 
 _MAX_IMAGES = 200
@@ -37,14 +37,7 @@ def estimate_by_shared_images(
     """
     here, there = _image_poses(first), _image_poses(second)
     shared = sorted(here.keys() & there.keys(), key=lambda image_key: (image_key[0], image_key[1]))
-    chosen = (
-        np.unique(
-            np.linspace(0, len(shared) - 1, min(len(shared), _MAX_IMAGES)).round().astype(int)
-        )
-        if shared
-        else []
-    )
-    poses = [(here[shared[k]], there[shared[k]]) for k in chosen]
+    poses = [(here[image], there[image]) for image in sample_evenly(shared, _MAX_IMAGES)]
     if len(poses) < config.min_independent:
         return None
     one, other = poses[len(poses) // 2]
@@ -63,19 +56,9 @@ def estimate_by_shared_images(
         np.stack([covariance for _, covariance in estimates]),
         config,
     )
-    return None if consensus is None else _to_worlds(consensus, one, other)
-
-
-def _to_worlds(
-    consensus: TransformConsensus, one: Rigid3, other: Rigid3
-) -> tuple[Rigid3, np.ndarray, int]:
-    adjoint = one.adjoint()
-    covariance = adjoint @ consensus.covariance @ adjoint.T
-    return (
-        one @ consensus.a_from_b @ other.inverse(),
-        0.5 * (covariance + covariance.T),
-        int(np.count_nonzero(consensus.is_inlier)),
-    )
+    if consensus is None:
+        return None
+    return *consensus.between(one, other.inverse()), int(np.count_nonzero(consensus.is_inlier))
 
 
 def _image_poses(topomap: TopoMetricMap) -> dict[tuple[str, bytes], Rigid3]:

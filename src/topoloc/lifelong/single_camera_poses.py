@@ -10,6 +10,7 @@ stream's poses are used for frames without any odometry.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence, Set
 from itertools import groupby
 
@@ -19,7 +20,11 @@ from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
 from topoloc.lifelong.noise_scale import NoiseScale
-from topoloc.lifelong.scale_estimation import find_largest_consensus, scale_to_metres
+from topoloc.lifelong.scale_estimation import (
+    MotionTolerance,
+    find_motion_consensus,
+    scale_to_metres,
+)
 from topoloc.lifelong.session_poses import (
     Progress,
     SessionPoses,
@@ -156,9 +161,7 @@ def align_stretch_to_map(
         motion contradict each other there.
     """
     within_stretch = {index: answer for index, answer in localized.items() if index in odom}
-    inlier_idx = find_largest_consensus(
-        odom, within_stretch, config.slack * d_thresh, config.slack_deg, config.scale
-    )
+    inlier_idx = _find_consensus(odom, within_stretch, d_thresh, config)
     aligned = None
     for _ in range(_NUM_REFITS):  # each refit uses the inliers found with the previous scale
         metric = (
@@ -185,6 +188,21 @@ def align_stretch_to_map(
     )
 
 
+def _find_consensus(
+    odom: Mapping[int, Rigid3],
+    localized: Mapping[int, Localization],
+    d_thresh: float,
+    config: SessionPosesConfig,
+) -> list[int]:
+    """Return the frames of the most localizations that one similarity transform of the motion
+    explains. Return none if they are fewer than three, because a similarity explains any two."""
+    tolerance = MotionTolerance(
+        config.slack * d_thresh, config.slack_deg, config.scale.max_error, drift_deg=1.0
+    )
+    inlier_idx = find_motion_consensus(odom, localized, tolerance, config.scale)
+    return inlier_idx if len(inlier_idx) > 2 else []
+
+
 def _reject_ambiguous(
     odom: Mapping[int, Rigid3],
     within_stretch: Mapping[int, Localization],
@@ -195,9 +213,7 @@ def _reject_ambiguous(
     """Return the agreeing localizations, or none if a large rival set agrees on another trajectory.
     A place that looks like another one is localized wrongly for as long as it is in view."""
     rest = {index: answer for index, answer in within_stretch.items() if index not in inlier_idx}
-    rivals = find_largest_consensus(
-        odom, rest, config.slack * d_thresh, config.slack_deg, config.scale
-    )
+    rivals = _find_consensus(odom, rest, d_thresh, config)
     return (
         []
         if len(rivals) >= max(config.min_agreeing, config.rival_share * len(inlier_idx))
@@ -222,7 +238,12 @@ def _reject_contradicted(
     apart = {
         index
         for index, answer in within_stretch.items()
-        if _contradicts(answer, poses[index], d_thresh, config)
+        if (pose := poses[index]) is not None
+        and not pose.is_same(
+            answer.world_from_cam,
+            config.contradiction * d_thresh + 3.0 * config.widened * answer.position_sigma_m,
+            math.inf,
+        )
     }
     contradicted = _find_contradicted_frames(list(within_stretch), apart)
     left = [None if index in contradicted else pose for index, pose in enumerate(poses)]
@@ -237,20 +258,10 @@ def _pose_if_consistent(
     the map's nodes."""
     if pose is None or answer is None:
         return pose
-    apart = answer.world_from_cam.inverse() @ pose
-    is_near = (
-        np.linalg.norm(apart.translation) <= config.slack * d_thresh
-        and np.degrees(apart.angle()) <= config.slack_deg
+    is_same = pose.is_same(
+        answer.world_from_cam, config.slack * d_thresh, math.radians(config.slack_deg)
     )
-    return pose if is_near else None
-
-
-def _contradicts(
-    answer: Localization, pose: Rigid3 | None, d_thresh: float, config: SessionPosesConfig
-) -> bool:
-    assert pose is not None
-    off = float(np.linalg.norm(answer.world_from_cam.translation - pose.translation))
-    return off > config.contradiction * d_thresh + 3.0 * config.widened * answer.position_sigma_m
+    return pose if is_same else None
 
 
 def _find_contradicted_frames(answered: list[int], apart: Set[int]) -> set[int]:

@@ -12,6 +12,7 @@ something else.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -30,6 +31,7 @@ from topoloc.geometry.transform_consensus import (
     find_consensus,
     propagate_estimate,
 )
+from topoloc.lifelong.leave_one_out import sample_evenly
 from topoloc.lifelong.node_localization import localize_nodes
 from topoloc.lifelong.shared_images import estimate_by_shared_images
 from topoloc.localization.localizer import Localizer
@@ -182,21 +184,15 @@ class _Comparison:
         if isinstance(found, NotJoined):
             return found
         consensus, ends = found
-        first_from_second = (
-            self._tiles[0].world_from_node(ends[0])
-            @ consensus.a_from_b
-            @ self._tiles[1].world_from_node(ends[1]).inverse()
+        first_from_second, covariance = consensus.between(
+            self._tiles[0].world_from_node(ends[0]),
+            self._tiles[1].world_from_node(ends[1]).inverse(),
         )
         near = self._find_nearby_nodes(first_from_second)
         self._localize_nodes(near)
         tested = self._verify(first_from_second, near)
-        to_world = self._tiles[0].world_from_node(ends[0]).adjoint()
-        covariance = to_world @ consensus.covariance @ to_world.T
         joint = TileTransform(
-            first_from_second,
-            0.5 * (covariance + covariance.T),
-            int(np.count_nonzero(consensus.is_inlier)),
-            *tested,
+            first_from_second, covariance, int(np.count_nonzero(consensus.is_inlier)), *tested
         )
         return self._decide(joint)
 
@@ -318,12 +314,7 @@ class _Comparison:
                 for summary in of.topomap.summaries
             ]
             near = np.flatnonzero(np.array(apart) <= self._config.near * config.d_thresh)
-            chosen = np.unique(
-                np.linspace(0, len(near) - 1, min(len(near), self._config.num_asked))
-                .round()
-                .astype(int)
-            )
-            rows.append(as_rows(near[chosen]) if len(near) else [])
+            rows.append(sample_evenly(as_rows(near), self._config.num_asked))
         return rows
 
     def _verify(
@@ -340,23 +331,16 @@ class _Comparison:
             for row in rows:
                 if row not in known:
                     continue
-                result, world_from_cam = known[row], pose @ of.world_from_node(row)
-                is_at_pose = result is not None and _is_at_pose(result, world_from_cam, d_thresh)
-                num_at_pose += is_at_pose
-                shares.append(_unguided_inlier_ratio(result) if is_at_pose else 0.0)
+                result, share = known[row], 0.0
+                if result is not None and result.world_from_cam.is_same(
+                    pose @ of.world_from_node(row), 0.3 * d_thresh, math.radians(2.0)
+                ):
+                    num_at_pose, share = num_at_pose + 1, _unguided_inlier_ratio(result)
+                shares.append(share)
         return len(shares), num_at_pose, float(np.quantile(shares, 0.25)) if shares else 0.0
 
 
-def _is_at_pose(result: Localization | None, world_from_cam: Rigid3, d_thresh: float) -> bool:
-    if result is None:
-        return False
-    off = result.world_from_cam.inverse() @ world_from_cam
-    return bool(
-        np.linalg.norm(off.translation) <= 0.3 * d_thresh and np.degrees(off.angle()) <= 2.0
-    )
-
-
-def _unguided_inlier_ratio(result: Localization | None) -> float:
+def _unguided_inlier_ratio(result: Localization) -> float:
     """Return the share of unguided matches that agree with the pose."""
-    evidence = None if result is None else result.evidence
+    evidence = result.evidence
     return 0.0 if evidence is None else evidence.num_inliers / max(evidence.num_matches, 1)

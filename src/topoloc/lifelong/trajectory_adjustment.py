@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.alignment import compute_path_lengths
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.lifelong.scale_estimation import compute_path_lengths
 from topoloc.localization.result import Localization
 from topoloc.slam.bundle_adjustment import BundleConfig, PosePrior, adjust_bundle
 from topoloc.slam.keyframes import FramePose, KeyFrame

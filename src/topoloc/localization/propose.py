@@ -29,7 +29,7 @@ import numpy as np
 from topoloc.features.matching import Matcher
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.belief import Hypothesis, is_same_pose
+from topoloc.localization.belief import Hypothesis, is_same_fit
 from topoloc.localization.guided import (
     count_consistent_displacements,
     match_guided,
@@ -250,7 +250,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     kept: list[PoseFit] = []
     for fit in sorted(fits, key=lambda fit: -fit.num_inliers):
         if isinstance(fit, PoseFit) and not any(
-            is_same_pose(fit, other, search.config.evidence) for other in kept
+            is_same_fit(fit, other, search.config.evidence) for other in kept
         ):
             kept.append(fit)
             yield Proposal("viewpoints", fit, is_guided=True)
@@ -285,9 +285,9 @@ def _propose_repetitions(search: Search) -> Iterator[Proposal]:
         tried.append(hypothesis.world_from_cam)
         for move in search.map.moves(search.map.topomap.row_of(hypothesis.fit.node_id)):
             world_from_cam = Rigid3(move[:3, :3], move[:3, 3]) @ hypothesis.world_from_cam
-            if _is_near_any(
-                world_from_cam,
-                [*tried, *(other.world_from_cam for other in search.belief.hypotheses)],
+            known = [*tried, *(other.world_from_cam for other in search.belief.hypotheses)]
+            if any(
+                world_from_cam.is_same(other, MIN_SHIFT, _MAX_SAME_POSE_ANGLE) for other in known
             ):
                 continue
             if num_asked == config.max_repetitions:
@@ -300,17 +300,6 @@ def _propose_repetitions(search: Search) -> Iterator[Proposal]:
             previous = set(map(id, search.belief.hypotheses))
             yield Proposal("repetition", fit, is_guided=True, repeats=hypothesis.evidence)
             waiting += [other for other in search.belief.hypotheses if id(other) not in previous]
-
-
-def _is_near_any(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
-    """Return whether a pose equals one of the others, instead of being a repetition of it."""
-    distances = np.linalg.norm(
-        np.array([other.translation for other in others]) - world_from_cam.translation, axis=1
-    )
-    return any(
-        (world_from_cam.inverse() @ others[k]).angle() < _MAX_SAME_POSE_ANGLE
-        for k in np.flatnonzero(distances < MIN_SHIFT)
-    )
 
 
 def _fit_moved_pose(

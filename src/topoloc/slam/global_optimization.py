@@ -12,6 +12,7 @@ from jaxtyping import Int
 
 from topoloc.bounds import Above
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.transform_consensus import diagonal_covariance
 from topoloc.slam.bundle_adjustment import BundleConfig, adjust_bundle
 from topoloc.slam.keyframes import KeyFrame, Landmarks, Observations
 from topoloc.slam.loop_closure import Link
@@ -135,19 +136,15 @@ def _motion_edge(keyframe: KeyFrame, index: dict[int, int], config: GlobalMapCon
     source = keyframe.motion.source
     motion = keyframe.cam_from_world @ source.cam_from_world.inverse()
     metres = config.motion_sigma * float(np.linalg.norm(motion.translation)) + 1e-3
-    covariance = keyframe.motion.covariance + _diagonal_covariance(metres, config.motion_sigma_deg)
+    covariance = keyframe.motion.covariance + diagonal_covariance(metres, config.motion_sigma_deg)
     return Edge(index[id(source)], index[id(keyframe)], motion, covariance, is_loop=False)
 
 
 def _link_edge(link: Link, config: GlobalMapConfig) -> Edge:
-    covariance = config.link_covariance_scale * link.match.covariance + _diagonal_covariance(
+    covariance = config.link_covariance_scale * link.match.covariance + diagonal_covariance(
         config.link_sigma, config.link_sigma_deg
     )
     return Edge(link.source, link.target, link.match.target_from_source, covariance, is_loop=True)
-
-
-def _diagonal_covariance(metres: float, degrees: float) -> np.ndarray:
-    return np.diag(np.square([metres] * 3 + [np.deg2rad(degrees)] * 3))
 
 
 def _move_keyframes(
@@ -188,7 +185,6 @@ def _add_link_landmarks(
 ) -> None:
     source = keyframes[link.source]
     place = source.place
-    assert place is not None
     for source_row, target_row in zip(
         link.match.source_rows.tolist(), link.match.target_rows.tolist(), strict=True
     ):
@@ -210,7 +206,6 @@ def _feature_observation(
 ) -> Observations:
     """Return a local feature as an observation: its pixel, and its disparity if it has a depth."""
     place, stereo = keyframe.place, keyframe.stereo
-    assert place is not None
     measured = np.array([[*place.features.points_img[row].astype(np.float64), np.nan]])
     weights = np.full((1, 3), 1.0 / config.sigma_feature_px)
     weights[0, 2] = 0.0

@@ -16,9 +16,7 @@ import numpy as np
 
 from topoloc.bounds import Above, AtLeast, Between
 from topoloc.disk_list import DiskList
-from topoloc.features.features import Features
 from topoloc.features.parallel import parallel_map
-from topoloc.geometry.rigid import Rigid3
 from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.vlad import SurfVlad, learn_words_from_parts, vlad
 from topoloc.slam.keyframes import KeyFrame
@@ -81,7 +79,9 @@ def find_links(
     proposals = _propose_pairs(keyframes, places, config)
     links = []
     for done, link in enumerate(
-        parallel_map(lambda pair: _match_keyframes(pair[1], pair[0], keyframes, config), proposals)
+        parallel_map(
+            lambda pair: match_keyframes(pair[1], pair[0], keyframes, config.matching), proposals
+        )
     ):
         if link is not None:
             links.append(link)
@@ -136,25 +136,21 @@ def rank_places(
 
     Each key frame must have place features. Nothing is generated if there are no features at all.
     """
-
-    def features(row: int) -> Features:
-        place = keyframes[row].place
-        assert place is not None
-        return place.features
-
-    num_features = [len(features(row)) for row in range(len(keyframes))]
+    num_features = [len(keyframe.place.features) for keyframe in keyframes]
     if sum(num_features) == 0:
         return
-    words = learn_words_from_parts(num_features, lambda row: features(row).descriptors, config)
+    words = learn_words_from_parts(
+        num_features, lambda row: keyframes[row].place.features.descriptors, config
+    )
     vlads = DiskList(
-        (vlad(features(row).descriptors, words) for row in range(len(keyframes))), _MAX_VLAD_BYTES
+        (vlad(keyframe.place.features.descriptors, words) for keyframe in keyframes),
+        _MAX_VLAD_BYTES,
     )
-    localizer, blank = (
-        SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config),
-        np.zeros((1, 1), np.uint8),
-    )
-    for row in range(len(keyframes)):
-        yield [score.row for score in localizer.rank(blank, features(row), num or len(keyframes))]
+    localizer = SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config)
+    blank = np.zeros((1, 1), np.uint8)
+    for keyframe in keyframes:
+        scores = localizer.rank(blank, keyframe.place.features, num or len(keyframes))
+        yield [score.row for score in scores]
 
 
 def _is_loop_candidate(
@@ -169,11 +165,10 @@ def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame], config: LoopConf
     if source.submap != target.submap:
         return source.recording != target.recording or is_reachable(link, keyframes, config)
     way = _path_length(keyframes, link.source, link.target)
-    drift = _pose_difference(
-        link.match.target_from_source, target.cam_from_world @ source.cam_from_world.inverse()
-    )
-    return bool(
-        drift[0] < 0.5 + config.max_drift * way and drift[1] < np.deg2rad(config.max_drift_deg)
+    return link.match.target_from_source.is_same(
+        target.cam_from_world @ source.cam_from_world.inverse(),
+        0.5 + config.max_drift * way,
+        np.deg2rad(config.max_drift_deg),
     )
 
 
@@ -250,7 +245,7 @@ def _has_rival(
         if i not in (link.source, link.target)
         and keyframes[i].submap == keyframes[link.source].submap
     ):
-        match = _match_keyframes(source, link.target, keyframes, config)
+        match = match_keyframes(source, link.target, keyframes, config.matching)
         if (
             match is not None
             and _is_within_drift(match, keyframes, config)
@@ -260,13 +255,12 @@ def _has_rival(
     return False
 
 
-def _match_keyframes(
-    source: int, target: int, keyframes: Sequence[KeyFrame], config: LoopConfig
+def match_keyframes(
+    source: int, target: int, keyframes: Sequence[KeyFrame], config: PlaceMatchingConfig
 ) -> Link | None:
-    a, b = keyframes[source].place, keyframes[target].place
-    assert a is not None
-    assert b is not None
-    match = match_places(a, b, keyframes[target].stereo, config.matching)
+    """Link two key frames by their matches. None if too few of them agree."""
+    a, b = keyframes[source], keyframes[target]
+    match = match_places(a.place, b.place, b.stereo, config)
     return None if match is None else Link(source, target, match)
 
 
@@ -306,13 +300,8 @@ def _are_consistent(
         + np.linalg.norm(targets.translation)
         + np.linalg.norm(expected.translation)
     )
-    metres, radians = _pose_difference(link.match.target_from_source, expected)
-    return bool(
-        metres < config.max_disagreement * (1.0 + way) + drift
-        and radians < np.deg2rad(config.max_disagreement_deg)
+    return link.match.target_from_source.is_same(
+        expected,
+        config.max_disagreement * (1.0 + way) + drift,
+        np.deg2rad(config.max_disagreement_deg),
     )
-
-
-def _pose_difference(a: Rigid3, b: Rigid3) -> tuple[float, float]:
-    """Return the difference in metres and radians."""
-    return float(np.linalg.norm(a.translation - b.translation)), (a @ b.inverse()).angle()

@@ -15,6 +15,7 @@ from typing import Annotated
 import numpy as np
 
 from topoloc.bounds import Above, AtLeast, Between
+from topoloc.geometry.alignment import normalized_pose_error
 from topoloc.geometry.rigid import Rigid3
 
 
@@ -57,10 +58,8 @@ class Prediction:
 
     def distance(self, cam_from_world: Rigid3) -> float:
         """Return the distance of a pose from the prediction, in sigma."""
-        away = cam_from_world @ self.cam_from_world.inverse()
-        return float(
-            max(np.linalg.norm(away.translation) / self.sigma, away.angle() / self.sigma_rad)
-        )
+        poses = self.cam_from_world.inverse(), cam_from_world.inverse()
+        return normalized_pose_error(*poses, self.sigma, self.sigma_rad)
 
 
 def select_expected_pose(

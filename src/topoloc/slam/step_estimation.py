@@ -110,6 +110,16 @@ class Tracks:
         """Start tracks at these points."""
         return cls(landmark_ids, points_img, points_img, np.zeros(len(points_img), np.float32))
 
+    @classmethod
+    def empty(cls) -> Tracks:
+        """Return no tracks."""
+        return cls.from_points(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+
+    def median_motion_px(self) -> float:
+        """Return the median distance from the last key frame's pixels, 0 without points."""
+        moved = np.linalg.norm(self.points_img - self.points_ref, axis=1)
+        return float(np.median(moved)) if len(moved) else 0.0
+
     def select(self, rows: np.ndarray) -> Tracks:
         """Return the given rows."""
         return Tracks(
@@ -132,9 +142,11 @@ class LastFrame:
 class Step:
     """Hold a pose that enough points agree on.
 
-    `inlier_ratio` is the share of inliers among the points that should be visible.
+    `reference` is the last key frame. `inlier_ratio` is the share of inliers among the points that
+    should be visible.
     """
 
+    reference: KeyFrame
     cam_from_world: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     tracks: Tracks
@@ -161,7 +173,8 @@ class StepEstimator:
             return None
         should = max(int(np.count_nonzero(self._is_in_image(pose.cam_from_world))), 1)
         inlier_ratio = min(np.count_nonzero(pose.inliers) / should, 1.0)
-        return Step(pose.cam_from_world, pose.covariance, tracks.select(pose.inliers), inlier_ratio)
+        kept = tracks.select(pose.inliers)
+        return Step(self.reference, pose.cam_from_world, pose.covariance, kept, inlier_ratio)
 
     def find_repeated_motions(self, prediction: Prediction) -> list[Rigid3]:
         """Return the motions after which the last image would look the same.
@@ -223,11 +236,8 @@ class StepEstimator:
 
     def is_close(self, a: Rigid3, b: Rigid3) -> bool:
         """Return whether two cam_from_world are the same within `same_step`."""
-        away = a @ b.inverse()
-        return bool(
-            np.linalg.norm(away.translation) < self.config.same_step * self._median_depth()
-            and away.angle() < self.config.same_step
-        )
+        same_step = self.config.same_step
+        return a.inverse().is_same(b.inverse(), same_step * self._median_depth(), same_step)
 
     def _is_in_image(self, cam_from_world: Rigid3) -> np.ndarray:
         camera = self.measured.stereo.camera

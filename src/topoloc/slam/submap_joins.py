@@ -31,8 +31,14 @@ from topoloc.geometry.transform_consensus import (
     propagate_estimate,
 )
 from topoloc.slam.keyframes import KeyFrame, PlaceFeatures
-from topoloc.slam.loop_closure import Link, LoopConfig, is_reachable, rank_places
-from topoloc.slam.place_matching import PlaceMatchingConfig, count_repeated_features, match_places
+from topoloc.slam.loop_closure import (
+    Link,
+    LoopConfig,
+    is_reachable,
+    match_keyframes,
+    rank_places,
+)
+from topoloc.slam.place_matching import PlaceMatchingConfig, count_repeated_features
 
 _MIN_LOOSE_INLIERS = 6  # matches that agree on a known pose
 _MIN_ROTATION_TRACE = 1.0  # of a rotation by 90 degrees, beyond which images hardly overlap
@@ -135,9 +141,11 @@ def _is_distinct(
     `repeated` caches the counts by key frame.
     """
     for end in (link.source, link.target):
-        place = keyframes[end].place
-        if end not in repeated and place is not None:
-            repeated[end] = count_repeated_features(place, keyframes[end].stereo, config.matching)
+        if end not in repeated:
+            keyframe = keyframes[end]
+            repeated[end] = count_repeated_features(
+                keyframe.place, keyframe.stereo, config.matching
+            )
     rivals = max(repeated[link.source], repeated[link.target])
     return rivals < max(
         config.consensus.rival_share * len(link.match.source_rows), config.matching.min_inliers
@@ -231,21 +239,20 @@ def _match_pairs(
 
     Links within a recording that exceed the camera's maximum speed are skipped.
     """
-    links = []
-    for source, target in (ends for pair in pairs for ends in (pair, pair[::-1])):
-        a, b = keyframes[source].place, keyframes[target].place
-        match = (
-            match_places(a, b, keyframes[target].stereo, config.matching)
-            if a is not None and b is not None
-            else None
+    links = (
+        match_keyframes(source, target, keyframes, config.matching)
+        for pair in pairs
+        for source, target in (pair, pair[::-1])
+    )
+    return [
+        link
+        for link in links
+        if link is not None
+        and (
+            keyframes[link.source].recording != keyframes[link.target].recording
+            or is_reachable(link, keyframes, loops)
         )
-        if match is not None:
-            link = Link(source, target, match)
-            if keyframes[source].recording != keyframes[target].recording or is_reachable(
-                link, keyframes, loops
-            ):
-                links.append(link)
-    return links
+    ]
 
 
 def _order_ends(link: Link, keyframes: Sequence[KeyFrame]) -> list[int]:
@@ -294,19 +301,15 @@ def _is_join_verified(
     for source, target, rows in _find_overlapping_views(
         consensus.a_from_b, keyframes, ends, config
     ):
-        a, b = keyframes[source].place, keyframes[target].place
-        assert a is not None
-        assert b is not None
-        cells = _compute_cells(a, keyframes[source], config)
+        cells = _compute_cells(keyframes[source], config)
         seen, found = (
             np.bincount(cells[rows], minlength=config.cells**2),
             np.zeros(config.cells**2, np.int64),
         )
-        match = match_places(a, b, keyframes[target].stereo, loosely)
-        if match is not None and _is_link_consistent(
-            Link(source, target, match), consensus, keyframes, ends, config
-        ):
-            found = np.bincount(cells[np.intersect1d(match.source_rows, rows)], minlength=len(seen))
+        link = match_keyframes(source, target, keyframes, loosely)
+        if link is not None and _is_link_consistent(link, consensus, keyframes, ends, config):
+            again = np.intersect1d(link.match.source_rows, rows)
+            found = np.bincount(cells[again], minlength=len(seen))
         num_seen, num_found, num_covered = (
             num_seen + seen.sum(),
             num_found + found.sum(),
@@ -319,13 +322,11 @@ def _is_join_verified(
     return bool(num_seen >= config.min_seen_points and enough)
 
 
-def _compute_cells(
-    place: PlaceFeatures, keyframe: KeyFrame, config: JoinConfig
-) -> Int[np.ndarray, " n"]:
+def _compute_cells(keyframe: KeyFrame, config: JoinConfig) -> Int[np.ndarray, " n"]:
     """Return the grid cell of each feature in its image."""
     camera = keyframe.stereo.camera
     columns_rows = np.floor(
-        config.cells * place.features.points_img / [camera.width, camera.height]
+        config.cells * keyframe.place.features.points_img / [camera.width, camera.height]
     ).astype(np.int64)
     return np.clip(columns_rows, 0, config.cells - 1) @ [1, config.cells]
 
@@ -338,9 +339,15 @@ def _is_link_consistent(
     config: JoinConfig,
 ) -> bool:
     estimates, covariances = _compute_estimates([link], keyframes, ends, config)
-    residual = (estimates[0] @ consensus.a_from_b.inverse()).log()
-    square = residual @ np.linalg.solve(covariances[0] + consensus.covariance, residual)
-    return bool(square <= config.consensus.max_sigmas**2)
+    return (
+        estimates[0]
+        .inverse()
+        .is_same(
+            consensus.a_from_b.inverse(),
+            covariance=covariances[0] + consensus.covariance,
+            max_square=config.consensus.max_sigmas**2,
+        )
+    )
 
 
 def _find_overlapping_views(
@@ -393,7 +400,6 @@ def _find_covisible_features(
 ) -> Int[np.ndarray, " n"]:
     """Return the features of `source` in view of `target` from a similar direction and distance."""
     place = source.place
-    assert place is not None
     valid = np.flatnonzero(place.points.valid)
     points = target_from_source.apply(place.points.points_cam[valid])
     pixels, camera = target.stereo.project(points)[:, :2], target.stereo.camera

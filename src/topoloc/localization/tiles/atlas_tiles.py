@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import numpy as np
 from msgspec import structs
 
 from topoloc.atlas.atlas import Atlas
@@ -134,13 +133,11 @@ class AtlasTiles:
         world_from_other = self.other_from_world(other_id, tile_id)
         if world_from_other is None:
             return False
-        apart = pose.world_from_cam.inverse() @ world_from_other @ other_pose.world_from_cam
         metres, radians = _join_sigmas(self.atlas.tile(tile_id), pose, self.atlas.tile(other_id))
-        near = float(np.linalg.norm(apart.translation)) < _SAME_METRES + min(
-            _SIGMAS * metres, _SAME_METRES
-        )
-        return near and math.degrees(apart.angle()) < _SAME_DEG + min(
-            _SIGMAS * math.degrees(radians), _SAME_DEG
+        return pose.world_from_cam.is_same(
+            world_from_other @ other_pose.world_from_cam,
+            _SAME_METRES + min(_SIGMAS * metres, _SAME_METRES),
+            math.radians(_SAME_DEG + min(_SIGMAS * math.degrees(radians), _SAME_DEG)),
         )
 
     def with_tile(self, result: R, tile_id: str) -> R:

@@ -380,8 +380,6 @@ def _is_seen_by_nodes(search: Search, cam_from_world: Rigid3) -> bool:
 
 def _are_near(search: Search, a_from_world: Rigid3, b_from_world: Rigid3) -> bool:
     """Return whether two imprecise proposals are so close that only one is refined."""
-    apart = a_from_world @ b_from_world.inverse()
-    distance = float(
-        np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation)
+    return a_from_world.inverse().is_same(
+        b_from_world.inverse(), 1.5 * search.map.d_thresh, math.radians(20.0)
     )
-    return distance < 1.5 * search.map.d_thresh and math.degrees(apart.angle()) < 20.0
