@@ -30,7 +30,7 @@ from topoloc.atlas.descriptor_shard import DescriptorShard
 from topoloc.atlas.global_descriptors import GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index import AtlasIndex
 from topoloc.atlas.index_files import open_index
-from topoloc.atlas.manifest import StoredFile, Tile
+from topoloc.atlas.manifest import PlacesFile, StoredFile, Tile
 from topoloc.retrieval.descriptor_kernels import multiply_rows
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
@@ -129,8 +129,7 @@ def tiles_of(
             Tile(
                 f"{number:07d}",
                 stored,
-                stored,
-                versions,
+                PlacesFile(stored.name, stored.sha256, 1, versions),
                 "0" * 16,
                 1,
                 (kind,),
@@ -139,6 +138,9 @@ def tiles_of(
                 300.0,
                 box,
                 "w",
+                None,
+                None,
+                None,
             )
         )
 
@@ -351,7 +353,7 @@ def main() -> None:
     atlas = Atlas.open(args.atlas)
     of_tiles = [
         load_global_descriptors(
-            atlas.store.local_path(tile.places.name, tile.places.sha256), tile.vocabularies
+            atlas.store.local_path(tile.places.name, tile.places.sha256), tile.places.vocabularies
         )
         for tile in atlas.manifest.tiles
     ]

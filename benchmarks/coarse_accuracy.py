@@ -77,7 +77,7 @@ def main() -> None:
 
 def trained(topomap: TopoMetricMap, method: str, weights: str | None) -> CoarseLocalizer:
     if method == "surf-vlad":
-        return open_coarse_localizer(topomap.coarse_models[method])
+        return open_coarse_localizer(topomap.first_layer.coarse_models[method])
     name, _, backbone = method.partition(" ")
     if backbone == "compact":
         config = CoarseTrainingConfig(cnn_fc=CnnFcConfig(picture=COMPACT_PICTURE))
@@ -99,9 +99,12 @@ def judge(
         image = sequence[i].image
         first, *_ = localizer.rank(image, extract_features(to_grey(image), features_config), 1)
         distances = node_distances(world_from_cam, nodes, lambda_rot)
-        hits.append(first.node_id == int(np.argmin(distances)))
-        near.append(hits[-1] or first.node_id in find_neighbour_ids(topomap, distances))
-        away.append(distances[first.node_id] / d_thresh)
+        hits.append(first.row == int(np.argmin(distances)))
+        near.append(
+            hits[-1]
+            or topomap.summaries[first.row].node_id in find_neighbour_ids(topomap, distances)
+        )
+        away.append(distances[first.row] / d_thresh)
     return {
         "top_1": float(np.mean(hits)),
         "neighbour": float(np.mean(near)),

@@ -117,7 +117,9 @@ def form_of(name: str, kind: str, topomap: TopoMetricMap) -> tuple[Form, int]:
     scale = find_feature_type(kind).descriptor_scale
     if name == "bytes" or name.startswith("coarse"):
         return coarse(int(name.removeprefix("coarse") or 1) if name != "bytes" else 1, scale), 0
-    learned_from = np.concatenate([node.features.descriptors for node in topomap.nodes_of(kind)])
+    learned_from = np.concatenate(
+        [node.features.descriptors for node in topomap.layers[kind].nodes]
+    )
     learned_from = learned_from[:: max(len(learned_from) // _LEARNED_FROM, 1)]
     if name == "binary":
         return binary(learned_from), 3 * learned_from.shape[1] * 4
@@ -136,7 +138,7 @@ def with_descriptors(
     for kind in topomap.kinds:
         form, once = form_of(name, kind, whole)
         num_bytes, nodes[kind] = num_bytes + once, []
-        for node in topomap.nodes_of(kind):
+        for node in topomap.layers[kind].nodes:
             restored, of_node = form(node.features.descriptors)
             num_bytes += of_node
             nodes[kind].append(
@@ -146,7 +148,8 @@ def with_descriptors(
                     stored_descriptors=None,
                 )
             )
-    return replace(topomap, nodes=nodes.pop(topomap.kind), other_kinds=nodes), num_bytes
+    layers = {kind: replace(layer, nodes=nodes[kind]) for kind, layer in topomap.layers.items()}
+    return replace(topomap, layers=layers), num_bytes
 
 
 def written(topomap: TopoMetricMap) -> tuple[int, int]:
@@ -185,7 +188,7 @@ def asked(topomap: TopoMetricMap, queries: str, step: int) -> str:
 def main(args: Args) -> None:
     with TopoMetricMap.load(args.map) as whole:
         nothing = {
-            kind: [np.zeros(len(node.features), bool) for node in whole.nodes_of(kind)]
+            kind: [np.zeros(len(node.features), bool) for node in whole.layers[kind].nodes]
             for kind in whole.kinds
         }
         for most in args.landmarks:

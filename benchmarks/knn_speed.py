@@ -61,7 +61,7 @@ def measure(size: int, dimension: int) -> dict[str, float]:
         start = time.perf_counter()
         (best,) = index.rank_nodes(query, 1)
         times.append((time.perf_counter() - start) * 1e3)
-        hits += best.node_id == row
+        hits += best.row == row
     index_mb = (
         faiss.serialize_index(index._cells).nbytes / 1e6
         if index._cells is not None

@@ -22,9 +22,10 @@ import cv2
 import numpy as np
 import tyro
 
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import match_features
 from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose

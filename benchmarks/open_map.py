@@ -24,8 +24,9 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.build import BuildConfig
-from topoloc.mapping.topomap import Edge, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
-from topoloc.retrieval.vlad import SurfVlad, VladConfig
+from topoloc.mapping.topomap import Edge, Layer, NodeSummary, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.retrieval.coarse import VladConfig
+from topoloc.retrieval.vlad import SurfVlad
 
 NUM_POINTS = 800
 IMAGES_A_NODE = 3
@@ -63,15 +64,15 @@ def made_up_map(num_nodes: int) -> TopoMetricMap:
     words = unit(rng.standard_normal((config.num_words, 66)))  # descriptors with their places
     coarse = SurfVlad(words, projection[0], projection, vectors, image_nodes, config)
     effective = BuildConfig()
+    nodes = [TopoNode(summary, camera, features, points, covs, jpeg) for summary in summaries]
     return TopoMetricMap(
         summaries,
-        [TopoNode(summary, camera, features, points, covs, jpeg) for summary in summaries],
+        {"surf": Layer(nodes, {SurfVlad.name: coarse.to_model()})},
         [Edge(k, k + 1) for k in range(num_nodes - 1)],
         [
             PlaceImage("made up", f"{n}.png", int(node), poses[node], small)
             for n, node in enumerate(image_nodes)
         ],
-        {SurfVlad.name: coarse.to_model()},
         asdict(effective) | {"nodes": asdict(effective.nodes.resolved(4.0))},
     )
 

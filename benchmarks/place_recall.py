@@ -91,7 +91,7 @@ def judge(
         times, ranked = [], []
         for features, image in queries:
             start = time.perf_counter()
-            ranked.append([score.node_id for score in coarse.rank(image, features, max(_FIRST))])
+            ranked.append([score.row for score in coarse.rank(image, features, max(_FIRST))])
             times.append(1e3 * (time.perf_counter() - start))
         for what, right in hits:
             found = np.array([right[k, row] for k, row in enumerate(ranked)])

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import FeatureConfig, extract_features
-from topoloc.features.matching import MatchingConfig, match_features, match_pooled
+from topoloc.features.matching import match_features, match_pooled
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
 from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import prepare_frame

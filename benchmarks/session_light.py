@@ -139,7 +139,7 @@ def _recall(model: SurfVlad, asked: Sequence[View], right: np.ndarray, rows: np.
         view = asked[k]
         blank = np.zeros((view.size[1], view.size[0]), np.uint8)
         ranked.append(
-            [right[k, score.node_id] for score in model.rank(blank, view.features, max(_FIRST))]
+            [right[k, score.row] for score in model.rank(blank, view.features, max(_FIRST))]
         )
     hits = np.array(ranked)
     return "  ".join(f"@{n} {int(hits[:, :n].any(axis=1).sum()):3d}" for n in _FIRST)

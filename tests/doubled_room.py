@@ -37,7 +37,7 @@ def twice(topomap: TopoMetricMap, share_alike: float = 1.0) -> TopoMetricMap:
         changed = replace(node, features=replace(node.features, descriptors=descriptors))
         copies.append(_moved(changed, num_nodes + node.summary.node_id))
     nodes = [*topomap.nodes, *copies]
-    model = topomap.coarse_models[SurfVlad.name]
+    model = topomap.first_layer.coarse_models[SurfVlad.name]
     ids = model.arrays["node_ids"]
     arrays = dict(model.arrays) | {
         "vectors": np.concatenate([model.arrays["vectors"]] * 2),
@@ -45,9 +45,7 @@ def twice(topomap: TopoMetricMap, share_alike: float = 1.0) -> TopoMetricMap:
     }
     coarse = {SurfVlad.name: replace(model, arrays=arrays)}
     return replace(
-        topomap,
-        nodes=nodes,
+        topomap.with_first_layer(nodes=nodes, coarse_models=coarse),
         summaries=[node.summary for node in nodes],
-        coarse_models=coarse,
         edges=[],
     )

@@ -10,9 +10,8 @@ from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.topomap import Edge, NodeSummary, TopoMetricMap, TopoNode
-from topoloc.retrieval.coarse import NodeScore
+from topoloc.localization.result import CandidateNode, Localization, NotLocalized
+from topoloc.mapping.topomap import Edge, Layer, NodeSummary, TopoMetricMap, TopoNode
 
 TIMES_MS = {
     "patch_normalization": 2.0,
@@ -44,21 +43,23 @@ def answer(
     )
     truth = pose(x)
     found = Rigid3(off.rotation @ truth.rotation, truth.translation + off.translation)
-    candidates = [NodeScore(first_candidate, 0.9), NodeScore(1 - first_candidate, 0.4)]
+    candidates = [CandidateNode(first_candidate, 0.9), CandidateNode(1 - first_candidate, 0.4)]
     result = Localization(found, 1e-4 * np.eye(6), 0.9, node_id, candidates, 50, 40, TIMES_MS)
     return EvaluatedQuery(query, result, truth, 0, "walk", picture)
 
 
 def lost(query: str, x: float, reason: str = "too_few_inliers") -> EvaluatedQuery:
     """A query at `x` without a pose."""
-    result = NotLocalized(reason, [NodeScore(1, 0.2)], 9, 3, TIMES_MS)  # pyright: ignore[reportArgumentType]
+    result = NotLocalized(reason, [CandidateNode(1, 0.2)], 9, 3, TIMES_MS)  # pyright: ignore[reportArgumentType]
     return EvaluatedQuery(query, result, pose(x), 0, "walk", picture)
 
 
 def elsewhere(query: str, accepted: bool) -> EvaluatedQuery:
     """An image from elsewhere."""
     if accepted:
-        result = Localization(pose(0.0), np.eye(6), 0.9, 1, [NodeScore(1, 0.3)], 12, 12, TIMES_MS)
+        result = Localization(
+            pose(0.0), np.eye(6), 0.9, 1, [CandidateNode(1, 0.3)], 12, 12, TIMES_MS
+        )
         return EvaluatedQuery(query, result, None, None, "moon", picture)
     return EvaluatedQuery(
         query,
@@ -86,7 +87,7 @@ def two_nodes() -> TopoMetricMap:
     summaries = [NodeSummary(i, "walk", f"{i}.png", i, pose(float(i)), 0) for i in range(2)]
     nodes = [TopoNode(summary, camera, features, points, roots, jpeg) for summary in summaries]
     return TopoMetricMap(
-        summaries, nodes, [Edge(0, 1)], [], {}, {"nodes": {"lambda_rot": 1.0}}, 1.0
+        summaries, {"surf": Layer(nodes)}, [Edge(0, 1)], [], {"nodes": {"lambda_rot": 1.0}}, 1.0
     )
 
 

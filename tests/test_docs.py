@@ -18,9 +18,8 @@ import topoloc.plugin
 from topoloc.apps.cli import all_commands, main
 from topoloc.evaluation.metrics import EvaluatedQuery, summarize
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import CandidateNode, Localization, NotLocalized
 from topoloc.mapping import schema
-from topoloc.retrieval.coarse import NodeScore
 
 DOORS = (topoloc, topoloc.plugin)
 ROOT = Path(__file__).parents[1]
@@ -33,7 +32,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 JOURNAL = sorted((ROOT / "docs" / "journal").glob("*.md"))
 
 LOCALIZED = Localization(
-    Rigid3.identity(), np.eye(6), 1.0, 0, [NodeScore(0, 1.0)], 30, 20, {"total": 1.0}
+    Rigid3.identity(), np.eye(6), 1.0, 0, [CandidateNode(0, 1.0)], 30, 20, {"total": 1.0}
 )
 UNREADABLE = NotLocalized("unreadable", detail="which file, and why")
 

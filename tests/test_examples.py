@@ -170,7 +170,7 @@ def test_train_classifier(run: Run, coarse: str, tmp_path: Path, request: pytest
             request.getfixturevalue("shared") / "weights/squeezenet1_1-imagenet-features.pth",
         )
     printed = run("train_classifier", "--epochs", 1, *weights)
-    assert set(TopoMetricMap.load(tmp_path / "lab_learned.topo").coarse_models) >= {
+    assert set(TopoMetricMap.load(tmp_path / "lab_learned.topo").first_layer.coarse_models) >= {
         "surf-vlad",
         coarse,
     }

@@ -1,7 +1,7 @@
 """Decode untrusted JSON into msgspec structs and other annotated types.
 
 msgspec checks types, bounds and keys. NaN and infinity pass it unless a number has bounds, so
-numbers are annotated as `Finite`.
+numbers are annotated as `Finite`. Arrays are annotated with their shapes, and poses as `Rigid3`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from topoloc.errors import TopolocError
@@ -23,11 +24,6 @@ Positive = Annotated[float, Meta(gt=0, le=1e300)]
 Count = Annotated[int, Meta(ge=0, lt=2**53)]
 """A whole number that every JSON reader represents exactly."""
 Nanoseconds = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-MatrixRow = tuple[Finite, Finite, Finite, Finite]
-Matrix34 = tuple[MatrixRow, MatrixRow, MatrixRow]
-"""Rows of a rigid transform."""
-_Row6 = Annotated[list[Finite], Meta(min_length=6, max_length=6)]
-Matrix66 = Annotated[list[_Row6], Meta(min_length=6, max_length=6)]
 
 
 def decode_json(
@@ -50,10 +46,32 @@ def decode_json(
     except (ValueError, RecursionError) as failure:
         raise error(f"{where}: not JSON ({str(failure)[:100]})") from None
     try:
-        return msgspec.convert(parsed, kind)
+        return msgspec.convert(parsed, kind, dec_hook=_decode_custom)
     except (ValueError, RecursionError, TopolocError) as failure:
         fault, _, path = " ".join(str(failure).split()).partition(" - at `$")
         if fault.endswith("1e+300"):
             fault = "a finite number is expected"
         place = f"{path.strip('.`')[:100]}: " if path else ""
         raise error(f"{where}: {place}{fault[:200]}") from None
+
+
+def encode_json(value: Any) -> Any:
+    """Return a struct or dataclass as objects that `json.dumps` takes. Arrays and poses become
+    lists of rows."""
+    return msgspec.to_builtins(value, enc_hook=lambda custom: custom.tolist())
+
+
+def _decode_custom(kind: Any, value: Any) -> Any:
+    """Decode a value of a class with `from_json`, or a jaxtyping array of its shape."""
+    if isinstance(value, str):  # `from_json` would decode it once more
+        raise ValueError(f"Expected `{kind.__name__}`, got `str`")
+    if hasattr(kind, "from_json"):
+        try:
+            return kind.from_json(value)
+        except TopolocError as error:
+            raise ValueError(str(error)) from None
+    array = np.array(value)
+    is_finite = array.dtype.kind in "iuf" and np.isfinite(array).all()
+    if not is_finite or not isinstance(array := array.astype(np.float64), kind):
+        raise ValueError(f"finite numbers of shape ({kind.dim_str}) are expected")
+    return array

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from topoloc.json_data import Finite, decode_json
     from topoloc.localization.node_matching import NodeMatcher
     from topoloc.mapping.build import Progress
-    from topoloc.mapping.sessions import find_source_path
     from topoloc.recordings.atomic import (
         atomic_write,
         remove_stale_files,
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
         Recording,
         as_monocular,
         find_nearest_idx,
+        find_source_path,
         has_scale,
         list_images,
         natural_key,
@@ -166,7 +166,7 @@ _MODULES = {
     "field_annotations": "topoloc.bounds",
     "find_format": "topoloc.recordings.open",
     "find_nearest_idx": "topoloc.recordings.recording",
-    "find_source_path": "topoloc.mapping.sessions",
+    "find_source_path": "topoloc.recordings.recording",
     "find_violation": "topoloc.bounds",
     "format_length": "topoloc.evaluation.metrics",
     "group_by_recording": "topoloc.evaluation.metrics",

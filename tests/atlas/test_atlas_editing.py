@@ -13,6 +13,7 @@ from pathlib import Path
 from uuid import uuid4
 
 import pytest
+from msgspec import structs
 
 from topoloc.atlas import editing
 from topoloc.atlas.atlas import Atlas, tile_problem
@@ -154,7 +155,7 @@ def test_two_writers_at_once_lose_nothing(
     ready = Atlas.open(somewhere).tile("room")
 
     def made(new: NewTile, store: Store) -> Tile:
-        return replace(ready, tile_id=new.tile_id, world=new.world)
+        return structs.replace(ready, tile_id=new.tile_id, world=new.world)
 
     monkeypatch.setattr(editing, "store_tile", made)
     begin, failures = threading.Barrier(2), list[BaseException]()

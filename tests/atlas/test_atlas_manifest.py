@@ -4,16 +4,15 @@ not."""
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec import structs
+from msgspec.structs import replace
 
-from topoloc.atlas.manifest import Manifest, StoredFile, Tile
+from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -22,12 +21,11 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 def _tile(name: str, georeference: Georeference | None = None) -> Tile:
     stored = StoredFile(f"tiles/{name}-0123.topo", "ab" * 32, 10)
     box = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.5]])
-    places = structs.replace(stored, name=f"tiles/{name}-0123.places")
+    places = PlacesFile(f"tiles/{name}-0123.places", stored.sha256, 10, {"surf": "12ab"})
     return Tile(
         name,
         stored,
         places,
-        {"surf": "12ab"},
         "0" * 16,
         1,
         ("surf",),
@@ -37,6 +35,8 @@ def _tile(name: str, georeference: Georeference | None = None) -> Tile:
         box,
         name,
         georeference,
+        None,
+        None,
     )
 
 

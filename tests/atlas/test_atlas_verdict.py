@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.config import AtlasConfig
-from topoloc.atlas.manifest import Manifest, StoredFile, Tile
+from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.store import FolderStore
 from topoloc.geometry.rigid import Rigid3
@@ -18,10 +19,9 @@ from topoloc.localization.evidence import Evidence
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.provenance import Provenance
-from topoloc.localization.result import Localization, NotLocalized
+from topoloc.localization.result import CandidateNode, Localization, NotLocalized
 from topoloc.localization.tiles.atlas_tiles import AtlasTiles
 from topoloc.localization.tiles.tile_results import TileResult, merge_tile_results
-from topoloc.retrieval.coarse import NodeScore
 
 STRONG = Evidence(200, 150, 400, 500, 20, 0.9, 0.05, 0.7)
 FAIR = Evidence(100, 30, 80, 400, 20, 0.5, 0.15, 0.15)
@@ -32,7 +32,10 @@ WEAK = Evidence(60, 8, 20, 400, 15, 0.2, 0.8, 0.02)
 def _tile(name: str, world: str | None = None) -> Tile:
     stored = StoredFile(f"tiles/{name}.topo", "ab" * 32, 10)
     box = np.zeros((2, 3))
-    return Tile(name, stored, stored, {}, "0" * 16, 1, ("surf",), 4, (), 300.0, box, world or name)
+    return Tile(
+        *(name, stored, PlacesFile(stored.name, stored.sha256, 10, {}), "0" * 16, 1, ("surf",), 4),
+        *((), 300.0, box, world or name, None, None, None),
+    )
 
 
 def _pose(evidence: Evidence, x: float = 0.0, probability: float = 0.95) -> Localization:
@@ -42,7 +45,7 @@ def _pose(evidence: Evidence, x: float = 0.0, probability: float = 0.95) -> Loca
         np.eye(6) * 1e-6,
         probability,
         3,
-        [NodeScore(3, 0.5)],
+        [CandidateNode(3, 0.5)],
         9,
         8,
         evidence=evidence,
@@ -106,7 +109,7 @@ def test_the_same_pose_in_two_tiles_of_one_world_is_one():
 def test_tiles_that_lie_in_the_atlas_are_compared_there():
     shift = Rigid3(np.eye(3), np.array([10.0, 0.0, 0.0]))
     a, b = (
-        replace(_tile(name), atlas_from_world=pose)
+        structs.replace(_tile(name), atlas_from_world=pose)
         for name, pose in (("a", Rigid3.identity()), ("b", shift))
     )
     agreed = _merge((a, _pose(FAIR, x=12.0)), (b, _pose(FAIR, x=2.0)))

@@ -15,7 +15,7 @@ from topoloc.atlas import descriptor_shard, index_files
 from topoloc.atlas.descriptor_shard import DescriptorShard
 from topoloc.atlas.global_descriptors import GlobalDescriptors
 from topoloc.atlas.index_files import OpenedIndex, open_index
-from topoloc.atlas.manifest import StoredFile, Tile
+from topoloc.atlas.manifest import PlacesFile, StoredFile, Tile
 from topoloc.errors import AtlasError
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
@@ -51,8 +51,7 @@ class Campus:
                 Tile(
                     name,
                     stored,
-                    stored,
-                    versions,
+                    PlacesFile(stored.name, stored.sha256, 1, versions),
                     "0" * 16,
                     1,
                     ("surf",),
@@ -61,6 +60,9 @@ class Campus:
                     300.0,
                     np.zeros((2, 3)),
                     name,
+                    None,
+                    None,
+                    None,
                 )
             )
         self.read.clear()

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from msgspec import structs
 
 from topoloc.atlas.joins import Join
 from topoloc.atlas.joint_worlds import adjust_joins
-from topoloc.atlas.manifest import Manifest, StoredFile, Tile
+from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -45,12 +44,11 @@ def _tile(
 ) -> Tile:
     stored = StoredFile(f"tiles/{name}-0123.topo", contents * 32, 10)
     box = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 5.5]])
-    places = structs.replace(stored, name=f"tiles/{name}-0123.places")
+    places = PlacesFile(f"tiles/{name}-0123.places", stored.sha256, 10, {"surf": "12ab"})
     return Tile(
         name,
         stored,
         places,
-        {"surf": "12ab"},
         "0" * 16,
         1,
         ("surf",),
@@ -60,6 +58,8 @@ def _tile(
         box,
         world or name,
         georeference,
+        None,
+        None,
     )
 
 

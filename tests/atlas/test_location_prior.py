@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from built_room import unseen_views
 from tiny_world import CAMERA
@@ -17,7 +17,7 @@ from topoloc.atlas.location_prior import (
     distances_to_boxes,
     tiles_in_reach,
 )
-from topoloc.atlas.manifest import Manifest, StoredFile, Tile
+from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
@@ -37,8 +37,7 @@ def _tile(name: str, origin: GeoPoint | None = None, world: str | None = None) -
     return Tile(
         name,
         stored,
-        stored,
-        {},
+        PlacesFile(stored.name, stored.sha256, 10, {}),
         "0" * 16,
         1,
         ("surf",),
@@ -49,6 +48,7 @@ def _tile(name: str, origin: GeoPoint | None = None, world: str | None = None) -
         world or name,
         known,
         geo_box,
+        None,
     )
 
 

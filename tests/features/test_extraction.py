@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import (
     NORMALIZATIONS,
     FeatureConfig,
@@ -12,7 +13,7 @@ from topoloc.features.extraction import (
     extract_from_normalized,
     normalize_image,
 )
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import match_features
 
 
 def picture(seed: int = 0) -> np.ndarray:

@@ -3,13 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topoloc.features.matching import (
-    Matcher,
-    MatchingConfig,
-    find_similar_pairs,
-    match_features,
-    match_pooled,
-)
+from topoloc.features.config import MatchingConfig
+from topoloc.features.matching import Matcher, find_similar_pairs, match_features, match_pooled
 from topoloc.features.matching_kernels import TILE
 
 

@@ -102,6 +102,34 @@ def test_skew_is_the_cross_product(v, w):
     np.testing.assert_allclose(skew(v) @ w, np.cross(v, w), atol=1e-9)
 
 
+@given(rigids, tangents.filter(lambda xi: np.linalg.norm(xi[3:]) < 3.1))
+def test_the_squared_distance_is_that_of_the_right_perturbation(a, xi):
+    covariance = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
+    expected = float(xi @ np.linalg.solve(covariance, xi))
+    other = a @ Rigid3.exp(xi)
+    assert a.squared_distance(other, covariance) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+    for factor, is_same in ((0.9, False), (1.1, expected > 0.0)):
+        limit = {"covariance": covariance, "max_square": factor * expected}
+        assert a.is_same(other, **limit) is is_same or expected < 1e-3
+
+
+def test_poses_within_both_tolerances_are_the_same():
+    pose = Rigid3.exp(np.array([3.0, -1.0, 2.0, 0.5, -0.3, 1.0]))
+    for metres, radians, is_same in ((0.4, 0.08, True), (0.6, 0.08, False), (0.4, 0.12, False)):
+        other = pose @ Rigid3(exp_so3(np.array([0.0, radians, 0.0])), np.array([metres, 0.0, 0.0]))
+        assert pose.is_same(other, 0.5, 0.1) is is_same
+        assert other.is_same(pose, 0.5, 0.1) is is_same
+    assert not pose.is_same(pose)
+
+
+def test_poses_are_the_same_if_the_covariance_allows_what_the_tolerance_does_not():
+    here, there = Rigid3.identity(), Rigid3(np.eye(3), np.array([1.5, 0.0, 0.0]))
+    along, across = np.diag([0.5, *[1e-8] * 5]), np.diag([1e-8, 0.5, *[1e-8] * 4])
+    assert here.is_same(there, 0.5, 0.1, along, 12.6)
+    assert not here.is_same(there, 0.5, 0.1, across, 12.6)
+    assert here.is_same(there, 2.0, 0.1, across, 12.6)
+
+
 @given(rigids, rigids, st.floats(0.0, 1.0))
 def test_interpolation_meets_both_ends_and_turns_evenly(a, b, fraction):
     assert_same(a.interpolate(b, 0.0), a)

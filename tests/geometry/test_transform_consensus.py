@@ -7,7 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.transform_consensus import _residuals, find_consensus
+from topoloc.geometry.transform_consensus import (
+    _residuals,
+    find_consensus,
+    find_least_median,
+    select_hypothesis,
+)
 
 seeds = st.integers(0, 2**31)
 
@@ -148,3 +153,20 @@ def test_of_very_many_a_sample_of_hypotheses_is_enough():
 def test_fewer_than_asked_for_say_nothing():
     assert find_consensus([], np.zeros((0, 6, 6))) is None
     assert find_consensus([Rigid3.identity()] * 2, np.tile(np.eye(6), (2, 1, 1))) is None
+
+
+def test_the_hypothesis_with_most_agreeing_estimates_is_selected():
+    agree = np.array([[1, 0, 0, 1], [1, 1, 1, 0], [0, 1, 1, 1]], np.bool_)
+    assert select_hypothesis(agree) == (1, 3)  # the first of equals
+    of_one_image = np.array([[0, 0], [0, 1], [0, 2], [1, 3]])
+    assert select_hypothesis(agree, of_one_image) == (2, 2)
+
+
+def test_the_least_median_ignores_less_than_half_of_the_errors():
+    shifts = [0.0, 0.1, 0.1, 0.1, 50.0, 60.0, 0.1]
+    hypotheses = [Rigid3(np.eye(3), np.array([shift, 0.0, 0.0])) for shift in shifts]
+    best, median = find_least_median(
+        hypotheses, lambda one: np.abs(one.translation[0] - np.array(shifts))
+    )
+    assert best is hypotheses[1]
+    assert median == pytest.approx(0.0)

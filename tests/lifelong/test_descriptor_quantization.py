@@ -30,7 +30,7 @@ def path(room_map: Path, tmp_path: Path) -> Path:
 def _descriptors(path: Path) -> list[np.ndarray]:
     with TopoMetricMap.load(path) as topomap:
         return [
-            node.features.descriptors for kind in topomap.kinds for node in topomap.nodes_of(kind)
+            node.features.descriptors for layer in topomap.layers.values() for node in layer.nodes
         ]
 
 

@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,13 @@ from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.apps.cli import main
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.lifelong.update import is_well_localized
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.topomap import Layer
 from topoloc.recordings.recording import SequenceView
 
 OTHER_WORLD = Rigid3(exp_so3(np.array([0.1, 0.4, -0.8])), np.array([-4.0, 7.0, 1.0]))
@@ -48,14 +51,15 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     )
 
 
-def test_two_maps_become_one_in_the_world_of_the_first(maps: tuple[Path, Path], tmp_path: Path):
+def test_two_maps_become_one_in_the_world_of_the_first(
+    maps: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     before = [path.read_bytes() for path in maps]
-    out, said, settings = tmp_path / "both.topo", tmp_path / "said.json", tmp_path / "settings.toml"
-    settings.write_text("[update]\nmin_inliers = 250\n")
-    assert (
-        main(["merge", *map(str, maps), str(out), "--json", str(said), "--config", str(settings)])
-        == 0
+    out, said = tmp_path / "both.topo", tmp_path / "said.json"
+    monkeypatch.setattr(
+        "topoloc.lifelong.merge.is_well_localized", partial(is_well_localized, min_inliers=250)
     )
+    assert main(["merge", *map(str, maps), str(out), "--json", str(said)]) == 0
     assert [path.read_bytes() for path in maps] == before
     facts = json.loads(said.read_text())
     assert facts["agreeing"] >= 5
@@ -100,9 +104,8 @@ def test_what_cannot_be_merged_is_named(
         "merge", first, tmp_path / "none.topo", tmp_path / "both.topo"
     )
     with TopoMetricMap.load(first) as topomap:
-        replace(topomap, other_kinds={"sift": topomap.nodes}, map_id="0123456789abcdef").save(
-            tmp_path / "two.topo"
-        )
+        layers = {**topomap.layers, "sift": Layer(topomap.nodes)}
+        replace(topomap, layers=layers, map_id="0123456789abcdef").save(tmp_path / "two.topo")
     assert "holds no features sift" in complaint(
         "merge", tmp_path / "two.topo", second, tmp_path / "both.topo"
     )

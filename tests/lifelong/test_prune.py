@@ -55,7 +55,7 @@ def _with_later_session(
                 )
             )
         sessions = [*topomap.sessions, replace(topomap.sessions[0], session_id=1, name="later")]
-        edit.commit(replace(topomap, nodes=nodes, sessions=sessions), "later")
+        edit.commit(replace(topomap.with_first_layer(nodes=nodes), sessions=sessions), "later")
 
 
 def _num_points(path: Path) -> list[int]:

@@ -20,7 +20,9 @@ from topoloc.lifelong.recall_change import measure_recall_change
 def test_a_map_that_lost_its_landmarks_localizes_fewer_of_its_earlier_nodes(room_map: Path):
     with TopoMetricMap.load(room_map) as topomap:
         nodes = [select_landmarks(node, np.arange(3)) for node in topomap.nodes]
-        poorer = replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes])
+        poorer = replace(
+            topomap.with_first_layer(nodes=nodes), summaries=[node.summary for node in nodes]
+        )
         counts = measure_recall_change(topomap, poorer, max_queries=4)
         assert measure_recall_change(topomap, poorer, max_queries=0) == {}
     assert counts == {

@@ -6,7 +6,11 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.scale_estimation import find_largest_consensus, scale_to_metres
+from topoloc.lifelong.scale_estimation import (
+    MotionTolerance,
+    find_motion_consensus,
+    scale_to_metres,
+)
 from topoloc.lifelong.single_camera_poses import align_stretch_to_map
 from topoloc.localization.result import Localization
 
@@ -15,6 +19,7 @@ TRUTH = [
     Rigid3(exp_so3(np.array([0.0, 0.0, 0.02 * k])), np.array([0.2 * k, 0.5 * np.sin(0.1 * k), 0.0]))
     for k in range(80)
 ]
+TOLERANCE = MotionTolerance(0.2, 2.0, 0.05, 1.0)
 WRONG = Rigid3(np.eye(3), np.array([2.0, 1.0, 0.0]))
 
 
@@ -45,7 +50,7 @@ def _answers(numbers: list[int], wrong: list[int]) -> dict[int, Localization]:
 
 def test_wrong_answers_are_left_out():
     answers = _answers(list(range(0, 80, 4)), [8, 40, 64])
-    agreeing = find_largest_consensus(_motion(0.05), answers, 0.2, 2.0)
+    agreeing = find_motion_consensus(_motion(0.05), answers, TOLERANCE, is_metric=False)
     assert agreeing == [k for k in answers if k not in (8, 40, 64)]
 
 
@@ -55,9 +60,11 @@ def test_a_drifting_unit_is_held_between_answers_and_wrong_ones_bend_nothing():
     assert poses is not None
     assert agreeing == [k for k in answers if k != 40]
     off = [
-        np.linalg.norm(poses[k].translation - (WORLD_FROM_OWN @ TRUTH[k]).translation)
-        for k in range(80)
-    ]  # pyright: ignore[reportOptionalMemberAccess]
+        np.linalg.norm(pose.translation - (WORLD_FROM_OWN @ true).translation)
+        for pose, true in zip(poses, TRUTH, strict=True)
+        if pose is not None
+    ]
+    assert len(off) == len(TRUTH)
     assert max(off) < 0.1
 
 

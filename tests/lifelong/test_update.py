@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from topoloc.apps.cli import main
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.update import update_map
+from topoloc.lifelong.update import is_well_localized, update_map
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
@@ -93,13 +94,16 @@ def _off(answers: list[Localization | None], indices: np.ndarray) -> list[float]
     ]
 
 
-def test_a_session_goes_on_from_what_is_mapped(map_file: Path, second_half: Path, tmp_path: Path):
+def test_a_session_goes_on_from_what_is_mapped(
+    map_file: Path, second_half: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     before, far = map_file.read_bytes(), np.arange(18.1, 23.0, 1.2)
     known = [0 if answer is None else answer.num_inliers for answer in _answers(map_file, far)]
     joined, said = tmp_path / "joined.tum", tmp_path / "said.json"
-    settings = tmp_path / "settings.toml"
-    settings.write_text("[update]\nmin_inliers = 250\n")
-    options = ["--joined", str(joined), "--json", str(said), "--config", str(settings)]
+    monkeypatch.setattr(
+        "topoloc.lifelong.update.is_well_localized", partial(is_well_localized, min_inliers=250)
+    )
+    options = ["--joined", str(joined), "--json", str(said)]
     assert main(["update", str(map_file), str(second_half), *options]) == 0
     positions = np.loadtxt(joined)[:, 1:4]
     truth = np.array([path_pose(k).translation for k in ON])
@@ -190,7 +194,9 @@ def test_a_session_that_shows_nothing_new_adds_counts_alone(map_file: Path, tmp_
         assert num_sums > 0
 
 
-def test_a_changed_room_is_learnt_from_a_single_camera(map_file: Path, tmp_path: Path):
+def test_a_changed_room_is_learnt_from_a_single_camera(
+    map_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Two of the five surfaces look otherwise; the camera tells neither depth nor poses."""
     panels = room()
     for number in (0, 3):
@@ -211,9 +217,10 @@ def test_a_changed_room_is_learnt_from_a_single_camera(map_file: Path, tmp_path:
     )
     (folder / "camera.json").write_text(json.dumps(CAMERA.to_json()))
     before = _answers(map_file, asked, panels)
-    settings = tmp_path / "settings.toml"
-    settings.write_text("[update]\nmin_inliers = 10000\n")  # all of it is to be learnt
-    assert main(["update", str(map_file), str(folder), "--config", str(settings)]) == 0
+    monkeypatch.setattr(  # all of it is to be learnt
+        "topoloc.lifelong.update.is_well_localized", lambda answer, d_thresh: False
+    )
+    assert main(["update", str(map_file), str(folder)]) == 0
     after = _answers(map_file, asked, panels)
     with TopoMetricMap.load(map_file) as topomap:
         assert topomap.sessions[-1].poses_from == "map"

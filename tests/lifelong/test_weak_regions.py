@@ -84,8 +84,7 @@ def _changed(
     nodes = change(list(topomap.nodes))
     sessions = [replace(topomap.sessions[0], session_id=k, name=f"walk {k}") for k in range(2)]
     return replace(
-        topomap,
-        nodes=nodes,
+        topomap.with_first_layer(nodes=nodes),
         summaries=[node.summary for node in nodes],
         sessions=sessions,
         repetitions=None,
@@ -175,13 +174,13 @@ def test_the_command_prints_writes_and_draws(
 
 
 def test_what_is_of_recordings_is_not_taken_beside_it(
-    room_map: Path, queries: Path, tmp_path: Path, complaint: Callable[..., str]
+    room_map: Path, with_outpost: Path, queries: Path, tmp_path: Path, complaint: Callable[..., str]
 ):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     refused = complaint("evaluate", path, queries, "--against-itself", "--poses", "mm", status=2)
     assert "asks the map alone, without recordings, --poses" in refused
-    assert "give the tile's own file" in complaint(
-        "evaluate", _atlas(path, tmp_path), "--against-itself", status=2
+    assert "name the file of the tile" in complaint(
+        "evaluate", _atlas(path, with_outpost, tmp_path), "--against-itself", status=2
     )
     assert "or --against-itself" in complaint("evaluate", path, status=2)
     before = path.read_bytes()
@@ -191,7 +190,7 @@ def test_what_is_of_recordings_is_not_taken_beside_it(
     assert path.read_bytes() == before
 
 
-def _atlas(path: Path, tmp_path: Path) -> Path:
+def _atlas(path: Path, other: Path, tmp_path: Path) -> Path:
     folder = tmp_path / "atlas"
-    assert main(["atlas", "create", str(folder), str(path)]) == 0
+    assert main(["atlas", "create", str(folder), str(path), str(other)]) == 0
     return folder

@@ -17,11 +17,12 @@ from topoloc.localization.local_map import LocalMap
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.query import Query
+from topoloc.localization.result import CandidateNode
 from topoloc.localization.search import Search
 from topoloc.retrieval.coarse import NodeScore
 
 WEIGHTS = load_fitted_weights("surf")
-CANDIDATES = [NodeScore(3, 0.5)]
+CANDIDATES = [CandidateNode(3, 0.5)]
 EXACT = 1e-8 * np.eye(6)
 
 
@@ -95,7 +96,7 @@ def believed(hypotheses: list[Hypothesis], config: LocalizerConfig | None = None
     not_open = object.__new__(OpenMap)
     not_open.node_ids, not_open.kind = list(range(10)), SURF
     search = Search(
-        query, not_open, resolved, WEIGHTS, correlated_error_share=0.0, ranked=CANDIDATES
+        query, not_open, resolved, WEIGHTS, correlated_error_share=0.0, ranked=[NodeScore(3, 0.5)]
     )
     for hypothesis in hypotheses:
         search.belief = search.belief.with_hypothesis(hypothesis, resolved.evidence, WEIGHTS.rivals)

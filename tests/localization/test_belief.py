@@ -18,7 +18,7 @@ from topoloc.localization.belief import (
     MIN_LOG_ODDS_MARGIN,
     Belief,
     Hypothesis,
-    is_same_pose,
+    is_same_fit,
     log_odds_margin,
 )
 from topoloc.localization.config import LocalizerConfig
@@ -56,8 +56,8 @@ def test_a_hypothesis_of_the_same_pose_replaces_the_weaker_one_and_not_the_stron
 
 def test_poses_within_twice_what_is_tolerated_are_one():
     here = made_fit(0.0)
-    assert is_same_pose(here, made_fit(0.4), CONFIG)
-    assert not is_same_pose(here, made_fit(0.6), CONFIG)
+    assert is_same_fit(here, made_fit(0.4), CONFIG)
+    assert not is_same_fit(here, made_fit(0.6), CONFIG)
 
 
 @pytest.mark.parametrize(
@@ -73,10 +73,10 @@ def test_poses_that_are_not_near_are_one_where_the_same_features_show_the_same_p
     features = made_features(len(POINTS))
     one = made_fit(0.0, POINTS, features)
     assert (
-        is_same_pose(one, made_fit(1.0, POINTS + np.array([moved, 0.0, 0.0]), features), CONFIG)
+        is_same_fit(one, made_fit(1.0, POINTS + np.array([moved, 0.0, 0.0]), features), CONFIG)
         is expected
     )
-    assert not is_same_pose(
+    assert not is_same_fit(
         one, made_fit(1.0, POINTS, made_features(len(POINTS))), CONFIG
     )  # of other features nothing follows
 

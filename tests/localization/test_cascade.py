@@ -157,7 +157,9 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_feature
     ) -> tuple[IntrinsicsDeviation | None, CalibrationMismatch | None]:
         seen, _ = check_image_calibration(search, fit)
         shift = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        doubt = CalibrationMismatch(200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), True, False, shift)
+        doubt = CalibrationMismatch(
+            200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), ["focal_length"], shift
+        )
         return seen, doubt if search.query.feature_config.kind == "sift" else None
 
     monkeypatch.setattr("topoloc.localization.result_decision.check_image_calibration", doubted)

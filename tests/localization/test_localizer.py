@@ -157,7 +157,7 @@ def test_a_camera_of_another_size_is_an_error(localizer: Localizer):
 
 def test_a_map_without_nodes_cannot_be_asked(localizer: Localizer):
     with pytest.raises(EmptyMapError, match="no nodes"):
-        Localizer(replace(localizer.topomap, summaries=[], nodes=[]))
+        Localizer(replace(localizer.topomap, summaries=[]))
 
 
 class _FromBelow:
@@ -172,7 +172,7 @@ class _FromBelow:
 
 def test_a_coarse_localizer_of_one_s_own_answers_instead_of_the_map_s(localizer: Localizer):
     own = _FromBelow()
-    without = replace(localizer.topomap, coarse_models={})
+    without = localizer.topomap.with_first_layer(coarse_models={})
     result = Localizer(
         without, LocalizerConfig(num_candidates=2, coarse="netvlad"), coarse=own
     ).localize(PICTURE, CAMERA)
@@ -184,7 +184,7 @@ def test_an_unknown_coarse_localizer_names_those_there_are(localizer: Localizer)
     with pytest.raises(MapError, match=r"'netvlad' \(it has: surf-vlad\)"):
         Localizer(localizer.topomap, LocalizerConfig(coarse="netvlad"))
     with pytest.raises(MapError, match="it has: none"):
-        Localizer(replace(localizer.topomap, coarse_models={}))
+        Localizer(localizer.topomap.with_first_layer(coarse_models={}))
 
 
 # time

@@ -7,11 +7,10 @@ import json
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.retrieval.coarse import NodeScore
+from topoloc.localization.result import Alternative, CandidateNode, Localization, NotLocalized
 
 POSE = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5]))
-CANDIDATES = [NodeScore(17, 0.812345), NodeScore(3, 0.4)]
+CANDIDATES = [CandidateNode(17, 0.812345), CandidateNode(3, 0.4)]
 TIMES_MS = {"features": 30.12345, "total": 60.0}
 
 

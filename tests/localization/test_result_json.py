@@ -24,8 +24,13 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.provenance import Provenance
-from topoloc.localization.result import Alternative, Localization, NotLocalized, result_from_json
-from topoloc.retrieval.coarse import NodeScore
+from topoloc.localization.result import (
+    Alternative,
+    CandidateNode,
+    Localization,
+    NotLocalized,
+    result_from_json,
+)
 from topoloc.tracking.tracker import Tracker
 
 POSE = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, -2.0, 0.5]))
@@ -40,7 +45,7 @@ LOCALIZED = Localization(
     np.diag(np.arange(1.0, 7.0)) * 1e-5,
     0.98,
     17,
-    [NodeScore(17, 0.8)],
+    [CandidateNode(17, 0.8)],
     212,
     158,
     {"total": 60.0},
@@ -53,7 +58,7 @@ LOCALIZED = Localization(
 REFUSED = NotLocalized(
     *(
         "ambiguous",
-        [NodeScore(3, 0.7)],
+        [CandidateNode(3, 0.7)],
         96,
         61,
         {"total": 88.1},
@@ -74,8 +79,7 @@ SUSPECTED = replace(
         300.0,
         np.array([320.0, 200.5]),
         np.array([320.0, 190.0]),
-        True,
-        False,
+        ["focal_length"],
         np.arange(6.0),
     ),
 )
@@ -214,6 +218,7 @@ def test_a_geopose_leads_back_to_the_pose():
             **LOCALIZED.to_json(""),
             "world_from_cam": {"translation": [0, 0, 10**400], "quat_wxyz": [1, 0, 0, 0]},
         },
+        {**LOCALIZED.to_json(""), "world_from_cam": json.dumps(POSE.to_json())},
         {**LOCALIZED.to_json(""), "probability": 1.5},
         {**LOCALIZED.to_json(""), "node": True},
         {**LOCALIZED.to_json(""), "camera": {"model": "PINHOLE"}},

@@ -28,8 +28,8 @@ def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
             "length_m": topomap.length_m,
             "default_coarse": topomap.default_coarse,
         }
-        if topomap.shared_errors is not None:
-            facts["shared_errors"] = asdict(topomap.shared_errors)
+        if topomap.first_layer.shared_errors is not None:
+            facts["shared_errors"] = asdict(topomap.first_layer.shared_errors)
         database.executemany(
             "INSERT INTO map VALUES (?, ?)",
             [(key, json.dumps(value)) for key, value in facts.items()],
@@ -53,7 +53,7 @@ def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
             " ?, ?, ?, ?)",
             images,
         )
-        models = [("", model) for model in topomap.coarse_models.values()]
+        models = [("", model) for model in topomap.first_layer.coarse_models.values()]
         if topomap.sides is not None:
             for node in topomap.sides.nodes:
                 _insert(database, node, VIRTUAL_PREFIX)

@@ -36,11 +36,15 @@ def _without_a_node(path: Path, changes: dict | None = None) -> None:
     with edit_map(path) as edit:
         topomap, gone = edit.topomap, edit.topomap.summaries[-1].node_id
         first, *rest = list(topomap.nodes)[:-1]
+        nodes = [replace(first, template_jpeg=first.template_jpeg + b"\0"), *rest]
+        layers = {
+            kind: replace(layer, nodes=nodes if kind == topomap.kind else list(layer.nodes)[:-1])
+            for kind, layer in topomap.layers.items()
+        }
         changed = replace(
             topomap,
             summaries=list(topomap.summaries)[:-1],
-            nodes=[replace(first, template_jpeg=first.template_jpeg + b"\0"), *rest],
-            other_kinds={kind: list(nodes)[:-1] for kind, nodes in topomap.other_kinds.items()},
+            layers=layers,
             edges=[edge for edge in topomap.edges if gone not in (edge.source_id, edge.target_id)],
             place_images=[image for image in topomap.place_images if image.node_id != gone],
             repetitions=None,

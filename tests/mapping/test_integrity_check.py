@@ -69,7 +69,7 @@ def test_nodes_that_were_moved_together_are_found(tiny_recording: Path):
         for row, node in enumerate(topomap.nodes)
     ]
     found = find_contradictions(
-        replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes])
+        replace(topomap.with_first_layer(nodes=nodes), summaries=[node.summary for node in nodes])
     )
     assert {contradiction.node_id for contradiction in found} == moved
     assert all(0.9 < contradiction.metres < 1.1 for contradiction in found)

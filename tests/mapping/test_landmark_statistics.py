@@ -3,6 +3,8 @@ be taken away again."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +13,48 @@ import topoloc
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.landmark_statistics import (
-    AccumulatedStatistics,
+    PULL_SCALE,
     LandmarkStatistics,
     merge_count_statistics,
 )
-from topoloc.mapping.landmarks import (
-    Observations,
-    compute_session_statistics,
-    refine_points,
-)
+from topoloc.mapping.landmarks import Observations, compute_session_statistics, refine_points
 from topoloc.mapping.topomap import TopoMetricMap
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """The sums of all points of a node over some sessions; -1 stands for no session."""
+
+    information: np.ndarray
+    pulls: np.ndarray
+    expected: np.ndarray
+    seen: np.ndarray
+    first_session: np.ndarray
+    last_session: np.ndarray
+
+    @staticmethod
+    def of(statistics: Sequence[LandmarkStatistics], num_points: int) -> Sums:
+        """Add up the statistics, as the file's page describes them (A = L L', g = L times the
+        pulls)."""
+        information, pulls = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
+        expected, seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
+        first, last = np.full(num_points, -1), np.full(num_points, -1)
+        for part in sorted(statistics, key=lambda part: part.session_id):
+            lower = np.zeros((len(part.rows), 3, 3))
+            lower[:, *np.tril_indices(3)] = part.roots
+            information[part.rows] += lower @ lower.transpose(0, 2, 1)
+            pulls[part.rows] += (lower @ (part.pulls / PULL_SCALE)[:, :, None])[:, :, 0]
+            expected[part.rows] += part.expected
+            seen[part.rows] += part.seen
+            saw = part.rows[part.seen > 0]
+            last[saw] = part.session_id
+            first[saw] = np.where(first[saw] < 0, part.session_id, first[saw])
+        return Sums(information, pulls, expected, seen, first, last)
+
+    def solve(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The positions and covariances by these sums, of points stored at `points_cam`."""
+        covariances = np.linalg.inv(self.information)
+        return points_cam - (covariances @ self.pulls[:, :, None])[:, :, 0], covariances
 
 
 def covariances_of(node: TopoNode) -> np.ndarray:
@@ -32,7 +66,7 @@ def covariances_of(node: TopoNode) -> np.ndarray:
 def test_positions_and_covariances_of_a_saved_map_follow_from_its_sums(saved: Path):
     topomap = TopoMetricMap.load(saved)
     for node in topomap.nodes:
-        total = AccumulatedStatistics.accumulate(list(node.session_statistics), len(node.features))
+        total = Sums.of(list(node.session_statistics), len(node.features))
         points, covariances = total.solve(node.points_cam.astype(np.float64))
         known = covariances_of(node)
         sigmas = np.sqrt(np.einsum("nii->ni", known))
@@ -85,12 +119,10 @@ def test_a_session_can_be_taken_away_again():
         (3, 3),
         (2, 2),
     ]
-    together = AccumulatedStatistics.accumulate(session_statistics, 40)
+    together = Sums.of(session_statistics, 40)
     np.testing.assert_array_equal(together.first_session, 0)
     np.testing.assert_array_equal(together.last_session, 7)
-    back, covariance = AccumulatedStatistics.accumulate(session_statistics[:1], 40).solve(
-        both.points_cam
-    )
+    back, covariance = Sums.of(session_statistics[:1], 40).solve(both.points_cam)
     moved = np.linalg.norm(both.points_cam - alone.points_cam, axis=1)
     assert np.median(np.linalg.norm(back - alone.points_cam, axis=1)) < 0.15 * np.median(moved)
     assert (
@@ -147,8 +179,8 @@ def test_sessions_that_only_counted_take_the_room_of_two():
     assert together[1].seen.tolist() == [4, 5, 1]
     assert together[2].expected.tolist() == [5, 7]
     before, after = (
-        AccumulatedStatistics.accumulate(session_statistics, 3),
-        AccumulatedStatistics.accumulate(together, 3),
+        Sums.of(session_statistics, 3),
+        Sums.of(together, 3),
     )
     np.testing.assert_array_equal(before.expected, after.expected)
     np.testing.assert_array_equal(before.seen, after.seen)

@@ -19,8 +19,8 @@ from topoloc.retrieval.coarse import open_coarse_localizer
 def read_all(path: Path) -> None:
     topomap = TopoMetricMap.load(path)
     list(topomap.summaries), list(topomap.nodes), list(topomap.place_images)
-    for name in topomap.coarse_models:
-        open_coarse_localizer(topomap.coarse_models[name])
+    for name in topomap.first_layer.coarse_models:
+        open_coarse_localizer(topomap.first_layer.coarse_models[name])
 
 
 def test_entries_are_counted_and_sliced_as_in_a_list(saved: Path):
@@ -33,7 +33,7 @@ def test_entries_are_counted_and_sliced_as_in_a_list(saved: Path):
     with pytest.raises(IndexError):
         topomap.nodes[len(topomap.nodes)]
     with pytest.raises(KeyError):
-        topomap.coarse_models["cnn-fc"]
+        topomap.first_layer.coarse_models["cnn-fc"]
 
 
 def test_a_loaded_map_can_be_saved_again_also_over_itself(saved: Path):
@@ -79,8 +79,8 @@ def test_opening_reads_no_node(saved: Path):
 def test_a_map_that_never_measured_its_shared_errors_says_so(
     tiny_map: TopoMetricMap, tmp_path: Path
 ):
-    replace(tiny_map, shared_errors=None).save(tmp_path / "older.topo")
-    assert TopoMetricMap.load(tmp_path / "older.topo").shared_errors is None
+    tiny_map.with_first_layer(shared_errors=None).save(tmp_path / "older.topo")
+    assert TopoMetricMap.load(tmp_path / "older.topo").first_layer.shared_errors is None
 
 
 SPOILT = {
@@ -135,6 +135,6 @@ def test_overwritten_pages_are_a_map_error_or_do_no_harm(saved: Path):
 
 def test_unknown_coarse_models_are_named(saved: Path):
     topomap = TopoMetricMap.load(saved)
-    model = replace(topomap.coarse_models["surf-vlad"], name="cnn-xy")
+    model = replace(topomap.first_layer.coarse_models["surf-vlad"], name="cnn-xy")
     with pytest.raises(MapError, match="'cnn-xy' is not known"):
         open_coarse_localizer(model)

@@ -25,7 +25,7 @@ def test_everything_comes_back(tiny_map: TopoMetricMap, saved: Path):
     assert list(loaded.sessions) == list(tiny_map.sessions)
     assert list(loaded.edits) == list(tiny_map.edits)
     assert loaded.length_m == tiny_map.length_m
-    assert loaded.shared_errors == tiny_map.shared_errors is not None
+    assert loaded.first_layer.shared_errors == tiny_map.first_layer.shared_errors is not None
     assert len(loaded.nodes) == len(loaded.summaries) == len(tiny_map.nodes)
     for one, other, summary in zip(loaded.nodes, tiny_map.nodes, loaded.summaries, strict=True):
         for s in (one.summary, summary):

@@ -11,14 +11,15 @@ import pytest
 
 from topoloc import TopoMetricMap
 from topoloc.features.features import Features
+from topoloc.mapping.coarse_models import open_map_coarse_localizer
 from topoloc.mapping.session_illumination import (
     compute_illumination_distance,
     find_node_illumination_groups,
     group_by_illumination,
 )
 from topoloc.mapping.sessions import Illumination, Session
-from topoloc.mapping.topomap import open_map_coarse_localizer
-from topoloc.retrieval.vlad import SurfVlad, VladConfig
+from topoloc.retrieval.coarse import VladConfig
+from topoloc.retrieval.vlad import SurfVlad
 
 DAY = Illumination(0.5, 0.2, 0.02, 0.05, 1.0, 1.0)
 CLOUDS = replace(DAY, level=0.45, contrast=0.18)
@@ -78,7 +79,7 @@ def _asked(model: SurfVlad, vector: np.ndarray, words: np.ndarray) -> list[int]:
         responses=np.ones(1, np.float32),
         descriptors=(words + vector).astype(np.float32),
     )
-    return [score.node_id for score in model.rank(np.zeros((10, 10), np.uint8), features, 3)]
+    return [score.row for score in model.rank(np.zeros((10, 10), np.uint8), features, 3)]
 
 
 def test_a_night_of_half_the_way_does_not_draw_the_other_half_to_itself():

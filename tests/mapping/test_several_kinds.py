@@ -19,10 +19,11 @@ from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.open_map import OpenMap
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.integrity_check import find_map_damage, list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
 from topoloc.retrieval.cell_grid import CellGrid
@@ -46,9 +47,11 @@ def test_both_kinds_come_back_and_are_saved_again_to_the_byte(
     assert loaded.kinds == of_two.kinds == ["surf", "sift"]
     assert loaded.config == of_two.config
     assert loaded.config.other_kinds == ("sift",)
-    assert set(loaded.coarse_models) == {"surf-vlad", "surf-vlad@sift"}
+    stored = [model["name"] for model in list_coarse_models(path)]
+    assert stored == ["surf-vlad", "surf-vlad@sift"]
     for kind in loaded.kinds:
-        one, other = loaded.with_feature_type(kind), of_two.with_feature_type(kind)
+        one, other = loaded.layers[kind], of_two.layers[kind]
+        assert list(one.coarse_models) == list(other.coarse_models) == ["surf-vlad"]
         assert one.shared_errors == other.shared_errors is not None
         for node, was in zip(one.nodes, other.nodes, strict=True):
             assert node.features.descriptors.shape == was.features.descriptors.shape
@@ -79,9 +82,9 @@ def test_a_damaged_point_of_the_second_kind_is_found(path: Path):
 
 
 def test_it_localizes_by_the_second_kind_alone(path: Path):
-    by_sift = TopoMetricMap.load(path).with_feature_type("sift")
-    assert (by_sift.kinds, by_sift.config.kinds, by_sift.sides) == (["sift"], ["sift"], None)
-    localizer = Localizer(by_sift)
+    loaded = TopoMetricMap.load(path)
+    assert loaded.sides_for("sift") is None
+    localizer = Localizer(loaded, LocalizerConfig(kinds=("sift",)))
     results = [(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()]
     assert all(
         isinstance(result, Localization) and translation_error(result.world_from_cam, truth) < 0.03
@@ -89,12 +92,9 @@ def test_it_localizes_by_the_second_kind_alone(path: Path):
     )
 
 
-def test_it_is_itself_by_its_first_kind_and_nothing_by_one_that_it_does_not_hold(
-    of_two: TopoMetricMap,
-):
-    assert of_two.with_feature_type("surf") is of_two
-    with pytest.raises(FeatureTypeError, match=r"no features orb \(it holds: surf, sift\)"):
-        of_two.with_feature_type("orb")
+def test_a_kind_that_it_does_not_hold_is_refused(of_two: TopoMetricMap):
+    with pytest.raises(FeatureTypeError, match=r"no features xfeat \(it holds: surf, sift\)"):
+        OpenMap(of_two, kind="xfeat")
 
 
 def test_the_cells_of_a_network_are_learnt_kept_and_asked(
@@ -104,10 +104,9 @@ def test_the_cells_of_a_network_are_learnt_kept_and_asked(
         open_sequence(f"{tiny_recording}@0::2"), BuildConfig(other_kinds=("topoloc-net",))
     ).save(tmp_path / "room.topo")
     loaded = TopoMetricMap.load(tmp_path / "room.topo")
-    assert "cell_vectors" not in loaded.coarse_models["surf-vlad"].arrays
-    assert len(loaded.coarse_models["surf-vlad@topoloc-net"].arrays["cell_vectors"]) == len(
-        loaded.place_images
-    )
+    assert "cell_vectors" not in loaded.first_layer.coarse_models["surf-vlad"].arrays
+    model = loaded.layers["topoloc-net"].coarse_models["surf-vlad"]
+    assert len(model.arrays["cell_vectors"]) == len(loaded.place_images)
     assert find_map_damage(tmp_path / "room.topo") == []
     compute_similarity, asked = CellGrid.compute_similarity, list[tuple[int, ...]]()
     monkeypatch.setattr(

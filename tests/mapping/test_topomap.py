@@ -18,9 +18,10 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
+from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.entries import Edge, VirtualNodes
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoMetricMap, node_ids_to_rows
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.recording import SequenceView
 from topoloc_training.coarse_training import in_ids
 
@@ -35,7 +36,7 @@ def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMet
         for node in nodes
     ]
     alive = {node.summary.node_id for node in nodes}
-    models = {name: in_ids(model, ids) for name, model in topomap.coarse_models.items()}
+    models = {name: in_ids(model, ids) for name, model in topomap.first_layer.coarse_models.items()}
     edges = [Edge(of[edge.source_id], of[edge.target_id]) for edge in topomap.edges]
     images = [replace(image, node_id=of[image.node_id]) for image in topomap.place_images]
     sides = topomap.sides
@@ -56,14 +57,11 @@ def with_ids(topomap: TopoMetricMap, ids: list[int], kept: list[int]) -> TopoMet
             [node.summary for node in described], described, side_models, sides.kind
         )
     return replace(
-        topomap,
-        nodes=nodes,
+        topomap.with_first_layer(nodes=nodes, coarse_models=models, shared_errors=None),
         summaries=[node.summary for node in nodes],
         edges=[edge for edge in edges if {edge.source_id, edge.target_id} <= alive],
         place_images=[image for image in images if image.node_id in alive],
-        coarse_models=models,
         sides=sides,
-        shared_errors=None,
     )
 
 
@@ -119,8 +117,7 @@ def test_ids_of_removed_nodes_are_not_used_again(renumbered: Path):
     topomap = TopoMetricMap.load(renumbered)
     assert topomap.next_ids.node == topomap.summaries[-1].node_id + 1
     fewer = replace(
-        topomap,
-        nodes=topomap.nodes[:2],
+        topomap.with_first_layer(nodes=topomap.nodes[:2]),
         summaries=topomap.summaries[:2],
         edges=[],
         place_images=[],
@@ -131,7 +128,7 @@ def test_ids_of_removed_nodes_are_not_used_again(renumbered: Path):
 
 
 def test_a_model_of_removed_nodes_alone_is_a_map_error():
-    model = built_corridor().coarse_models["surf-vlad"]
+    model = built_corridor().first_layer.coarse_models["surf-vlad"]
     with pytest.raises(MapError, match="knows none"):
         node_ids_to_rows(model, [5000, 6000])
 

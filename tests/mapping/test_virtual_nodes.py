@@ -23,10 +23,10 @@ from topoloc.features.virtual_views import make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.build import BuildConfig, build_map
+from topoloc.mapping.config import VirtualNodesConfig
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.mapping.topomap import NodeSummary, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.mapping.virtual_nodes import (
-    VirtualNodesConfig,
     collect_virtual_nodes,
     create_virtual_nodes,
     select_virtual_view_nodes,
@@ -120,7 +120,7 @@ def test_each_is_ranked_first_by_its_own_looks_and_its_centre_is_where_it_looks(
     assert centres.shape == (len(sides.nodes), 3)
     no_picture = np.zeros((1, 1), np.uint8)
     for node, centre in zip(sides.nodes, centres, strict=True):
-        assert coarse.rank(no_picture, node.features, 1)[0].node_id == node.summary.node_id
+        assert coarse.rank(no_picture, node.features, 1)[0].row == node.summary.node_id
         points_world = node.summary.world_from_cam.apply(node.points_cam.astype(np.float64))
         assert abs(abs(centre[0]) - 1.1) < 0.03
         assert points_world[:, 1].min() < centre[1] < points_world[:, 1].max()

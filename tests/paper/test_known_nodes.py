@@ -33,7 +33,7 @@ def test_the_nearest_node_is_ranked_first_in_every_call(tiny_recording: Path):
         known_nodes.world_from_cam = summary.world_from_cam
         first, again = (known_nodes.rank(None, None, 3) for _ in range(2))
         assert first == again
-        assert first[0].node_id == row
+        assert first[0].row == row
         scores = [score.score for score in first]
         assert scores == sorted(scores, reverse=True)
 

@@ -3,8 +3,6 @@ known noise, and the rendered room."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -146,7 +144,7 @@ class TestChoice:
 
     def test_pictures_that_look_elsewhere_or_stand_in_one_place_do_not_count(self):
         turned = [
-            replace(pose, rotation=exp_so3(np.array([0.0, 1.5 * (k % 2), 0.0])))
+            Rigid3(exp_so3(np.array([0.0, 1.5 * (k % 2), 0.0])), pose.translation)
             for k, pose in enumerate(self.LINE)
         ]
         assert all(k % 2 == 0 for k in select_source_images(turned, 4, 0.1))

@@ -13,14 +13,14 @@ from topoloc.errors import MapError
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
+from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.topomap import node_ids_to_rows
 from topoloc.recordings.image_io import read_image, to_grey
 from topoloc.retrieval import descriptor_index
 from topoloc.retrieval.cell_grid import CellGrid
-from topoloc.retrieval.coarse import open_coarse_localizer
+from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer
 from topoloc.retrieval.descriptor_kernels import max_shifted_products
-from topoloc.retrieval.vlad import SurfVlad, VladConfig, append_positions, learn_words, vlad
+from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words, vlad
 
 NO_IMAGE = np.zeros((6, 8), np.uint8)
 ROWS, COLUMNS, CHANNELS = 4, 6, 16
@@ -93,9 +93,9 @@ def test_where_vlad_cannot_tell_the_cells_do():
     cells = places(40)
     with_cells, features = alike_by_vlad(cells)
     asked = cells + 0.5 * places(40, seed=9)
-    named = [with_cells.rank(NO_IMAGE, replace(features, cells=one), 1)[0].node_id for one in asked]
+    named = [with_cells.rank(NO_IMAGE, replace(features, cells=one), 1)[0].row for one in asked]
     assert named == list(range(40))
-    assert [score.node_id for score in with_cells.rank(NO_IMAGE, features, 5)] == [
+    assert [score.row for score in with_cells.rank(NO_IMAGE, features, 5)] == [
         0,
         1,
         2,
@@ -103,7 +103,7 @@ def test_where_vlad_cannot_tell_the_cells_do():
         4,
     ]  # without cells VLAD alone ranks
     without, _ = alike_by_vlad(None)
-    assert without.rank(NO_IMAGE, replace(features, cells=cells[5]), 1)[0].node_id == 0
+    assert without.rank(NO_IMAGE, replace(features, cells=cells[5]), 1)[0].row == 0
     assert not any(name.startswith("cell") for name in without.to_model().arrays)
 
 
@@ -113,7 +113,7 @@ def test_of_many_images_the_nearest_by_vlad_are_compared(monkeypatch: pytest.Mon
     cells = places(60)
     with_cells, features = alike_by_vlad(cells, 60)
     for k in (0, 30, 59):
-        assert with_cells.rank(NO_IMAGE, replace(features, cells=cells[k]), 1)[0].node_id == k
+        assert with_cells.rank(NO_IMAGE, replace(features, cells=cells[k]), 1)[0].row == k
 
 
 def test_the_stored_model_ranks_alike():
@@ -127,7 +127,7 @@ def test_the_stored_model_ranks_alike():
     reopened = open_coarse_localizer(model)
     for one in asked:
         ranked = [c.rank(NO_IMAGE, replace(features, cells=one), 30) for c in (reopened, localizer)]
-        assert [score.node_id for score in ranked[0]] == [score.node_id for score in ranked[1]]
+        assert [score.row for score in ranked[0]] == [score.row for score in ranked[1]]
         np.testing.assert_allclose(
             [score.score for score in ranked[0]], [score.score for score in ranked[1]], atol=2e-3
         )
@@ -138,7 +138,7 @@ def test_nodes_that_are_no_more_are_not_named():
     localizer, features = alike_by_vlad(cells, 6)
     left = open_coarse_localizer(node_ids_to_rows(localizer.to_model(), [0, 2, 5]))
     assert [
-        left.rank(NO_IMAGE, replace(features, cells=cells[k]), 1)[0].node_id for k in (0, 2, 5)
+        left.rank(NO_IMAGE, replace(features, cells=cells[k]), 1)[0].row for k in (0, 2, 5)
     ] == [0, 1, 2]
 
 
@@ -200,7 +200,7 @@ def test_a_real_walk_by_day_is_known_by_night(shared: Path):
             words, vlads, np.arange(100), config, [features.cells for features in mapped]
         )
         ranked = [
-            [score.node_id for score in localizer.rank(np.empty((360, 640), np.uint8), features, 5)]
+            [score.row for score in localizer.rank(np.empty((360, 640), np.uint8), features, 5)]
             for features in night
         ]
         apart = np.abs(np.array(ranked) - np.arange(0, 100, 2)[:, None])

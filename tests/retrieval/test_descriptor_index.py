@@ -34,7 +34,7 @@ def test_ranking_is_that_of_each_nodes_best_image(
         sorted(best.values(), reverse=True)[: len(ranking)], abs=1e-5
     )
     assert [score.score for score in ranking] == pytest.approx(
-        [best[score.node_id] for score in ranking], abs=1e-5
+        [best[score.row] for score in ranking], abs=1e-5
     )
 
 
@@ -42,7 +42,7 @@ def test_a_node_of_many_images_does_not_hide_the_others():
     vectors = unit(np.vstack([np.ones((500, 8)), np.eye(8)]))
     node_ids = np.concatenate([np.zeros(500, np.int64), np.arange(1, 9)])
     ranking = DescriptorIndex(vectors, node_ids).rank_nodes(unit(np.ones(8)), 5)
-    assert [score.node_id for score in ranking] == [0, 1, 2, 3, 4]
+    assert [score.row for score in ranking] == [0, 1, 2, 3, 4]
 
 
 def test_many_vectors_are_searched_by_cells_and_nearly_always_as_exactly():
@@ -56,9 +56,9 @@ def test_many_vectors_are_searched_by_cells_and_nearly_always_as_exactly():
     )
     queries = unit(vectors[::20] + 0.05 * rng.standard_normal((150, 24)))
     pairs = [(exact.rank_nodes(query, 5), by_cells.rank_nodes(query, 5)) for query in queries]
-    assert np.mean([a[0].node_id == b[0].node_id for a, b in pairs]) >= 0.98
+    assert np.mean([a[0].row == b[0].row for a, b in pairs]) >= 0.98
     for a, b in pairs:
-        assert len({score.node_id for score in b}) == len(b) == 5
+        assert len({score.row for score in b}) == len(b) == 5
         assert [score.score for score in b] == sorted((score.score for score in b), reverse=True)
         assert b[0].score <= a[0].score + 2e-3  # the cells keep half floats
 
@@ -74,7 +74,7 @@ def test_cells_look_further_where_one_node_has_most_images():
     )
     node_ids = np.concatenate([np.zeros(900, np.int64), np.arange(1, 9)])
     ranking = DescriptorIndex(vectors, node_ids, max_exact=100).rank_nodes(unit(np.ones(8)), 3)
-    assert len({score.node_id for score in ranking}) == 3
+    assert len({score.row for score in ranking}) == 3
 
 
 def test_words_do_not_depend_on_the_number_of_threads_which_stays_as_it_was():

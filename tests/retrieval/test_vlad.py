@@ -16,10 +16,9 @@ from topoloc.features.features import Features
 from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
 from topoloc.recordings.image_io import to_grey
-from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse_localizer
+from topoloc.retrieval.coarse import CoarseLocalizer, VladConfig, open_coarse_localizer
 from topoloc.retrieval.vlad import (
     SurfVlad,
-    VladConfig,
     append_positions,
     learn_words,
     learn_words_from_parts,
@@ -131,8 +130,8 @@ def test_a_place_seen_again_comes_first(dimension: int):
     assert isinstance(localizer, CoarseLocalizer)
     for k, image_rows in enumerate(rows):
         ranking = localizer.rank(NO_IMAGE, feature_config_for(image_rows[::2]), 5)
-        assert ranking[0].node_id == k // 2
-        assert len({score.node_id for score in ranking}) == 5
+        assert ranking[0].row == k // 2
+        assert len({score.row for score in ranking}) == 5
         assert sorted((score.score for score in ranking), reverse=True) == [
             score.score for score in ranking
         ]
@@ -157,8 +156,7 @@ def test_the_same_things_elsewhere_in_the_picture_are_another_place(weight: floa
     again = SurfVlad.from_model(localizer.to_model())
     picture = np.zeros((100, 200), np.uint8)
     named = [
-        again.rank(picture, things(order).select(np.arange(3, 60)), 1)[0].node_id
-        for order in orders
+        again.rank(picture, things(order).select(np.arange(3, 60)), 1)[0].row for order in orders
     ]
     num_right = sum(node_id == k for k, node_id in enumerate(named))
     assert num_right == 12 if weight > 0.0 else num_right < 6
@@ -187,13 +185,13 @@ def test_maps_without_places_in_their_words_are_read():
         model,
         settings={key: value for key, value in model.settings.items() if key != "position_weight"},
     )
-    assert SurfVlad.from_model(old).rank(NO_IMAGE, feature_config_for(rows[3]), 1)[0].node_id == 1
+    assert SurfVlad.from_model(old).rank(NO_IMAGE, feature_config_for(rows[3]), 1)[0].row == 1
 
 
 def test_more_images_than_dimensions():
     localizer, rows = fitted(150, images_a_node=10, num_words=2)
     assert len(rows) > 2 * 64
-    assert localizer.rank(NO_IMAGE, feature_config_for(rows[37][::2]), 1)[0].node_id == 3
+    assert localizer.rank(NO_IMAGE, feature_config_for(rows[37][::2]), 1)[0].row == 3
 
 
 @pytest.mark.parametrize("num_images", [1, 2])
@@ -201,7 +199,7 @@ def test_maps_of_one_or_two_images(num_images: int):
     localizer, rows = fitted(num_images, images_a_node=1)
     ranking = localizer.rank(NO_IMAGE, feature_config_for(rows[-1]), 5)
     assert len(ranking) == num_images
-    assert ranking[0].node_id == num_images - 1
+    assert ranking[0].row == num_images - 1
     assert ranking[0].score == pytest.approx(1.0, abs=1e-4)
 
 
@@ -210,7 +208,7 @@ def test_images_all_alike_are_ranked_all_the_same():
     words = learn_words(rows, config)
     localizer = SurfVlad.fit(words, np.tile(vlad(rows, words), (5, 1)), np.arange(5), config)
     ranking = localizer.rank(NO_IMAGE, feature_config_for(rows), 5)
-    assert [score.node_id for score in ranking] == [0, 1, 2, 3, 4]
+    assert [score.row for score in ranking] == [0, 1, 2, 3, 4]
     assert [score.score for score in ranking] == pytest.approx([1.0] * 5, abs=1e-5)
 
 
@@ -230,7 +228,7 @@ def test_the_stored_model_ranks_alike():
         one, other = (
             c.rank(NO_IMAGE, feature_config_for(image_rows[:60]), 3) for c in (localizer, reopened)
         )
-        assert one[0].node_id == other[0].node_id
+        assert one[0].row == other[0].row
         np.testing.assert_allclose([s.score for s in one], [s.score for s in other], atol=5e-3)
 
 
@@ -238,13 +236,13 @@ def share_of_near_candidates(map_part: str, query_part: str, config: BuildConfig
     """Of the queries, those with a node within 2 D_thresh (Eq. 1) among the five best."""
     topomap = build_map(topoloc.open_sequence(map_part), config)
     nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    coarse = open_coarse_localizer(topomap.coarse_models["surf-vlad"])
+    coarse = open_coarse_localizer(topomap.first_layer.coarse_models["surf-vlad"])
     queries = topoloc.open_sequence(query_part)
     near = []
     for frame, pose in zip((queries[k] for k in range(len(queries))), queries.poses, strict=True):
         assert pose is not None
         features = extract_features(to_grey(frame.image), FeatureConfig())
-        candidates = [score.node_id for score in coarse.rank(frame.image, features, 5)]
+        candidates = [score.row for score in coarse.rank(frame.image, features, 5)]
         distances = node_distances(pose, nodes, topomap.config.lambda_rot)
         near.append(distances[candidates].min() <= 2 * topomap.config.d_thresh)
     return float(np.mean(near))

@@ -19,7 +19,7 @@ from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceFeatures
-from topoloc.slam.loop_closure import find_links
+from topoloc.slam.loop_closure import find_links, match_keyframes
 from topoloc.slam.odometry import Odometry
 from topoloc.slam.place_matching import extract_place_features, match_places
 from topoloc.slam.slam import run_slam
@@ -83,9 +83,10 @@ def looking_at(*recordings: StereoSequence):
 def test_what_both_sides_of_a_gap_see_at_their_edges_joins_them_and_no_frame_is_lost(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    strict = partial(match_places, min_inliers=120)  # no single pair of pictures is believed
-    monkeypatch.setattr("topoloc.slam.odometry.match_places", strict)
-    monkeypatch.setattr("topoloc.slam.loop_closure.match_places", strict)
+    limit = 120  # no single pair of pictures is believed, except by joins
+    for module, function in (("odometry", match_places), ("loop_closure", match_keyframes)):
+        strict = partial(function, min_inliers=limit)
+        monkeypatch.setattr(f"topoloc.slam.{module}.{function.__name__}", strict)
     room = tiny_world.room()
     walked = FrameList([*frames(HERE, room), *frames(BEYOND, room, AROUND, GAP_S)])
     result = run_slam(walked)

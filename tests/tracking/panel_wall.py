@@ -37,7 +37,7 @@ class PanelWall(Localizer):
     def __init__(self) -> None:
         self.xs: list[float] = []
         self.num_asked, self.probability = 0, 0.99
-        opened = MapContext(TopoMetricMap([], [], [], [], {}), LocalizerConfig(), (), {})
+        opened = MapContext(TopoMetricMap([], {}, [], []), LocalizerConfig(), (), {})
         self._tiles = OneMap(opened)
 
     def localize_with_inliers(

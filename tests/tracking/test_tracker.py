@@ -118,8 +118,9 @@ def test_what_the_map_is_wrong_by_is_no_noise(tiny_recording: Path, answers: lis
     """A map that says more of its own errors is followed as closely, and the answers say as much
     more."""
     topomap = built_room(tiny_recording)
-    assert topomap.shared_errors is not None
-    doubtful = Localizer(replace(topomap, shared_errors=replace(topomap.shared_errors, rho=0.5)))
+    errors = topomap.first_layer.shared_errors
+    assert errors is not None
+    doubtful = Localizer(topomap.with_first_layer(shared_errors=replace(errors, rho=0.5)))
     others = _stream(Tracker(doubtful), 0, 30)
     for other, answer in zip(others, answers, strict=False):
         assert translation_error(_smoothed(other), _smoothed(answer)) < 0.01

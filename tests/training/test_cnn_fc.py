@@ -45,7 +45,7 @@ def test_from_nothing_it_learns_the_room(room_set: TrainingSet):
     localizer = open_coarse_localizer(model)
     assert isinstance(localizer, CnnFc)
     pictures = [decode_stored_image(jpeg) for jpeg in room_set.jpegs]
-    answers = [ranking[0].node_id for ranking in localizer.rank_batch(pictures, 1)]
+    answers = [ranking[0].row for ranking in localizer.rank_batch(pictures, 1)]
     assert np.mean(np.array(answers) == room_set.node_ids) > 0.9
     probabilities = localizer.probabilities([unseen_views()[0][0]])
     assert probabilities.sum() == pytest.approx(1.0, abs=1e-5)
@@ -119,7 +119,7 @@ def test_a_loss_that_is_not_finite_ends_with_the_last_good_state(
 
 def test_one_node_and_nodes_with_one_image(two_images: TrainingSet, room_set: TrainingSet):
     localizer = open_coarse_localizer(train(two_images, config(1)))
-    assert [(s.node_id, s.score) for s in localizer.rank(unseen_views()[0][0], NO_FEATURES, 5)] == [
+    assert [(s.row, s.score) for s in localizer.rank(unseen_views()[0][0], NO_FEATURES, 5)] == [
         (0, 1.0)
     ]
     rows = [

@@ -67,7 +67,7 @@ def _right(model: CoarseModel, grown: TopoMetricMap) -> np.ndarray:
     """Of each mapping picture, whether its node is named first."""
     localizer = open_coarse_localizer(model)
     ranked = [
-        localizer.rank(decode_stored_image(image.jpeg), NO_FEATURES, 1)[0].node_id
+        localizer.rank(decode_stored_image(image.jpeg), NO_FEATURES, 1)[0].row
         for image in grown.place_images
     ]
     return np.array(ranked) == [image.node_id for image in grown.place_images]
@@ -77,22 +77,24 @@ def test_vectors_of_new_pictures_join(grown: TopoMetricMap, half: TrainingSet):
     known = cnn_nn.train(half, "compact", None, CnnNnConfig(TINY), silent)
     new = [image for image in grown.place_images if image.node_id >= half.num_nodes]
     assert len(new) > 0
-    taught = update_coarse_models(replace(grown, coarse_models={"cnn-nn": known}), {}, new)
-    assert taught.not_updated == []
-    joined = taught.models["cnn-nn"].arrays
+    with_known = grown.with_first_layer(coarse_models={"cnn-nn": known})
+    taught, not_updated = update_coarse_models(with_known, {}, new)
+    assert not_updated == []
+    taught_model = taught.first_layer.coarse_models["cnn-nn"]
+    joined = taught_model.arrays
     assert np.array_equal(joined["vectors"][: len(half.jpegs)], known.arrays["vectors"])
     assert joined["node_ids"].tolist() == [*half.node_ids, *(image.node_id for image in new)]
     is_new = np.array([image.node_id >= half.num_nodes for image in grown.place_images])
     assert not _right(known, grown)[is_new].any()
-    assert _right(taught.models["cnn-nn"], grown).mean() > 0.9
+    assert _right(taught_model, grown).mean() > 0.9
 
 
 def test_a_classifier_is_widened_and_goes_on(grown: TopoMetricMap, half: TrainingSet):
     known = in_ids(
         cnn_fc.train(half, "compact", None, CLASSIFIER, silent), list(range(half.num_nodes))
     )
-    with_known = replace(grown, coarse_models={"cnn-fc": known})
-    assert update_coarse_models(with_known, {}, list(grown.place_images)).not_updated == ["cnn-fc"]
+    with_known = grown.with_first_layer(coarse_models={"cnn-fc": known})
+    assert update_coarse_models(with_known, {}, list(grown.place_images))[1] == ["cnn-fc"]
     config = CoarseTrainingConfig(cnn_fc=CLASSIFIER)
     widened = train_coarse(with_known, "cnn-fc", "compact", "map", config, silent)
     facts = widened.settings["trained"]

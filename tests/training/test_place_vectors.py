@@ -53,14 +53,14 @@ def test_mapping_images_are_found_and_unseen_ones_lead_near(
     assert isinstance(localizer, CoarseLocalizer)
     pictures = [decode_stored_image(jpeg) for jpeg in room_set.jpegs]
     rankings = localizer.rank_batch(pictures, 3)
-    assert [ranking[0].node_id for ranking in rankings] == room_set.node_ids.tolist()
+    assert [ranking[0].row for ranking in rankings] == room_set.node_ids.tolist()
     assert min(ranking[0].score for ranking in rankings) > 0.95
     for image, world_from_cam in unseen_views():
         (best, *_) = localizer.rank(image, NO_FEATURES, 3)
         node_images = [
             p
             for p, node in zip(room_set.world_from_cams, room_set.node_ids, strict=True)
-            if node == best.node_id
+            if node == best.row
         ]
         nearest = min(
             np.linalg.norm(p.translation - world_from_cam.translation) for p in node_images
@@ -89,7 +89,7 @@ def test_a_map_with_one_node_answers_with_it(two_images: TrainingSet, random_fil
     for name in ("cnn-nn", "vlad-nn"):
         localizer = open_coarse_localizer(learnt(name, two_images, random_file))
         ranking = localizer.rank(unseen_views()[0][0], NO_FEATURES, 4)
-        assert [score.node_id for score in ranking] == [0]
+        assert [score.row for score in ranking] == [0]
 
 
 def test_colour_size_and_shape_of_the_query_matter_little(
@@ -104,7 +104,7 @@ def test_colour_size_and_shape_of_the_query_matter_little(
         image.repeat(2, axis=0).repeat(2, axis=1),
         wider,
     ]
-    assert len({localizer.rank(variant, NO_FEATURES, 1)[0].node_id for variant in variants}) == 1
+    assert len({localizer.rank(variant, NO_FEATURES, 1)[0].row for variant in variants}) == 1
 
 
 def test_a_model_whose_arrays_do_not_fit_is_damaged(room_set: TrainingSet, random_file: Path):
@@ -130,7 +130,7 @@ def test_netvlads_own_vocabulary_is_taken_from_its_checkpoint(
     )
     assert model.arrays["network.pool.centroids"].shape == (3, 512)
     assert model.settings["weights"] == {"file": "netvlad.pth", "sha256": weights.sha256}
-    assert open_coarse_localizer(model).rank(unseen_views()[0][0], NO_FEATURES, 1)[0].node_id == 0
+    assert open_coarse_localizer(model).rank(unseen_views()[0][0], NO_FEATURES, 1)[0].row == 0
 
 
 def test_triplets_bring_near_images_together(room_set: TrainingSet):

@@ -79,7 +79,7 @@ def test_a_map_learns_and_is_asked(
     written = json.loads(facts.read_text())
     assert written["weights"]["file"] == "squeezenet.pth"
     after = TopoMetricMap.load(copied_map)
-    assert (sorted(after.coarse_models), after.default_coarse) == (
+    assert (sorted(after.first_layer.coarse_models), after.default_coarse) == (
         ["cnn-nn", "surf-vlad"],
         "surf-vlad",
     )
@@ -227,7 +227,7 @@ def test_a_tile_of_an_atlas_learns_alone(
     assert main([*words, "--tile", "hall"]) == 0
     atlas = Atlas.open(campus)
     known = {
-        tile.tile_id: sorted(TopoMetricMap.load(atlas.map_path(tile)).coarse_models)
+        tile.tile_id: sorted(TopoMetricMap.load(atlas.map_path(tile)).first_layer.coarse_models)
         for tile in atlas.manifest.tiles
     }
     assert known == {"room": ["surf-vlad"], "hall": ["cnn-nn", "surf-vlad"]}

@@ -16,6 +16,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import as_rows
 from topoloc.recordings.frame import StereoSequence
 from topoloc.retrieval.coarse import NodeScore
 
@@ -45,7 +46,7 @@ class KnownNodes:
             raise ValueError("set world_from_cam to the true pose before each query")
         distances = node_distances(self.world_from_cam, self._nodes, self._lambda_rot)
         nearest = np.argsort(distances, kind="stable")[:num_candidates]
-        return [NodeScore(int(row), -float(distances[row])) for row in nearest]
+        return [NodeScore(row, -float(distances[row])) for row in as_rows(nearest)]
 
 
 def answer_with_known_nodes(

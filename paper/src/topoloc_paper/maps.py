@@ -173,9 +173,8 @@ def opened(
     done = taught(bench, dataset, kind, method)
     with np.load(_model_path(bench, dataset, kind, method)) as arrays:
         model = CoarseModel(method, done.result["settings"], dict(arrays))
-    return replace(topomap, coarse_models={method: model}, default_coarse=method), digest_of(
-        [map_done.digest, done.digest]
-    )
+    topomap = topomap.with_first_layer(coarse_models={method: model})
+    return replace(topomap, default_coarse=method), digest_of([map_done.digest, done.digest])
 
 
 def path_of(bench: Bench, dataset: Dataset, kind: MapKind) -> Path:

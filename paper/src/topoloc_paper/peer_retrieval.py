@@ -24,14 +24,14 @@ class Retrieval:
     def __init__(self, topomap: TopoMetricMap) -> None:
         self._features = topomap.config.features
         self._world_from_nodes = [summary.world_from_cam for summary in topomap.summaries]
-        model = topomap.coarse_models["surf-vlad"]
+        model = topomap.first_layer.coarse_models["surf-vlad"]
         self._coarse = open_coarse_localizer(model)
         self.map_bytes = sum(array.nbytes for array in model.arrays.values())
 
     def nodes(self, image: Image, num: int) -> list[int]:
-        """The `num` best nodes, best first."""
+        """The rows of the `num` best nodes, best first."""
         return [
-            score.node_id
+            score.row
             for score in self._coarse.rank(
                 image, extract_features(to_grey(image), self._features), num
             )
@@ -41,8 +41,8 @@ class Retrieval:
         answers = []
         for frame in frames:
             start = time.perf_counter()
-            (node_id,) = self.nodes(frame.image, 1)
+            (row,) = self.nodes(frame.image, 1)
             answers.append(
-                PeerAnswer(self._world_from_nodes[node_id], 1e3 * (time.perf_counter() - start))
+                PeerAnswer(self._world_from_nodes[row], 1e3 * (time.perf_counter() - start))
             )
         return answers

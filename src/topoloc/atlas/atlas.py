@@ -181,7 +181,7 @@ class Atlas:
             AtlasError: the file is missing or damaged.
         """
         return load_global_descriptors(
-            self.store.local_path(tile.places.name, tile.places.sha256), tile.vocabularies
+            self.store.local_path(tile.places.name, tile.places.sha256), tile.places.vocabularies
         )
 
     @property

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from topoloc.atlas.atlas import store_at
 from topoloc.atlas.global_descriptors import compute_global_descriptors, save_global_descriptors
 from topoloc.atlas.joins import Join
-from topoloc.atlas.manifest import TILES, Manifest, StoredFile, Tile, check_tile_id
+from topoloc.atlas.manifest import TILES, Manifest, PlacesFile, StoredFile, Tile, check_tile_id
 from topoloc.atlas.store import MANIFEST, Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.geometry.geodesy import Georeference
-from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.kept_files import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import temporary_file
@@ -223,14 +223,15 @@ def store_tile(new: NewTile, store: Store) -> Tile:
             if (vocabulary := shared_vocabulary(kind)) is not None
         }
         save_global_descriptors(places, vectors)
-        tile = _describe_tile(new, topomap, versions)
-        vectors = _store_file(store, f"{new.tile_id}.places", places)
+        stored = _store_file(store, f"{new.tile_id}.places", places)
+        tile = _describe_tile(
+            new, topomap, PlacesFile(**structs.asdict(stored), vocabularies=versions)
+        )
     kept = [_store_file(store, f"{new.tile_id}.topo", one) for one in find_kept_files(new.path)]
     previous = [*kept, *new.older]
-    return replace(
+    return structs.replace(
         tile,
         map=_store_file(store, f"{new.tile_id}.topo", new.path),
-        places=vectors,
         recipe=new.recipe,
         previous=tuple(select_kept(previous, [stored.num_bytes for stored in previous])),
     )
@@ -274,8 +275,8 @@ class _TileChangedError(Exception):
 _UNKNOWN = StoredFile("", "", 0)
 
 
-def _describe_tile(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[str, str]) -> Tile:
-    """Return the manifest entry of a map with placeholder files."""
+def _describe_tile(new: NewTile, topomap: TopoMetricMap, places: PlacesFile) -> Tile:
+    """Return the manifest entry of a map with a placeholder of its file."""
     centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
     first_rows = {
         summary.session_id: row for row, summary in reversed(list(enumerate(topomap.summaries)))
@@ -284,9 +285,8 @@ def _describe_tile(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[s
     return Tile(
         new.tile_id,
         map=_UNKNOWN,
-        places=_UNKNOWN,
-        vocabularies=vocabularies,
-        map_id=get_map_id(topomap),
+        places=places,
+        map_id=topomap.id,
         map_version=topomap.version,
         kinds=tuple(topomap.kinds),
         num_nodes=len(topomap.summaries),
@@ -296,6 +296,7 @@ def _describe_tile(new: NewTile, topomap: TopoMetricMap, vocabularies: Mapping[s
         world=new.world,
         georeference=known,
         geo_box=None if known is None else _geo_box(known, centres),
+        atlas_from_world=None,
     )
 
 

@@ -30,13 +30,13 @@ def compute_global_descriptors(topomap: TopoMetricMap) -> dict[str, Float32[np.n
         AtlasError: no feature type of the map has one.
     """
     vectors = {}
-    for kind in topomap.kinds:
+    for kind, layer in topomap.layers.items():
         vocabulary = shared_vocabulary(kind)
         if vocabulary is None:
             continue
         rows = [
             vocabulary.global_descriptor(node.features, node.camera.width, node.camera.height)
-            for node in topomap.with_feature_type(kind).nodes
+            for node in layer.nodes
         ]
         vectors[kind] = np.stack(rows)
     if not vectors:

@@ -134,7 +134,9 @@ class _IndexBuilder:
     def __post_init__(self) -> None:
         self._checksums = {tile.tile_id: tile.places.sha256 for tile in self.tiles}
         vocabularies = {
-            kind: shared_vocabulary(kind) for tile in self.tiles for kind in tile.vocabularies
+            kind: shared_vocabulary(kind)
+            for tile in self.tiles
+            for kind in tile.places.vocabularies
         }
         self.versions = {
             kind: vocabulary.version
@@ -192,7 +194,7 @@ class _IndexBuilder:
         for tile in self.tiles:
             ours = [
                 kind
-                for kind, version in tile.vocabularies.items()
+                for kind, version in tile.places.vocabularies.items()
                 if self.versions.get(kind) == version
             ]
             lacking = [kind for kind in ours if tile.tile_id not in known[kind]]

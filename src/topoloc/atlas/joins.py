@@ -3,16 +3,14 @@ worlds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from topoloc.geometry.rigid import Rigid3, skew
-from topoloc.json_data import Count, Finite, Matrix34, Matrix66
+from topoloc.json_data import Count, Finite, encode_json
 
 ID = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}\Z"
 """Pattern of tile ids and world names."""
@@ -20,8 +18,7 @@ TileId = Annotated[str, Meta(pattern=ID)]
 _MAX_METRES = 1e8
 
 
-@dataclass(frozen=True, eq=False)
-class Join:
+class Join(Struct, frozen=True, eq=False):
     """Hold the relative pose of two tiles.
 
     `first_from_second` transforms the world of the second map into that of the first. `covariance`
@@ -30,23 +27,16 @@ class Join:
     are adjusted together. None: the join contradicts others and is not used.
     """
 
-    first: str
-    second: str
+    first: TileId
+    second: TileId
     first_from_second: Rigid3
     covariance: Float[np.ndarray, "6 6"]
-    num_agreeing: int
-    residual: float | None = 0.0
+    num_agreeing: Count
+    residual: Finite | None = 0.0
 
     def to_json(self) -> dict[str, Any]:
         """Return the join as a JSON object."""
-        return {
-            "first": self.first,
-            "second": self.second,
-            "first_from_second": self.first_from_second.matrix()[:3].tolist(),
-            "covariance": self.covariance.tolist(),
-            "num_agreeing": self.num_agreeing,
-            "residual": self.residual,
-        }
+        return encode_json(self)
 
     def sigmas_at(self, point_second: Float[np.ndarray, "3"]) -> tuple[float, float]:
         """Return one sigma of the position (m, in the worst direction) of a point of the second
@@ -59,84 +49,16 @@ class Join:
         return self.first, self.second
 
 
-@dataclass(frozen=True, eq=False)
-class JointPose:
+class JointPose(Struct, frozen=True, eq=False, rename={"joint": "world"}):
     """Hold the pose of a world in its joint world.
 
     The joint world has the name and coordinates of one of the joined worlds. `covariance` is that
     of the left perturbation of `joint_from_world` (m, rad).
     """
 
-    joint: str
+    joint: TileId
     joint_from_world: Rigid3
     covariance: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the pose as a JSON object."""
-        pose = self.joint_from_world.matrix()[:3].tolist()
-        return {
-            "world": self.joint,
-            "joint_from_world": pose,
-            "covariance": self.covariance.tolist(),
-        }
-
-
-class JoinJson(Struct, frozen=True):
-    """Hold the JSON of a `Join`."""
-
-    first: TileId
-    second: TileId
-    first_from_second: Matrix34
-    covariance: Matrix66
-    num_agreeing: Count
-    residual: Finite | None
-
-    def join(self) -> Join:
-        """Return the join. Raises ValueError or TrajectoryError if its matrices are invalid."""
-        return Join(
-            self.first,
-            self.second,
-            _pose(self.first_from_second),
-            _covariance(self.covariance, is_definite=True),
-            self.num_agreeing,
-            self.residual,
-        )
-
-
-class JointPoseJson(Struct, frozen=True):
-    """Hold the JSON of a `JointPose`."""
-
-    world: TileId
-    joint_from_world: Matrix34
-    covariance: Matrix66
-
-    def pose(self) -> JointPose:
-        """Return the pose. Raises ValueError or TrajectoryError if its matrices are invalid."""
-        covariance = _covariance(self.covariance, is_definite=False)
-        return JointPose(self.world, _pose(self.joint_from_world), covariance)
-
-
-def _pose(rows: Matrix34) -> Rigid3:
-    pose = Rigid3.from_matrix(rows)
-    if np.abs(pose.translation).max() > _MAX_METRES:
-        raise ValueError("a pose is further away than the earth is wide")
-    return pose
-
-
-def _covariance(rows: Sequence[Sequence[float]], is_definite: bool) -> Float[np.ndarray, "6 6"]:
-    """Return a 6x6 covariance as an exactly symmetric matrix. Raises ValueError if it is none."""
-    matrix = np.array(rows)
-    symmetric = 0.5 * (matrix + matrix.T)
-    values = np.linalg.eigvalsh(symmetric)
-    slack = 1e-9 * max(float(values[-1]), 0.0)
-    if (
-        np.abs(matrix).max() > _MAX_METRES**2
-        or np.abs(matrix - symmetric).max() > slack
-        or values[0] < -slack
-        or (is_definite and values[0] <= 0.0)
-    ):
-        raise ValueError("the covariance of a join is no covariance")
-    return symmetric
 
 
 def sigmas_at(
@@ -155,3 +77,17 @@ def sigmas_at(
         for block in (moved @ covariance @ moved.T, covariance[3:, 3:])
     )
     return float(np.sqrt(max(metres, 0.0))), float(np.sqrt(max(radians, 0.0)))
+
+
+def check_join(pose: Rigid3, covariance: Float[np.ndarray, "6 6"], is_definite: bool) -> None:
+    """Check a relative pose and its covariance. Raises ValueError if the covariance is none, or the
+    pose is further away than the earth is wide."""
+    values = np.linalg.eigvalsh(covariance)
+    slack = 1e-9 * max(float(values[-1]), 0.0)
+    if (
+        max(np.abs(pose.translation).max(), np.abs(covariance).max() ** 0.5) > _MAX_METRES
+        or np.abs(covariance - covariance.T).max() > 2.0 * slack
+        or values[0] < -slack
+        or (is_definite and values[0] <= 0.0)
+    ):
+        raise ValueError("a join whose pose or covariance is none")

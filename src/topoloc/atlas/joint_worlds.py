@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
+from msgspec.structs import replace
 
 from topoloc.atlas.joins import Join, JointPose
 from topoloc.geometry.geodesy import GeoPoint

@@ -11,26 +11,25 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import Meta, Struct, to_builtins
+from msgspec import Meta, Struct
 
-from topoloc.atlas.joins import ID, Join, JoinJson, JointPose, JointPoseJson, TileId
+from topoloc.atlas.joins import ID, Join, JointPose, TileId, check_join
 from topoloc.atlas.joint_worlds import place_tiles
-from topoloc.errors import AtlasError, GeoreferenceError, TrajectoryError
-from topoloc.geometry.geodesy import GeoPoint, Georeference, GeoreferenceJson
+from topoloc.errors import AtlasError
+from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Count, Finite, Matrix34, Positive, decode_json
+from topoloc.json_data import Count, Finite, Positive, decode_json, encode_json
 
 FORMAT, FORMAT_VERSION = "topoloc-atlas", 1
 TILES = "tiles"
 FileName = Annotated[str, Meta(pattern=rf"^{TILES}/[A-Za-z0-9][A-Za-z0-9_.-]{{0,199}}\Z")]
 Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
-_Point = tuple[Finite, Finite, Finite]
 
 
 class StoredFile(Struct, frozen=True, rename={"name": "file", "num_bytes": "bytes"}):
@@ -41,13 +40,17 @@ class StoredFile(Struct, frozen=True, rename={"name": "file", "num_bytes": "byte
     num_bytes: Count
 
 
-@dataclass(frozen=True, eq=False)
-class Tile:
+class PlacesFile(StoredFile, frozen=True):
+    """Describe a file of global descriptors (`global_descriptors.py`), with the versions of their
+    vocabularies by feature type."""
+
+    vocabularies: dict[str, str]
+
+
+class Tile(Struct, frozen=True, eq=False, omit_defaults=True, rename={"tile_id": "id"}):
     """Describe a map of the atlas.
 
     Attributes:
-        places: file of the global descriptors (`global_descriptors.py`).
-        vocabularies: versions of their vocabularies, by feature type.
         focal_px: focal length (pixels) of the map's finest camera.
         box_world: minimum and maximum coordinates of the nodes' cameras in the map's own world,
             metres.
@@ -62,22 +65,21 @@ class Tile:
         previous: map files before the last edits, the newest first, to undo them.
     """
 
-    tile_id: str
+    tile_id: TileId
     map: StoredFile
-    places: StoredFile
-    vocabularies: Mapping[str, str]
-    map_id: str
-    map_version: int
+    places: PlacesFile
+    map_id: Annotated[str, Meta(pattern=r"^[0-9a-f]{16}\Z")]
+    map_version: Count
     kinds: tuple[str, ...]
-    num_nodes: int
+    num_nodes: Count
     sessions: tuple[str, ...]
-    focal_px: float
+    focal_px: Positive
     box_world: Float[np.ndarray, "2 3"]
-    world: str
-    georeference: Georeference | None = None
-    geo_box: tuple[float, float, float, float] | None = None
-    atlas_from_world: Rigid3 | None = None
-    recipe: str | None = None
+    world: TileId
+    georeference: Georeference | None
+    geo_box: tuple[Finite, Finite, Finite, Finite] | None
+    atlas_from_world: Rigid3 | None
+    recipe: Sha256 | None = None
     joint: JointPose | None = None
     previous: tuple[StoredFile, ...] = ()
 
@@ -106,32 +108,7 @@ class Tile:
 
     def to_json(self) -> dict[str, Any]:
         """Return the tile as a JSON object."""
-        known = self.georeference
-        made_of: dict[str, Any] = {} if self.recipe is None else {"recipe": self.recipe}
-        if self.joint is not None:
-            made_of["joint"] = self.joint.to_json()
-        if self.previous:
-            made_of["previous"] = to_builtins(self.previous)
-        return made_of | {
-            "id": self.tile_id,
-            "map": to_builtins(self.map),
-            "places": to_builtins(self.places) | {"vocabularies": dict(self.vocabularies)},
-            "map_id": self.map_id,
-            "map_version": self.map_version,
-            "kinds": list(self.kinds),
-            "num_nodes": self.num_nodes,
-            "sessions": list(self.sessions),
-            "focal_px": self.focal_px,
-            "world": self.world,
-            "box_world": self.box_world.tolist(),
-            "georeference": None if known is None else known.to_json(),
-            "geo_box": None if self.geo_box is None else list(self.geo_box),
-            "atlas_from_world": (
-                None
-                if self.atlas_from_world is None
-                else self.atlas_from_world.matrix()[:3].tolist()
-            ),
-        }
+        return encode_json(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,13 +119,31 @@ class Manifest:
     georeferenced. `retired` maps files of earlier manifests to the time at which they were dropped
     (Unix seconds). `joins` holds the relative poses of tiles, including those that contradict
     others.
+
+    Raises:
+        ValueError: two tiles have one id, or joins are invalid.
     """
 
-    serial: int = 0
+    serial: Count = 0
     tiles: tuple[Tile, ...] = ()
     origin: GeoPoint | None = None
-    retired: Mapping[str, float] = field(default_factory=dict)
+    retired: Mapping[FileName, Finite] = field(default_factory=dict)
     joins: tuple[Join, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len({tile.tile_id for tile in self.tiles}) < len(self.tiles):
+            raise ValueError("tiles: two of one id")
+        for tile in self.tiles:
+            if tile.joint is not None:
+                check_join(tile.joint.joint_from_world, tile.joint.covariance, is_definite=False)
+        for join in self.joins:
+            if join.first >= join.second or not {*join.pair} <= self.by_id.keys():
+                raise ValueError(
+                    f"a join of {join.first} and {join.second}, not two tiles in order"
+                )
+            check_join(join.first_from_second, join.covariance, is_definite=True)
+        if len({join.pair for join in self.joins}) < len(self.joins):
+            raise ValueError("two joins of the same tiles")
 
     @cached_property
     def by_id(self) -> dict[str, Tile]:
@@ -225,16 +220,9 @@ class Manifest:
 
     def to_bytes(self) -> bytes:
         """Return the contents of `atlas.json`."""
-        origin = self.origin
-        data = {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "serial": self.serial,
-            "origin": None if origin is None else asdict(origin),
-            "tiles": [tile.to_json() for tile in self.tiles],
-            "retired": dict(self.retired),
-            **({"joins": [join.to_json() for join in self.joins]} if self.joins else {}),
-        }
+        data = {"format": FORMAT, "version": FORMAT_VERSION} | encode_json(self)
+        if not self.joins:
+            data.pop("joins", None)
         return (json.dumps(data, indent=1) + "\n").encode("utf-8")
 
     @staticmethod
@@ -246,16 +234,26 @@ class Manifest:
         """
         fault = f"{where} is no manifest of an atlas, or a damaged one"
         whole = decode_json(data, dict[str, Any], AtlasError, fault)
-        written = decode_json(whole, _Header, AtlasError, fault).version
-        if written != FORMAT_VERSION:
+        version = whole.get("version")
+        if whole.get("format") == FORMAT and version != FORMAT_VERSION:
             raise AtlasError(
-                f"{fault}: version {written} of the format; this topoloc reads version"
+                f"{fault}: version {str(version)[:20]} of the format; this topoloc reads version"
                 f" {FORMAT_VERSION}"
             )
-        try:
-            return decode_json(whole, _ManifestJson, AtlasError, fault).manifest()
-        except (ValueError, GeoreferenceError, TrajectoryError) as error:
-            raise AtlasError(f"{fault}: {error}") from None
+        decode_json(whole, _Header, AtlasError, fault)
+        read = decode_json(whole, Manifest, AtlasError, fault)
+        return replace(read, tiles=tuple(sorted(read.tiles, key=lambda tile: tile.tile_id)))
+
+
+class _Header(Struct, frozen=True):
+    """Hold the format and the required keys of a manifest, which are checked first."""
+
+    format: Literal["topoloc-atlas"]
+    version: int
+    serial: Any
+    origin: Any
+    tiles: Annotated[list[Any], Meta(max_length=1_000_000)]
+    retired: Any
 
 
 def check_tile_id(tile_id: str) -> None:
@@ -269,93 +267,3 @@ def check_tile_id(tile_id: str) -> None:
             f"no tile can be called {tile_id[:80]!r}: at most 100 letters, digits, `_`, `-` and"
             " `.`, a letter or digit first"
         )
-
-
-class _PlacesJson(StoredFile, frozen=True):
-    """Hold the JSON of the file of the global descriptors."""
-
-    vocabularies: dict[str, str]
-
-
-class _TileJson(Struct, frozen=True):
-    """Hold the JSON of a `Tile`."""
-
-    id: TileId
-    map: StoredFile
-    places: _PlacesJson
-    map_id: Annotated[str, Meta(pattern=r"^[0-9a-f]{16}\Z")]
-    map_version: Count
-    kinds: tuple[str, ...]
-    num_nodes: Count
-    sessions: tuple[str, ...]
-    focal_px: Positive
-    world: TileId
-    box_world: tuple[_Point, _Point]
-    georeference: GeoreferenceJson | None
-    geo_box: tuple[Finite, Finite, Finite, Finite] | None
-    atlas_from_world: Matrix34 | None
-    recipe: Sha256 | None = None
-    joint: JointPoseJson | None = None
-    previous: tuple[StoredFile, ...] = ()
-
-    def tile(self) -> Tile:
-        """Return the tile. Raises ValueError, GeoreferenceError or TrajectoryError."""
-        places, pose = self.places, self.atlas_from_world
-        return Tile(
-            tile_id=self.id,
-            map=self.map,
-            places=StoredFile(places.name, places.sha256, places.num_bytes),
-            vocabularies=places.vocabularies,
-            map_id=self.map_id,
-            map_version=self.map_version,
-            kinds=self.kinds,
-            num_nodes=self.num_nodes,
-            sessions=self.sessions,
-            focal_px=self.focal_px,
-            box_world=np.array(self.box_world),
-            world=self.world,
-            georeference=None if self.georeference is None else self.georeference.georeference(),
-            geo_box=self.geo_box,
-            atlas_from_world=None if pose is None else Rigid3.from_matrix(pose),
-            recipe=self.recipe,
-            joint=None if self.joint is None else self.joint.pose(),
-            previous=self.previous,
-        )
-
-
-class _Header(Struct, frozen=True):
-    """Hold the format of a manifest, which is checked before its other keys."""
-
-    format: Literal["topoloc-atlas"]
-    version: int
-
-
-class _ManifestJson(Struct, frozen=True):
-    """Hold the JSON of a `Manifest`."""
-
-    serial: Count
-    origin: GeoPoint | None
-    tiles: Annotated[list[_TileJson], Meta(max_length=1_000_000)]
-    retired: dict[FileName, Finite]
-    joins: tuple[JoinJson, ...] = ()
-
-    def manifest(self) -> Manifest:
-        """Return the manifest. Raises ValueError, GeoreferenceError or TrajectoryError."""
-        tiles = sorted((row.tile() for row in self.tiles), key=lambda tile: tile.tile_id)
-        if len({tile.tile_id for tile in tiles}) < len(tiles):
-            raise ValueError("tiles: two of one id")
-        joins = tuple(row.join() for row in self.joins)
-        _check_joins(joins, {tile.tile_id for tile in tiles})
-        return Manifest(self.serial, tuple(tiles), self.origin, self.retired, joins)
-
-
-def _check_joins(joins: Sequence[Join], known: set[str]) -> None:
-    for join in joins:
-        if not known.issuperset(join.pair):
-            raise ValueError(f"a join of {join.first} and {join.second}, which are not both tiles")
-        if join.first >= join.second:
-            raise ValueError(
-                f"a join of {join.first} and {join.second}, which are not two in their order"
-            )
-    if len({join.pair for join in joins}) < len(joins):
-        raise ValueError("two joins of the same tiles")

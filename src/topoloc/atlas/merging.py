@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from topoloc.atlas.atlas import Atlas, is_atlas, store_at, tile_problem
 from topoloc.atlas.editing import new_tiles, store_tile

@@ -12,6 +12,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image
 
 # A query is recalled if its pose error is within both (metres, degrees). Recall counts all queries.
@@ -33,22 +34,19 @@ class EvaluatedQuery:
       transform. The pose then counts as false.
     """
 
-    max_translation_m: ClassVar[float] = MAX_TRANSLATION
-    max_rotation_deg: ClassVar[float] = MAX_ROTATION_DEG
+    MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
+    MAX_ROTATION_DEG: ClassVar[float] = MAX_ROTATION_DEG
     """A pose that is further off than either is a false accept."""
 
     query: str
     result: Localization | NotLocalized
     world_from_cam: Rigid3 | None
-    nearest_node_id: int | None = None
+    nearest_node_id: NodeId | None = None
     recording: str = ""
     read_image: Callable[[], Image] | None = None
     camera: Camera | None = None
-    neighbour_ids: frozenset[int] = frozenset()
+    neighbour_ids: frozenset[NodeId] = frozenset()
     is_in_other_world: bool = False
-
-    MAX_TRANSLATION: ClassVar[float] = MAX_TRANSLATION
-    MAX_ROTATION_DEG: ClassVar[float] = MAX_ROTATION_DEG
 
     @property
     def translation_m(self) -> float:
@@ -82,8 +80,8 @@ class EvaluatedQuery:
             return False
         if self.world_from_cam is None or self.is_in_other_world:
             return True
-        return (
-            self.translation_m > self.MAX_TRANSLATION or self.rotation_deg > self.MAX_ROTATION_DEG
+        return not self.world_from_cam.is_same(
+            self.result.world_from_cam, self.MAX_TRANSLATION, np.deg2rad(self.MAX_ROTATION_DEG)
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -13,8 +13,9 @@ from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 
 # A node within this many D_thresh counts as a neighbour of the query.
@@ -49,7 +50,7 @@ def localize_queries(
     """
     with localizer.in_tile(tile_id) as in_tile:
         topomap, tile_id = in_tile.topomap, in_tile.tile_ids[0]
-        nodes = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+        nodes = topomap.node_poses
     frames = find_frames_with_truth(sequence) if frames is None else frames
     label = label or sequence.name
     answers = []
@@ -129,7 +130,7 @@ def create_image_reader(sequence: StereoSequence, index: int) -> Callable[[], Im
 
 def find_neighbour_ids(
     topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]
-) -> frozenset[int]:
+) -> frozenset[NodeId]:
     """Return the ids of nodes connected to the nearest node by an edge, and of nodes within 1.5
     D_thresh. `distances` holds D_total to each node (metres, Eq. 1)."""
     nearest = topomap.summaries[int(np.argmin(distances))].node_id

@@ -14,8 +14,14 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.evaluation.metrics import EvaluatedQuery
-from topoloc.geometry.alignment import align_poses, rotation_error, translation_error
+from topoloc.geometry.alignment import (
+    align_poses,
+    normalized_pose_error,
+    rotation_error,
+    translation_error,
+)
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.transform_consensus import find_least_median
 from topoloc.localization.result import Localization
 
 _MIN_ANSWERS = 5
@@ -67,12 +73,11 @@ def fit_worlds(answers: Sequence[EvaluatedQuery]) -> WorldFit | None:
     if before < _MIN_ERROR:
         return None
     proposals = [found @ true.inverse() for found, true in pairs]
-    best = min(proposals, key=lambda one: float(np.median(_normalized_errors(one, pairs))))
-    errors = _normalized_errors(best, pairs)
+    best, median = find_least_median(proposals, lambda one: _normalized_errors(one, pairs))
     agreeing = [
         pair
-        for pair, error in zip(pairs, errors, strict=True)
-        if error < max(_GATE * float(np.median(errors)), 1e-3)
+        for pair, error in zip(pairs, _normalized_errors(best, pairs), strict=True)
+        if error < max(_GATE * median, 1e-3)
     ]
     map_from_truth = align_poses([found for found, _ in agreeing], [true for _, true in agreeing])
     if float(np.median(_normalized_errors(map_from_truth, pairs))) > _MAX_SHARE * before or 2 * len(
@@ -89,10 +94,7 @@ def _normalized_errors(
     map_from_truth: Rigid3, pairs: Sequence[tuple[Rigid3, Rigid3]]
 ) -> Float[np.ndarray, " n"]:
     """Return the error of each result, 1 for 25 cm or 2 degrees."""
-    moved = [(found, map_from_truth @ true) for found, true in pairs]
+    scales = _POSITION_SCALE_M, _ROTATION_SCALE
     return np.array(
-        [
-            max(translation_error(a, b) / _POSITION_SCALE_M, rotation_error(a, b) / _ROTATION_SCALE)
-            for a, b in moved
-        ]
+        [normalized_pose_error(found, map_from_truth @ true, *scales) for found, true in pairs]
     )

@@ -7,14 +7,11 @@ distance^2 = 2 - 2 product.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
-
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
-from topoloc.bounds import Between
+from topoloc.features.config import MatchingConfig
 from topoloc.features.features import Matches
 from topoloc.features.matching_kernels import GROUP, ROWS, TILE, find_nearest, find_similar
 from topoloc.features.parallel import parallel_for_rows
@@ -24,23 +21,6 @@ _FLANN_KDTREE = 1
 _FLANN_NEIGHBOURS = 8  # the nearest of these that is not a duplicate is the rival
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NO_RADII = np.zeros(0, np.float32)
-
-
-@dataclass(frozen=True)
-class MatchingConfig:
-    """Hold the settings of descriptor matching."""
-
-    method: Literal["exact", "flann"] = "exact"
-    """`exact` compares every descriptor with every other. `flann` searches FLANN's KD-trees."""
-    ratio: Annotated[float | None, Between(0, 1)] = None
-    """A match must be nearer than `ratio` times its nearest rival. 0 accepts every nearest
-    neighbour. Unset: the default of the feature type."""
-    mutual: bool = True
-    """Require that the query feature is also the nearest one of its train feature."""
-
-    def resolved(self, ratio: float) -> MatchingConfig:
-        """Return this configuration with `ratio`, unless its own is set."""
-        return self if self.ratio is not None else replace(self, ratio=ratio)
 
 
 _NO_RATIO_TEST = MatchingConfig(ratio=0.0)

@@ -159,6 +159,22 @@ def rotation_error(a_from_b: Rigid3, estimated_a_from_b: Rigid3) -> float:
     return Rigid3(a_from_b.rotation.T @ estimated_a_from_b.rotation, np.zeros(3)).angle()
 
 
+def normalized_pose_error(
+    a_from_b: Rigid3, estimated_a_from_b: Rigid3, metres: float, radians: float
+) -> float:
+    """Return the larger of the translation error in units of `metres` and the rotation error in
+    units of `radians`."""
+    return max(
+        translation_error(a_from_b, estimated_a_from_b) / metres,
+        rotation_error(a_from_b, estimated_a_from_b) / radians,
+    )
+
+
+def compute_path_lengths(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Return the distance travelled up to each position, in the unit of the positions."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+
+
 @dataclass(frozen=True)
 class Drift:
     """Hold the mean error of relative poses: translation as a fraction of the path length (0.01 is
@@ -209,9 +225,7 @@ def relative_drift(
             " poses"
         )
     positions = np.array([pose.translation for pose in true_world_from_cams]).reshape(-1, 3)
-    path_lengths = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
-    )
+    path_lengths = compute_path_lengths(positions)
     lengths = KITTI_LENGTHS if path_lengths[-1] >= _MIN_KITTI_LENGTH else SHORT_LENGTHS
     translations, rotations = [], []
     for length in lengths:

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import Struct
 
-from topoloc.json_data import Finite, NonNegative
+from topoloc.json_data import NonNegative, encode_json
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,25 +33,25 @@ class CalibrationMismatch:
     """Compare the camera estimated from an image with the calibration, in pixels of the original
     image.
 
-    `shift` is the left perturbation (metres, radians) from the pose under the calibration to the
-    pose under the estimated camera.
+    `of` names the deviating parts: "focal_length", "principal_point". `shift` is the left
+    perturbation (metres, radians) from the pose under the calibration to the pose under the
+    estimated camera.
     """
 
-    focal_length_px: float
-    focal_sigma_px: float
-    calibrated_focal_length_px: float
+    focal_length_px: NonNegative
+    focal_sigma_px: NonNegative
+    calibrated_focal_length_px: NonNegative
     principal_point_px: Float[np.ndarray, " 2"]
     calibrated_principal_point_px: Float[np.ndarray, " 2"]
-    has_focal_mismatch: bool
-    has_principal_point_mismatch: bool
+    of: list[str]
     shift: Float[np.ndarray, " 6"]
 
     def __str__(self) -> str:
         parts = []
-        if self.has_focal_mismatch:
+        if "focal_length" in self.of:
             measured = f"f = {self.focal_length_px:.0f} +- {max(self.focal_sigma_px, 0.5):.0f} px"
             parts.append(f"{measured}, the calibration {self.calibrated_focal_length_px:.0f}")
-        if self.has_principal_point_mismatch:
+        if "principal_point" in self.of:
             (x, y), (cx, cy) = self.principal_point_px, self.calibrated_principal_point_px
             parts.append(
                 f"the principal point at ({x:.0f}, {y:.0f}), the calibration ({cx:.0f}, {cy:.0f})"
@@ -61,42 +60,4 @@ class CalibrationMismatch:
 
     def to_json(self) -> dict[str, Any]:
         """Return the mismatch as JSON, with a text for the user as `detail`."""
-        of = {
-            "focal_length": self.has_focal_mismatch,
-            "principal_point": self.has_principal_point_mismatch,
-        }
-        return {
-            "focal_length_px": self.focal_length_px,
-            "focal_sigma_px": self.focal_sigma_px,
-            "calibrated_focal_length_px": self.calibrated_focal_length_px,
-            "of": [name for name, is_off in of.items() if is_off],
-            "shift": self.shift.tolist(),
-            "principal_point_px": self.principal_point_px.tolist(),
-            "calibrated_principal_point_px": self.calibrated_principal_point_px.tolist(),
-            "detail": str(self),
-        }
-
-
-class MismatchJson(Struct, frozen=True):
-    """Hold the JSON of a `CalibrationMismatch`."""
-
-    focal_length_px: NonNegative
-    focal_sigma_px: NonNegative
-    calibrated_focal_length_px: NonNegative
-    principal_point_px: tuple[Finite, Finite]
-    calibrated_principal_point_px: tuple[Finite, Finite]
-    of: list[str]
-    shift: tuple[Finite, Finite, Finite, Finite, Finite, Finite]
-
-    def mismatch(self) -> CalibrationMismatch:
-        """Return the mismatch."""
-        return CalibrationMismatch(
-            self.focal_length_px,
-            self.focal_sigma_px,
-            self.calibrated_focal_length_px,
-            np.array(self.principal_point_px),
-            np.array(self.calibrated_principal_point_px),
-            "focal_length" in self.of,
-            "principal_point" in self.of,
-            np.array(self.shift),
-        )
+        return encode_json(self) | {"detail": str(self)}

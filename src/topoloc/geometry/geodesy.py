@@ -10,16 +10,15 @@ with x to latitude 0, longitude 0 and z to the north pole. Formulas: Torge and M
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import Struct
 
-from topoloc.errors import GeoreferenceError, TrajectoryError
+from topoloc.errors import GeoreferenceError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Finite, Matrix34, NonNegative, decode_json
+from topoloc.json_data import NonNegative, decode_json, encode_json
 
 SEMI_MAJOR = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
@@ -104,7 +103,21 @@ class GeoPoint:
         return Rigid3(np.array([east, north, up]).T, self.ecef())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
+class Quaternion:
+    """Hold a unit quaternion. Raises ValueError if its length is not 1 within 0.001."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+    def __post_init__(self) -> None:
+        if not abs(math.hypot(self.x, self.y, self.z, self.w) - 1.0) < 1e-3:  # true for NaN
+            raise ValueError("a quaternion that is not of unit length")
+
+
+@dataclass(frozen=True)
 class GeoPose:
     """Hold an OGC GeoPose 1.0, Basic-Quaternion: the camera's place, and its orientation relative
     to east-north-up at that place.
@@ -113,40 +126,22 @@ class GeoPose:
     """
 
     position: GeoPoint
-    quat_wxyz: Float[np.ndarray, "4"]
+    quaternion: Quaternion
+
+    @property
+    def quat_wxyz(self) -> Float[np.ndarray, "4"]:
+        """Return the orientation as an array (w, x, y, z)."""
+        q = self.quaternion
+        return np.array([q.w, q.x, q.y, q.z])
 
     def to_json(self) -> dict[str, dict[str, float]]:
         """Return the strict form, with exactly the members of the standard."""
-        w, x, y, z = self.quat_wxyz.tolist()
-        return {"position": asdict(self.position), "quaternion": {"x": x, "y": y, "z": z, "w": w}}
+        return encode_json(self)
 
     @staticmethod
     def from_json(data: Any) -> GeoPose:
         """Read the form of `to_json`. Raises GeoreferenceError if the data have another form."""
-        return decode_json(data, GeoPoseJson, GeoreferenceError, "no GeoPose").geopose()
-
-
-class _Quaternion(Struct, frozen=True):
-    x: Finite
-    y: Finite
-    z: Finite
-    w: Finite
-
-    def __post_init__(self) -> None:
-        if not abs(math.hypot(self.w, self.x, self.y, self.z) - 1.0) < 1e-3:
-            raise ValueError("a quaternion that is not of unit length")
-
-
-class GeoPoseJson(Struct, frozen=True):
-    """Hold the JSON of a `GeoPose`."""
-
-    position: GeoPoint
-    quaternion: _Quaternion
-
-    def geopose(self) -> GeoPose:
-        """Return the GeoPose."""
-        q = self.quaternion
-        return GeoPose(self.position, np.array([q.w, q.x, q.y, q.z]))
+        return decode_json(data, GeoPose, GeoreferenceError, "no GeoPose")
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,23 +156,16 @@ class Georeference:
     origin: GeoPoint
     enu_from_world: Rigid3
     source: str
-    rms_m: float | None = None
+    rms_m: NonNegative | None = None
 
     def to_json(self) -> dict[str, object]:
         """Return the form stored in the map file."""
-        return {
-            "origin": asdict(self.origin),
-            "enu_from_world": self.enu_from_world.matrix()[:3].tolist(),
-            "source": self.source,
-            "rms_m": self.rms_m,
-        }
+        return encode_json(self)
 
     @staticmethod
     def from_json(data: Any) -> Georeference:
         """Read the form of `to_json`. Raises GeoreferenceError if the data have another form."""
-        return decode_json(
-            data, GeoreferenceJson, GeoreferenceError, "no georeference"
-        ).georeference()
+        return decode_json(data, Georeference, GeoreferenceError, "no georeference")
 
     def geopoint(self, point_world: Float[np.ndarray, "3"]) -> GeoPoint:
         """Return latitude, longitude and height of a point in the world frame (metres). Raises
@@ -191,30 +179,10 @@ class Georeference:
         ecef_from_cam = self.origin.ecef_from_enu() @ self.enu_from_world @ world_from_cam
         position = GeoPoint.from_ecef(ecef_from_cam.translation)
         enu_from_body = position.ecef_from_enu().rotation.T @ ecef_from_cam.rotation @ CAM_FROM_BODY
-        return GeoPose(position, Rigid3(enu_from_body, np.zeros(3)).quat_wxyz())
+        w, x, y, z = Rigid3(enu_from_body, np.zeros(3)).quat_wxyz().tolist()
+        return GeoPose(position, Quaternion(x, y, z, w))
 
     def heading_deg(self, direction_world: Float[np.ndarray, "3"]) -> float:
         """Return the heading of a direction in degrees clockwise from true north, 0 to 360."""
         east, north, _ = self.enu_from_world.rotation @ direction_world
         return math.degrees(math.atan2(east, north)) % 360.0
-
-
-class GeoreferenceJson(Struct, frozen=True):
-    """Hold the JSON of a `Georeference`."""
-
-    origin: GeoPoint
-    enu_from_world: Matrix34
-    source: str
-    rms_m: NonNegative | None
-
-    def georeference(self) -> Georeference:
-        """Return the georeference. Raises GeoreferenceError if its matrix is not a pose."""
-        matrix = np.array(self.enu_from_world)
-        try:
-            enu_from_world = Rigid3.from_matrix(matrix)
-        except TrajectoryError as error:
-            raise GeoreferenceError(f"no georeference: enu_from_world: {error}") from None
-        if np.abs(enu_from_world.matrix()[:3] - matrix).max() < 1e-9:
-            # Keep the stored values bit by bit.
-            enu_from_world = Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
-        return Georeference(self.origin, enu_from_world, self.source, self.rms_m)

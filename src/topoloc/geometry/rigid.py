@@ -7,17 +7,15 @@ the left: ``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
 from msgspec import Struct
 
 from topoloc.errors import TrajectoryError
-from topoloc.json_data import Finite, decode_json
+from topoloc.json_data import decode_json
 
 _SMALL_ANGLE = 1e-7
 _TOLERANCE = 1e-2
@@ -93,13 +91,15 @@ def matrix_from_quat_wxyz(quat_wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray
     )
 
 
-@dataclass(frozen=True, eq=False)
 class Rigid3:
     """Hold a rigid transform ``a_from_b``: ``point_a = rotation @ point_b + translation``
     (metres)."""
 
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, "3"]
+    def __init__(
+        self, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
+    ) -> None:
+        self.rotation: Final = rotation
+        self.translation: Final = translation
 
     @staticmethod
     def identity() -> Rigid3:
@@ -150,12 +150,23 @@ class Rigid3:
 
     @staticmethod
     def from_json(data: Any, name: str = "pose") -> Rigid3:
-        """Parse the form of `to_json`, from text or an object. `name` is its name in errors.
+        """Parse the form of `to_json`, from text or an object, or the rows of a 3x4 or 4x4 matrix.
+        A rotation that is orthonormal within 1e-9 keeps its bits. `name` is the pose's name in
+        errors.
 
         Raises:
-            TrajectoryError: it has another form, or the quaternion is not of unit length.
+            TrajectoryError: it has another form, or no unit quaternion or rotation.
         """
-        return decode_json(data, PoseJson, TrajectoryError, name).rigid()
+        if isinstance(data, list):
+            rigid, rows = Rigid3.from_matrix(data), np.array(data, np.float64)[:3]
+            is_exact = np.abs(rigid.rotation - rows[:, :3]).max() < 1e-9
+            return Rigid3(rows[:, :3].copy(), rows[:, 3].copy()) if is_exact else rigid
+        pose = decode_json(data, _PoseJson, TrajectoryError, name)
+        return Rigid3.from_quat_wxyz(pose.quat_wxyz, pose.translation)
+
+    def tolist(self) -> list[list[float]]:
+        """Return the rows of the 3x4 matrix."""
+        return self.matrix()[:3].tolist()
 
     @staticmethod
     def exp(xi: Float[np.ndarray, "6"]) -> Rigid3:
@@ -203,6 +214,39 @@ class Rigid3:
         """Return the rotation angle in radians, in [0, pi]."""
         return float(np.linalg.norm(log_so3(self.rotation)))
 
+    def is_same(
+        self,
+        other: Rigid3,
+        metres: float = 0.0,
+        radians: float = 0.0,
+        covariance: Float[np.ndarray, "6 6"] | None = None,
+        max_square: float = 0.0,
+    ) -> bool:
+        """Return whether two world_from_cam are the same pose.
+
+        They are if their translations differ by less than `metres` and their rotations by less than
+        `radians`. With a covariance they also are if `squared_distance` is less than `max_square`.
+        """
+        shift = other.translation - self.translation
+        square = float(shift @ shift)
+        if square < metres**2 and (self.inverse() @ other).angle() < radians:
+            return True
+        if covariance is None:
+            return False
+        limit = max_square * float(np.trace(covariance))
+        if square > limit or (self.inverse() @ other).angle() ** 2 > limit:
+            return False  # the difference is longer than the largest that the covariance allows
+        return self.squared_distance(other, covariance) < max_square
+
+    def squared_distance(self, other: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> float:
+        """Return the squared Mahalanobis distance between two world_from_cam.
+
+        `covariance` is the sum of those of their right perturbations (m, rad), which are the left
+        ones of cam_from_world. The distance follows chi^2 with 6 degrees of freedom.
+        """
+        difference = (self.inverse() @ other).log()
+        return float(difference @ np.linalg.solve(covariance, difference))
+
     def interpolate(self, other: Rigid3, fraction: float) -> Rigid3:
         """Return the pose between this one (fraction 0) and `other` (fraction 1). The position is
         linear, the rotation follows the geodesic."""
@@ -211,19 +255,13 @@ class Rigid3:
         return Rigid3(exp_so3(fraction * omega) @ self.rotation, translation)
 
 
-class PoseJson(Struct, frozen=True):
-    """Hold the JSON of a pose: translation in metres, unit quaternion."""
-
-    translation: tuple[Finite, Finite, Finite]
-    quat_wxyz: tuple[Finite, Finite, Finite, Finite]
+class _PoseJson(Struct, frozen=True):
+    translation: Float[np.ndarray, "3"]
+    quat_wxyz: Float[np.ndarray, "4"]
 
     def __post_init__(self) -> None:
-        if not abs(math.hypot(*self.quat_wxyz) - 1.0) < 1e-3:
+        if not abs(np.linalg.norm(self.quat_wxyz) - 1.0) < 1e-3:
             raise ValueError("quat_wxyz is not of unit length")
-
-    def rigid(self) -> Rigid3:
-        """Return the transform."""
-        return Rigid3.from_quat_wxyz(np.array(self.quat_wxyz), np.array(self.translation))
 
 
 def inverse_covariance(

@@ -3,11 +3,14 @@
 Each estimate is a hypothesis. The one with the most independent estimates that agree within their
 covariances is refined with all of these (weighted least squares on SE(3)). It is rejected if too
 few estimates agree, or if nearly as many agree on another transform.
+
+`select_hypothesis` alone serves estimates whose agreement is no matter of one covariance each, such
+as those of a motion that drifts. `find_least_median` serves measurements without covariances.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +67,19 @@ class TransformConsensus:
 
     def is_consistent(self, a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> bool:
         """Return whether an estimate agrees with the transform."""
-        residual = (a_from_b @ self.a_from_b.inverse()).log()
-        square = residual @ np.linalg.solve(covariance + self.covariance, residual)
-        return bool(square <= self.max_sigmas**2)
+        return a_from_b.inverse().is_same(
+            self.a_from_b.inverse(),
+            covariance=covariance + self.covariance,
+            max_square=self.max_sigmas**2,
+        )
+
+    def between(
+        self, c_from_a: Rigid3, b_from_d: Rigid3
+    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+        """Return c_from_d and the covariance of its left perturbation."""
+        adjoint = c_from_a.adjoint()
+        covariance = adjoint @ self.covariance @ adjoint.T
+        return c_from_a @ self.a_from_b @ b_from_d, 0.5 * (covariance + covariance.T)
 
 
 def find_consensus(
@@ -104,7 +117,7 @@ def find_consensus(
     if image_ids is None:
         image_ids = np.column_stack([np.arange(num), np.arange(num)])
     distances = _pairwise_distances(a_from_bs, covariances, max_hypotheses)
-    best, agreeing = _select_best_hypothesis(distances <= max_sigmas, image_ids)
+    best, agreeing = select_hypothesis(distances <= max_sigmas, image_ids)
     if agreeing < min_independent:
         return None
     is_inlier = distances[best] <= max_sigmas
@@ -112,7 +125,7 @@ def find_consensus(
     sigmas = _distances(a_from_b, covariance, a_from_bs, covariances)
     is_inlier, others = sigmas <= max_sigmas, sigmas > rival_sigmas
     num_independent = _count_independent(is_inlier, image_ids)
-    _, rivals = _select_best_hypothesis((distances <= max_sigmas) & others, image_ids)
+    _, rivals = select_hypothesis((distances <= max_sigmas) & others, image_ids)
     if num_independent < min_independent or rivals >= max(rival_share * num_independent, 2):
         return None
     a_from_b, covariance = _refine_transform(a_from_bs, covariances, is_inlier)
@@ -177,12 +190,17 @@ def _residuals(hypothesis: Rigid3, a_from_bs: Sequence[Rigid3]) -> Float[np.ndar
     )
 
 
-def _select_best_hypothesis(
-    agree: Bool[np.ndarray, "h n"], image_ids: Int[np.ndarray, "n 2"]
+def select_hypothesis(
+    agree: Bool[np.ndarray, "h n"], image_ids: Int[np.ndarray, "n 2"] | None = None
 ) -> tuple[int, int]:
-    """Return the hypothesis with the most independent agreeing estimates, and their number. Among
-    equals, the one with the most agreeing estimates wins."""
+    """Return the hypothesis (row) with the most independent agreeing estimates, and their number.
+
+    Among equals, the one with the most agreeing estimates wins. `image_ids` is as in
+    `find_consensus`.
+    """
     counts = agree.sum(axis=1)
+    if image_ids is None:
+        return int(np.argmax(counts)), int(counts.max())
     best, support = 0, 0
     for k in np.argsort(-counts, kind="stable").tolist():
         if counts[k] <= support:
@@ -191,6 +209,19 @@ def _select_best_hypothesis(
         if num > support:
             best, support = k, num
     return best, support
+
+
+def find_least_median(
+    hypotheses: Iterable[Rigid3], errors: Callable[[Rigid3], Float[np.ndarray, " n"]]
+) -> tuple[Rigid3, float]:
+    """Return the hypothesis with the least median of its errors, and that median.
+
+    Rousseeuw, *Least median of squares regression*, 1984. More than half of the measurements must
+    be right.
+    """
+    medians = ((float(np.median(errors(one))), one) for one in hypotheses)
+    median, best = min(medians, key=lambda pair: pair[0])
+    return best, median
 
 
 def _count_independent(chosen: Bool[np.ndarray, " n"], image_ids: Int[np.ndarray, "n 2"]) -> int:

@@ -12,7 +12,8 @@ import numpy as np
 
 from topoloc.errors import MissingExtraError
 from topoloc.features.features import Features
-from topoloc.mapping.topomap import PlaceImage, TopoMetricMap
+from topoloc.mapping.topomap import Layer, PlaceImage, TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseModel, ExtendableLocalizer, open_coarse_localizer
 from topoloc.retrieval.network_images import decode_stored_image
 from topoloc.retrieval.vlad import SurfVlad
@@ -25,24 +26,16 @@ class PlaceFeatures:
     features: Features
     width: int
     height: int
-    node_id: int
-
-
-@dataclass(frozen=True, eq=False)
-class UpdatedCoarseModels:
-    """Hold a map's extended coarse localizers and the names of the localizers that were not
-    updated."""
-
-    models: dict[str, CoarseModel]
-    not_updated: list[str]
+    node_id: NodeId
 
 
 def update_coarse_models(
     topomap: TopoMetricMap,
     views: Mapping[str, Sequence[PlaceFeatures]],
     images: Sequence[PlaceImage],
-) -> UpdatedCoarseModels:
-    """Return the map's coarse localizers with new places added.
+) -> tuple[TopoMetricMap, list[str]]:
+    """Return the map with new places added to its coarse localizers, and the names of those that
+    were not updated.
 
     Localizers that use local features are extended with `views`. Localizers that compare network
     descriptors are extended with `images`. A localizer with one output per node (cnn-fc) cannot be
@@ -57,26 +50,26 @@ def update_coarse_models(
     Raises:
         MapError: a coarse localizer of the map, or an image, is damaged.
     """
-    models, not_updated = dict(topomap.coarse_models), []
-    for name, model in models.items():
-        of_name, _, of_kind = name.partition("@")
-        if of_name == SurfVlad.name:
-            models[name] = _add_features(model, views.get(of_kind or topomap.kind, []))
-        elif images:
-            extended = _add_images(model, images)
-            models[name] = extended or model
-            not_updated += [] if extended else [name]
-    return UpdatedCoarseModels(models, sorted(not_updated))
+    layers, not_updated = dict[str, Layer](), list[str]()
+    for kind, layer in topomap.layers.items():
+        models = dict(layer.coarse_models)
+        for name, model in models.items():
+            if name == SurfVlad.name:
+                models[name] = _add_features(model, views.get(kind, []))
+            elif images:
+                extended = _add_images(model, images)
+                models[name] = extended or model
+                not_updated += [] if extended else [name]
+        layers[kind] = replace(layer, coarse_models=models)
+    return replace(topomap, layers=layers), sorted(not_updated)
 
 
 def _add_features(model: CoarseModel, views: Sequence[PlaceFeatures]) -> CoarseModel:
     if not views:
         return model
     described = [(view.features, view.width, view.height) for view in views]
-    extended = SurfVlad.from_model(model).extend_with_features(
-        described, np.array([view.node_id for view in views])
-    )
-    return replace(extended.to_model(), name=model.name)
+    node_ids = np.array([view.node_id for view in views])
+    return SurfVlad.from_model(model).extend_with_features(described, node_ids).to_model()
 
 
 def _add_images(model: CoarseModel, images: Sequence[PlaceImage]) -> CoarseModel | None:

@@ -10,6 +10,7 @@ length of a descriptor does not matter. The default step is 0.64 times a number'
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Int8
@@ -38,17 +39,16 @@ def quantize_map_descriptors(topomap: TopoMetricMap, step: float) -> TopoMetricM
     """
     if all(
         quantize_node_descriptors(node, step) is node
-        for kind in topomap.kinds
-        for node in topomap.nodes_of(kind)
+        for layer in topomap.layers.values()
+        for node in layer.nodes
     ):
         return topomap
-    nodes = {
-        kind: TransformedSequence(
-            topomap.nodes_of(kind), lambda node: quantize_node_descriptors(node, step)
-        )
-        for kind in topomap.kinds
+    quantize = partial(quantize_node_descriptors, step=step)
+    layers = {
+        kind: replace(layer, nodes=TransformedSequence(layer.nodes, quantize))
+        for kind, layer in topomap.layers.items()
     }
-    return replace(topomap, nodes=nodes.pop(topomap.kind), other_kinds=nodes)
+    return replace(topomap, layers=layers)
 
 
 def quantize_node_descriptors(node: TopoNode, step: float) -> TopoNode:

@@ -9,17 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Int
 
-from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import Row, as_rows
 
+T = TypeVar("T")
+
+T = TypeVar("T")
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 """Count a result as wrong if it is further off than this (metres, degrees)."""
 
@@ -34,7 +38,7 @@ class LeaveOneOutResult:
     num_inliers: int
 
 
-def sample_evenly(rows: Sequence[int], max_count: int) -> list[int]:
+def sample_evenly(rows: Sequence[T], max_count: int) -> list[T]:
     """Return at most `max_count` of `rows`, evenly spaced and in their order."""
     if len(rows) <= max_count:
         return list(rows)
@@ -44,33 +48,27 @@ def sample_evenly(rows: Sequence[int], max_count: int) -> list[int]:
     ]
 
 
-def beside(
-    topomap: TopoMetricMap, row: int, num_d_thresh: float, poses: NodePoses
-) -> Int[np.ndarray, " k"]:
+def beside(topomap: TopoMetricMap, row: Row, num_d_thresh: float) -> list[Row]:
     """Return the rows of a node and of the near nodes of its session.
 
     A node is near if its distance by Eq. 1 is at most `num_d_thresh` times D_thresh.
     """
     summary = topomap.summaries[row]
     near = np.flatnonzero(
-        node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
+        node_distances(summary.world_from_cam, topomap.node_poses, topomap.config.lambda_rot)
         <= num_d_thresh * topomap.config.d_thresh
     )
-    same = [
-        int(other)
-        for other in near
-        if topomap.summaries[int(other)].session_id == summary.session_id
-    ]
-    return np.array(sorted({row, *same}), np.int64)
+    same = (k for k in as_rows(near) if topomap.summaries[k].session_id == summary.session_id)
+    return sorted({row, *same})
 
 
 def localize_left_out(
     localizer: Localizer,
     stored: TopoMetricMap,
-    rows: Sequence[int],
+    rows: Sequence[Row],
     num_d_thresh: float,
     progress: Callable[[int, int], None] | None = None,
-) -> dict[int, LeaveOneOutResult]:
+) -> dict[Row, LeaveOneOutResult]:
     """Localize nodes of `stored` in the localizer's map while the nodes themselves are hidden.
 
     Args:
@@ -84,12 +82,11 @@ def localize_left_out(
         The results by row. A node is not localized if all nodes of the map would be hidden.
     """
     known = {summary.node_id for summary in localizer.topomap.summaries}
-    poses = NodePoses.of([summary.world_from_cam for summary in stored.summaries])
-    answers = dict[int, LeaveOneOutResult]()
+    answers = dict[Row, LeaveOneOutResult]()
     for done, row in enumerate(rows):
-        node = stored.nodes_of(stored.kind)[row]
-        features = {kind: stored.nodes_of(kind)[row].features for kind in stored.kinds}
-        near = [stored.summaries[int(k)].node_id for k in beside(stored, row, num_d_thresh, poses)]
+        node = stored.nodes[row]
+        features = {kind: layer.nodes[row].features for kind, layer in stored.layers.items()}
+        near = [stored.summaries[k].node_id for k in beside(stored, row, num_d_thresh)]
         hidden = [node_id for node_id in near if node_id in known]
         is_all = len(hidden) == len(localizer.topomap.summaries)
         result = (
@@ -109,8 +106,8 @@ def localize_left_out(
     return answers
 
 
-def _evaluate_result(result: Localization, world_from_cam) -> LeaveOneOutResult:
-    metres = translation_error(world_from_cam, result.world_from_cam)
-    degrees = np.degrees(rotation_error(world_from_cam, result.world_from_cam))
-    is_wrong = bool(metres > MAX_TRANSLATION or degrees > MAX_ROTATION_DEG)
+def _evaluate_result(result: Localization, world_from_cam: Rigid3) -> LeaveOneOutResult:
+    is_wrong = not world_from_cam.is_same(
+        result.world_from_cam, MAX_TRANSLATION, np.radians(MAX_ROTATION_DEG)
+    )
     return LeaveOneOutResult(not is_wrong, is_wrong, 0 if is_wrong else result.num_inliers)

@@ -24,8 +24,9 @@ from topoloc.lifelong.virtual_node_update import add_virtual_nodes
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.node_ids import NodeId, Row, as_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +61,12 @@ def merge_maps(
     if first.map_id is not None and first.map_id == second.map_id:
         raise MapError("they are one map in two versions; nothing is merged")
     aligned = _align_second_map(first, second, localizer_config, progress)
-    d_thresh = first.config.nodes.d_thresh
-    assert d_thresh is not None, "a map's own configuration is resolved"
-    added = [
-        row for row, answer in aligned.answers.items() if not is_well_localized(answer, d_thresh)
-    ]
-    poses = {row: pose for row, pose in enumerate(aligned.world_from_cams) if pose is not None}
+    added = as_rows(
+        row
+        for row, answer in aligned.answers.items()
+        if not is_well_localized(answer, first.config.d_thresh)
+    )
+    poses = {Row(row): pose for row, pose in enumerate(aligned.world_from_cams) if pose is not None}
     merged, not_updated = _add_nodes(first, second, added, poses)
     changes = {
         "nodes_of_second": len(second.summaries),
@@ -88,18 +89,16 @@ def _align_second_map(
     progress: Progress,
 ) -> SessionPoses:
     """Return poses of the second map's nodes, by row, in the world of the first map."""
-    rows = range(len(second.summaries))
+    rows = second.rows
     answers = localize_nodes(
         Localizer(first, localizer_config),
         second,
         rows,
         lambda done: progress("comparing the maps", done, len(rows)),
     )
-    odom = {row: summary.world_from_cam for row, summary in enumerate(second.summaries)}
-    d_thresh = first.config.nodes.d_thresh
-    assert d_thresh is not None, "a map's own configuration is resolved"
+    odom = dict(enumerate(summary.world_from_cam for summary in second.summaries))
     try:
-        return align_motion_to_map("the second map", odom, answers, d_thresh)
+        return align_motion_to_map("the second map", odom, {**answers}, first.config.d_thresh)
     except TrajectoryError as error:
         raise TrajectoryError(
             str(error).replace("the map stays as it is", "nothing is merged")
@@ -107,7 +106,7 @@ def _align_second_map(
 
 
 def _add_nodes(
-    first: TopoMetricMap, second: TopoMetricMap, added: Sequence[int], poses: Mapping[int, Rigid3]
+    first: TopoMetricMap, second: TopoMetricMap, added: Sequence[Row], poses: Mapping[Row, Rigid3]
 ) -> tuple[TopoMetricMap, list[str]]:
     """Return the first map with these nodes of the second, and the names of the coarse localizers
     that were not updated."""
@@ -118,37 +117,35 @@ def _add_nodes(
     }
     session_ids = {old: session.session_id for old, session in sessions.items()}
     first_id = first.free_ids.node
-    new_id = {row: first_id + k for k, row in enumerate(added)}
+    new_id = {row: NodeId(first_id + k) for k, row in enumerate(added)}
     nodes = {
         kind: [
-            _transform_node(second.nodes_of(kind)[row], new_id[row], poses[row], session_ids)
+            _transform_node(second.layers[kind].nodes[row], new_id[row], poses[row], session_ids)
             for row in added
         ]
         for kind in first.kinds
     }
     views = {kind: [_place_features(node) for node in of_kind] for kind, of_kind in nodes.items()}
     summaries = [*first.summaries, *(node.summary for node in nodes[first.kind])]
-    extended = {
-        kind: OverlaySequence(first.nodes_of(kind), {}, nodes[kind]) for kind in first.kinds
+    layers = {
+        kind: replace(layer, nodes=OverlaySequence(layer.nodes, {}, nodes[kind]))
+        for kind, layer in first.layers.items()
     }
     images = _select_images(second, new_id, poses, session_ids)
-    updated = update_coarse_models(first, views, images)
     merged = replace(
         first,
         summaries=summaries,
-        nodes=extended.pop(first.kind),
-        other_kinds=extended,
+        layers=layers,
         edges=sorted(
             {*first.edges, *_transfer_edges(first, second, new_id, poses)},
             key=lambda edge: (edge.source_id, edge.target_id),
         ),
         place_images=OverlaySequence(first.place_images, {}, images),
-        coarse_models=updated.models,
         length_m=first.length_m + second.length_m * len(added) / max(len(second.summaries), 1),
         sessions=[*first.sessions, *sessions.values()],
         sides=_transfer_virtual_nodes(first, second, new_id, poses, summaries),
     )
-    return merged, updated.not_updated
+    return update_coarse_models(merged, views, images)
 
 
 def _place_features(node: TopoNode) -> PlaceFeatures:
@@ -156,7 +153,7 @@ def _place_features(node: TopoNode) -> PlaceFeatures:
 
 
 def _transform_node(
-    node: TopoNode, node_id: int, world_from_cam: Rigid3, session_ids: Mapping[int, int]
+    node: TopoNode, node_id: NodeId, world_from_cam: Rigid3, session_ids: Mapping[int, int]
 ) -> TopoNode:
     """Return a node of the second map with the node id, pose and session id it has in the merged
     map."""
@@ -185,8 +182,8 @@ def _renumber_session(
 
 def _select_images(
     second: TopoMetricMap,
-    new_id: Mapping[int, int],
-    poses: Mapping[int, Rigid3],
+    new_id: Mapping[Row, NodeId],
+    poses: Mapping[Row, Rigid3],
     session_ids: Mapping[int, int],
 ) -> list[PlaceImage]:
     """Return the mapping images that belong to the added nodes. Other images of the second map are
@@ -210,17 +207,16 @@ def _select_images(
 def _transfer_edges(
     first: TopoMetricMap,
     second: TopoMetricMap,
-    new_id: Mapping[int, int],
-    poses: Mapping[int, Rigid3],
+    new_id: Mapping[Row, NodeId],
+    poses: Mapping[Row, Rigid3],
 ) -> set[Edge]:
     """Return the second map's edges. A skipped node is replaced by the nearest node of the first
     map."""
-    lambda_rot = first.config.nodes.lambda_rot
-    assert lambda_rot is not None, "a map's own configuration is resolved"
-    old = NodePoses.of([summary.world_from_cam for summary in first.summaries])
     ids = {}
-    for row, summary in enumerate(second.summaries):
-        nearest = int(node_distances(poses[row], old, lambda_rot).argmin())
+    for row, summary in zip(second.rows, second.summaries, strict=True):
+        nearest = int(
+            node_distances(poses[row], first.node_poses, first.config.lambda_rot).argmin()
+        )
         ids[summary.node_id] = new_id.get(row, first.summaries[nearest].node_id)
     return {
         Edge(ids[e.source_id], ids[e.target_id])
@@ -232,19 +228,18 @@ def _transfer_edges(
 def _transfer_virtual_nodes(
     first: TopoMetricMap,
     second: TopoMetricMap,
-    new_id: Mapping[int, int],
-    poses: Mapping[int, Rigid3],
+    new_id: Mapping[Row, NodeId],
+    poses: Mapping[Row, Rigid3],
     summaries: Sequence[Any],
 ):
     """Return the virtual nodes of both maps if they have the same feature type, else the first
     map's."""
     if first.sides is None or second.sides is None or first.sides.kind != second.sides.kind:
         return first.sides
-    row_of = {summary.node_id: row for row, summary in enumerate(second.summaries)}
     nodes = list[TopoNode]()
     known = {summary.node_id: summary for summary in summaries}
     for side in second.sides.nodes:
-        row = None if side.summary.of_node is None else row_of[side.summary.of_node]
+        row = None if side.summary.of_node is None else second.row_of(side.summary.of_node)
         if row is not None and row in new_id:
             of_node = known[new_id[row]]
             moved = (

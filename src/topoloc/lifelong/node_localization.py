@@ -8,14 +8,15 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import Row
 
 
 def localize_nodes(
     localizer: Localizer,
     source_map: TopoMetricMap,
-    rows: Sequence[int],
+    rows: Sequence[Row],
     on_localized: Callable[[int], None] = lambda done: None,
-) -> dict[int, Localization | None]:
+) -> dict[Row, Localization | None]:
     """Localize nodes of another map in the localizer's map.
 
     Args:
@@ -27,10 +28,10 @@ def localize_nodes(
     Returns:
         The localizations by row. None if a node is not localized.
     """
-    answers: dict[int, Localization | None] = {}
+    answers: dict[Row, Localization | None] = {}
     for row in rows:
         features = {
-            kind: source_map.nodes_of(kind)[row].features for kind in localizer.topomap.kinds
+            kind: source_map.layers[kind].nodes[row].features for kind in localizer.topomap.kinds
         }
         result = localizer.localize_query(
             QueryImage.of_features(features, source_map.nodes[row].camera)

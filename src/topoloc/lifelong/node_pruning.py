@@ -17,9 +17,10 @@ from jaxtyping import Int
 
 from topoloc.lifelong.lazy_sequences import SelectedSequence
 from topoloc.lifelong.node_observation import observe_node
-from topoloc.mapping.nodes import NearestNodeSearch, NodePoses
+from topoloc.mapping.nodes import NearestNodeSearch
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes
+from topoloc.node_ids import NodeId, Row
 from topoloc.retrieval.coarse import CoarseModel
 
 _PER_VECTOR_ARRAYS = ("vectors", "centres", "cell_vectors")
@@ -47,19 +48,14 @@ def compute_node_support(topomap: TopoMetricMap, num_compared: int) -> NodeSuppo
     Raises:
         MapError: a node cannot be read.
     """
-    config = topomap.config
-    lambda_rot = config.nodes.lambda_rot
-    assert lambda_rot is not None, "a map's own configuration is resolved"
-    nearest = NearestNodeSearch(
-        NodePoses.of([summary.world_from_cam for summary in topomap.summaries]), lambda_rot
-    )
+    nearest = NearestNodeSearch(topomap.node_poses, topomap.config.lambda_rot)
     count = min(num_compared + 1, len(topomap.summaries))
     supporters = np.array(
         [nearest.rows(summary.world_from_cam, count) for summary in topomap.summaries], np.int64
     )
     landmarks = np.zeros(supporters.shape, np.int64)
-    for kind in topomap.kinds:
-        nodes = topomap.nodes_of(kind)
+    for layer in topomap.layers.values():
+        nodes = layer.nodes
         for row, others in enumerate(supporters):
             seen = [
                 _count_recognised_landmarks(nodes[int(k)], nodes[row], topomap)
@@ -68,8 +64,7 @@ def compute_node_support(topomap: TopoMetricMap, num_compared: int) -> NodeSuppo
                 for k in others
             ]
             landmarks[row] = np.maximum(landmarks[row], seen)
-    row_of = {summary.node_id: row for row, summary in enumerate(topomap.summaries)}
-    owners = [row_of[image.node_id] for image in topomap.place_images]
+    owners = [topomap.row_of(image.node_id) for image in topomap.place_images]
     return NodeSupport(
         supporters, landmarks, np.maximum(np.bincount(owners, minlength=len(supporters)), 1)
     )
@@ -86,7 +81,7 @@ def _count_recognised_landmarks(node: TopoNode, view: TopoNode, topomap: TopoMet
 
 def iterate_node_removals(
     support: NodeSupport, min_held: int
-) -> Iterable[tuple[int, Int[np.ndarray, " nodes"]]]:
+) -> Iterable[tuple[Row, Int[np.ndarray, " nodes"]]]:
     """Yield the rows of nodes in the order of removal, each with the current supporter of every
     node.
 
@@ -106,7 +101,7 @@ def iterate_node_removals(
         loss_of_supporter = np.bincount(supporter, losses, minlength=num)
         loss_of_supporter[supporter[(remaining < min_held) | (first == second)]] = np.inf
         loss_of_supporter[~is_kept] = np.inf
-        row = int(loss_of_supporter.argmin())
+        row = Row(int(loss_of_supporter.argmin()))
         if not np.isfinite(loss_of_supporter[row]):
             return
         is_kept[row] = False
@@ -114,7 +109,7 @@ def iterate_node_removals(
 
 
 def remove_nodes(
-    topomap: TopoMetricMap, removed: Sequence[int], supporter: Int[np.ndarray, " nodes"]
+    topomap: TopoMetricMap, removed: Sequence[Row], supporter: Int[np.ndarray, " nodes"]
 ) -> TopoMetricMap:
     """Return the map without the nodes `removed`.
 
@@ -127,10 +122,16 @@ def remove_nodes(
         supporter: the row of the supporting node, for each node.
     """
     gone = set(removed)
-    kept = [row for row in range(len(topomap.summaries)) if row not in gone]
+    kept = [row for row in topomap.rows if row not in gone]
     ids = [summary.node_id for summary in topomap.summaries]
     new_id = {ids[row]: ids[int(supporter[row])] for row in gone}
-    nodes = {kind: SelectedSequence(topomap.nodes_of(kind), kept) for kind in topomap.kinds}
+    layers = {}
+    for kind, layer in topomap.layers.items():
+        models = layer.coarse_models.items()
+        reassigned = {name: _reassign_descriptors(model, new_id) for name, model in models}
+        layers[kind] = replace(
+            layer, nodes=SelectedSequence(layer.nodes, kept), coarse_models=reassigned
+        )
     edges = {
         tuple(new_id.get(one, one) for one in (edge.source_id, edge.target_id))
         for edge in topomap.edges
@@ -138,22 +139,19 @@ def remove_nodes(
     return replace(
         topomap,
         summaries=[topomap.summaries[row] for row in kept],
-        nodes=nodes.pop(topomap.kind),
-        other_kinds=nodes,
+        layers=layers,
         edges=[Edge(source, target) for source, target in sorted(edges) if source != target],
         place_images=_reassign_images(topomap.place_images, new_id),
-        coarse_models={
-            name: _reassign_descriptors(model, new_id)
-            for name, model in topomap.coarse_models.items()
-        },
         sides=_remove_virtual_nodes(topomap, new_id),
     )
 
 
-def _reassign_images(images: Sequence[PlaceImage], new_id: Mapping[int, int]) -> list[PlaceImage]:
+def _reassign_images(
+    images: Sequence[PlaceImage], new_id: Mapping[NodeId, NodeId]
+) -> list[PlaceImage]:
     """Return the images of the kept nodes and the first image of each removed node, which passes to
     its supporter."""
-    kept, seen = list[PlaceImage](), set[int]()
+    kept, seen = list[PlaceImage](), set[NodeId]()
     for image in images:
         if image.node_id not in new_id:
             kept.append(image)
@@ -163,7 +161,7 @@ def _reassign_images(images: Sequence[PlaceImage], new_id: Mapping[int, int]) ->
     return kept
 
 
-def _reassign_descriptors(model: CoarseModel, new_id: Mapping[int, int]) -> CoarseModel:
+def _reassign_descriptors(model: CoarseModel, new_id: Mapping[NodeId, NodeId]) -> CoarseModel:
     """Return a coarse localizer with the global descriptors of removed nodes reduced to one each.
     The descriptor nearest to the node's mean is kept and passes to the supporter."""
     vectors, of_node = model.arrays.get("vectors"), model.arrays.get("node_ids")
@@ -186,7 +184,9 @@ def _reassign_descriptors(model: CoarseModel, new_id: Mapping[int, int]) -> Coar
     return replace(model, arrays=arrays | {"node_ids": ids[is_kept]})
 
 
-def _remove_virtual_nodes(topomap: TopoMetricMap, new_id: Mapping[int, int]) -> VirtualNodes | None:
+def _remove_virtual_nodes(
+    topomap: TopoMetricMap, new_id: Mapping[NodeId, NodeId]
+) -> VirtualNodes | None:
     """Return the virtual nodes of the nodes that stay."""
     sides = topomap.sides
     if sides is None or not any(summary.of_node in new_id for summary in sides.summaries):
@@ -198,14 +198,14 @@ def _remove_virtual_nodes(topomap: TopoMetricMap, new_id: Mapping[int, int]) -> 
 
 
 def select_removed_nodes(
-    support: NodeSupport, min_held: int, is_enough: Callable[[list[int]], bool]
-) -> tuple[list[int], Int[np.ndarray, " nodes"]] | None:
+    support: NodeSupport, min_held: int, is_enough: Callable[[list[Row]], bool]
+) -> tuple[list[Row], Int[np.ndarray, " nodes"]] | None:
     """Return the nodes to remove and the final supporter of every node.
 
     Removal ends when `is_enough` returns true or no further node can be removed. Returns None if no
     node can be removed.
     """
-    removed, last = list[int](), None
+    removed, last = list[Row](), None
     for row, supporter in iterate_node_removals(support, min_held):
         removed.append(row)
         last = supporter

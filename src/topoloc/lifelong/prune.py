@@ -78,7 +78,7 @@ class _FileSize:
     def bytes_without_points(self, topomap: TopoMetricMap) -> float:
         """Return the bytes of this file without the landmarks of its map."""
         return self.size - sum(
-            of_one * sum(len(node.features) for node in topomap.nodes_of(kind))
+            of_one * sum(len(node.features) for node in topomap.layers[kind].nodes)
             for kind, of_one in self.bytes_per_point.items()
         )
 
@@ -147,14 +147,15 @@ def _merge_session_counts(topomap: TopoMetricMap) -> TopoMetricMap:
 
     if not any(
         len(list(node.session_statistics)) > len(list(merge_counts(node).session_statistics))
-        for kind in topomap.kinds
-        for node in topomap.nodes_of(kind)
+        for layer in topomap.layers.values()
+        for node in layer.nodes
     ):
         return topomap
-    nodes = {
-        kind: TransformedSequence(topomap.nodes_of(kind), merge_counts) for kind in topomap.kinds
+    layers = {
+        kind: replace(layer, nodes=TransformedSequence(layer.nodes, merge_counts))
+        for kind, layer in topomap.layers.items()
     }
-    return replace(topomap, nodes=nodes.pop(topomap.kind), other_kinds=nodes)
+    return replace(topomap, layers=layers)
 
 
 def _drop_nodes(topomap: TopoMetricMap, file: _FileSize, max_bytes: int) -> TopoMetricMap:
@@ -167,7 +168,7 @@ def _drop_nodes(topomap: TopoMetricMap, file: _FileSize, max_bytes: int) -> Topo
     # landmarks.
     min_held = 60
     remaining = {
-        kind: np.array([(~_find_vanished(node)).sum() for node in topomap.nodes_of(kind)])
+        kind: np.array([(~_find_vanished(node)).sum() for node in topomap.layers[kind].nodes])
         for kind in topomap.kinds
     }
     min_bytes = sum(
@@ -204,7 +205,8 @@ def _prune_landmarks(
         max_bytes: the budget in bytes, or None.
     """
     vanished = {
-        kind: [_find_vanished(node) for node in topomap.nodes_of(kind)] for kind in topomap.kinds
+        kind: [_find_vanished(node) for node in topomap.layers[kind].nodes]
+        for kind in topomap.kinds
     }
     remaining = {
         kind: [int((~of_node).sum()) for of_node in vanished[kind]] for kind in topomap.kinds
@@ -249,11 +251,9 @@ def _drop_landmarks(
     """Remove the `vanished` landmarks (a mask per node) and keep at most `most` of the others per
     node."""
     pruned, num_gone, num_dropped = {}, 0, 0
-    for kind in topomap.kinds:
+    for kind, layer in topomap.layers.items():
         changed = {}
-        for row, (node, of_node) in enumerate(
-            zip(topomap.nodes_of(kind), vanished[kind], strict=True)
-        ):
+        for row, (node, of_node) in enumerate(zip(layer.nodes, vanished[kind], strict=True)):
             rows = np.flatnonzero(~of_node)
             kept = rows if len(rows) <= most else rows[_select_landmarks(node, rows, most)]
             num_gone, num_dropped = (
@@ -262,11 +262,9 @@ def _drop_landmarks(
             )
             if len(kept) < len(of_node):
                 changed[row] = select_landmarks(node, kept)
-        pruned[kind] = OverlaySequence(topomap.nodes_of(kind), changed, [])
-    nodes = pruned.pop(topomap.kind)
-    smaller = replace(
-        topomap, summaries=[node.summary for node in nodes], nodes=nodes, other_kinds=pruned
-    )
+        pruned[kind] = replace(layer, nodes=OverlaySequence(layer.nodes, changed, []))
+    summaries = [node.summary for node in pruned[topomap.kind].nodes]
+    smaller = replace(topomap, summaries=summaries, layers=pruned)
     return PrunedMap(
         with_map_statistics(smaller), {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped}
     )

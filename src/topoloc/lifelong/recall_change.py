@@ -33,7 +33,7 @@ def measure_recall_change(
     Raises:
         MapError: a map cannot be read. Further errors as of `Localizer`.
     """
-    rows = sample_evenly(range(len(before.summaries)), max_queries)
+    rows = sample_evenly(before.rows, max_queries)
     if not rows:
         return {}
     counts = {"earlier_asked": len(rows)}

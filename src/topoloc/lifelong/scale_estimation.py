@@ -8,13 +8,17 @@ transform explains.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from topoloc.geometry.alignment import compute_path_lengths
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.transform_consensus import select_hypothesis
+from topoloc.lifelong.leave_one_out import sample_evenly
 from topoloc.localization.result import Localization
 
 # Factor applied to the sigmas of localizations, because neighbours share errors of the map.
@@ -39,66 +43,76 @@ class _LocalizedFrames:
         return _LocalizedFrames(*(column[rows] for column in vars(self).values()))
 
 
-def find_largest_consensus(
+@dataclass(frozen=True)
+class MotionTolerance:
+    """Hold the tolerance between two localizations: a constant part (m, degrees), and the drift per
+    metre travelled between them (m, degrees)."""
+
+    slack: float
+    slack_deg: float
+    drift: float
+    drift_deg: float
+
+
+def find_motion_consensus(
     odom: Mapping[int, Rigid3],
     localized: Mapping[int, Localization],
-    slack_m: float,
-    slack_deg: float,
+    tolerance: MotionTolerance,
+    *,
+    is_metric: bool,
 ) -> list[int]:
-    """Return the frames of the largest set of localizations that one similarity transform of the
-    motion explains.
-
-    The tolerance grows with the distance travelled. Sets of fewer than three give an empty list.
+    """Return the frames of the largest set of localizations that one transform of the motion
+    explains.
 
     Args:
         odom: the motion, as poses by frame.
         localized: the localizations by frame.
-        slack_m: the constant tolerance in metres.
-        slack_deg: the constant tolerance in degrees.
+        tolerance: the tolerance of agreeing localizations.
+        is_metric: whether the motion has metric scale. The transform is rigid then. Otherwise it is
+            a similarity transform.
     """
+    answers = _collect_localized_frames(odom, localized)
+    hypotheses = (
+        [(row, 1.0) for row in range(len(answers.rows))]
+        if is_metric
+        else list(_similarity_hypotheses(answers))
+    )
+    if not hypotheses:
+        return []
+    agree = np.stack([_find_inliers(answers, *one, tolerance) for one in hypotheses])
+    best, _ = select_hypothesis(agree)
+    return [index for index, is_in in zip(localized, agree[best], strict=True) if is_in]
+
+
+def _similarity_hypotheses(answers: _LocalizedFrames) -> Iterator[tuple[int, float]]:
+    """Generate a localization and the scale of its distance from another one, for pairs that are
+    clearly apart."""
     # Number of localizations, evenly spaced, of which all pairs are tried as a similarity
     # transform.
-    max_pairs = 40
-    answers = _collect_localized_frames(odom, localized)
-    num = len(answers.rows)
-    tried = (
-        np.unique(np.linspace(0, num - 1, min(num, max_pairs)).astype(int))
-        if num
-        else np.zeros(0, int)
-    )
-    best: Bool[np.ndarray, " k"] = np.zeros(num, np.bool_)
-    for i in tried:
-        for j in tried[tried != i]:
-            agrees = _find_inliers(answers, int(i), int(j), slack_m, slack_deg)
-            best = agrees if agrees.sum() > best.sum() else best
-    return (
-        [index for index, is_in in zip(localized, best, strict=True) if is_in]
-        if best.sum() > 2
-        else []
-    )
+    max_rows = 40
+    rows = sample_evenly(range(len(answers.rows)), max_rows)
+    for i, j in permutations(rows, 2):
+        apart, own_apart = (
+            float(np.linalg.norm(places[i] - places[j])) for places in (answers.world, answers.odom)
+        )
+        sigma = WIDENED * float(np.hypot(answers.sigmas[i], answers.sigmas[j]))
+        if own_apart > 0.0 and apart > sigma:
+            yield i, apart / own_apart
 
 
 def _find_inliers(
-    answers: _LocalizedFrames, i: int, j: int, slack_m: float, slack_deg: float
+    answers: _LocalizedFrames, row: int, scale: float, tolerance: MotionTolerance
 ) -> Bool[np.ndarray, " k"]:
-    """Return the inliers of the similarity with the rotation of localization i and the scale of the
-    distance from i to j."""
-    # Tolerance of one similarity transform, as a share of the distance travelled between two
-    # localizations.
-    max_error = 0.05
-    apart, own_apart = (
-        float(np.linalg.norm(places[i] - places[j])) for places in (answers.world, answers.odom)
-    )
-    if own_apart <= 0.0 or apart <= WIDENED * float(np.hypot(answers.sigmas[i], answers.sigmas[j])):
-        return np.zeros(len(answers.rows), np.bool_)
-    scale, turn = apart / own_apart, answers.world_rotations[i] @ answers.odom_rotations[i].T
-    off = np.linalg.norm(
-        answers.world - answers.world[i] - scale * (answers.odom - answers.odom[i]) @ turn.T, axis=1
-    )
+    """Return the inliers of the transform with this scale that localization `row` defines."""
+    turn = answers.world_rotations[row] @ answers.odom_rotations[row].T
+    ways = scale * (answers.odom - answers.odom[row]) @ turn.T
+    off = np.linalg.norm(answers.world - answers.world[row] - ways, axis=1)
     traces = np.einsum("kij,kij->k", answers.world_rotations, turn @ answers.odom_rotations)
     turned = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
-    way = scale * np.abs(answers.path_lengths - answers.path_lengths[i])
-    return (off <= slack_m + max_error * way) & (turned <= slack_deg + way)
+    length = scale * np.abs(answers.path_lengths - answers.path_lengths[row])
+    return (off <= tolerance.slack + tolerance.drift * length) & (
+        turned <= tolerance.slack_deg + tolerance.drift_deg * length
+    )
 
 
 def scale_to_metres(
@@ -202,11 +216,6 @@ def _collect_localized_frames(
         path_lengths[rows],
         np.array([answer.position_sigma_m for answer in found]),
     )
-
-
-def compute_path_lengths(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Return the distance travelled up to each position, in the unit of the positions."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
 
 
 def _interpolation_weights(

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
 from topoloc.lifelong.noise_scale import LocalizedStep, NoiseScale, estimate_noise_scale
-from topoloc.lifelong.scale_estimation import WIDENED
+from topoloc.lifelong.scale_estimation import WIDENED, MotionTolerance, find_motion_consensus
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.config import MapConfig
@@ -70,8 +70,6 @@ def estimate_poses_by_motion(
         CalibrationError: the images contradict their calibration.
         UnreadableImageError, QueryError: an image cannot be read or localized.
     """
-    d_thresh = map_config.nodes.d_thresh
-    assert d_thresh is not None, "a map's own configuration is resolved"
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
     motions = [odom for poses in stretches if (odom := _known_poses(poses))]
     if not motions:
@@ -96,7 +94,7 @@ def estimate_poses_by_motion(
         sequence.name,
         motions,
         [{index: answers[index] for index in of_motion} for of_motion in queried],
-        d_thresh,
+        map_config.d_thresh,
     )
 
 
@@ -186,42 +184,16 @@ def _find_consensus(
             " place, or changed; the map stays as it is"
         )
     _check_scale(name, odom, localized)
-    path_lengths, slack_m = _path_lengths(odom), SLACK * d_thresh
-    agrees = np.array([_find_inliers(k, odom, localized, path_lengths, slack_m) for k in indices])
-    best = agrees[int(np.argmax(agrees.sum(axis=1)))]
-    if best.sum() < max(MIN_AGREEING, min_share * len(indices)):
+    # Drift of the motion between two agreeing localizations: a share of the distance travelled, and
+    # degrees per metre.
+    tolerance = MotionTolerance(SLACK * d_thresh, SLACK_DEG, drift=0.03, drift_deg=0.3)
+    inlier_idx = find_motion_consensus(odom, localized, tolerance, is_metric=True)
+    if len(inlier_idx) < max(MIN_AGREEING, min_share * len(indices)):
         raise TrajectoryError(
-            f"{name}: of {len(indices)} pictures that the map localizes {int(best.sum())} agree"
+            f"{name}: of {len(indices)} pictures that the map localizes {len(inlier_idx)} agree"
             " with its poses; the map stays as it is"
         )
-    return [index for index, is_in in zip(indices, best, strict=True) if is_in]
-
-
-def _find_inliers(
-    k: int,
-    odom: Mapping[int, Rigid3],
-    localized: Mapping[int, Localization],
-    path_lengths: Mapping[int, float],
-    slack_m: float,
-) -> Bool[np.ndarray, " n"]:
-    """Return the mask of localizations that agree with the transform defined by localization
-    `k`."""
-    # Tolerance of the position between two agreeing localizations, as a share of the distance
-    # travelled between them. `slack` is added.
-    max_drift = 0.03
-    # Tolerance of the rotation between two agreeing localizations, in degrees per metre
-    # travelled. `slack_deg` is added.
-    max_turn_drift_deg = 0.3
-    world_from_odom = localized[k].world_from_cam @ odom[k].inverse()
-    agrees = []
-    for index, answer in localized.items():
-        off = answer.world_from_cam.inverse() @ world_from_odom @ odom[index]
-        path_length = abs(path_lengths[index] - path_lengths[k])
-        near = float(np.linalg.norm(off.translation)) <= slack_m + max_drift * path_length
-        agrees.append(
-            near and np.degrees(off.angle()) <= SLACK_DEG + max_turn_drift_deg * path_length
-        )
-    return np.array(agrees)
+    return inlier_idx
 
 
 def _too_few_message(num_queried: int) -> str:
@@ -261,13 +233,6 @@ def _check_scale(
         raise TrajectoryError(
             f"{name}: a metre of its poses is {scale:.3g} m of the map; the map stays as it is"
         )
-
-
-def _path_lengths(odom: Mapping[int, Rigid3]) -> dict[int, float]:
-    """Return the metres travelled up to each frame."""
-    positions = np.array([pose.translation for pose in odom.values()])
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return dict(zip(odom, np.concatenate([[0.0], np.cumsum(steps)]).tolist(), strict=True))
 
 
 def _optimize_motion(

@@ -13,11 +13,11 @@ import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import (
-    TransformConsensus,
     diagonal_covariance,
     find_consensus,
     propagate_estimate,
 )
+from topoloc.lifelong.leave_one_out import sample_evenly
 from topoloc.mapping.topomap import TopoMetricMap
 
 _SIGMA_M, _SIGMA_DEG = 0.01, 0.1  # of the transform between the maps as one image gives it
@@ -35,12 +35,7 @@ def estimate_by_shared_images(
     max_images = 200  # evenly spaced
     here, there = _image_poses(first), _image_poses(second)
     shared = sorted(here.keys() & there.keys(), key=lambda image_key: (image_key[0], image_key[1]))
-    chosen = (
-        np.unique(np.linspace(0, len(shared) - 1, min(len(shared), max_images)).round().astype(int))
-        if shared
-        else []
-    )
-    poses = [(here[shared[k]], there[shared[k]]) for k in chosen]
+    poses = [(here[image], there[image]) for image in sample_evenly(shared, max_images)]
     if not poses:
         return None
     one, other = poses[len(poses) // 2]
@@ -60,19 +55,9 @@ def estimate_by_shared_images(
         np.stack([covariance for _, covariance in estimates]),
         rival_share=0.34,
     )
-    return None if consensus is None else _to_worlds(consensus, one, other)
-
-
-def _to_worlds(
-    consensus: TransformConsensus, one: Rigid3, other: Rigid3
-) -> tuple[Rigid3, np.ndarray, int]:
-    adjoint = one.adjoint()
-    covariance = adjoint @ consensus.covariance @ adjoint.T
-    return (
-        one @ consensus.a_from_b @ other.inverse(),
-        0.5 * (covariance + covariance.T),
-        int(np.count_nonzero(consensus.is_inlier)),
-    )
+    if consensus is None:
+        return None
+    return *consensus.between(one, other.inverse()), int(np.count_nonzero(consensus.is_inlier))
 
 
 def _image_poses(topomap: TopoMetricMap) -> dict[tuple[str, bytes], Rigid3]:

@@ -10,6 +10,7 @@ stream's poses are used for frames without any odometry.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence, Set
 from itertools import groupby
 
@@ -19,7 +20,12 @@ from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
 from topoloc.lifelong.noise_scale import NoiseScale
-from topoloc.lifelong.scale_estimation import WIDENED, find_largest_consensus, scale_to_metres
+from topoloc.lifelong.scale_estimation import (
+    WIDENED,
+    MotionTolerance,
+    find_motion_consensus,
+    scale_to_metres,
+)
 from topoloc.lifelong.session_poses import (
     MIN_AGREEING,
     SLACK,
@@ -87,8 +93,7 @@ def estimate_poses_by_map(
             f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures:"
             " too few to join"
         )
-    d_thresh = map_config.nodes.d_thresh
-    assert d_thresh is not None, "a map's own configuration is resolved"
+    d_thresh = map_config.d_thresh
     clear = {
         index
         for index, answer in localized.items()
@@ -154,7 +159,7 @@ def align_stretch_to_map(
         motion contradict each other there.
     """
     within_stretch = {index: answer for index, answer in localized.items() if index in odom}
-    inlier_idx = find_largest_consensus(odom, within_stretch, SLACK * d_thresh, SLACK_DEG)
+    inlier_idx = _find_consensus(odom, within_stretch, d_thresh)
     num_refits = 3  # each with another scale
     aligned = None
     for _ in range(num_refits):  # each refit uses the inliers found with the previous scale
@@ -178,6 +183,18 @@ def align_stretch_to_map(
     return _reject_contradicted(aligned.world_from_cams, within_stretch, inlier_idx, d_thresh)
 
 
+def _find_consensus(
+    odom: Mapping[int, Rigid3],
+    localized: Mapping[int, Localization],
+    d_thresh: float,
+) -> list[int]:
+    """Return the frames of the most localizations that one similarity transform of the motion
+    explains. Return none if they are fewer than three, because a similarity explains any two."""
+    tolerance = MotionTolerance(SLACK * d_thresh, SLACK_DEG, drift=0.05, drift_deg=1.0)
+    inlier_idx = find_motion_consensus(odom, localized, tolerance, is_metric=False)
+    return inlier_idx if len(inlier_idx) > 2 else []
+
+
 def _reject_ambiguous(
     odom: Mapping[int, Rigid3],
     within_stretch: Mapping[int, Localization],
@@ -190,7 +207,7 @@ def _reject_ambiguous(
     # this share of their number agrees on another trajectory.
     rival_share = 0.3
     rest = {index: answer for index, answer in within_stretch.items() if index not in inlier_idx}
-    rivals = find_largest_consensus(odom, rest, SLACK * d_thresh, SLACK_DEG)
+    rivals = _find_consensus(odom, rest, d_thresh)
     return [] if len(rivals) >= max(MIN_AGREEING, rival_share * len(inlier_idx)) else inlier_idx
 
 
@@ -202,6 +219,9 @@ def _reject_contradicted(
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
     """Remove poses and localizations of frames for which map and motion contradict each other.
     Return None for the poses if too few localizations are left."""
+    # A frame has no pose if map and motion differ by more than this many D_thresh. Three sigmas of
+    # the localization, multiplied by `WIDENED`, are added.
+    contradiction = 0.1
     within_stretch = {
         index: answer
         for index, answer in localized.items()
@@ -210,7 +230,12 @@ def _reject_contradicted(
     apart = {
         index
         for index, answer in within_stretch.items()
-        if _contradicts(answer, poses[index], d_thresh)
+        if (pose := poses[index]) is not None
+        and not pose.is_same(
+            answer.world_from_cam,
+            contradiction * d_thresh + 3.0 * WIDENED * answer.position_sigma_m,
+            math.inf,
+        )
     }
     contradicted = _find_contradicted_frames(list(within_stretch), apart)
     left = [None if index in contradicted else pose for index, pose in enumerate(poses)]
@@ -225,21 +250,8 @@ def _pose_if_consistent(
     the map's nodes."""
     if pose is None or answer is None:
         return pose
-    apart = answer.world_from_cam.inverse() @ pose
-    is_near = (
-        np.linalg.norm(apart.translation) <= SLACK * d_thresh
-        and np.degrees(apart.angle()) <= SLACK_DEG
-    )
-    return pose if is_near else None
-
-
-def _contradicts(answer: Localization, pose: Rigid3 | None, d_thresh: float) -> bool:
-    # Of a single camera, a frame has no pose if map and motion differ by more than this many
-    # D_thresh. Three sigmas of the localization, multiplied by `widened`, are added.
-    contradiction = 0.1
-    assert pose is not None
-    off = float(np.linalg.norm(answer.world_from_cam.translation - pose.translation))
-    return off > contradiction * d_thresh + 3.0 * WIDENED * answer.position_sigma_m
+    is_same = pose.is_same(answer.world_from_cam, SLACK * d_thresh, math.radians(SLACK_DEG))
+    return pose if is_same else None
 
 
 def _find_contradicted_frames(answered: list[int], apart: Set[int]) -> set[int]:

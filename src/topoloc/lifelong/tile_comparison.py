@@ -12,9 +12,9 @@ something else.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -27,12 +27,14 @@ from topoloc.geometry.transform_consensus import (
     find_consensus,
     propagate_estimate,
 )
+from topoloc.lifelong.leave_one_out import sample_evenly
 from topoloc.lifelong.node_localization import localize_nodes
 from topoloc.lifelong.shared_images import estimate_by_shared_images
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import Row, as_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,20 +49,7 @@ class OpenTile:
         """Return the tile's map."""
         return self.localizer.topomap
 
-    @cached_property
-    def poses(self) -> NodePoses:
-        """Return the poses of the tile's nodes."""
-        return NodePoses.of([summary.world_from_cam for summary in self.topomap.summaries])
-
-    @property
-    def apart(self) -> tuple[float, float]:
-        """Return D_thresh (metres) and lambda (metres per radian) of Eq. 1."""
-        nodes = self.topomap.config.nodes
-        assert nodes.d_thresh is not None, "a map's own configuration is resolved"
-        assert nodes.lambda_rot is not None, "a map's own configuration is resolved"
-        return nodes.d_thresh, nodes.lambda_rot
-
-    def world_from_node(self, row: int) -> Rigid3:
+    def world_from_node(self, row: Row) -> Rigid3:
         """Return the pose of the node of a row."""
         return self.topomap.summaries[row].world_from_cam
 
@@ -97,8 +86,8 @@ class _Answer:
     """Hold the localization of node `queried` of one map in the other map, whose nearest match is
     node `matched_row`."""
 
-    queried: int
-    matched_row: int
+    queried: Row
+    matched_row: Row
     result: Localization
 
 
@@ -142,7 +131,7 @@ class _Comparison:
 
     def __init__(self, first: OpenTile, second: OpenTile) -> None:
         self._tiles = first, second
-        self._answers: tuple[dict[int, Localization | None], ...] = (
+        self._answers: tuple[dict[Row, Localization | None], ...] = (
             {},
             {},
         )  # nodes of the second tile in the first, and nodes of the first in the second
@@ -160,21 +149,15 @@ class _Comparison:
         if isinstance(found, NotJoined):
             return found
         consensus, ends = found
-        first_from_second = (
-            self._tiles[0].world_from_node(ends[0])
-            @ consensus.a_from_b
-            @ self._tiles[1].world_from_node(ends[1]).inverse()
+        first_from_second, covariance = consensus.between(
+            self._tiles[0].world_from_node(ends[0]),
+            self._tiles[1].world_from_node(ends[1]).inverse(),
         )
         near = self._find_nearby_nodes(first_from_second, max_queries)
         self._localize_nodes(near)
         tested = self._verify(first_from_second, near)
-        to_world = self._tiles[0].world_from_node(ends[0]).adjoint()
-        covariance = to_world @ consensus.covariance @ to_world.T
         joint = TileTransform(
-            first_from_second,
-            0.5 * (covariance + covariance.T),
-            int(np.count_nonzero(consensus.is_inlier)),
-            *tested,
+            first_from_second, covariance, int(np.count_nonzero(consensus.is_inlier)), *tested
         )
         return self._decide(joint, min_near)
 
@@ -202,15 +185,15 @@ class _Comparison:
             )
         return found
 
-    def _rank_nodes_by_similarity(self) -> list[list[int]]:
+    def _rank_nodes_by_similarity(self) -> list[list[Row]]:
         """Return the rows of the second tile's nodes, and of the first's, by similarity to the
         other tile's most similar node."""
         first, second = (tile.vectors for tile in self._tiles)
         kind = [kind for kind in first if kind in second][-1]
         alike = first[kind] @ second[kind].T
-        return [np.argsort(-alike.max(axis=side), kind="stable").tolist() for side in (0, 1)]
+        return [as_rows(np.argsort(-alike.max(axis=side), kind="stable")) for side in (0, 1)]
 
-    def _localize_nodes(self, rows: Sequence[Sequence[int]]) -> None:
+    def _localize_nodes(self, rows: Sequence[Sequence[Row]]) -> None:
         """Localize nodes of the second tile in the first, and nodes of the first in the second, if
         not done before."""
         for queried, of, known, wanted in zip(
@@ -236,7 +219,7 @@ class _Comparison:
         ]
         return found if any(found) else []
 
-    def _find_consensus(self) -> tuple[TransformConsensus, tuple[int, int]] | NotJoined:
+    def _find_consensus(self) -> tuple[TransformConsensus, tuple[Row, Row]] | NotJoined:
         """Return the transform between two nodes, one of each tile, and the rows of these nodes."""
         by_first, by_second = self._localized_nodes()
         answers = [*by_first, *by_second]
@@ -261,7 +244,7 @@ class _Comparison:
         )
 
     def _estimate_transform(
-        self, one: _Answer, ends: tuple[int, int], is_from_second: bool
+        self, one: _Answer, ends: tuple[Row, Row], is_from_second: bool
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """Return the transform between the nodes `ends` according to one localization:
         first_from_second."""
@@ -291,7 +274,7 @@ class _Comparison:
             to_first, by_from_asked, covariance, from_second, drift=0.01, drift_deg=0.1
         )
 
-    def _find_nearby_nodes(self, first_from_second: Rigid3, max_queries: int) -> list[list[int]]:
+    def _find_nearby_nodes(self, first_from_second: Rigid3, max_queries: int) -> list[list[Row]]:
         """Return nodes of the second tile, and of the first, that the transform puts near a node of
         the other. At most `max_queries` of each tile are chosen, evenly spaced."""
         # A node must be localized if it is within this many D_thresh (distance of Eq. 1)
@@ -304,20 +287,17 @@ class _Comparison:
             (first_from_second, first_from_second.inverse()),
             strict=True,
         ):
-            d_thresh, lambda_rot = queried.apart
+            config, node_poses = queried.topomap.config, queried.topomap.node_poses
             apart = [
-                node_distances(pose @ summary.world_from_cam, queried.poses, lambda_rot).min()
+                node_distances(pose @ summary.world_from_cam, node_poses, config.lambda_rot).min()
                 for summary in of.topomap.summaries
             ]
-            near = np.flatnonzero(np.array(apart) <= max_distance * d_thresh)
-            chosen = np.unique(
-                np.linspace(0, len(near) - 1, min(len(near), max_queries)).round().astype(int)
-            )
-            rows.append(near[chosen].tolist() if len(near) else [])
+            near = np.flatnonzero(np.array(apart) <= max_distance * config.d_thresh)
+            rows.append(sample_evenly(as_rows(near), max_queries))
         return rows
 
     def _verify(
-        self, first_from_second: Rigid3, near: Sequence[Sequence[int]]
+        self, first_from_second: Rigid3, near: Sequence[Sequence[Row]]
     ) -> tuple[int, int, float]:
         """Return the number of tested nodes, the number localized at their expected pose, and the
         lower quartile of the share of agreeing matches."""
@@ -326,27 +306,20 @@ class _Comparison:
         for queried, of, known, rows, pose in zip(
             self._tiles, self._tiles[::-1], self._answers, near, poses, strict=True
         ):
-            d_thresh, _ = queried.apart
+            d_thresh = queried.topomap.config.d_thresh
             for row in rows:
                 if row not in known:
                     continue
-                result, world_from_cam = known[row], pose @ of.world_from_node(row)
-                is_at_pose = result is not None and _is_at_pose(result, world_from_cam, d_thresh)
-                num_at_pose += is_at_pose
-                shares.append(_unguided_inlier_ratio(result) if is_at_pose else 0.0)
+                result, share = known[row], 0.0
+                if result is not None and result.world_from_cam.is_same(
+                    pose @ of.world_from_node(row), 0.3 * d_thresh, math.radians(2.0)
+                ):
+                    num_at_pose, share = num_at_pose + 1, _unguided_inlier_ratio(result)
+                shares.append(share)
         return len(shares), num_at_pose, float(np.quantile(shares, 0.25)) if shares else 0.0
 
 
-def _is_at_pose(result: Localization | None, world_from_cam: Rigid3, d_thresh: float) -> bool:
-    if result is None:
-        return False
-    off = result.world_from_cam.inverse() @ world_from_cam
-    return bool(
-        np.linalg.norm(off.translation) <= 0.3 * d_thresh and np.degrees(off.angle()) <= 2.0
-    )
-
-
-def _unguided_inlier_ratio(result: Localization | None) -> float:
+def _unguided_inlier_ratio(result: Localization) -> float:
     """Return the share of unguided matches that agree with the pose."""
-    evidence = None if result is None else result.evidence
+    evidence = result.evidence
     return 0.0 if evidence is None else evidence.num_inliers / max(evidence.num_matches, 1)

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.alignment import compute_path_lengths
 from topoloc.geometry.rigid import Rigid3, exp_so3, inverse_covariance, log_so3
-from topoloc.lifelong.scale_estimation import compute_path_lengths
 from topoloc.localization.result import Localization
 from topoloc.slam.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import FramePose, KeyFrame
@@ -228,11 +228,10 @@ def _apply_correction(
 def _is_correctable(pose: Rigid3, answer: Localization) -> bool:
     """Return whether the pose is within three sigmas of the localization. Otherwise one of the two
     is wrong, and a correction cannot decide which."""
-    shift, rotation_vector = _pose_error(pose, answer)
-    is_near = np.linalg.norm(shift) <= _MAX_SIGMAS * answer.position_sigma_m
-    return bool(
-        is_near
-        and np.degrees(np.linalg.norm(rotation_vector)) <= _MAX_SIGMAS * answer.rotation_sigma_deg
+    return pose.is_same(
+        answer.world_from_cam,
+        _MAX_SIGMAS * answer.position_sigma_m,
+        math.radians(_MAX_SIGMAS * answer.rotation_sigma_deg),
     )
 
 

@@ -51,11 +51,12 @@ from topoloc.mapping.node_drafts import (
     observe_draft,
 )
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.sessions import Illumination, Session, average_illumination, find_source_path
+from topoloc.mapping.sessions import Illumination, Session, average_illumination
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.recording import SequenceView, find_source_path
 from topoloc.retrieval.network_images import decode_stored_image
 from topoloc.tracking.tracker import Tracker
 
@@ -129,8 +130,8 @@ def update_map(
     frames = select_posed_frames(posed_sequence, session_id)
     content = _create_session_content(topomap, frames, session_poses, progress)
     session = _create_session(session_id, sequence, frames, content, poses_from)
-    updated = update_coarse_models(topomap, content.views, content.images)
-    changed = replace(_add_session(topomap, session, frames, content), coarse_models=updated.models)
+    changed = _add_session(topomap, session, frames, content)
+    changed, not_updated = update_coarse_models(changed, content.views, content.images)
     changes = {
         "session": session_id,
         "recording": sequence.name,
@@ -140,7 +141,7 @@ def update_map(
     changes |= (
         {"poses_from": poses_from}
         | _count_changes(session_poses, content, topomap.kind)
-        | {"not_taught": updated.not_updated}
+        | {"not_taught": not_updated}
     )
     changed = with_map_statistics(changed, progress)
     return MapUpdate(
@@ -226,9 +227,7 @@ def _create_session_content(
     progress: Progress,
 ) -> _SessionContent:
     map_config = topomap.config
-    d_thresh, lambda_rot = map_config.nodes.d_thresh, map_config.nodes.lambda_rot
-    assert d_thresh is not None
-    assert lambda_rot is not None
+    d_thresh, lambda_rot = map_config.d_thresh, map_config.lambda_rot
     locator = PointLocator(frames, map_config)
     by_index = {frame.index: frame for frame in frames}
     wanted = [
@@ -256,10 +255,11 @@ def _create_session_content(
         defaultdict(list),
         [],
     )
-    old = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    old = topomap.node_poses
     new = NodePoses.of([draft.image.world_from_cam for draft in drafts]) if drafts else None
     drafted = {draft.frame: draft.image for draft in drafts}
     first_id = topomap.free_ids.node
+    new_ids = [NodeId(first_id + k) for k in range(len(drafts))]
     for done, frame in enumerate(frames):
         to_old = node_distances(frame.world_from_cam, old, lambda_rot)
         to_new = (
@@ -277,24 +277,19 @@ def _create_session_content(
                 )
             if is_of_new:
                 _observe_new_nodes(drafts, frame, image, np.argsort(to_new, kind="stable"), topomap)
-                _add_place_image(content, frame, image, first_id + int(to_new.argmin()))
+                _add_place_image(content, frame, image, new_ids[int(to_new.argmin())])
         progress(f"pictures of {frame.sequence.name}", done + 1, len(frames))
     for kind in topomap.kinds:
-        content.nodes[kind] = [
-            finish_node(first_id + k, draft, kind) for k, draft in enumerate(drafts)
-        ]
-    for k, draft in enumerate(drafts):
+        content.nodes[kind] = [finish_node(*one, kind) for one in zip(new_ids, drafts, strict=True)]
+    for node_id, draft in zip(new_ids, drafts, strict=True):
         content.sides.extend(
-            replace(side, summary=replace(side.summary, of_node=first_id + k))
-            for side in draft.sides
+            replace(side, summary=replace(side.summary, of_node=node_id)) for side in draft.sides
         )
     return content
 
 
-def is_well_localized(answer: Localization | None, d_thresh: float) -> bool:
+def is_well_localized(answer: Localization | None, d_thresh: float, min_inliers: int = 60) -> bool:
     """Return whether the map localizes an image well enough that it needs no node."""
-    # Minimum number of inliers of a well localized image. Such an image becomes no node.
-    min_inliers = 60
     # Maximum position sigma of a well localized image, in D_thresh. Correlated errors of the
     # map's points are left out, because a node aligned by the map would share them.
     max_sigma = 0.3
@@ -328,14 +323,14 @@ def _observe_map_nodes(
     for row in nearest[:NODES_PER_IMAGE].tolist():
         cam_from_node = image.world_from_cam.inverse() @ topomap.summaries[row].world_from_cam
         for kind, features in image.features.items():
-            node = topomap.nodes_of(kind)[row]
+            node = topomap.layers[kind].nodes[row]
             content.observations[kind, row].append(
                 observe_node(node, features, image.camera, cam_from_node, session_id)
             )
 
 
 def _add_place_image(
-    content: _SessionContent, frame: MappingFrame, image: MappingImage, node_id: int
+    content: _SessionContent, frame: MappingFrame, image: MappingImage, node_id: NodeId
 ) -> None:
     content.images.append(
         PlaceImage(
@@ -380,7 +375,10 @@ def _add_session(
     frames: Sequence[MappingFrame],
     content: _SessionContent,
 ) -> TopoMetricMap:
-    nodes = {kind: _merge_nodes(topomap, kind, content) for kind in topomap.kinds}
+    layers = {
+        kind: replace(layer, nodes=_merge_nodes(layer.nodes, kind, content))
+        for kind, layer in topomap.layers.items()
+    }
     summaries = [*topomap.summaries, *(node.summary for node in content.nodes[topomap.kind])]
     steps = [
         b.world_from_cam.translation - a.world_from_cam.translation for a, b in pairwise(frames)
@@ -388,8 +386,7 @@ def _add_session(
     return replace(
         topomap,
         summaries=summaries,
-        nodes=nodes.pop(topomap.kind),
-        other_kinds=nodes,
+        layers=layers,
         edges=sorted(
             {*topomap.edges, *_find_traversed_edges(topomap, summaries, frames)},
             key=lambda edge: (edge.source_id, edge.target_id),
@@ -402,11 +399,11 @@ def _add_session(
 
 
 def _merge_nodes(
-    topomap: TopoMetricMap, kind: str, content: _SessionContent
+    before: Sequence[TopoNode], kind: str, content: _SessionContent
 ) -> OverlaySequence[TopoNode]:
     """Return the existing nodes of a feature type with the session's statistics, followed by the
     new nodes."""
-    before, changed = topomap.nodes_of(kind), {}
+    changed = {}
     for (of_kind, row), observations in content.observations.items():
         if of_kind == kind:
             node = before[row]
@@ -425,11 +422,11 @@ def _find_traversed_edges(
     topomap: TopoMetricMap, summaries: Sequence[Any], frames: Sequence[MappingFrame]
 ) -> set[Edge]:
     """Return an edge for each transition of the session between two nodes."""
-    lambda_rot = topomap.config.nodes.lambda_rot
-    assert lambda_rot is not None
     poses = NodePoses.of([summary.world_from_cam for summary in summaries])
     nearest = [
-        summaries[int(node_distances(frame.world_from_cam, poses, lambda_rot).argmin())].node_id
+        summaries[
+            int(node_distances(frame.world_from_cam, poses, topomap.config.lambda_rot).argmin())
+        ].node_id
         for frame in frames
     ]
     return {Edge(source, target) for source, target in pairwise(nearest) if source != target}

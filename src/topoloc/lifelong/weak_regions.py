@@ -20,6 +20,7 @@ from topoloc.lifelong.leave_one_out import LeaveOneOutResult, localize_left_out,
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.node_ids import NodeId, Row
 
 Reason = Literal["not_held", "few_landmarks", "one_direction", "single_session"]
 REASONS: tuple[Reason, ...] = get_args(Reason)
@@ -31,7 +32,7 @@ class NodeQuality:
     """Hold the quality of a node. `answer` is None if the node was not localized in the rest of the
     map. `seen_share` is the share of its landmarks that other sessions saw."""
 
-    node_id: int
+    node_id: NodeId
     name: str
     session_id: int
     world_from_cam: Rigid3
@@ -201,7 +202,7 @@ def find_weak_regions(
     apart = 3.0  # weak nodes within this many D_thresh of each other form one region
     topomap, rows = (
         localizer.topomap,
-        sample_evenly(range(len(localizer.topomap.summaries)), max_queries),
+        sample_evenly(localizer.topomap.rows, max_queries),
     )
 
     def report_progress(done: int, total: int) -> None:
@@ -209,11 +210,12 @@ def find_weak_regions(
             progress("asking the map without the node", done, total)
 
     answers = localize_left_out(localizer, topomap, rows, beside, report_progress)
-    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
-    has_opposite_view = _has_opposite_view(poses, reach * topomap.config.d_thresh, min_turn_deg)
+    has_opposite_view = _has_opposite_view(
+        topomap.node_poses, reach * topomap.config.d_thresh, min_turn_deg
+    )
     nodes = [
-        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), poses, stood_by)
-        for row in range(len(topomap.summaries))
+        _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), stood_by)
+        for row in topomap.rows
     ]
     names = {session.session_id: session.name for session in topomap.sessions}
     names |= {
@@ -226,10 +228,9 @@ def find_weak_regions(
 
 def _assess_node(
     topomap: TopoMetricMap,
-    row: int,
+    row: Row,
     answer: LeaveOneOutResult | None,
     has_opposite_view: bool,
-    poses: NodePoses,
     stood_by: float,
 ) -> NodeQuality:
     # The rest of the map must localize a node with at least this many inliers. An update adds
@@ -247,7 +248,7 @@ def _assess_node(
         reasons.append("few_landmarks")
     if not has_opposite_view:
         reasons.append("one_direction")
-    if seen_share < min_seen_share and not _has_other_session(topomap, row, poses, stood_by):
+    if seen_share < min_seen_share and not _has_other_session(topomap, row, stood_by):
         reasons.append("single_session")
     return NodeQuality(
         summary.node_id,
@@ -270,13 +271,11 @@ def _seen_share(node: TopoNode) -> float:
     return float(seen.mean()) if len(seen) else 0.0
 
 
-def _has_other_session(
-    topomap: TopoMetricMap, row: int, poses: NodePoses, num_d_thresh: float
-) -> bool:
+def _has_other_session(topomap: TopoMetricMap, row: Row, num_d_thresh: float) -> bool:
     """Return whether a node of another session is within `num_d_thresh` times D_thresh."""
     summary = topomap.summaries[row]
     near = np.flatnonzero(
-        node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot)
+        node_distances(summary.world_from_cam, topomap.node_poses, topomap.config.lambda_rot)
         <= num_d_thresh * topomap.config.d_thresh
     )
     return any(topomap.summaries[int(other)].session_id != summary.session_id for other in near)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -55,11 +54,6 @@ class Hypothesis:
         """Return the pose."""
         return self.fit.world_from_cam
 
-    @cached_property
-    def variance(self) -> float:
-        """Return an upper bound of the variance in any direction."""
-        return float(np.trace(self.covariance))
-
     @property
     def probability(self) -> float:
         """Return the probability of this pose if "not in the map" is the only alternative."""
@@ -92,18 +86,20 @@ def _log_odds_margins(
     return np.where(by_odds, log_odds[:, None] - log_odds, scores[:, None] - scores)
 
 
-def is_same_pose(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
+def is_same_fit(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
     """Return whether two fits describe the same pose.
 
     They do if both could be right within the tolerance, or if they share map points for the same
     features. An imprecise pose may be far from its refined version but matches the same features to
     the same points. Two similar places match the same features to different points.
     """
-    distance = np.linalg.norm(a.world_from_cam.translation - b.world_from_cam.translation)
-    if distance < 2.0 * config.max_translation and _relative_pose(a, b).angle() < math.radians(
-        2.0 * config.max_rotation_deg
-    ):
-        return True
+    return a.world_from_cam.is_same(
+        b.world_from_cam, 2.0 * config.max_translation, math.radians(2.0 * config.max_rotation_deg)
+    ) or _share_points(a, b)
+
+
+def _share_points(a: PoseFit, b: PoseFit) -> bool:
+    """Return whether two fits match most of their common features to the same points."""
     if a.features is not b.features or not a.may_share_points(b):
         return False
     rows_a, rows_b = a.inlier_query_idx, b.inlier_query_idx
@@ -179,21 +175,7 @@ def _rank_hypotheses(hypotheses: tuple[Hypothesis, ...], weights: RivalWeights) 
 
 
 def _agree_on_pose(a: Hypothesis, b: Hypothesis, config: EvidenceConfig) -> bool:
-    """Return whether `is_same_pose` holds, or the covariances allow both to be the same pose."""
-    if is_same_pose(a.fit, b.fit, config):
-        return True
-    limit = _CHI_SQUARE_6_AT_95 * (a.variance + b.variance)
-    apart = a.world_from_cam.rotation.T @ (
-        b.world_from_cam.translation - a.world_from_cam.translation
+    """Return whether `is_same_fit` holds, or the covariances allow both to be the same pose."""
+    return is_same_fit(a.fit, b.fit, config) or a.world_from_cam.is_same(
+        b.world_from_cam, covariance=a.covariance + b.covariance, max_square=_CHI_SQUARE_6_AT_95
     )
-    if apart @ apart > limit or (turn := _relative_pose(a.fit, b.fit)).angle() ** 2 > limit:
-        return False  # the log of the rotation and translation is longer than either
-    vector = turn.log()
-    return (
-        float(vector @ np.linalg.solve(a.covariance + b.covariance, vector)) < _CHI_SQUARE_6_AT_95
-    )
-
-
-def _relative_pose(a: PoseFit, b: PoseFit) -> Rigid3:
-    """Return cam_a_from_cam_b."""
-    return a.world_from_cam.inverse() @ b.world_from_cam

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 from topoloc.bounds import AtLeast, Between
+from topoloc.features.config import MatchingConfig
 from topoloc.features.feature_types import FeatureType
-from topoloc.features.matching import MatchingConfig
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.localization.evidence import EvidenceConfig
 from topoloc.localization.guided import GuidedConfig

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Float
@@ -85,13 +86,8 @@ def check_image_calibration(
     by_calibration, calibrated, first, place = fit, fit.camera, fit.cam_from_world, fit.node_id
     fit, found = _refine_image_calibration(search, fit, found)
     seen = compute_intrinsics_deviation(calibrated, fit.camera, found, place)
-    has_focal_mismatch, has_principal_point_mismatch = _is_calibration_off(
-        fit, found, calibrated, *_REPORTED_LIMITS
-    )
-    if (
-        not (has_focal_mismatch or has_principal_point_mismatch)
-        or _gain(by_calibration, fit) < _LEAST_GAIN
-    ):
+    is_off = _is_calibration_off(fit, found, calibrated, *_REPORTED_LIMITS)
+    if not any(is_off) or _gain(by_calibration, fit) < _LEAST_GAIN:
         return seen, None
     camera, scale = corrected_camera(fit.camera, found), search.query.scale
     sigma = math.sqrt(
@@ -104,8 +100,7 @@ def check_image_calibration(
         calibrated.fx * scale,
         _principal_point(camera, scale),
         _principal_point(calibrated, scale),
-        has_focal_mismatch,
-        has_principal_point_mismatch,
+        list(compress(("focal_length", "principal_point"), is_off)),
         (found.cam_from_world @ first.inverse()).log(),
     )
 

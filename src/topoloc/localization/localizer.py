@@ -42,6 +42,7 @@ from topoloc.localization.search import Trace
 from topoloc.localization.tiles.tile_search import TileSearch
 from topoloc.localization.tiles.tiles import OneMap, Reach, TileRanking, Tiles
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseLocalizer, Image
 
 if TYPE_CHECKING:
@@ -193,7 +194,7 @@ class Localizer:
         )
         return other
 
-    def without(self, node_ids: Iterable[int]) -> Localizer:
+    def without(self, node_ids: Iterable[NodeId]) -> Localizer:
         """Return a localizer for the same map without these nodes.
 
         An image recorded at one of them is then localized in the rest of the map. At least one node

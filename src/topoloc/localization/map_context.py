@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from msgspec import structs
+
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features.feature_types import check_available, select_stored_types
 from topoloc.geometry.camera import Camera
@@ -22,8 +24,8 @@ from topoloc.localization.query_session import QuerySession
 from topoloc.localization.result import Localization, NotLocalized, R
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
-from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseLocalizer
 
 
@@ -44,26 +46,30 @@ class FeatureTypeContext:
     @staticmethod
     def of(
         topomap: TopoMetricMap,
+        kind: str,
         config: LocalizerConfig,
         coarse: CoarseLocalizer | None = None,
         weights: FittedWeights | None = None,
     ) -> FeatureTypeContext:
-        """Open a map for its first feature type.
+        """Open a map for a feature type.
 
         `weights` replaces the shipped weights. Raises the errors of `OpenMap`.
         """
-        opened = OpenMap(topomap, coarse or config.coarse)
+        opened = OpenMap(topomap, coarse or config.coarse, kind)
         c, weights = config.for_feature_type(opened.kind), weights or _select_weights(opened)
-        rho = find_correlated_error_share(topomap, c.guided, c.pose, weights.shared_errors)
+        rho = find_correlated_error_share(
+            topomap, kind, c.guided, c.pose, weights.shared_errors
+        )
         return FeatureTypeContext(opened, c, weights, rho)
 
 
 def _select_weights(opened: OpenMap) -> FittedWeights:
     """Return the shipped weights. Those of virtual views belong to their own feature type."""
-    weights, sides = load_fitted_weights(opened.kind.name), opened.topomap.sides
-    if sides is None or not sides.is_used_with(opened.kind.name):
-        return weights
-    return replace(weights, walls=load_fitted_weights(sides.kind).walls)
+    kind = opened.kind.name
+    weights, sides = load_fitted_weights(kind), opened.topomap.sides_for(kind)
+    return (
+        weights if sides is None else replace(weights, walls=load_fitted_weights(sides.kind).walls)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +100,7 @@ class MapContext:
         kinds, unavailable_types = select_feature_types(topomap, requested)
         types = tuple(
             FeatureTypeContext.of(
-                topomap.with_feature_type(kind),
-                config,
-                coarse,
-                weights if kind == kinds[0] else None,
+                topomap, kind, config, coarse, weights if kind == kinds[0] else None
             )
             for kind in kinds
         )
@@ -106,14 +109,14 @@ class MapContext:
     @cached_property
     def map_id(self) -> str:
         """Return the map's id, 16 hexadecimal digits."""
-        return get_map_id(self.topomap)
+        return self.topomap.id
 
     @property
     def first(self) -> FeatureTypeContext:
         """Return the feature type of the first search."""
         return self.types[0]
 
-    def without(self, node_ids: Iterable[int]) -> MapContext:
+    def without(self, node_ids: Iterable[NodeId]) -> MapContext:
         """Return the map without these nodes. See `Localizer.without`."""
         rows = [self.topomap.row_of(node_id) for node_id in node_ids]
         types = tuple(replace(one, map=one.map.without(rows)) for one in self.types)
@@ -158,7 +161,7 @@ class MapContext:
             alternatives = result.alternatives
             if georeference:
                 alternatives = tuple(
-                    replace(one, geopose=georeference.geopose(one.world_from_cam))
+                    structs.replace(one, geopose=georeference.geopose(one.world_from_cam))
                     for one in alternatives
                 )
             return replace(result, provenance=provenance, alternatives=alternatives)

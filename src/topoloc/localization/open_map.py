@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from topoloc.errors import EmptyMapError
 from topoloc.features.feature_types import find_feature_type
@@ -27,9 +27,11 @@ from topoloc.localization.map_facts.repetition import (
     has_repetitions,
 )
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
+from topoloc.mapping.coarse_models import open_map_coarse_localizer
 from topoloc.mapping.node_cache import CachedNodes
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.mapping.topomap import TopoMetricMap, TopoNode, open_map_coarse_localizer
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
 
@@ -48,37 +50,45 @@ class OpenMap:
     Args:
         coarse: name of one of the map's coarse localizers, or any object with
             `CoarseLocalizer.rank`. None: the map's default.
+        kind: the feature type of the points that are used. None: the map's first.
 
     Raises:
         EmptyMapError: the map has no node.
+        FeatureTypeError: the map has no such feature type.
         MapError: the map has no such coarse localizer.
     """
 
-    def __init__(self, topomap: TopoMetricMap, coarse: str | CoarseLocalizer | None = None) -> None:
+    def __init__(
+        self,
+        topomap: TopoMetricMap,
+        coarse: str | CoarseLocalizer | None = None,
+        kind: str | None = None,
+    ) -> None:
         if len(topomap.summaries) == 0:
             raise EmptyMapError("the map has no nodes")
-        self.topomap = topomap
+        kind = kind or topomap.kind
+        self.topomap, self._nodes = topomap, topomap.find_layer(kind).nodes
         by_name = (
-            open_map_coarse_localizer(topomap, coarse or topomap.default_coarse)
+            open_map_coarse_localizer(topomap, coarse or topomap.default_coarse, kind)
             if coarse is None or isinstance(coarse, str)
             else None
         )
         self.coarse: CoarseLocalizer = coarse if by_name is None else by_name  # pyright: ignore[reportAttributeAccessIssue]
-        self.feature_config = topomap.config.features
-        self.kind = find_feature_type(self.feature_config.kind)
+        self.feature_config = topomap.config.feature_config_for(kind)
+        self.kind = find_feature_type(kind)
         self.node_ids = [summary.node_id for summary in topomap.summaries]
-        self.node_poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+        self.node_poses = topomap.node_poses
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
-        self._local_map = CachedNodes(lambda row: LocalMap.of_node(topomap.nodes[row]))
+        self._local_map = CachedNodes(lambda row: LocalMap.of_node(self._nodes[row]))
         self._moves = CachedNodes(self._find_moves)
         self._stored_moves = _stored_moves(topomap)
-        self.focal = _max_focal_length(topomap)
+        self.focal = self._max_focal_length()
         self._predicted_at_nodes: tuple[Camera, CachedNodes[Float32[np.ndarray, "n 5"]]] | None = (
             None
         )
-        self._masked_rows = list[int]()
+        self._masked_rows = list[Row]()
 
-    def without(self, rows: Iterable[int]) -> OpenMap:
+    def without(self, rows: Iterable[Row]) -> OpenMap:
         """Return the same map without these nodes. The other rows keep their numbers.
 
         Loaded nodes are shared. Virtual views are not used.
@@ -92,29 +102,18 @@ class OpenMap:
     @cached_property
     def walls(self) -> VirtualViewIndex | None:
         """Return the map's virtual views, None if it has none for this feature type."""
-        sides = self.topomap.sides
-        return (
-            VirtualViewIndex(self.topomap, sides)
-            if sides is not None and sides.is_used_with(self.kind.name)
-            else None
-        )
+        sides = self.topomap.sides_for(self.kind.name)
+        return None if sides is None else VirtualViewIndex(self.topomap, sides)
 
-    def with_node_ids(self, candidates: list[NodeScore]) -> list[NodeScore]:
-        """Return candidates with node ids. Internally, `node_id` of a candidate is the row of its
-        node."""
-        return [
-            NodeScore(self.node_ids[candidate.node_id], candidate.score) for candidate in candidates
-        ]
-
-    def cam_from_world(self, row: int) -> Rigid3:
+    def cam_from_world(self, row: Row) -> Rigid3:
         """Return cam_from_world of a node."""
         return self.topomap.summaries[row].world_from_cam.inverse()
 
-    def local_map(self, rows: Sequence[int] | Int[np.ndarray, " n"]) -> LocalMap:
+    def local_map(self, rows: Sequence[Row]) -> LocalMap:
         """Return the points of these nodes, pooled."""
-        return LocalMap.concatenate([self._local_map(int(row)) for row in rows])
+        return LocalMap.concatenate([self._local_map(row) for row in rows])
 
-    def predict_at_node(self, row: int, camera: Camera) -> Float32[np.ndarray, "n 5"]:
+    def predict_at_node(self, row: Row, camera: Camera) -> Float32[np.ndarray, "n 5"]:
         """Return `predict_key_points` of a node's points for a camera at the node's pose.
 
         The predictions are cached for one camera.
@@ -129,7 +128,7 @@ class OpenMap:
             self._predicted_at_nodes = kept = (camera, read)
         return kept[1](row)
 
-    def repeats(self, row: int) -> Float[np.ndarray, "k 3"]:
+    def repeats(self, row: Row) -> Float[np.ndarray, "k 3"]:
         """Return the repetition shifts (metres, world) of a node: its moves without rotation.
 
         See `repetition.py`.
@@ -137,7 +136,7 @@ class OpenMap:
         moves = self.moves(row)
         return moves[(moves[:, :3, :3] == np.eye(3)).all(axis=(1, 2)), :3, 3]
 
-    def moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
+    def moves(self, row: Row) -> Float[np.ndarray, "k 4 4"]:
         """Return the transforms (world) that move a node's content onto copies of it in the map.
 
         They are read from the map if it stores them, and computed otherwise.
@@ -145,8 +144,8 @@ class OpenMap:
         known = self._stored_moves
         return self._moves(row) if known is None else known.get(self.node_ids[row], _NO_MOVES)
 
-    def _find_moves(self, row: int) -> Float[np.ndarray, "k 4 4"]:
-        node = self.topomap.nodes[row]
+    def _find_moves(self, row: Row) -> Float[np.ndarray, "k 4 4"]:
+        node = self._nodes[row]
         found = [Rigid3(np.eye(3), shift) for shift in self._find_shifts(row)]
         found += [
             move
@@ -155,7 +154,7 @@ class OpenMap:
         ]
         return np.array([move.matrix() for move in found]).reshape(-1, 4, 4)
 
-    def _similar_distant_nodes(self, node: TopoNode) -> Iterator[list[int]]:
+    def _similar_distant_nodes(self, node: TopoNode) -> Iterator[list[Row]]:
         """Generate groups of rows of distant nodes that look like this one, most similar first.
 
         Each group holds up to three nodes near each other.
@@ -165,9 +164,9 @@ class OpenMap:
         blank = np.zeros((node.camera.height, node.camera.width), np.uint8)
         far = self.distances(node.summary.world_from_cam) > _GROUP_RADIUS * self.d_thresh
         left = [
-            found.node_id
+            found.row
             for found in self._appearance_ranker.rank(blank, node.features, _NUM_SIMILAR_NODES)
-            if far[found.node_id]
+            if far[found.row]
         ]
         for _ in range(_MAX_SIMILAR_GROUPS):
             if not left:
@@ -182,13 +181,14 @@ class OpenMap:
     @cached_property
     def _appearance_ranker(self) -> CoarseLocalizer | None:
         """Return the coarse localizer that needs features only, None if the map has none."""
+        kind = self.kind.name
         return (
-            open_map_coarse_localizer(self.topomap, SurfVlad.name)
-            if SurfVlad.name in self.topomap.coarse_models
+            open_map_coarse_localizer(self.topomap, SurfVlad.name, kind)
+            if SurfVlad.name in self.topomap.layers[kind].coarse_models
             else None
         )
 
-    def _find_shifts(self, row: int) -> Float[np.ndarray, "k 3"]:
+    def _find_shifts(self, row: Row) -> Float[np.ndarray, "k 3"]:
         node, poses = self._local_map(row), self.node_poses
         if not has_repetitions(node):
             return np.zeros((0, 3))
@@ -200,7 +200,16 @@ class OpenMap:
         )
         near = near[np.argsort(away[near], kind="stable")]
         spread = np.unique(np.linspace(0, len(near) - 1, NUM_NEIGHBOURS).round().astype(int))
-        return find_repetition_shifts(node, self.local_map(near[spread]))
+        return find_repetition_shifts(node, self.local_map(as_rows(near[spread])))
+
+    def _max_focal_length(self) -> float:
+        """Return the focal length (pixels) of the finest mapping camera.
+
+        Each recording is assumed to have one camera.
+        """
+        summaries = self.topomap.summaries
+        first_rows = {summaries[row].session_id: row for row in reversed(range(len(summaries)))}
+        return max(self._nodes[row].camera.fx for row in first_rows.values())
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll."""
@@ -208,28 +217,27 @@ class OpenMap:
         distances[self._masked_rows] = np.inf
         return distances
 
-    def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> Int[np.ndarray, " n"]:
+    def nearest(self, world_from_cam: Rigid3, num_nodes: int) -> list[Row]:
         """Return the rows of the nodes nearest to a camera, nearest first."""
-        return np.argsort(self.distances(world_from_cam), kind="stable")[
-            : min(num_nodes, len(self.node_ids) - len(self._masked_rows))
-        ]
+        order = np.argsort(self.distances(world_from_cam), kind="stable")
+        return as_rows(order[: min(num_nodes, len(self.node_ids) - len(self._masked_rows))])
 
 
 class _MaskedCoarseLocalizer:
     """Rank nodes with another coarse localizer and leave out some rows."""
 
-    def __init__(self, coarse: CoarseLocalizer, masked_rows: frozenset[int]) -> None:
+    def __init__(self, coarse: CoarseLocalizer, masked_rows: frozenset[Row]) -> None:
         self._coarse, self._masked_rows = coarse, masked_rows
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """See `CoarseLocalizer.rank`."""
         ranked = self._coarse.rank(image, features, num_candidates + len(self._masked_rows))
-        return [candidate for candidate in ranked if candidate.node_id not in self._masked_rows][
+        return [candidate for candidate in ranked if candidate.row not in self._masked_rows][
             :num_candidates
         ]
 
 
-def _stored_moves(topomap: TopoMetricMap) -> Mapping[int, Float[np.ndarray, "k 4 4"]] | None:
+def _stored_moves(topomap: TopoMetricMap) -> Mapping[NodeId, Float[np.ndarray, "k 4 4"]] | None:
     """Return the map's stored moves by node id, None if they belong to other nodes."""
     known = topomap.repetitions
     return (
@@ -237,17 +245,6 @@ def _stored_moves(topomap: TopoMetricMap) -> Mapping[int, Float[np.ndarray, "k 4
         if known is not None and known.digest == digest_of(topomap.summaries)
         else None
     )
-
-
-def _max_focal_length(topomap: TopoMetricMap) -> float:
-    """Return the focal length (pixels) of the finest mapping camera.
-
-    Each recording is assumed to have one camera.
-    """
-    first_rows = {
-        topomap.summaries[row].session_id: row for row in reversed(range(len(topomap.summaries)))
-    }
-    return max(topomap.nodes[row].camera.fx for row in first_rows.values())
 
 
 QUARTER_TURN = Rigid3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))

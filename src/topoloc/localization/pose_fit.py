@@ -15,6 +15,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera, nominal_camera
 from topoloc.localization.local_map import LocalMap
+from topoloc.node_ids import NodeId
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +76,12 @@ class PointMatches:
         return len(self.inlier_query_idx)
 
     @property
-    def node_id(self) -> int:
+    def node_id(self) -> NodeId:
         """Return the node with the most inliers, -1 if there are no inliers."""
         node_ids, counts = np.unique(
             self.local_map.node_ids[self.inlier_point_idx], return_counts=True
         )
-        return int(node_ids[counts.argmax()]) if len(counts) else -1
+        return NodeId(int(node_ids[counts.argmax()]) if len(counts) else -1)
 
 
 @dataclass(frozen=True, eq=False)

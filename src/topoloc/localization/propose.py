@@ -29,7 +29,7 @@ import numpy as np
 from topoloc.features.matching import Matcher
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.belief import Hypothesis, is_same_pose
+from topoloc.localization.belief import Hypothesis, is_same_fit
 from topoloc.localization.guided import (
     count_consistent_displacements,
     match_guided,
@@ -41,6 +41,7 @@ from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 from topoloc.mapping.nodes import node_distances
+from topoloc.node_ids import Row
 from topoloc.retrieval.coarse import NodeScore
 
 _MAX_SAME_POSE_ANGLE = 0.25  # radians
@@ -55,7 +56,7 @@ def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
     only retrieval is used.
     """
     if prior is not None:
-        rows = [candidate.node_id for candidate in _nearest_nodes(search, prior)]
+        rows = [candidate.row for candidate in _nearest_nodes(search, prior)]
         yield _propose_from_nodes(search, "prior", rows, float(search.config.num_chance_inliers))
         return
     rows = _rank_nodes(search)
@@ -99,13 +100,13 @@ def propose_quick(search: Search, least: float) -> Proposal | None:
     return quick_proposal if quick_proposal.fit.num_inliers >= least else None
 
 
-def _rank_nodes(search: Search) -> list[int]:
+def _rank_nodes(search: Search) -> list[Row]:
     """Rank the nodes with the coarse localizer and return the rows of the candidates."""
     features = search.query.features
     with search.query.clock.stage("coarse"):
         num_ranked = max(search.config.num_candidates, 48)
         search.ranked = search.map.coarse.rank(search.query.image, features, num_ranked)
-    return [candidate.node_id for candidate in search.candidates]
+    return [candidate.row for candidate in search.candidates]
 
 
 def _nearest_nodes(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
@@ -113,11 +114,11 @@ def _nearest_nodes(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
     1)."""
     distances = search.map.distances(world_from_cam)
     rows = search.map.nearest(world_from_cam, search.config.num_candidates)
-    search.ranked = [NodeScore(int(row), -float(distances[row])) for row in rows]
+    search.ranked = [NodeScore(row, -float(distances[row])) for row in rows]
     return search.ranked
 
 
-def _propose_from_nodes(search: Search, source: Source, rows: list[int], least: float) -> Proposal:
+def _propose_from_nodes(search: Search, source: Source, rows: list[Row], least: float) -> Proposal:
     """Propose a pose from the pooled points of these nodes.
 
     The strongest features are matched first. All are matched if at least `least` of these agree but
@@ -131,7 +132,7 @@ def _propose_from_nodes(search: Search, source: Source, rows: list[int], least: 
     return proposal
 
 
-def _create_matcher(search: Search, rows: list[int]) -> tuple[LocalMap, Matcher]:
+def _create_matcher(search: Search, rows: list[Row]) -> tuple[LocalMap, Matcher]:
     """Return the points of these nodes and a matcher of the query's features with them."""
     points = search.map.local_map(rows)
     return points, Matcher(
@@ -185,8 +186,8 @@ def _propose_similar_places(search: Search) -> Iterator[Proposal]:
     if not search.ranked or not config.max_groups:
         return
     least = min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
-    left = [candidate.node_id for candidate in search.ranked if candidate.score >= least]
-    queried = {candidate.node_id for candidate in search.candidates}
+    left = [candidate.row for candidate in search.ranked if candidate.score >= least]
+    queried = {candidate.row for candidate in search.candidates}
     reach = num_d_thresh * search.map.d_thresh
     if best is not None and best.probability >= search.config.evidence.min_probability:
         far = search.map.distances(best.world_from_cam) > reach
@@ -243,7 +244,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     found = []
     with query.clock.stage("matching"):
         for candidate in search.ranked[: config.num_nodes]:
-            row = candidate.node_id
+            row = candidate.row
             local_map, predicted = (
                 search.map.local_map([row]),
                 search.map.predict_at_node(row, query.camera),
@@ -259,7 +260,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     found.sort(key=lambda one: -one[0])
     quick = replace(search.config.pose, max_iterations=max_iterations)
     # in a repetitive place many nodes see the same, and the right one is no better than the others
-    more = 3 if found and len(search.map.repeats(search.ranked[0].node_id)) else 1
+    more = 3 if found and len(search.map.repeats(search.ranked[0].row)) else 1
     with query.clock.stage("pnp"):
         fits = [
             fit_pose(query.features, query.input_camera, local_map, matches, quick)
@@ -268,7 +269,7 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     kept: list[PoseFit] = []
     for fit in sorted(fits, key=lambda fit: -fit.num_inliers):
         if isinstance(fit, PoseFit) and not any(
-            is_same_pose(fit, other, search.config.evidence) for other in kept
+            is_same_fit(fit, other, search.config.evidence) for other in kept
         ):
             kept.append(fit)
             yield Proposal("viewpoints", fit, is_guided=True)
@@ -303,9 +304,9 @@ def _propose_repetitions(search: Search) -> Iterator[Proposal]:
         tried.append(hypothesis.world_from_cam)
         for move in search.map.moves(search.map.topomap.row_of(hypothesis.fit.node_id)):
             world_from_cam = Rigid3(move[:3, :3], move[:3, 3]) @ hypothesis.world_from_cam
-            if _is_near_any(
-                world_from_cam,
-                [*tried, *(other.world_from_cam for other in search.belief.hypotheses)],
+            known = [*tried, *(other.world_from_cam for other in search.belief.hypotheses)]
+            if any(
+                world_from_cam.is_same(other, MIN_SHIFT, _MAX_SAME_POSE_ANGLE) for other in known
             ):
                 continue
             if num_asked == config.max_repetitions:
@@ -318,17 +319,6 @@ def _propose_repetitions(search: Search) -> Iterator[Proposal]:
             previous = set(map(id, search.belief.hypotheses))
             yield Proposal("repetition", fit, is_guided=True, repeats=hypothesis.evidence)
             waiting += [other for other in search.belief.hypotheses if id(other) not in previous]
-
-
-def _is_near_any(world_from_cam: Rigid3, others: list[Rigid3]) -> bool:
-    """Return whether a pose equals one of the others, instead of being a repetition of it."""
-    distances = np.linalg.norm(
-        np.array([other.translation for other in others]) - world_from_cam.translation, axis=1
-    )
-    return any(
-        (world_from_cam.inverse() @ others[k]).angle() < _MAX_SAME_POSE_ANGLE
-        for k in np.flatnonzero(distances < MIN_SHIFT)
-    )
 
 
 def _fit_moved_pose(

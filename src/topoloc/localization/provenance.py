@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from msgspec import Struct
+from msgspec.structs import asdict
 
+from topoloc.errors import CalibrationError, ResultError
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import PoseJson, Rigid3
-from topoloc.json_data import Count, Nanoseconds
+from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import Count, Nanoseconds, decode_json
 
 
 @dataclass(frozen=True)
@@ -56,33 +59,32 @@ class Provenance:
             "features": self.features,
         }
 
+    @staticmethod
+    def from_json(data: Mapping[str, Any]) -> Provenance:
+        """Parse the provenance in a result's JSON. Missing keys give the defaults.
 
-class ProvenanceJson(Struct, frozen=True, kw_only=True):
-    """Hold the keys of a result's JSON that describe its source."""
+        Raises:
+            ResultError: a value is invalid.
+        """
+        read = asdict(decode_json(data, _ProvenanceJson, ResultError, "no result"))
+        if read["camera"] is not None:
+            try:
+                read["camera"] = Camera.from_json(read["camera"])
+            except CalibrationError as error:
+                raise ResultError(f"no result: {error}") from None
+        return Provenance(**read)
 
-    map: str = ""
-    version: Count = 0
+
+class _ProvenanceJson(Struct, frozen=True, rename={"map_id": "map", "map_version": "version"}):
+    map_id: str = ""
+    map_version: Count = 0
     features: str = ""
     t_ns: Nanoseconds | None = None
     camera: dict[str, Any] | None = None
     tile: str | None = None
-    atlas_from_cam: PoseJson | None = None
+    atlas_from_cam: Rigid3 | None = None
     joint_world: str | None = None
-    joint_from_cam: PoseJson | None = None
-
-    def provenance(self) -> Provenance:
-        """Return the provenance. Raises CalibrationError if the camera is not usable."""
-        return Provenance(
-            self.map,
-            self.version,
-            self.features,
-            self.t_ns,
-            None if self.camera is None else Camera.from_json(self.camera),
-            self.tile,
-            None if self.atlas_from_cam is None else self.atlas_from_cam.rigid(),
-            self.joint_world,
-            None if self.joint_from_cam is None else self.joint_from_cam.rigid(),
-        )
+    joint_from_cam: Rigid3 | None = None
 
 
 EMPTY_PROVENANCE = Provenance()

@@ -9,24 +9,33 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
-from topoloc.errors import CalibrationError, ResultError
+from topoloc.errors import ResultError
 from topoloc.geometry.calibration_mismatch import (
     CalibrationMismatch,
     IntrinsicsDeviation,
-    MismatchJson,
 )
-from topoloc.geometry.geodesy import GeoPose, GeoPoseJson
-from topoloc.geometry.rigid import PoseJson, Rigid3
-from topoloc.json_data import Count, Finite, Matrix66, NonNegative, decode_json
+from topoloc.geometry.geodesy import GeoPose
+from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import Count, Finite, NonNegative, decode_json
 from topoloc.localization.evidence import Evidence
-from topoloc.localization.provenance import EMPTY_PROVENANCE, Provenance, ProvenanceJson
-from topoloc.retrieval.coarse import NodeScore
+from topoloc.localization.provenance import EMPTY_PROVENANCE, Provenance
+from topoloc.node_ids import NodeId
 
+Share = Annotated[float, Meta(ge=0, le=1)]
+_NodeId = Annotated[NodeId, Meta(ge=0, lt=2**53)]
 Reason = Literal[
     "too_few_matches", "too_few_inliers", "ambiguous", "not_in_map", "jump", "unreadable"
 ]
+
+
+class CandidateNode(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """Hold a node that retrieval found and its score. Higher is better. Scores are comparable
+    within one coarse localizer only."""
+
+    node_id: _NodeId
+    score: Finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +70,8 @@ class Localization:
     world_from_cam: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     probability: float
-    node_id: int
-    candidates: list[NodeScore]
+    node_id: NodeId
+    candidates: list[CandidateNode]
     num_matches: int
     num_inliers: int
     times_ms: dict[str, float] = field(default_factory=dict)
@@ -147,8 +156,7 @@ class Localization:
         return result
 
 
-@dataclass(frozen=True, eq=False)
-class Alternative:
+class Alternative(Struct, frozen=True, eq=False, rename={"node_id": "node"}):
     """Hold one possible pose of an ambiguous image and its probability.
 
     The probabilities of all alternatives sum to less than 1. The rest is the probability of none of
@@ -156,8 +164,8 @@ class Alternative:
     """
 
     world_from_cam: Rigid3
-    probability: float
-    node_id: int
+    probability: Share
+    node_id: _NodeId
     geopose: GeoPose | None = None
     tile: str | None = None
 
@@ -180,7 +188,7 @@ class NotLocalized:
     """
 
     reason: Reason
-    candidates: list[NodeScore] = field(default_factory=list)
+    candidates: list[CandidateNode] = field(default_factory=list)
     num_matches: int = 0
     num_inliers: int = 0
     times_ms: dict[str, float] = field(default_factory=dict)
@@ -232,11 +240,12 @@ def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | No
         ResultError: it is not a result.
     """
     data = decode_json(line, dict[str, Any], ResultError, "no result")
-    kind = _LocalizedLine if data.get("localized") is True else _RefusedLine
-    try:
-        return decode_json(data, kind, ResultError, "no result").result()
-    except CalibrationError as error:
-        raise ResultError(f"no result: {error}") from None
+    is_localized = data.get("localized") is True
+    kind = _LocalizedLine if is_localized else _RefusedLine
+    read = decode_json(data, kind, ResultError, "no result")
+    values: dict[str, Any] = structs.asdict(read) | {"provenance": Provenance.from_json(data)}
+    del values["localized"]
+    return Localization(**values) if is_localized else NotLocalized(**values)
 
 
 def with_time(result: R, t_ns: int) -> R:
@@ -254,94 +263,36 @@ def _evidence_json(result: Localization | NotLocalized) -> dict[str, Any]:
     }
 
 
-_Share = Annotated[float, Meta(ge=0, le=1)]
-_Candidates = Annotated[list[tuple[Count, Finite]], Meta(max_length=10_000)]
-
-
-class _Line(ProvenanceJson, frozen=True, kw_only=True):
-    """Hold the keys that the JSON of each result has. Other keys are ignored."""
+class _Line(Struct, frozen=True, kw_only=True, rename={"node_id": "node"}):
+    """Hold the keys of a result's JSON, by the names of the fields of the result."""
 
     localized: bool
-    candidates: _Candidates
+    candidates: Annotated[list[CandidateNode], Meta(max_length=10_000)]
     num_matches: Count
     num_inliers: Count
     times_ms: dict[str, Finite]
 
-    @property
-    def scores(self) -> list[NodeScore]:
-        """Return the candidates."""
-        return [NodeScore(node_id, score) for node_id, score in self.candidates]
-
 
 class _LocalizedLine(_Line, frozen=True, kw_only=True):
-    world_from_cam: PoseJson
-    covariance: Matrix66
-    probability: _Share
-    node: Count
+    world_from_cam: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+    probability: Share
+    node_id: _NodeId
     evidence: Evidence | None = None
     focal_length_px: NonNegative | None = None
-    noise_share: _Share = 1.0
+    noise_share: Share = 1.0
     calibrated: bool = True
-    geopose: GeoPoseJson | None = None
-    calibration_doubt: MismatchJson | None = None
+    geopose: GeoPose | None = None
+    calibration_doubt: CalibrationMismatch | None = None
 
     def __post_init__(self) -> None:
-        matrix = np.array(self.covariance)
-        diagonal = np.diag(matrix)
+        diagonal = np.diag(self.covariance)
         slack = 1e-6 * np.sqrt(np.abs(np.outer(diagonal, diagonal))) + 1e-300
-        if (diagonal < 0.0).any() or (np.abs(matrix - matrix.T) > slack).any():
+        if (diagonal < 0.0).any() or (np.abs(self.covariance - self.covariance.T) > slack).any():
             raise ValueError("covariance is not symmetric, or has a negative variance")
-
-    def result(self) -> Localization:
-        """Return the result. Raises CalibrationError if its camera is not usable."""
-        doubt = self.calibration_doubt
-        return Localization(
-            self.world_from_cam.rigid(),
-            np.array(self.covariance),
-            self.probability,
-            self.node,
-            self.scores,
-            self.num_matches,
-            self.num_inliers,
-            self.times_ms,
-            self.evidence,
-            self.focal_length_px,
-            self.noise_share,
-            self.calibrated,
-            self.provenance(),
-            None if self.geopose is None else self.geopose.geopose(),
-            None if doubt is None else doubt.mismatch(),
-        )
-
-
-class _AlternativeJson(Struct, frozen=True):
-    world_from_cam: PoseJson
-    probability: _Share
-    node: Count
-    geopose: GeoPoseJson | None = None
-    tile: str | None = None
-
-    def alternative(self) -> Alternative:
-        """Return the alternative."""
-        geopose = None if self.geopose is None else self.geopose.geopose()
-        pose = self.world_from_cam.rigid()
-        return Alternative(pose, self.probability, self.node, geopose, self.tile)
 
 
 class _RefusedLine(_Line, frozen=True, kw_only=True):
     reason: Reason
     detail: str = ""
-    alternatives: Annotated[tuple[_AlternativeJson, ...], Meta(max_length=10_000)] = ()
-
-    def result(self) -> NotLocalized:
-        """Return the result. Raises CalibrationError if its camera is not usable."""
-        return NotLocalized(
-            self.reason,
-            self.scores,
-            self.num_matches,
-            self.num_inliers,
-            self.times_ms,
-            self.detail,
-            tuple(one.alternative() for one in self.alternatives),
-            self.provenance(),
-        )
+    alternatives: Annotated[tuple[Alternative, ...], Meta(max_length=10_000)] = ()

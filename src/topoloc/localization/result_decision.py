@@ -128,11 +128,13 @@ def _is_unclear_and_distant(search: Search, best: Hypothesis, other: Hypothesis)
     """
     if best.is_from_virtual_views:
         return False
-    apart, config = best.world_from_cam.inverse() @ other.world_from_cam, search.config.evidence
-    is_elsewhere = np.linalg.norm(
-        apart.translation
-    ) > 2.0 * config.max_translation or apart.angle() > math.radians(_MIN_DISTANT_ANGLE_DEG)
-    return bool(is_elsewhere) and best.log_odds <= search.weights.evidence.clear_log_odds
+    return best.log_odds <= search.weights.evidence.clear_log_odds and not (
+        best.world_from_cam.is_same(
+            other.world_from_cam,
+            2.0 * search.config.evidence.max_translation,
+            math.radians(_MIN_DISTANT_ANGLE_DEG),
+        )
+    )
 
 
 def _build_localization(

@@ -13,6 +13,7 @@ from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PointMatches, PoseFit
 from topoloc.localization.query import Query
+from topoloc.localization.result import CandidateNode
 from topoloc.retrieval.coarse import NodeScore
 
 
@@ -110,9 +111,9 @@ class Search:
         return self.ranked[: self.config.num_candidates]
 
     @property
-    def named(self) -> list[NodeScore]:
+    def named(self) -> list[CandidateNode]:
         """Return the candidates by node id, as they are reported."""
-        return self.map.with_node_ids(self.candidates)
+        return [CandidateNode(self.map.node_ids[one.row], one.score) for one in self.candidates]
 
     @property
     def best(self) -> Hypothesis | None:

@@ -42,18 +42,12 @@ from topoloc.mapping.node_drafts import (
 )
 from topoloc.mapping.nodes import NearestNodeSearch, NodeConfig, NodePoses, select_node_frames
 from topoloc.mapping.schema import SCHEMA_VERSION
-from topoloc.mapping.sessions import (
-    Edit,
-    Illumination,
-    Session,
-    average_illumination,
-    find_pose_source,
-    find_source_path,
-    today,
-)
-from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.sessions import Edit, Illumination, Session, average_illumination, today
+from topoloc.mapping.topomap import Layer, TopoMetricMap
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.recording import find_pose_source, find_source_path
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
@@ -104,18 +98,19 @@ def build_map(
     locator = PointLocator(frames, config)
     node_config = _resolve_node_config(frames, locator, config)
     drafts = _draft_nodes(frames, locator, node_config, config, progress)
-    place_images, lights, coarse = _process_mapping_images(
+    place_images, lights, models = _process_mapping_images(
         frames, drafts, node_config, config, progress
     )
     of_kind, sides = _finish_nodes(drafts, config)
-    nodes = of_kind.pop(config.features.kind)
+    layers = {
+        kind: Layer(nodes, {models[kind].name: models[kind]}) for kind, nodes in of_kind.items()
+    }
     poses_from = poses_from or [find_pose_source(sequence) for sequence in sequences]
     return TopoMetricMap(
-        summaries=[node.summary for node in nodes],
-        nodes=nodes,
+        summaries=[node.summary for node in of_kind[config.features.kind]],
+        layers=layers,
         edges=_connect_nodes(frames, [image.node_id for image in place_images]),
         place_images=place_images,
-        coarse_models={model.name: model for model in coarse},
         config=replace(config, nodes=node_config),
         length_m=_compute_trajectory_length(frames),
         sides=collect_virtual_nodes(sides, config.virtual_view_type),
@@ -124,7 +119,6 @@ def build_map(
             for k, sequence in enumerate(sequences)
         ],
         edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
-        other_kinds=of_kind,
     )
 
 
@@ -224,7 +218,7 @@ def _process_mapping_images(
     node_config: NodeConfig,
     config: BuildConfig,
     progress: Progress,
-) -> tuple[list[PlaceImage], list[Illumination], list[CoarseModel]]:
+) -> tuple[list[PlaceImage], list[Illumination], dict[str, CoarseModel]]:
     """Process every mapping image after the nodes are drafted.
 
     Each image is labelled with its nearest node and observes the points of near nodes. Its
@@ -251,7 +245,7 @@ def _process_mapping_images(
             vlads[kind].append(visit.vlads[kind])
             cells[kind].append(features.cells)
         of_image = (
-            visit.nearest,
+            NodeId(visit.nearest),
             image.world_from_cam,
             image.place_jpeg,
             frame.session_id,
@@ -265,18 +259,8 @@ def _process_mapping_images(
         kind: (words[kind], vlads[kind], node_ids, config.vlad_config_for(kind), cells[kind])
         for kind in config.kinds
     }
-    first, models = (
-        config.features.kind,
-        {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()},
-    )
-    return (
-        images,
-        lights,
-        [
-            model if kind == first else replace(model, name=f"{model.name}@{kind}")
-            for kind, model in models.items()
-        ],
-    )
+    models = {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()}
+    return images, lights, models
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,8 +269,8 @@ class _ImageObservations:
     nodes by row, and its VLADs by feature type."""
 
     image: MappingImage
-    nearest: int
-    observed: dict[int, dict[str, Observations]]
+    nearest: Row
+    observed: dict[Row, dict[str, Observations]]
     vlads: dict[str, Float32[np.ndarray, " v"]]
 
 
@@ -305,7 +289,7 @@ def _observe_image(
         if read is None
         else extract_mapping_image(frame, prepare_view(read, with_depth=False), config)
     )
-    nearest = nodes.rows(image.world_from_cam, NODES_PER_IMAGE).tolist()
+    nearest = as_rows(nodes.rows(image.world_from_cam, NODES_PER_IMAGE))
     around = {row: drafts.disk_list[row] for row in nearest}
     observed = {
         row: observe_draft(draft, image, frame.session_id)
@@ -345,21 +329,21 @@ def _finish_nodes(
     """Return the nodes by feature type and all virtual nodes. Each draft is read once."""
     of_kind, sides = {kind: DiskList[TopoNode]() for kind in config.kinds}, DiskList[TopoNode]()
 
-    def finish_nodes(node_id: int) -> tuple[list[TopoNode], list[TopoNode]]:
-        draft = drafts.disk_list[node_id]
-        return [finish_node(node_id, draft, kind) for kind in config.kinds], draft.sides
+    def finish_nodes(row: Row) -> tuple[list[TopoNode], list[TopoNode]]:
+        draft = drafts.disk_list[row]
+        return [finish_node(NodeId(row), draft, kind) for kind in config.kinds], draft.sides
 
-    for node_id, (nodes, of_node) in enumerate(
-        parallel_map(finish_nodes, range(len(drafts.disk_list)))
+    for row, (nodes, of_node) in enumerate(
+        parallel_map(finish_nodes, as_rows(range(len(drafts.disk_list))))
     ):
         for kind, node in zip(config.kinds, nodes, strict=True):
             of_kind[kind].append(node)
         for side in of_node:
-            sides.append(replace(side, summary=replace(side.summary, of_node=node_id)))
+            sides.append(replace(side, summary=replace(side.summary, of_node=NodeId(row))))
     return dict(of_kind), sides
 
 
-def _connect_nodes(frames: list[MappingFrame], node_ids: list[int]) -> list[Edge]:
+def _connect_nodes(frames: list[MappingFrame], node_ids: list[NodeId]) -> list[Edge]:
     """Return an edge for each transition of a recording between two nodes."""
     steps = pairwise(zip(frames, node_ids, strict=True))
     edges = {

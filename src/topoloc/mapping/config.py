@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
-from topoloc.bounds import parse_settings
+from topoloc.bounds import AtLeast, parse_settings
 from topoloc.errors import ConfigError, MissingExtraError, WeightsError
 from topoloc.features.feature_types import (
     SURF,
@@ -17,12 +17,20 @@ from topoloc.features.feature_types import (
 from topoloc.json_data import decode_json
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.validation import CorruptDataError
-from topoloc.mapping.virtual_nodes import VirtualNodesConfig
 from topoloc.removed_settings import drop_removed_settings
-from topoloc.retrieval.vlad import VladConfig
+from topoloc.retrieval.coarse import VladConfig
 
 CONFIG_VERSION = 1
 """Version of the JSON in the map file. It increases if the meaning of a key changes."""
+
+
+@dataclass(frozen=True)
+class VirtualNodesConfig:
+    """Configure which nodes have virtual nodes."""
+
+    spacing: Annotated[float, AtLeast(0)] = 3.0
+    """Nodes are selected by Eq. 1 with this many times the map's D_thresh and half the weight of
+    rotation. 0 creates no virtual nodes."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint
-from topoloc.mapping.contents import MapContents
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.text_files import parse_times, read_rows
 
 _MAX_GAP_NS = 2_000_000_000
@@ -48,7 +48,7 @@ def read_control_points(path: Path) -> ControlPoints:
     )
 
 
-def read_gnss(path: Path, topomap: MapContents) -> ControlPoints:
+def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
     """Read lines of ``name, lat, lon, h`` or ``time, lat, lon, h``: the places of mapping images by
     name, or of the camera by time.
 
@@ -86,7 +86,7 @@ def read_gnss(path: Path, topomap: MapContents) -> ControlPoints:
 
 
 def _interpolate_at_times(
-    path: Path, topomap: MapContents, t_ns: Sequence[int], places: Sequence[GeoPoint]
+    path: Path, topomap: TopoMetricMap, t_ns: Sequence[int], places: Sequence[GeoPoint]
 ) -> ControlPoints:
     """Interpolate the places of the nodes at their times."""
     origin = places[0].ecef_from_enu()
@@ -121,7 +121,7 @@ def _interpolate_at_times(
     )
 
 
-def _find_positions_by_name(topomap: MapContents) -> dict[str, Float[np.ndarray, "3"]]:
+def _find_positions_by_name(topomap: TopoMetricMap) -> dict[str, Float[np.ndarray, "3"]]:
     """Return the positions of mapping images by full name, file name, and name with the recording.
     Ambiguous names are left out."""
     positions, twice = dict[str, np.ndarray](), set[str]()

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import EmptyMapError
-from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.integrity_check import list_coarse_models
 from topoloc.mapping.sessions import Session
 from topoloc.mapping.topomap import TopoMetricMap
@@ -23,10 +22,11 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
     """
     if len(topomap.summaries) == 0:
         raise EmptyMapError(f"map {path} has no nodes")
+    models = list_coarse_models(path)
     centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
     return {
         "path": str(path),
-        "map": get_map_id(topomap),
+        "map": topomap.id,
         "version": topomap.version,
         "georeference": None if topomap.georeference is None else topomap.georeference.to_json(),
         "bytes": path.stat().st_size,
@@ -39,10 +39,10 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
         "recordings": sorted({s.recording for s in topomap.summaries}),
         "sessions": [_session_facts(session) for session in topomap.sessions],
         "edits": [asdict(edit) for edit in topomap.edits],
-        "coarse": sorted(topomap.coarse_models),
+        "coarse": [model["name"] for model in models],
         "default_coarse": topomap.default_coarse,
         "kinds": topomap.kinds,
-        "coarse_models": list_coarse_models(path),
+        "coarse_models": models,
         "config": topomap.config.to_json(),
     }
 

@@ -15,6 +15,7 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
+from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseModel
 
 
@@ -27,14 +28,14 @@ class NodeSummary:
     `of_node` is the id of the node that a virtual node belongs to.
     """
 
-    node_id: int
+    node_id: NodeId
     recording: str
     name: str
     t_ns: int
     world_from_cam: Rigid3
     num_points: int
     session_id: int = 0
-    of_node: int | None = None
+    of_node: NodeId | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ class PlaceImage:
 
     recording: str
     name: str
-    node_id: int
+    node_id: NodeId
     world_from_cam: Rigid3
     jpeg: bytes
     session_id: int = 0
@@ -105,8 +106,8 @@ class VirtualNodes:
 class Edge:
     """A transition of the camera from node `source_id` to node `target_id`."""
 
-    source_id: int
-    target_id: int
+    source_id: NodeId
+    target_id: NodeId
 
 
 @no_type_check  # as for virtual nodes
@@ -120,7 +121,7 @@ class Repetitions:
     """
 
     digest: str
-    moves: Mapping[int, Float[np.ndarray, "k 4 4"]]
+    moves: Mapping[NodeId, Float[np.ndarray, "k 4 4"]]
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from topoloc.errors import GeoreferenceError
 from topoloc.geometry.alignment import nearest_rotation
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.transform_consensus import find_least_median
 
 UP_ENU = np.array([0.0, 0.0, 1.0])
 AXES = {
@@ -185,18 +186,13 @@ class _PointPairs:
 def _robust_weights(pairs: _PointPairs) -> Float[np.ndarray, " n"]:
     """Return Cauchy weights, 0 for points further off than `_GATE` standard deviations."""
     rng, num_points = np.random.default_rng(0), len(pairs.world)
-    best, min_median = Rigid3.identity(), math.inf
-    for _ in range(_NUM_SAMPLES):
-        weights = np.zeros(num_points)
-        weights[rng.choice(num_points, 3, replace=False)] = 1.0
-        sample = pairs.align(weights)
-        median = float(np.median(pairs.residuals(sample)))
-        best, min_median = (sample, median) if median < min_median else (best, min_median)
-    weights, enu_from_world, sigma = (
-        np.ones(num_points),
-        best,
-        max(min_median / _MEDIAN_NORM, _MIN_SIGMA),
+    samples = (rng.choice(num_points, 3, replace=False) for _ in range(_NUM_SAMPLES))
+    weights = np.ones(num_points)
+    enu_from_world, min_median = find_least_median(
+        (pairs.align(np.isin(np.arange(num_points), sample) * weights) for sample in samples),
+        pairs.residuals,
     )
+    sigma = max(min_median / _MEDIAN_NORM, _MIN_SIGMA)
     for _ in range(_NUM_STEPS):
         scaled = pairs.residuals(enu_from_world) / (math.sqrt(3.0) * sigma)
         weights = np.where(scaled < _GATE, 1.0 / (1.0 + (scaled / 2.385) ** 2), 0.0)

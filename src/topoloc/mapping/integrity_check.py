@@ -4,15 +4,17 @@ Also list its coarse localizers."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError
 from topoloc.json_data import decode_json
+from topoloc.mapping.coarse_models import open_map_coarse_localizer
 from topoloc.mapping.map_file import MapFile
 from topoloc.mapping.map_writing import compute_map_digest
 from topoloc.mapping.schema import SORT_COLUMNS, TABLES
-from topoloc.mapping.topomap import TopoMetricMap, open_map_coarse_localizer
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.validation import CorruptDataError
 from topoloc.retrieval.coarse import open_coarse_localizer
 
@@ -64,9 +66,8 @@ def _check_rows(file: MapFile) -> Iterator[str]:
 
 
 def _check_entries(topomap: TopoMetricMap) -> Iterator[str]:
-    yield from _check_each(topomap.nodes, _read_session_statistics)
-    for nodes in topomap.other_kinds.values():
-        yield from _check_each(nodes, _read_session_statistics)
+    for layer in topomap.layers.values():
+        yield from _check_each(layer.nodes, _read_session_statistics)
     yield from _check_each(topomap.place_images, lambda image: topomap.row_of(image.node_id))
     if topomap.repetitions is not None:
         moves = topomap.repetitions.moves
@@ -81,8 +82,9 @@ def _check_entries(topomap: TopoMetricMap) -> Iterator[str]:
                 f"an edge from node {edge.source_id} to node {edge.target_id}, one of which is"
                 " missing"
             )
-    for name in topomap.coarse_models:
-        yield from _try_read(lambda name=name: open_map_coarse_localizer(topomap, name))[1]
+    for kind, layer in topomap.layers.items():
+        for name in layer.coarse_models:
+            yield from _try_read(partial(open_map_coarse_localizer, topomap, name, kind))[1]
     if topomap.sides is not None:
         yield from _check_each(topomap.sides.nodes, lambda node: None)
         sides = topomap.sides.coarse_models

@@ -92,60 +92,6 @@ class LandmarkStatistics:
             self.seen.sum(dtype=np.int64) >= min_seen_share * self.expected.sum(dtype=np.int64)
         )
 
-    def information(self) -> Float[np.ndarray, "m 3 3"]:
-        """Return A of each point, in 1 / square metres."""
-        lower = self._lower()
-        return lower @ lower.transpose(0, 2, 1)
-
-    def pull(self) -> Float[np.ndarray, "m 3"]:
-        """Return g of each point, in 1 / metres."""
-        return (self._lower() @ (self.pulls.astype(np.float64) / PULL_SCALE)[:, :, None])[:, :, 0]
-
-    def _lower(self) -> Float[np.ndarray, "m 3 3"]:
-        lower = np.zeros((len(self.rows), 3, 3))
-        lower[:, *np.tril_indices(3)] = self.roots
-        return lower
-
-
-@dataclass(frozen=True, eq=False)
-class AccumulatedStatistics:
-    """Hold the sums of all points of a node over some sessions. `first_session` and `last_session`
-    are -1 if no session saw the point."""
-
-    information: Float[np.ndarray, "n 3 3"]
-    pulls: Float[np.ndarray, "n 3"]
-    expected: Int[np.ndarray, " n"]
-    seen: Int[np.ndarray, " n"]
-    first_session: Int[np.ndarray, " n"]
-    last_session: Int[np.ndarray, " n"]
-
-    @staticmethod
-    def accumulate(
-        statistics: Sequence[LandmarkStatistics], num_points: int
-    ) -> AccumulatedStatistics:
-        """Add up the statistics in the order of the sessions."""
-        information, pulls = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
-        expected, seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
-        first, last = np.full(num_points, -1), np.full(num_points, -1)
-        for of_session in sorted(statistics, key=lambda part: part.session_id):
-            rows = of_session.rows
-            information[rows] += of_session.information()
-            pulls[rows] += of_session.pull()
-            expected[rows] += of_session.expected
-            seen[rows] += of_session.seen
-            saw = rows[of_session.seen > 0]
-            last[saw] = of_session.session_id
-            first[saw] = np.where(first[saw] < 0, of_session.session_id, first[saw])
-        return AccumulatedStatistics(information, pulls, expected, seen, first, last)
-
-    def solve(
-        self, points_cam: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-        """Return the positions (metres) and covariances according to these sums, for points stored
-        at `points_cam`."""
-        covariances = np.linalg.inv(self.information)
-        return points_cam - (covariances @ self.pulls[:, :, None])[:, :, 0], covariances
-
 
 def merge_count_statistics(statistics: Iterable[LandmarkStatistics]) -> list[LandmarkStatistics]:
     """Merge the count-only sessions into at most two, each with the id of its last session.

@@ -19,7 +19,6 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.json_data import decode_json
 from topoloc.mapping.config import CONFIG_VERSION, MapConfig, config_from_text
-from topoloc.mapping.contents import MapContents, NextIds
 from topoloc.mapping.entries import (
     CorrelatedErrors,
     Edge,
@@ -32,8 +31,9 @@ from topoloc.mapping.entries import (
 from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
 from topoloc.mapping.map_file import MapFile
 from topoloc.mapping.point_encoding import points_from_row
-from topoloc.mapping.schema import SORT_COLUMNS, VIRTUAL_PREFIX
+from topoloc.mapping.schema import SORT_COLUMNS, VIRTUAL_PREFIX, layer_suffix, split_layer_name
 from topoloc.mapping.sessions import Edit, Session
+from topoloc.mapping.topomap import Layer, NextIds, TopoMetricMap
 from topoloc.mapping.validation import (
     MAX_POINTS,
     CorruptDataError,
@@ -42,6 +42,7 @@ from topoloc.mapping.validation import (
     check_count,
     pose_from_bytes,
 )
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseModel
 
 T = TypeVar("T")
@@ -51,7 +52,7 @@ MAX_ID = 2**53
 _MAX_MOVES = 1000
 
 
-def open_map(path: Path, digest: str | None = None) -> tuple[MapContents, MapFile]:
+def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
     """Open a map file without reading its nodes. It stays open.
 
     Args:
@@ -67,13 +68,15 @@ def open_map(path: Path, digest: str | None = None) -> tuple[MapContents, MapFil
         if digest is not None and file.digest != digest:
             raise MapError(f"map {path} is not the one that was pickled: it was replaced since")
         with file.read_connection():
-            return _read_contents(file), file
+            topomap = _read_contents(file)
+            topomap.__dict__["_opened"] = file  # not a field, so that a changed copy has no file
+            return topomap
     except BaseException:
         file.close()
         raise
 
 
-def _read_contents(file: MapFile) -> MapContents:
+def _read_contents(file: MapFile) -> TopoMetricMap:
     facts = file.facts
     missing = [key for key in ("config", "length_m") if key not in facts]
     if missing:
@@ -96,25 +99,18 @@ def _read_contents(file: MapFile) -> MapContents:
             models,
             kind,
         )
-    return MapContents(
+    return TopoMetricMap(
         summaries=_lazy_summaries(file),
-        nodes=_lazy_nodes(file, config.features.kind),
+        layers={kind: _read_layer(file, kind, config.features.kind) for kind in kinds},
         edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
         place_images=_LazySequence(
             partial(file.count, "place_images"), partial(_read_place_image, file)
         ),
-        coarse_models=_LazyMapping(file, "coarse_models", _model_from_row),
         config=config,
         length_m=_read_length(facts["length_m"]),
         default_coarse=decode_json(
             facts.get("default_coarse", '"surf-vlad"'), str, CorruptDataError, "default_coarse"
         ),
-        shared_errors=_read_correlated_errors(facts, "shared_errors"),
-        other_shared_errors={
-            kind: found
-            for kind in kinds
-            if (found := _read_correlated_errors(facts, f"shared_errors@{kind}"))
-        },
         repetitions=(
             Repetitions(facts["repetitions"], _LazyMapping(file, "repetitions", _moves_from_row))
             if "repetitions" in facts
@@ -130,11 +126,6 @@ def _read_contents(file: MapFile) -> MapContents:
         georeference=(
             Georeference.from_json(facts["georeference"]) if "georeference" in facts else None
         ),
-        other_kinds={
-            kind: _lazy_nodes(file, kind, is_default=False)
-            for kind in kinds
-            if kind != config.features.kind
-        },
     )
 
 
@@ -163,6 +154,17 @@ def _read_feature_types(facts: Mapping[str, str], config: MapConfig) -> list[str
     for kind in kinds:
         find_feature_type(kind)
     return kinds
+
+
+# No return type, see below.
+def _read_layer(file: MapFile, kind: str, first: str):
+    """Return the layer of a feature type, given the map's first type."""
+    suffix = layer_suffix(kind, first)
+    return Layer(
+        _lazy_nodes(file, kind, is_default=kind == first),
+        _LazyMapping(file, "coarse_models", _model_from_row, suffix),
+        _read_correlated_errors(file.facts, f"shared_errors{suffix}"),
+    )
 
 
 def _read_map_id(facts: Mapping[str, str]) -> str | None:
@@ -214,7 +216,7 @@ def _session_from_row(row: Mapping[str, Any]) -> Session:
 class _LazySequence(Sequence[T]):
     """Show rows of the map, numbered from 0, and read each when accessed."""
 
-    def __init__(self, length: Callable[[], int], read: Callable[[int], T]) -> None:
+    def __init__(self, length: Callable[[], int], read: Callable[[Row], T]) -> None:
         self._length, self._read = length, read
 
     def __len__(self) -> int:
@@ -222,11 +224,11 @@ class _LazySequence(Sequence[T]):
 
     def __getitem__(self, index):  # type: ignore[override]
         if isinstance(index, slice):
-            return [self._read(i) for i in range(*index.indices(len(self)))]
+            return [self._read(row) for row in as_rows(range(*index.indices(len(self))))]
         position = index + len(self) if index < 0 else index
         if not 0 <= position < len(self):
             raise IndexError(index)
-        return self._read(int(position))
+        return self._read(Row(int(position)))
 
 
 # No return types: a type check at run time would read an entry.
@@ -246,7 +248,7 @@ def _lazy_nodes(file: MapFile, kind: str, prefix: str = "", is_default: bool = T
     )
 
 
-def _read_summary(file: MapFile, prefix: str, row: int) -> NodeSummary:
+def _read_summary(file: MapFile, prefix: str, row: Row) -> NodeSummary:
     return _read_summaries(file, prefix)[row]
 
 
@@ -265,11 +267,11 @@ def _read_summaries(file: MapFile, prefix: str) -> list[NodeSummary]:
 
 
 def _summary_from_row(
-    row: Mapping[str, Any], file: MapFile, nodes: Mapping[int, NodeSummary] | None
+    row: Mapping[str, Any], file: MapFile, nodes: Mapping[NodeId, NodeSummary] | None
 ) -> NodeSummary:
     """Return the summary of a node. With `nodes` it is a virtual node, whose session is that of its
     node."""
-    node_id = check_count(row["node_id"], 0, MAX_ID, "a node's id")
+    node_id = NodeId(check_count(row["node_id"], 0, MAX_ID, "a node's id"))
     num_points = check_count(
         row["num_points"], 0, MAX_POINTS, f"the number of points of node {node_id}"
     )
@@ -289,7 +291,7 @@ def _summary_from_row(
     )
 
 
-def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: int) -> TopoNode:
+def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: Row) -> TopoNode:
     """Read the node of a row with its points of a feature type. With the prefix `VIRTUAL_PREFIX` it
     is a virtual node, which has no template. Raises MapError."""
     with file.read_connection():
@@ -323,7 +325,7 @@ def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: int
         )
 
 
-def _read_camera(file: MapFile, prefix: str, node_id: int) -> Camera:
+def _read_camera(file: MapFile, prefix: str, node_id: NodeId) -> Camera:
     rows = partial(file.rows, f"{prefix}nodes", ("node_id", "camera_id"))
     camera_id = file.cached(
         f"{prefix}camera_ids", lambda: {row["node_id"]: row["camera_id"] for row in rows()}
@@ -341,7 +343,7 @@ class _LazyStatistics:
     """Show each session's statistics of a node's points. Localization does not need them, so they
     are read when accessed."""
 
-    def __init__(self, file: MapFile, node_id: int, kind: str, num_points: int) -> None:
+    def __init__(self, file: MapFile, node_id: NodeId, kind: str, num_points: int) -> None:
         self._file, self._node_id, self._kind, self._num_points = file, node_id, kind, num_points
 
     def _list_session_ids(self) -> list[int]:
@@ -397,17 +399,29 @@ def _read_place_image(file: MapFile, row: int) -> PlaceImage:
 
 
 class _LazyMapping(Mapping[K, V]):
-    """Show rows of a table by their key, and read each when accessed."""
+    """Show rows of a table by their key, or those of one layer by the names in it. Each is read
+    when accessed."""
 
-    def __init__(self, file: MapFile, table: str, read: Callable[[dict[str, Any]], V]) -> None:
-        self._file, self._table, self._read = file, table, read
+    def __init__(
+        self,
+        file: MapFile,
+        table: str,
+        read: Callable[[dict[str, Any]], V],
+        suffix: str | None = None,
+    ) -> None:
+        self._file, self._table, self._read, self._suffix = file, table, read, suffix
         self._key = SORT_COLUMNS[table]
 
-    def _keys(self) -> dict[K, None]:
-        return self._file.cached(
+    def _keys(self) -> dict[Any, Any]:
+        """Return the stored key of each key."""
+        stored = self._file.cached(
             self._table,
-            lambda: {row[self._key]: None for row in self._file.rows(self._table, (self._key,))},
+            lambda: [row[self._key] for row in self._file.rows(self._table, (self._key,))],
         )
+        if self._suffix is None:
+            return {key: key for key in stored}
+        named = ((*split_layer_name(key), key) for key in stored)
+        return {name: key for name, suffix, key in named if suffix == self._suffix}
 
     def __len__(self) -> int:
         return len(self._keys())
@@ -416,20 +430,17 @@ class _LazyMapping(Mapping[K, V]):
         return iter(self._keys())
 
     def __getitem__(self, key: K) -> V:
-        if key not in self._keys():
-            raise KeyError(key)
+        stored = self._keys()[key]
         with self._file.read_connection():
-            return self._read(
-                _require_row(
-                    self._file.row(self._table, **{self._key: key}), f"{self._table} {key}"
-                )
-            )
+            row = self._file.row(self._table, **{self._key: stored})
+            return self._read(_require_row(row, f"{self._table} {stored}"))
 
 
 def _model_from_row(row: dict[str, Any]) -> CoarseModel:
     name, what = row["name"], f"coarse localizer {row['name']}"
     settings = _decode_object(row["settings"], what)
-    return CoarseModel(name, settings, arrays_from_npz(row["arrays"], what))
+    arrays = arrays_from_npz(row["arrays"], what)
+    return CoarseModel(split_layer_name(name)[0], settings, arrays)
 
 
 def _moves_from_row(row: dict[str, Any]) -> np.ndarray:

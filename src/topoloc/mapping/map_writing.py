@@ -13,7 +13,7 @@ import os
 import sqlite3
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ from topoloc.errors import MapError
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import config_to_text
-from topoloc.mapping.contents import MapContents, NextIds, get_map_id
 from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.landmark_statistics import encode_statistics
 from topoloc.mapping.point_encoding import compress_array, node_to_arrays
@@ -36,8 +35,10 @@ from topoloc.mapping.schema import (
     VIRTUAL_PREFIX,
     compute_checksum,
     create_table_statement,
+    layer_suffix,
 )
 from topoloc.mapping.sessions import Session, sessions_from_names
+from topoloc.mapping.topomap import NextIds, TopoMetricMap
 from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.coarse import CoarseModel
 
@@ -46,7 +47,7 @@ _PAGE_BYTES = 1024
 pages cost 1 to 5 kB more per node."""
 
 
-def save_map(topomap: MapContents, path: Path) -> None:
+def save_map(topomap: TopoMetricMap, path: Path) -> None:
     """Write the map to `path` atomically. A reader sees the old map or the new one.
 
     Raises:
@@ -66,7 +67,7 @@ def save_map(topomap: MapContents, path: Path) -> None:
         raise MapError(f"cannot write map {path}: {error}") from error
 
 
-def write_map(topomap: MapContents, path: Path) -> None:
+def write_map(topomap: TopoMetricMap, path: Path) -> None:
     """Write the map to the empty file `path`. Raises MapError if the disk is full."""
     try:
         # an empty name creates a private temporary database, removed at closing
@@ -92,7 +93,7 @@ class _Writer:
         }
         self._camera_ids: dict[str, int] = {}
 
-    def write(self, topomap: MapContents) -> None:
+    def write(self, topomap: TopoMetricMap) -> None:
         """Write all tables of the map in one transaction."""
         self._database.execute("PRAGMA journal_mode = OFF")
         self._database.execute("BEGIN")
@@ -114,8 +115,10 @@ class _Writer:
         for edge in sorted(topomap.edges, key=lambda edge: (edge.source_id, edge.target_id)):
             self._insert("edges", edge.source_id, edge.target_id)
         next_image = self._write_images(topomap, ids)
-        for model in sorted(topomap.coarse_models.values(), key=lambda model: model.name):
-            self._insert_model(model)
+        for kind, layer in topomap.layers.items():
+            for model in layer.coarse_models.values():
+                suffix = layer_suffix(kind, topomap.kind)
+                self._insert_model(replace(model, name=model.name + suffix))
         if topomap.sides is not None:
             virtual_view_type = topomap.sides.kind
             for (of_side,) in parallel_map(
@@ -132,11 +135,10 @@ class _Writer:
         self._write_metadata(topomap, sessions, next_image)
         self._database.execute("COMMIT")
 
-    def _write_nodes(self, topomap: MapContents, session_ids: Mapping[str, int]) -> None:
-        others = sorted(topomap.other_kinds.items())
+    def _write_nodes(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> None:
         read = (
-            [(node, topomap.kind), *((nodes[row], kind) for kind, nodes in others)]
-            for row, node in enumerate(topomap.nodes)
+            [(topomap.layers[kind].nodes[row], kind) for kind in topomap.kinds]
+            for row in range(len(topomap.nodes))
         )
         for (node, kind, blobs), *of_others in parallel_map(_encode_nodes, read):
             self._insert_node(node, kind, blobs, session_ids)
@@ -144,7 +146,7 @@ class _Writer:
             for of_other in of_others:
                 self._insert_points(*of_other)
 
-    def _write_images(self, topomap: MapContents, session_ids: Mapping[str, int]) -> int:
+    def _write_images(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> int:
         """Write the images. Images without an id receive the next ones. Return the id after the
         last."""
         next_id = max(topomap.next_ids.place_image, 1)
@@ -164,7 +166,7 @@ class _Writer:
         return next_id
 
     def _write_metadata(
-        self, topomap: MapContents, sessions: Sequence[Session], next_image: int
+        self, topomap: TopoMetricMap, sessions: Sequence[Session], next_image: int
     ) -> None:
         used = NextIds(
             session=max((session.session_id + 1 for session in sessions), default=0),
@@ -177,7 +179,7 @@ class _Writer:
         )
         facts = {
             "config": config_to_text(topomap.config),
-            "kinds": json.dumps([topomap.kind, *sorted(topomap.other_kinds)]),
+            "kinds": json.dumps(topomap.kinds),
             "length_m": json.dumps(topomap.length_m),
             "default_coarse": json.dumps(topomap.default_coarse),
             "next_ids": json.dumps(
@@ -190,7 +192,7 @@ class _Writer:
                 {table: len(rows) for table, rows in self._checksums.items() if table != "map"}
             ),
         }
-        facts["map_id"] = get_map_id(topomap)
+        facts["map_id"] = topomap.id
         if changes := {
             str(edit.edit_id): dict(edit.changes) for edit in topomap.edits if edit.changes
         }:
@@ -199,10 +201,10 @@ class _Writer:
             facts["kind_of_sides"] = json.dumps(topomap.sides.kind)
         if topomap.georeference is not None:
             facts["georeference"] = json.dumps(topomap.georeference.to_json())
-        if topomap.shared_errors is not None:
-            facts["shared_errors"] = json.dumps(asdict(topomap.shared_errors))
-        for kind, errors in topomap.other_shared_errors.items():
-            facts[f"shared_errors@{kind}"] = json.dumps(asdict(errors))
+        for kind, layer in topomap.layers.items():
+            if layer.shared_errors is not None:
+                key = f"shared_errors{layer_suffix(kind, topomap.kind)}"
+                facts[key] = json.dumps(asdict(layer.shared_errors))
         if topomap.repetitions is not None:
             facts["repetitions"] = topomap.repetitions.digest
         for key, value in sorted(facts.items()):

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from topoloc.disk_list import bytes_of
+from topoloc.node_ids import Row
 
 T = TypeVar("T")
 
@@ -23,7 +24,7 @@ class NodeCache:
     def __init__(self, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
         self._lock = threading.Lock()
         self._removed_owners: list[int] = []
-        self._entries: OrderedDict[tuple[int, int], tuple[Any, int]] = OrderedDict()
+        self._entries: OrderedDict[tuple[int, Row], tuple[Any, int]] = OrderedDict()
         self._max_bytes, self._num_bytes = max_bytes, 0
 
     @property
@@ -37,7 +38,7 @@ class NodeCache:
             self._max_bytes = max_bytes
             self._shrink()
 
-    def get(self, owner: int, row: int) -> Any:
+    def get(self, owner: int, row: Row) -> Any:
         """Return an entry and mark it as the most recently used. Return None if it is not
         cached."""
         with self._lock:
@@ -47,7 +48,7 @@ class NodeCache:
             self._entries.move_to_end((owner, row))
             return entry[0]
 
-    def put(self, owner: int, row: int, value: Any, num_bytes: int) -> None:
+    def put(self, owner: int, row: Row, value: Any, num_bytes: int) -> None:
         """Add an entry and drop the least recently used ones beyond the budget. An entry larger
         than the budget is not kept."""
         with self._lock:
@@ -91,14 +92,14 @@ class CachedNodes(Generic[T]):
     _next_owner = 0
     _owner_lock = threading.Lock()
 
-    def __init__(self, read: Callable[[int], T], cache: NodeCache = NODE_CACHE) -> None:
+    def __init__(self, read: Callable[[Row], T], cache: NodeCache = NODE_CACHE) -> None:
         with CachedNodes._owner_lock:
             CachedNodes._next_owner += 1
             self._owner = CachedNodes._next_owner
         self._read, self._cache = read, cache
         weakref.finalize(self, cache.remove_owner, self._owner)
 
-    def __call__(self, row: int) -> T:
+    def __call__(self, row: Row) -> T:
         value = self._cache.get(self._owner, row)
         if value is None:
             value = self._read(row)

@@ -27,6 +27,7 @@ from topoloc.mapping.mapping_frames import (
     encode_thumbnail,
 )
 from topoloc.mapping.virtual_nodes import create_virtual_nodes
+from topoloc.node_ids import NodeId, Row
 from topoloc.points.metric_points import keypoint_sigmas
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.retrieval.vlad import append_positions
@@ -83,13 +84,13 @@ class NodeDrafts:
 
     disk_list: DiskList[NodeDraft]
     world_from_nodes: list[Rigid3] = field(default_factory=list)
-    rows: dict[MappingFrame, int] = field(default_factory=dict)
+    rows: dict[MappingFrame, Row] = field(default_factory=dict)
     cameras: dict[int, Camera] = field(default_factory=dict)
     num_points: dict[str, list[int]] = field(default_factory=dict)
 
     def append(self, draft: NodeDraft) -> None:
         """Add a draft as the last row."""
-        self.rows[draft.frame] = len(self.disk_list)
+        self.rows[draft.frame] = Row(len(self.disk_list))
         self.world_from_nodes.append(draft.image.world_from_cam)
         self.cameras.setdefault(draft.frame.session_id, draft.image.camera)
         for kind, points in draft.points.items():
@@ -123,7 +124,13 @@ def create_node_draft(
         )
     template_jpeg = encode_thumbnail(view.picture, 240, quality=75)
     summary = NodeSummary(
-        -1, frame.sequence.name, frame.name, frame.t_ns, image.world_from_cam, 0, frame.session_id
+        NodeId(-1),
+        frame.sequence.name,
+        frame.name,
+        frame.t_ns,
+        image.world_from_cam,
+        0,
+        frame.session_id,
     )
     sides = (
         create_virtual_nodes(
@@ -153,7 +160,7 @@ def observe_draft(
     return observed
 
 
-def finish_node(node_id: int, draft: NodeDraft, kind: str, max_points: int = 800) -> TopoNode:
+def finish_node(node_id: NodeId, draft: NodeDraft, kind: str, max_points: int = 800) -> TopoNode:
     """Refine the points of a feature type and return the node. Points observed again are preferred,
     then the strongest. At most `max_points` are kept."""
     points, frame, image = draft.points[kind], draft.frame, draft.image

@@ -212,3 +212,14 @@ SCHEMA_2_VIEWS = {
     + _VIRTUAL_NODE_VIEWS
     + _POINT_VIEWS.format("side_"),
 }
+
+
+def layer_suffix(kind: str, first: str) -> str:
+    """Return the end of the stored names of a feature type, given the map's first type."""
+    return "" if kind == first else f"@{kind}"
+
+
+def split_layer_name(stored: str) -> tuple[str, str]:
+    """Return a stored name without its `layer_suffix`, and the suffix."""
+    name, at, kind = stored.partition("@")
+    return name, at + kind

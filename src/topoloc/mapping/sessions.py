@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from topoloc.geometry.camera import Camera
-from topoloc.recordings.frame import Image, StereoSequence
-from topoloc.recordings.recording import Recording, SequenceView
+from topoloc.retrieval.coarse import Image
 
 _YEAR_2000_NS = 946_684_800 * 1_000_000_000
 """Earlier times belong to clocks that start at 0 and have no date."""
@@ -107,25 +106,6 @@ def today() -> str:
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     now = datetime.fromtimestamp(int(epoch), UTC) if epoch.isdigit() else datetime.now(UTC)
     return now.date().isoformat()
-
-
-def find_source_path(sequence: StereoSequence) -> str | None:
-    """Return the folder or file of a sequence, or None."""
-    while isinstance(sequence, SequenceView):
-        sequence = sequence.base
-    return str(sequence.root) if isinstance(sequence, Recording) else None
-
-
-def find_pose_source(sequence: StereoSequence) -> str:
-    """Return `truth` if the poses are the recording's own, else `given`."""
-    if isinstance(sequence, SequenceView):
-        before = sequence.base.poses
-        is_same = all(
-            pose is before[index]
-            for index, pose in zip(sequence.indices, sequence.poses, strict=True)
-        )
-        return find_pose_source(sequence.base) if is_same else "given"
-    return "truth" if isinstance(sequence, Recording) else "given"
 
 
 def average_illumination(lights: Sequence[Illumination]) -> Illumination | None:

@@ -10,17 +10,19 @@ Every entry has an id that never changes and is never reused. Computations use r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, no_type_check
+from typing import TYPE_CHECKING, Any, ClassVar, no_type_check
 
 import numpy as np
 
-from topoloc.errors import FeatureTypeError, MapError
-from topoloc.mapping.contents import MapContents, get_map_id
+from topoloc.errors import FeatureTypeError
+from topoloc.geometry.geodesy import Georeference
+from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.config import MapConfig
 from topoloc.mapping.entries import (
     CorrelatedErrors,
     Edge,
@@ -30,24 +32,20 @@ from topoloc.mapping.entries import (
     TopoNode,
     VirtualNodes,
 )
-from topoloc.mapping.map_file import MapFile
-from topoloc.mapping.map_reading import open_map
-from topoloc.mapping.map_writing import save_map
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
 from topoloc.mapping.schema import SCHEMA_VERSION
-from topoloc.mapping.session_illumination import find_node_illumination_groups
 from topoloc.mapping.sessions import Edit, Session
-from topoloc.retrieval.coarse import (
-    CoarseLocalizer,
-    CoarseModel,
-    DescriptorLocalizer,
-    open_coarse_localizer,
-)
+from topoloc.node_ids import NodeId, Row, as_rows
+from topoloc.retrieval.coarse import CoarseModel
+
+if TYPE_CHECKING:
+    from topoloc.mapping.map_file import MapFile
 
 __all__ = [
     "CorrelatedErrors",
     "Edge",
     "Edit",
+    "Layer",
     "NodeSummary",
     "PlaceImage",
     "Repetitions",
@@ -55,22 +53,125 @@ __all__ = [
     "TopoMetricMap",
     "TopoNode",
     "VirtualNodes",
-    "open_map_coarse_localizer",
 ]
 
 
-@no_type_check  # as for MapContents
+@dataclass(frozen=True)
+class NextIds:
+    """Hold the ids of the next new entries. They are larger than any id ever used in the map."""
+
+    session: int = 0
+    node: int = 0
+    place_image: int = 1
+    side_node: int = 0
+    edit: int = 1
+
+
+_MAP_ID = b"map id"
+
+
+@no_type_check  # a type check at run time would read entries from the file
 @dataclass(frozen=True, eq=False)
-class TopoMetricMap(MapContents):
-    """A topo-metric map, see `MapContents` for its fields.
+class Layer:
+    """Hold the part of a map that belongs to one feature type.
+
+    - `nodes[i]` is the node of row i with its points of this type.
+    - `coarse_models` holds coarse localizers by name. Those that need no local features stand in
+      the first layer only.
+    - `shared_errors` is None if not measured.
+    """
+
+    nodes: Sequence[TopoNode]
+    coarse_models: Mapping[str, CoarseModel] = field(default_factory=dict)
+    shared_errors: CorrelatedErrors | None = None
+
+
+@no_type_check  # as for layers
+@dataclass(frozen=True, eq=False)
+class TopoMetricMap:
+    """A topo-metric map.
+
+    - `summaries[i]` describes the node of row i. Their ids increase.
+    - `layers` holds the points of the nodes by feature type.
+    - `config` is the resolved configuration of the build.
+    - `length_m` is the mapped trajectory length in metres.
+    - `default_coarse` names the default coarse localizer.
+    - `repetitions` is None if not measured.
+    - `sides` holds the virtual nodes. None if no mapping image is wide enough to show the walls
+      beside the trajectory.
+    - `edits` begins with the build.
+    - `map_id` stays the same through all edits. None until the map is saved, and in older files.
+    - `georeference` is the pose of the map's world on earth, if known.
 
     The sequences and mappings of a loaded map read the file when an entry is accessed. A loaded map
     keeps its file open until `close` or the end of ``with TopoMetricMap.load(path) as topomap``. It
     is pickled as its path. Several threads may read it.
     """
 
+    summaries: Sequence[NodeSummary]
+    layers: Mapping[str, Layer]
+    edges: Sequence[Edge]
+    place_images: Sequence[PlaceImage]
+    config: MapConfig = field(default_factory=MapConfig)
+    length_m: float = 0.0
+    default_coarse: str = "surf-vlad"
+    repetitions: Repetitions | None = None
+    sides: VirtualNodes | None = None
+    sessions: Sequence[Session] = ()
+    edits: Sequence[Edit] = ()
+    next_ids: NextIds = NextIds()
+    map_id: str | None = None
+    georeference: Georeference | None = None
+
     schema_version: ClassVar[int] = SCHEMA_VERSION
     """Schema of the map files that `save` writes."""
+
+    @property
+    def kind(self) -> str:
+        """Return the first feature type of the map, which queries use first."""
+        return self.config.features.kind
+
+    @property
+    def version(self) -> int:
+        """Return the number of the last edit: 1 after the build, 0 without a history."""
+        return max((edit.edit_id for edit in self.edits), default=0)
+
+    @property
+    def free_ids(self) -> NextIds:
+        """Return ids that were never used in the map. Place images receive theirs at writing."""
+        return replace(
+            self.next_ids,
+            session=max(
+                [self.next_ids.session, *(session.session_id + 1 for session in self.sessions)]
+            ),
+            node=max([self.next_ids.node, *(summary.node_id + 1 for summary in self.summaries)]),
+            edit=max([self.next_ids.edit, *(edit.edit_id + 1 for edit in self.edits)]),
+        )
+
+    @property
+    def id(self) -> str:
+        """Return the map's id, 16 hexadecimal digits. It is computed from the nodes if the map has
+        none yet."""
+        return self.map_id or compute_nodes_digest(self.summaries, _MAP_ID)
+
+    @property
+    def kinds(self) -> list[str]:
+        """Return all feature types of the map, the first type first."""
+        return [self.kind, *sorted(self.layers.keys() - {self.kind})]
+
+    @property
+    def first_layer(self) -> Layer:
+        """Return the layer of the first feature type."""
+        return self.layers[self.kind]
+
+    @property
+    def nodes(self) -> Sequence[TopoNode]:
+        """Return the nodes with their points of the first feature type."""
+        return self.first_layer.nodes
+
+    def sides_for(self, kind: str) -> VirtualNodes | None:
+        """Return the virtual nodes that are queried with this feature type, if any."""
+        return self.sides if self.sides is not None and self.sides.is_used_with(kind) else None
 
     def describe(self, path: str | Path) -> dict[str, Any]:
         """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres,
@@ -79,21 +180,25 @@ class TopoMetricMap(MapContents):
 
         return describe_map(self, Path(path))
 
-    @property
-    def resolved_id(self) -> str:
-        """The map's identifier, 16 hexadecimal digits, also of a map without a stored one."""
-        return get_map_id(self)
-
-    def row_of(self, node_id: int) -> int:
+    def row_of(self, node_id: NodeId) -> Row:
         """Return the row of a node. Raises KeyError if the map has no node with this id."""
         return self._rows[node_id]
 
-    def find_neighbours(self, rows: Sequence[int], max_neighbours: int) -> list[list[int]]:
-        """Return for each of these nodes the nearest others of them, by the distance of Eq. 1.
+    @property
+    def rows(self) -> list[Row]:
+        """Return the rows of all nodes."""
+        return as_rows(range(len(self.summaries)))
 
-        Entries are positions in `rows`, the nearest first.
+    @cached_property
+    def node_poses(self) -> NodePoses:
+        """Return the poses of all nodes as arrays."""
+        return NodePoses.of([summary.world_from_cam for summary in self.summaries])
+
+    def find_neighbours(self, poses: list[Rigid3], max_neighbours: int) -> list[list[int]]:
+        """Return for each of these poses the nearest others of them, by the distance of Eq. 1.
+
+        Entries are positions in `poses`, the nearest first.
         """
-        poses = [self.summaries[row].world_from_cam for row in rows]
         stacked, neighbours = NodePoses.of(poses), list[list[int]]()
         for k, pose in enumerate(poses):
             distances = node_distances(pose, stacked, self.config.lambda_rot)
@@ -102,42 +207,34 @@ class TopoMetricMap(MapContents):
         return neighbours
 
     @cached_property
-    def _rows(self) -> dict[int, int]:
-        return {summary.node_id: row for row, summary in enumerate(self.summaries)}
+    def _rows(self) -> dict[NodeId, Row]:
+        return {summary.node_id: Row(row) for row, summary in enumerate(self.summaries)}
 
-    def with_feature_type(self, kind: str) -> TopoMetricMap:
-        """Return the map reduced to one of its feature types, including its virtual nodes. The
-        first type returns the map itself.
-
-        Raises:
-            FeatureTypeError: the map has no features of this type.
-        """
-        if kind == self.kind:
-            return self
-        if kind not in self.other_kinds:
+    def find_layer(self, kind: str) -> Layer:
+        """Return the layer of a feature type. Raises FeatureTypeError if the map has none."""
+        if kind not in self.layers:
             raise FeatureTypeError(
                 f"the map holds no features {kind} (it holds: {', '.join(self.kinds)})"
             )
-        return replace(
-            self,
-            nodes=self.other_kinds[kind],
-            config=replace(
-                self.config, features=self.config.feature_config_for(kind), other_kinds=()
-            ),
-            shared_errors=self.other_shared_errors.get(kind),
-            sides=self.sides if self.sides is not None and self.sides.is_used_with(kind) else None,
-            other_kinds={},
-            other_shared_errors={},
-        )
+        return self.layers[kind]
+
+    def with_first_layer(self, **changes: Any) -> TopoMetricMap:
+        """Return the map with fields of its first layer changed."""
+        first = replace(self.first_layer, **changes)
+        return replace(self, layers={**self.layers, self.kind: first})
 
     def save(self, path: str | Path) -> None:
         """Write the map file atomically. Raises MapError."""
+        from topoloc.mapping.map_writing import save_map
+
         save_map(self, Path(path))
 
     @staticmethod
     def load(path: str | Path) -> TopoMetricMap:
         """Open a map file. Nodes are read when accessed. Raises MapError, MapVersionError."""
-        return _wrap_contents(open_map(Path(path)))
+        from topoloc.mapping.map_reading import open_map
+
+        return open_map(Path(path))
 
     def close(self) -> None:
         """Close the file if the map was loaded. Later reads raise MapError."""
@@ -164,80 +261,6 @@ class TopoMetricMap(MapContents):
     def __reduce__(self) -> Any:
         if self.file is None:
             return super().__reduce__()
-        return _reload_map, (str(self.file.path.absolute()), self.file.digest)
+        from topoloc.mapping.map_reading import open_map
 
-
-def _reload_map(path: str, digest: str) -> TopoMetricMap:
-    """Open the map of a pickle. Raises MapError if the file was replaced."""
-    return _wrap_contents(open_map(Path(path), digest))
-
-
-def _wrap_contents(read: tuple[MapContents, MapFile]) -> TopoMetricMap:
-    contents, file = read
-    topomap = TopoMetricMap(**vars(contents))
-    topomap.__dict__["_opened"] = file  # not a field, so that a changed copy has no file
-    return topomap
-
-
-def open_map_coarse_localizer(topomap: TopoMetricMap, name: str) -> CoarseLocalizer:
-    """Open a map's coarse localizer, which identifies nodes by row.
-
-    If the sessions have several illuminations, descriptor localizers reduce the weight of
-    differences between these.
-
-    Raises:
-        MapError: the map has no localizer of this name, or it is damaged.
-    """
-    if (of_kind := f"{name}@{topomap.kind}") in topomap.coarse_models:
-        name = of_kind
-    if name not in topomap.coarse_models:
-        available = ", ".join(name for name in topomap.coarse_models if "@" not in name) or "none"
-        raise MapError(f"the map has no coarse localizer {name!r} (it has: {available})")
-    coarse = open_coarse_localizer(
-        node_ids_to_rows(
-            topomap.coarse_models[name], [summary.node_id for summary in topomap.summaries]
-        )
-    )
-    lights = (
-        find_node_illumination_groups(topomap.summaries, topomap.sessions)
-        if len(topomap.sessions) > 1
-        else None
-    )
-    return (
-        coarse.suppress_group_differences(lights)
-        if isinstance(coarse, DescriptorLocalizer) and lights is not None and lights.any()
-        else coarse
-    )
-
-
-def node_ids_to_rows(model: CoarseModel, ids: Sequence[int]) -> CoarseModel:
-    """Return a stored model with the ids of its nodes replaced by rows. Descriptors of other nodes
-    are removed."""
-    known = model.arrays.get("node_ids", _output_node_ids(model))
-    if known is None or known.ndim != 1 or known.dtype.kind not in "iu":
-        return model  # opening the model reports the error
-    if list(ids) == list(range(len(ids))) and (
-        len(known) == 0 or 0 <= known.min() <= known.max() < len(ids)
-    ):
-        return model
-    rows = {node_id: row for row, node_id in enumerate(ids)}
-    of_known = np.array([rows.get(int(node_id), -1) for node_id in known], np.int64)
-    if "vectors" not in model.arrays:  # one output per node
-        return replace(model, arrays={**model.arrays, "node_ids": of_known})
-    kept = of_known >= 0
-    if not kept.any():
-        raise MapError(f"the map's coarse localizer {model.name!r} knows none of its nodes")
-    per_vector = {
-        name: model.arrays[name][kept]
-        for name in ("vectors", "centres", "cell_vectors")
-        if len(model.arrays.get(name, ())) == len(kept)
-    }
-    return replace(model, arrays={**model.arrays, **per_vector, "node_ids": of_known[kept]})
-
-
-def _output_node_ids(model: CoarseModel) -> np.ndarray | None:
-    """Return the node ids of a model with one output per node, in the order of ids."""
-    num_nodes = model.settings.get("num_nodes")
-    return (
-        np.arange(num_nodes) if isinstance(num_nodes, int) and 0 <= num_nodes <= 1_000_000 else None
-    )
+        return open_map, (self.file.path.absolute(), self.file.digest)

@@ -11,42 +11,27 @@ gives a pose (`localization/walls/`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from topoloc.bounds import AtLeast
 from topoloc.disk_list import DiskList
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.mapping.nodes import NodeConfig, select_node_frames
+from topoloc.node_ids import NodeId, Row
 from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
-from topoloc.retrieval.vlad import (
-    SurfVlad,
-    VladConfig,
-    append_positions,
-    learn_words_from_parts,
-    vlad,
-)
-
-
-@dataclass(frozen=True)
-class VirtualNodesConfig:
-    """Configure which nodes have virtual nodes."""
-
-    spacing: Annotated[float, AtLeast(0)] = 3.0
-    """Nodes are selected by Eq. 1 with this many times the map's D_thresh and half the weight of
-    rotation. 0 creates no virtual nodes."""
+from topoloc.retrieval.coarse import VladConfig
+from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
 
 def select_virtual_view_nodes(
     world_from_nodes: list[Rigid3], node_config: NodeConfig, spacing: float
-) -> set[int]:
+) -> set[Row]:
     """Return the rows of the poses that need virtual views. `node_config` (of the map) must be
     resolved. `spacing` is that of `VirtualNodesConfig`."""
     # A node needs no virtual nodes if another node within this many D_thresh looks in the
@@ -66,7 +51,7 @@ def select_virtual_view_nodes(
         return bool((near & (axes @ axes[k] < -0.7)).any())
 
     return {
-        int(k)
+        Row(int(k))
         for k in select_node_frames(world_from_nodes, spaced)
         if not has_opposite_node(int(k))
     }
@@ -99,7 +84,8 @@ def collect_virtual_nodes(described: Sequence[TopoNode], kind: str) -> VirtualNo
     if len(described) == 0:
         return None
     nodes = DiskList(
-        replace(node, summary=replace(node.summary, node_id=k)) for k, node in enumerate(described)
+        replace(node, summary=replace(node.summary, node_id=NodeId(k)))
+        for k, node in enumerate(described)
     )
     model = _fit_vlad(nodes).to_model()
     model = replace(

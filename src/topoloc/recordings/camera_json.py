@@ -9,11 +9,11 @@ from typing import Any
 
 from msgspec import Struct
 
-from topoloc.errors import CalibrationError, TrajectoryError
+from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Finite, Positive, decode_json
+from topoloc.json_data import Positive, decode_json
 from topoloc.recordings.text_files import read_text
 
 FILE_NAME = "camera.json"
@@ -50,7 +50,7 @@ def read_camera_json(path: Path) -> CameraCalibration:
         else:
             rig = data.stereo_rig()
             camera = rig.left
-    except (CalibrationError, TrajectoryError) as error:
+    except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
     return CameraCalibration(camera, rig, data.depth_factor)
 
@@ -62,10 +62,10 @@ class _CameraFile(Struct, frozen=True):
     baseline: Positive | None = None
     left: dict[str, Any] | None = None
     right: dict[str, Any] | None = None
-    right_from_left: list[list[Finite]] | None = None
+    right_from_left: Rigid3 | None = None
 
     def stereo_rig(self) -> StereoRig:
-        """Return the stereo pair. Raises CalibrationError or TrajectoryError."""
+        """Return the stereo pair. Raises CalibrationError."""
         if self.left is None or self.right is None or self.right_from_left is None:
             raise CalibrationError(
                 'a stereo pair has "left", "right" and "right_from_left" (4x4, metres)'
@@ -73,5 +73,5 @@ class _CameraFile(Struct, frozen=True):
         return StereoRig(
             Camera.from_json(self.left, "left"),
             Camera.from_json(self.right, "right"),
-            Rigid3.from_matrix(self.right_from_left),
+            self.right_from_left,
         )

@@ -357,3 +357,22 @@ def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
             f"{path}: {shape[1]}x{shape[0]} pixels, but its camera is of"
             f" {camera.width}x{camera.height}"
         )
+
+
+def find_source_path(sequence: StereoSequence) -> str | None:
+    """Return the folder or file of a sequence, or None."""
+    while isinstance(sequence, SequenceView):
+        sequence = sequence.base
+    return str(sequence.root) if isinstance(sequence, Recording) else None
+
+
+def find_pose_source(sequence: StereoSequence) -> str:
+    """Return `truth` if the poses are the recording's own, else `given`."""
+    if isinstance(sequence, SequenceView):
+        before = sequence.base.poses
+        is_same = all(
+            pose is before[index]
+            for index, pose in zip(sequence.indices, sequence.poses, strict=True)
+        )
+        return find_pose_source(sequence.base) if is_same else "given"
+    return "truth" if isinstance(sequence, Recording) else "given"

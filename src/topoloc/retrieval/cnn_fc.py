@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from topoloc.errors import MapError
 from topoloc.features.features import Features
+from topoloc.node_ids import Row
 from topoloc.retrieval.backbones import Backbone, has_wide_classifier
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, read_setting
 from topoloc.retrieval.inference import Predictor, load_network_weights
@@ -98,7 +99,7 @@ class CnnFc:
             outputs = np.argsort(-row, kind="stable")
             outputs = outputs[self._rows[outputs] >= 0][:num_candidates]
             ranked.append(
-                [NodeScore(int(self._rows[output]), float(row[output])) for output in outputs]
+                [NodeScore(Row(int(self._rows[output])), float(row[output])) for output in outputs]
             )
         return ranked
 

@@ -9,14 +9,15 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from topoloc.bounds import parse_value
+from topoloc.bounds import AtLeast, Between, parse_value
 from topoloc.errors import ConfigError, MapError, MissingExtraError
 from topoloc.features.features import Features
+from topoloc.node_ids import Row
 
 CoarseName = Literal["surf-vlad", "cnn-fc", "cnn-nn", "vlad-nn"]
 COARSE_NAMES: tuple[CoarseName, ...] = get_args(CoarseName)
@@ -26,15 +27,26 @@ Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True)
+class VladConfig:
+    """Hold the settings of surf-vlad."""
+
+    num_words: Annotated[int, Between(1, 65_536)] = 64
+    """Visual words of the vocabulary."""
+    position_weight: Annotated[float | None, AtLeast(0)] = None
+    """Distance that opposite image borders add between two descriptors (of length 1). 0 ignores
+    positions. Unset: the default of the feature type."""
+    dimension: Annotated[int, Between(1, 65_536)] = 128
+    """Maximum length of a global descriptor after PCA."""
+    seed: Annotated[int, Between(0, 1_000_000_000)] = 0
+    """Seed of the vocabulary."""
+
+
+@dataclass(frozen=True)
 class NodeScore:
-    """Hold a candidate node and its score. Higher is better. Scores are comparable within one
-    localizer only.
+    """Hold the row of a candidate node in the open map and its score. Higher is better. Scores are
+    comparable within one localizer only."""
 
-    `node_id` is the node's id in results. Within a query it is the node's row in the open map
-    (`CoarseLocalizer.rank`).
-    """
-
-    node_id: int
+    row: Row
     score: float
 
 
@@ -119,14 +131,15 @@ def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
         MapError: the model is damaged, or this version does not support it.
         MissingExtraError: the model needs torch, which is not installed.
     """
-    name = model.name.partition("@")[0]  # the feature type may follow
-    if name not in COARSE_NAMES:
+    if model.name not in COARSE_NAMES:
         raise MapError(
             f"the map's coarse localizer {model.name!r} is not known to this version (known:"
             f" {', '.join(COARSE_NAMES)})"
         )
     try:
-        return importlib.import_module(f"topoloc.retrieval.{_MODULES[name]}").open_model(model)
+        return importlib.import_module(f"topoloc.retrieval.{_MODULES[model.name]}").open_model(
+            model
+        )
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise

@@ -12,6 +12,7 @@ import faiss
 import numpy as np
 from jaxtyping import Float32, Int
 
+from topoloc.node_ids import Row
 from topoloc.retrieval.coarse import NodeScore
 from topoloc.retrieval.descriptor_kernels import multiply_rows
 
@@ -33,17 +34,17 @@ class DescriptorIndex:
 
     Args:
         vectors: (n, d) unit vectors, one per mapping image.
-        node_ids: (n,) the node of each image.
+        node_rows: (n,) the row of each image's node.
         max_exact: maximum number of vectors for the exact search.
     """
 
     def __init__(
         self,
         vectors: Float32[np.ndarray, "n d"],
-        node_ids: Int[np.ndarray, " n"],
+        node_rows: Int[np.ndarray, " n"],
         max_exact: int = MAX_EXACT_VECTORS,
     ) -> None:
-        self._node_ids = node_ids
+        self._node_rows = node_rows
         self._vectors = np.ascontiguousarray(vectors) if len(vectors) <= max_exact else None
         self._cells = (
             None
@@ -92,7 +93,7 @@ class DescriptorIndex:
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
         assert self._cells is not None
         similarities, rows = self._cells.search(
-            np.ascontiguousarray(vector[None]), min(num_images, len(self._node_ids))
+            np.ascontiguousarray(vector[None]), min(num_images, len(self._node_rows))
         )
         found = rows[0] >= 0
         return rows[0][found], similarities[0][found]
@@ -103,9 +104,9 @@ class DescriptorIndex:
         similarities: Float32[np.ndarray, " k"],
         num_candidates: int,
     ) -> list[NodeScore]:
-        _, first = np.unique(self._node_ids[rows], return_index=True)
+        _, first = np.unique(self._node_rows[rows], return_index=True)
         best = np.sort(first)[:num_candidates]
-        return [NodeScore(int(self._node_ids[rows[i]]), float(similarities[i])) for i in best]
+        return [NodeScore(Row(int(self._node_rows[rows[i]])), float(similarities[i])) for i in best]
 
 
 def _build_inverted_file(vectors: Float32[np.ndarray, "n d"]) -> Any:

@@ -24,8 +24,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from topoloc.features.features import Features
+from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.descriptor_index import Whitening
-from topoloc.retrieval.vlad import VladConfig, append_positions, vlad
+from topoloc.retrieval.vlad import append_positions, vlad
 
 _FOLDER = "vocabularies"
 

@@ -13,18 +13,17 @@ If the features have image cells, the cells contribute half of the score (`cell_
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Annotated
+from dataclasses import asdict
 
 import numpy as np
 from jaxtyping import Float32, Int
 
-from topoloc.bounds import AtLeast, Between, parse_settings
+from topoloc.bounds import parse_settings
 from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.removed_settings import drop_removed_settings
 from topoloc.retrieval.cell_grid import CellGrid
-from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array
+from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, VladConfig, model_array
 from topoloc.retrieval.descriptor_index import DescriptorIndex, learn_visual_words, learn_whitening
 from topoloc.retrieval.descriptor_kernels import add_residuals, multiply_rows
 
@@ -33,21 +32,6 @@ _MIN_GROUP_SIZE = 8  # minimum number of images for a meaningful mean vector
 # Fraction of the group differences that is removed. Removing all costs more if every group covers
 # the whole place (docs/journal/retrieval.md).
 _SUPPRESSED_SHARE = 0.5
-
-
-@dataclass(frozen=True)
-class VladConfig:
-    """Hold the settings of surf-vlad."""
-
-    num_words: Annotated[int, Between(1, 65_536)] = 64
-    """Visual words of the vocabulary."""
-    position_weight: Annotated[float | None, AtLeast(0)] = None
-    """Distance that opposite image borders add between two descriptors (of length 1). 0 ignores
-    positions. Unset: the default of the feature type."""
-    dimension: Annotated[int, Between(1, 65_536)] = 128
-    """Maximum length of a global descriptor after PCA."""
-    seed: Annotated[int, Between(0, 1_000_000_000)] = 0
-    """Seed of the vocabulary."""
 
 
 class SurfVlad:
@@ -170,7 +154,7 @@ class SurfVlad:
         Groups of fewer than eight images are ignored, because their mean is too uncertain.
 
         Args:
-            group_of_node: the group of each node, indexed by the numbers in `node_ids`.
+            group_of_node: the group of each node, by row.
         """
         groups = group_of_node[self._node_ids]
         numbers, counts = np.unique(groups, return_counts=True)

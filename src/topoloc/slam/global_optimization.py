@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.transform_consensus import diagonal_covariance
 from topoloc.slam.bundle_adjustment import adjust_bundle
 from topoloc.slam.keyframes import KeyFrame, Landmarks, Observations
 from topoloc.slam.loop_closure import Link
@@ -105,7 +106,7 @@ def _motion_edge(keyframe: KeyFrame, index: dict[int, int]) -> Edge:
     source = keyframe.motion.source
     motion = keyframe.cam_from_world @ source.cam_from_world.inverse()
     metres = sigma_share * float(np.linalg.norm(motion.translation)) + 1e-3
-    covariance = keyframe.motion.covariance + _diagonal_covariance(metres, sigma_deg)
+    covariance = keyframe.motion.covariance + diagonal_covariance(metres, sigma_deg)
     return Edge(index[id(source)], index[id(keyframe)], motion, covariance, is_loop=False)
 
 
@@ -115,12 +116,8 @@ def _link_edge(link: Link) -> Edge:
     covariance_scale = 4.0
     sigma = 0.01  # sigma of a link, metres, in addition to that of PnP
     sigma_deg = 0.1  # sigma of a link, degrees, in addition to that of PnP
-    covariance = covariance_scale * link.match.covariance + _diagonal_covariance(sigma, sigma_deg)
+    covariance = covariance_scale * link.match.covariance + diagonal_covariance(sigma, sigma_deg)
     return Edge(link.source, link.target, link.match.target_from_source, covariance, is_loop=True)
-
-
-def _diagonal_covariance(metres: float, degrees: float) -> np.ndarray:
-    return np.diag(np.square([metres] * 3 + [np.deg2rad(degrees)] * 3))
 
 
 def _move_keyframes(
@@ -159,7 +156,6 @@ def _add_link_landmarks(
 ) -> None:
     source = keyframes[link.source]
     place = source.place
-    assert place is not None
     for source_row, target_row in zip(
         link.match.source_rows.tolist(), link.match.target_rows.tolist(), strict=True
     ):
@@ -180,7 +176,6 @@ def _feature_observation(keyframe: KeyFrame, row: int, landmark_id: int) -> Obse
     """Return a local feature as an observation: its pixel, and its disparity if it has a depth."""
     sigma_px = 0.8  # standard deviation of a feature's pixel in the global bundle adjustment
     place, stereo = keyframe.place, keyframe.stereo
-    assert place is not None
     measured = np.array([[*place.features.points_img[row].astype(np.float64), np.nan]])
     weights = np.full((1, 3), 1.0 / sigma_px)
     weights[0, 2] = 0.0

@@ -126,14 +126,15 @@ class KeyFrame:
         return self.place_idx is not None or self.pending_place is not None
 
     @property
-    def place(self) -> PlaceFeatures | None:
-        """Return the place features, None if there are none.
+    def place(self) -> PlaceFeatures:
+        """Return the place features, which must exist.
 
         It waits for the extraction if that is still running (`pending_place`).
         """
         if self.pending_place is not None:
             self.place, self.pending_place = self.pending_place.result(), None
-        return None if self.place_idx is None else self.places[self.place_idx]
+        assert self.place_idx is not None, "a key frame without place features"
+        return self.places[self.place_idx]
 
     @place.setter
     def place(self, view: PlaceFeatures) -> None:

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from topoloc.disk_list import DiskList
-from topoloc.features.features import Features
 from topoloc.features.parallel import parallel_map
-from topoloc.geometry.rigid import Rigid3
-from topoloc.retrieval.vlad import SurfVlad, VladConfig, learn_words_from_parts, vlad
+from topoloc.retrieval.coarse import VladConfig
+from topoloc.retrieval.vlad import SurfVlad, learn_words_from_parts, vlad
 from topoloc.slam.keyframes import KeyFrame
 from topoloc.slam.place_matching import PlaceMatch, match_places
 
@@ -44,7 +43,7 @@ def find_links(
     proposals = _propose_pairs(keyframes, places)
     links = []
     for done, link in enumerate(
-        parallel_map(lambda pair: _match_keyframes(pair[1], pair[0], keyframes), proposals)
+        parallel_map(lambda pair: match_keyframes(pair[1], pair[0], keyframes), proposals)
     ):
         if link is not None:
             links.append(link)
@@ -97,27 +96,21 @@ def rank_places(keyframes: Sequence[KeyFrame], num: int | None = None) -> Iterat
     Each key frame must have place features. Nothing is generated if there are no features at all.
     """
     config = VladConfig(num_words=32, position_weight=0.0)
-
-    def features(row: int) -> Features:
-        place = keyframes[row].place
-        assert place is not None
-        return place.features
-
-    num_features = [len(features(row)) for row in range(len(keyframes))]
+    num_features = [len(keyframe.place.features) for keyframe in keyframes]
     if sum(num_features) == 0:
         return
-    words = learn_words_from_parts(num_features, lambda row: features(row).descriptors, config)
+    words = learn_words_from_parts(
+        num_features, lambda row: keyframes[row].place.features.descriptors, config
+    )
     vlads = DiskList(
-        (vlad(features(row).descriptors, words) for row in range(len(keyframes))), _MAX_VLAD_BYTES
+        (vlad(keyframe.place.features.descriptors, words) for keyframe in keyframes),
+        _MAX_VLAD_BYTES,
     )
-    localizer, blank = (
-        SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config),
-        np.zeros((1, 1), np.uint8),
-    )
-    for row in range(len(keyframes)):
-        yield [
-            score.node_id for score in localizer.rank(blank, features(row), num or len(keyframes))
-        ]
+    localizer = SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config)
+    blank = np.zeros((1, 1), np.uint8)
+    for keyframe in keyframes:
+        scores = localizer.rank(blank, keyframe.place.features, num or len(keyframes))
+        yield [score.row for score in scores]
 
 
 def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
@@ -125,11 +118,11 @@ def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
     source, target = keyframes[link.source], keyframes[link.target]
     if source.submap != target.submap:
         return source.recording != target.recording or is_reachable(link, keyframes)
-    max_drift = _max_drift(keyframes, link.source, link.target)
-    drift = _pose_difference(
-        link.match.target_from_source, target.cam_from_world @ source.cam_from_world.inverse()
+    return link.match.target_from_source.is_same(
+        target.cam_from_world @ source.cam_from_world.inverse(),
+        0.5 + _max_drift(keyframes, link.source, link.target),
+        np.deg2rad(max_drift_deg),
     )
-    return bool(drift[0] < 0.5 + max_drift and drift[1] < np.deg2rad(max_drift_deg))
 
 
 def is_reachable(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
@@ -211,7 +204,7 @@ def _has_rival(link: Link, keyframes: Sequence[KeyFrame], places: list[int]) -> 
         if i not in (link.source, link.target)
         and keyframes[i].submap == keyframes[link.source].submap
     ):
-        match = _match_keyframes(source, link.target, keyframes)
+        match = match_keyframes(source, link.target, keyframes)
         if (
             match is not None
             and _is_within_drift(match, keyframes)
@@ -221,11 +214,16 @@ def _has_rival(link: Link, keyframes: Sequence[KeyFrame], places: list[int]) -> 
     return False
 
 
-def _match_keyframes(source: int, target: int, keyframes: Sequence[KeyFrame]) -> Link | None:
-    a, b = keyframes[source].place, keyframes[target].place
-    assert a is not None
-    assert b is not None
-    match = match_places(a, b, keyframes[target].stereo)
+def match_keyframes(
+    source: int,
+    target: int,
+    keyframes: Sequence[KeyFrame],
+    min_inliers: int = 25,
+    min_inlier_share: float = 0.35,
+) -> Link | None:
+    """Link two key frames by their matches. None if too few of them agree (`match_places`)."""
+    a, b = keyframes[source], keyframes[target]
+    match = match_places(a.place, b.place, b.stereo, min_inliers, min_inlier_share)
     return None if match is None else Link(source, target, match)
 
 
@@ -269,13 +267,8 @@ def _are_consistent(
         + np.linalg.norm(targets.translation)
         + np.linalg.norm(expected.translation)
     )
-    metres, radians = _pose_difference(link.match.target_from_source, expected)
-    return bool(
-        metres < max_disagreement * (1.0 + way) + drift
-        and radians < np.deg2rad(max_disagreement_deg)
+    return link.match.target_from_source.is_same(
+        expected,
+        max_disagreement * (1.0 + way) + drift,
+        np.deg2rad(max_disagreement_deg),
     )
-
-
-def _pose_difference(a: Rigid3, b: Rigid3) -> tuple[float, float]:
-    """Return the difference in metres and radians."""
-    return float(np.linalg.norm(a.translation - b.translation)), (a @ b.inverse()).angle()

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.matching import match_features
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera

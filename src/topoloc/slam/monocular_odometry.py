@@ -22,16 +22,15 @@ from topoloc.points.point_tracking import find_corners, track_points
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.frame_preparation import undistort_frame
 from topoloc.slam.bundle_adjustment import adjust_bundle, adjust_window
+from topoloc.slam.frame_tracker import FrameTracker
 from topoloc.slam.keyframes import (
-    DisparityBias,
     FramePose,
     KeyFrame,
     Landmarks,
     Motion,
     Observations,
 )
-from topoloc.slam.motion_prediction import MotionHistory
-from topoloc.slam.step_estimation import LastFrame, Step, StepEstimator, Tracks, is_keyframe_due
+from topoloc.slam.step_estimation import LastFrame, Step, Tracks
 from topoloc.slam.triangulation import is_well_triangulated, triangulate_points
 
 _PATCH_HALF_PX = 7
@@ -64,20 +63,14 @@ class _Initialization:
     tracks: Tracks
 
 
-class MonocularOdometry:
+class MonocularOdometry(FrameTracker):
     """Hold the state of one recording's odometry. `submaps` holds the sub-maps so far."""
 
     def __init__(self) -> None:
-        self._landmarks, self._bias = Landmarks(), DisparityBias()
-        self._history = MotionHistory()
+        super().__init__(Landmarks(), min_tracked=15, patch_half_px=_PATCH_HALF_PX)
         self.submaps: list[MonocularSubmap] = []
         self._initialization: _Initialization | None = None
-        self._reference: KeyFrame | None = None
-        self._reference_image: Float32[np.ndarray, "h w"] = np.zeros((0, 0), np.float32)
-        self._last_frame: LastFrame | None = None
-        self._tracks, self._untriangulated = _empty_tracks(), _empty_tracks()
-        self._recent_keyframes: list[KeyFrame] = []
-        self._num_lost = 0
+        self._untriangulated = Tracks.empty()
 
     def process(self, frame_idx: int, frame: StereoFrame) -> None:
         """Process the next frame."""
@@ -113,12 +106,7 @@ class MonocularOdometry:
             left = len(tracks.landmark_ids) / max(len(self._initialization.tracks.landmark_ids), 1)
             self._initialization.frames.append((frame_idx, frame, measured, tracks))
             if left >= min_share and len(self._initialization.frames) <= max_frames:
-                moved = (
-                    np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
-                    if len(tracks.landmark_ids)
-                    else 0.0
-                )
-                if moved > min_motion * measured.view.camera.width:
+                if tracks.median_motion_px() > min_motion * measured.view.camera.width:
                     self._start_submap(self._initialization)
                 return
         corners = _find_corners(measured, np.zeros((0, 2)))
@@ -206,7 +194,7 @@ class MonocularOdometry:
             pose = Rigid3.identity()
         else:
             of_it = tracks.select(np.isin(tracks.landmark_ids, known))
-            found = self._make_step_estimator(
+            found = self._step_estimator(
                 LastFrame(measured, first.cam_from_world), first, of_it, measured
             ).estimate_pose(of_it)
             if found is None:
@@ -221,63 +209,36 @@ class MonocularOdometry:
 
     def _track_frame(self, frame_idx: int, frame: StereoFrame, measured: MeasuredView) -> bool:
         """Track the points into the frame and add its pose. Return False if it fails."""
-        step = self._estimate_step(frame, measured)
-        if step is None or self._last_frame is None or self._reference is None:
+        last, reference = self._last_frame, self._reference
+        prediction = self._history.predict(frame.t_ns)
+        if last is None or reference is None or prediction is None:
             return False
-        untriangulated = self._make_step_estimator(
-            self._last_frame, self._reference, self._untriangulated, measured
-        ).track_points(step.cam_from_world)
-        self._tracks, self._untriangulated = step.tracks, untriangulated
+        step_estimator = self._step_estimator(last, reference, self._tracks, measured)
+        step = step_estimator.estimate_step(
+            prediction.cam_from_world
+        ) or step_estimator.estimate_step(last.cam_from_world)
+        if step is None:
+            return False
+        self._tracks, self._untriangulated = (
+            step.tracks,
+            self._step_estimator(last, reference, self._untriangulated, measured).track_points(
+                step.cam_from_world
+            ),
+        )
         self._update_last_frame(frame.t_ns, measured, step.cam_from_world)
-        if is_keyframe_due(self._tracks, self._reference, measured):
-            self._add_keyframe(frame_idx, frame, measured, step)
-        relative = self._last_frame.cam_from_world @ self._reference.cam_from_world.inverse()
+        relative = step.cam_from_world @ reference.cam_from_world.inverse()
+        if self._is_keyframe_due(reference, measured):
+            reference = self._add_keyframe(frame_idx, frame, measured, step)
+            relative = Rigid3.identity()
         self.submaps[-1].frames.append(
-            FramePose(frame_idx, self._reference, relative, measured.view.view_from_cam)
+            FramePose(frame_idx, reference, relative, measured.view.view_from_cam)
         )
         return True
 
-    def _estimate_step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
-        prediction = self._history.predict(frame.t_ns)
-        assert self._last_frame is not None
-        assert self._reference is not None
-        step_estimator = self._make_step_estimator(
-            self._last_frame, self._reference, self._tracks, measured
-        )
-        predicted = (
-            prediction.cam_from_world if prediction is not None else self._last_frame.cam_from_world
-        )
-        return step_estimator.estimate_step(predicted) or step_estimator.estimate_step(
-            self._last_frame.cam_from_world
-        )
-
-    def _make_step_estimator(
-        self, last: LastFrame, reference: KeyFrame, tracks: Tracks, measured: MeasuredView
-    ) -> StepEstimator:
-        return StepEstimator(
-            last,
-            reference,
-            self._reference_image,
-            tracks,
-            self._landmarks,
-            measured,
-            min_tracked=15,
-            patch_half_px=_PATCH_HALF_PX,
-        )
-
-    def _update_last_frame(self, t_ns: int, measured: MeasuredView, cam_from_world: Rigid3) -> None:
-        moved = (
-            cam_from_world @ self._last_frame.cam_from_world.inverse()
-            if self._last_frame is not None
-            else None
-        )
-        self._history.add_pose(t_ns, cam_from_world, moved)
-        self._last_frame = LastFrame(measured, cam_from_world)
-
     def _add_keyframe(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView, step: Step
-    ) -> None:
-        """Add the frame as a key frame.
+    ) -> KeyFrame:
+        """Add the frame as a key frame and return it.
 
         Triangulated points become landmarks, new corners are added as untriangulated points, and
         the window is adjusted.
@@ -293,7 +254,7 @@ class MonocularOdometry:
         seen = self._make_observations(
             _concatenate_tracks(tracks, untriangulated, fresh), len(tracks.landmark_ids)
         )
-        motion = Motion(self._reference, step.covariance) if self._reference is not None else None
+        motion = Motion(step.reference, step.covariance)
         keyframe = self._make_keyframe(
             frame_idx, frame.t_ns, measured, step.cam_from_world, seen, motion
         )
@@ -307,6 +268,7 @@ class MonocularOdometry:
             np.flatnonzero(np.isfinite(self._landmarks.positions[still.landmark_ids]).all(axis=1))
         )
         self._set_reference_keyframe(keyframe, measured, _concatenate_tracks(still, fresh))
+        return keyframe
 
     def _triangulate_tracks(
         self, ids: Int[np.ndarray, " n"], min_rays: int
@@ -398,16 +360,10 @@ class MonocularOdometry:
     def _set_reference_keyframe(
         self, keyframe: KeyFrame, measured: MeasuredView, untriangulated: Tracks
     ) -> None:
-        seen = keyframe.observations
-        points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
-        self._tracks = Tracks.from_points(seen.landmark_ids[seen.active], points)
+        self._set_reference(keyframe, measured)
         self._untriangulated = Tracks.from_points(
             untriangulated.landmark_ids, untriangulated.points_img
         )
-        self._reference, self._reference_image = keyframe, measured.left
-        if self._last_frame is not None:
-            self._last_frame.cam_from_world = keyframe.cam_from_world
-            self._history.update_last_pose(keyframe.cam_from_world)
 
 
 def _make_view(frame: StereoFrame, max_side_px: int) -> MeasuredView:
@@ -434,7 +390,3 @@ def _concatenate_tracks(*tracks: Tracks) -> Tracks:
             for columns in zip(*(vars(each).values() for each in tracks), strict=True)
         )
     )
-
-
-def _empty_tracks() -> Tracks:
-    return Tracks.from_points(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))

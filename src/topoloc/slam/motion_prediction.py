@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topoloc.geometry.alignment import normalized_pose_error
 from topoloc.geometry.rigid import Rigid3
 
 
@@ -33,10 +34,8 @@ class Prediction:
 
     def distance(self, cam_from_world: Rigid3) -> float:
         """Return the distance of a pose from the prediction, in sigma."""
-        away = cam_from_world @ self.cam_from_world.inverse()
-        return float(
-            max(np.linalg.norm(away.translation) / self.sigma, away.angle() / self.sigma_rad)
-        )
+        poses = self.cam_from_world.inverse(), cam_from_world.inverse()
+        return normalized_pose_error(*poses, self.sigma, self.sigma_rad)
 
 
 def select_expected_pose(prediction: Prediction | None, poses: Sequence[Rigid3]) -> Rigid3 | None:

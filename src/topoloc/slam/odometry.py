@@ -24,9 +24,9 @@ from topoloc.points.disparity import MeasuredView, measure_disparities, measured
 from topoloc.points.point_tracking import find_corners
 from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.bundle_adjustment import adjust_window
+from topoloc.slam.frame_tracker import FrameTracker
 from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import (
-    DisparityBias,
     FramePose,
     KeyFrame,
     Landmarks,
@@ -34,15 +34,15 @@ from topoloc.slam.keyframes import (
     Observations,
     PlaceFeatures,
 )
-from topoloc.slam.motion_prediction import MotionHistory, select_expected_pose
+from topoloc.slam.motion_prediction import select_expected_pose
 from topoloc.slam.place_matching import extract_place_features, match_places
-from topoloc.slam.step_estimation import LastFrame, Step, StepEstimator, Tracks, is_keyframe_due
+from topoloc.slam.step_estimation import Step, Tracks
 
 # bytes of about 80 places in memory, because matching two takes ten times as long as reading one
 _MAX_PLACE_BYTES = 16_000_000
 
 
-class Odometry:
+class Odometry(FrameTracker):
     """Hold the state of one recording's odometry.
 
     `keyframes` and `landmarks` are shared by all recordings, and this class adds to them.
@@ -55,20 +55,12 @@ class Odometry:
         landmarks: Landmarks,
         checks: InputChecks,
     ):
-        self._recording, self._keyframes, self._landmarks = recording, keyframes, landmarks
-        self._checks = checks
-        self._last_frame: LastFrame | None = None
-        self._reference: KeyFrame | None = None
-        self._reference_image: np.ndarray = np.zeros((0, 0), np.float32)
-        self._tracks = Tracks.from_points(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
-        self._recent_keyframes: list[KeyFrame] = []  # key frames since tracking last started
-        self._num_lost = 0
+        super().__init__(landmarks, min_tracked=25, patch_half_px=5)
+        self._recording, self._keyframes, self._checks = recording, keyframes, checks
         self._lost_frames: list[
             tuple[int, StereoFrame]
         ] = []  # frames since the camera was lost, which may start a sub-map
-        self._history = MotionHistory()
         self._repeated_motions: list[Rigid3] = []  # of the last frame before the camera was lost
-        self._bias = DisparityBias()
         self._place_features = DiskList[PlaceFeatures](max_bytes=_MAX_PLACE_BYTES)
         self._place_executor = ThreadPoolExecutor(1, initializer=mark_worker_thread)
         self._pending_keyframe: KeyFrame | None = None
@@ -106,19 +98,14 @@ class Odometry:
             return None
         self._num_lost, self._lost_frames = 0, []
         self._tracks = step.tracks
-        self._update_last_frame(frame, measured, step.cam_from_world)
-        assert self._reference is not None
-        cam_from_keyframe = step.cam_from_world @ self._reference.cam_from_world.inverse()
-        if is_keyframe_due(self._tracks, self._reference, measured):
-            self._add_keyframe(
-                frame,
-                frame_idx,
-                step.cam_from_world,
-                measured,
-                Motion(self._reference, step.covariance),
-            )
-            cam_from_keyframe = Rigid3.identity()
-        return FramePose(frame_idx, self._reference, cam_from_keyframe, measured.view.view_from_cam)
+        self._update_last_frame(frame.t_ns, measured, step.cam_from_world)
+        reference, cam_from_keyframe = step.reference, Rigid3.identity()
+        if self._is_keyframe_due(reference, measured):
+            motion = Motion(reference, step.covariance)
+            reference = self._add_keyframe(frame, frame_idx, step.cam_from_world, measured, motion)
+        else:
+            cam_from_keyframe = step.cam_from_world @ reference.cam_from_world.inverse()
+        return FramePose(frame_idx, reference, cam_from_keyframe, measured.view.view_from_cam)
 
     def _estimate_step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
         """Estimate the step from the last frame.
@@ -130,13 +117,8 @@ class Odometry:
         prediction = self._history.predict(frame.t_ns)
         if self._last_frame is None or self._reference is None or prediction is None:
             return None
-        step_estimator = StepEstimator(
-            self._last_frame,
-            self._reference,
-            self._reference_image,
-            self._tracks,
-            self._landmarks,
-            measured,
+        step_estimator = self._step_estimator(
+            self._last_frame, self._reference, self._tracks, measured
         )
         step = step_estimator.estimate_step(
             prediction.cam_from_world
@@ -170,17 +152,6 @@ class Odometry:
         """Return all poses that look the same in a repetitive place."""
         return [cam_from_world, *(repeat @ cam_from_world for repeat in self._repeated_motions)]
 
-    def _update_last_frame(
-        self, frame: StereoFrame, measured: MeasuredView, cam_from_world: Rigid3
-    ) -> None:
-        moved = (
-            cam_from_world @ self._last_frame.cam_from_world.inverse()
-            if self._last_frame is not None
-            else None
-        )
-        self._history.add_pose(frame.t_ns, cam_from_world, moved)
-        self._last_frame = LastFrame(measured, cam_from_world)
-
     def _add_keyframe(
         self,
         frame: StereoFrame,
@@ -188,8 +159,8 @@ class Odometry:
         cam_from_world: Rigid3,
         measured: MeasuredView,
         motion: Motion | None,
-    ) -> None:
-        """Add the frame as a key frame.
+    ) -> KeyFrame:
+        """Add the frame as a key frame and return it.
 
         Disparities are measured, landmarks are added and the window is adjusted. Tracking then
         continues from this frame.
@@ -226,10 +197,11 @@ class Odometry:
         self._keyframes.append(keyframe)
         self._recent_keyframes.append(keyframe)
         adjust_window(self._recent_keyframes, self._landmarks, 8, 5, max_steps=6)
-        self._set_reference_keyframe(keyframe, measured)
+        self._set_reference(keyframe, measured)
         self._checks.check_keyframe(keyframe, self._landmarks, measured)
         if self._is_new_place(keyframe):
             self._submit_place_extraction(keyframe, measured)
+        return keyframe
 
     def _make_observations(
         self, ids: np.ndarray, values: np.ndarray, sigmas: np.ndarray
@@ -241,15 +213,6 @@ class Odometry:
 
     def _next_submap(self) -> int:
         return self._keyframes[-1].submap + 1 if self._keyframes else 0
-
-    def _set_reference_keyframe(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
-        seen = keyframe.observations
-        points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
-        self._tracks = Tracks.from_points(seen.landmark_ids[seen.active], points)
-        self._reference, self._reference_image = keyframe, measured.left
-        if self._last_frame is not None:
-            self._last_frame.cam_from_world = keyframe.cam_from_world
-            self._history.update_last_pose(keyframe.cam_from_world)
 
     def _is_new_place(self, keyframe: KeyFrame) -> bool:
         # Minimum distance between key frames with place features (for loops), as a share
@@ -265,8 +228,8 @@ class Odometry:
         depth = keyframe.cam_from_world.apply(
             self._landmarks.positions[seen.landmark_ids[seen.active]]
         )[:, 2]
-        far = np.linalg.norm(motion.translation) > min_distance * np.median(depth)
-        return bool(far or motion.angle() > np.deg2rad(min_angle_deg))
+        metres = min_distance * float(np.median(depth))
+        return not motion.is_same(Rigid3.identity(), metres, np.deg2rad(min_angle_deg))
 
     def _submit_place_extraction(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
         """Extract the place features of a key frame in a background thread.
@@ -274,7 +237,7 @@ class Odometry:
         Only one extraction is pending, so that few images are in memory.
         """
         if self._pending_keyframe is not None:
-            assert self._pending_keyframe.place is not None  # waits
+            _ = self._pending_keyframe.place  # waits
         keyframe.pending_place = self._place_executor.submit(extract_place_features, measured.view)
         self._pending_keyframe = keyframe
 
@@ -349,12 +312,11 @@ class Odometry:
         """Start tracking with this frame as a key frame."""
         self._last_frame, self._recent_keyframes = None, []
         self._history.reset()
-        self._tracks = self._tracks.select(np.zeros(0, np.int64))
-        self._add_keyframe(frame, frame_idx, cam_from_world, measured, motion)
-        self._update_last_frame(frame, measured, cam_from_world)
+        self._tracks = Tracks.empty()
+        keyframe = self._add_keyframe(frame, frame_idx, cam_from_world, measured, motion)
+        self._update_last_frame(frame.t_ns, measured, cam_from_world)
         self._num_lost, self._lost_frames = 0, []
-        assert self._reference is not None
-        return FramePose(frame_idx, self._reference, Rigid3.identity(), measured.view.view_from_cam)
+        return FramePose(frame_idx, keyframe, Rigid3.identity(), measured.view.view_from_cam)
 
     def _relocalize(
         self, frame: StereoFrame, measured: MeasuredView
@@ -367,9 +329,7 @@ class Odometry:
         here = extract_place_features(measured.view)
         prediction = self._history.predict(frame.t_ns)
         for keyframe in self._last_places(num_places):
-            place = keyframe.place
-            assert place is not None
-            match = match_places(place, here, measured.stereo)
+            match = match_places(keyframe.place, here, measured.stereo)
             if match is None:
                 continue
             cam_from_world = match.target_from_source @ keyframe.cam_from_world

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
-from topoloc.geometry.alignment import nearest_rotation
+from topoloc.geometry.alignment import nearest_rotation, normalized_pose_error, rotation_error
 from topoloc.geometry.pose_conventions import (
     AXES,
     DIRECTIONS,
@@ -206,12 +206,9 @@ def evaluate_poses(
 
 
 def _is_informative(step: MeasuredStep) -> bool:
-    way = float(np.linalg.norm(step.first_from_last.translation))
-    return (
-        not step.has_scale
-        or way
-        > _MIN_TRANSLATION_RATIO * (_TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * step.median_depth)
-        or step.first_from_last.angle() > _MIN_ROTATION
+    tolerance = _TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * step.median_depth
+    return not step.has_scale or not step.first_from_last.is_same(
+        Rigid3.identity(), _MIN_TRANSLATION_RATIO * tolerance, _MIN_ROTATION
     )
 
 
@@ -227,38 +224,29 @@ def _compute_step_errors(
     informative_steps: Sequence[MeasuredStep], steps: Sequence[Rigid3]
 ) -> Float[np.ndarray, " n"]:
     """Return the error of each step relative to the measured one, in units of the tolerance."""
-    normalized_errors = []
-    for measured, step in zip(informative_steps, steps, strict=True):
-        apart, tolerated_turn = (
-            step.inverse() @ measured.first_from_last,
-            _ROTATION_TOLERANCE + _RELATIVE_TOLERANCE * measured.first_from_last.angle(),
-        )
-        normalized_errors.append(
-            max(_compute_translation_error(measured, step), apart.angle() / tolerated_turn)
-        )
-    return np.array(normalized_errors)
-
-
-def _compute_translation_error(measured: MeasuredStep, step: Rigid3) -> float:
-    """Return the translation error in units of the tolerance.
-
-    For a single camera only the direction is compared.
-    """
-    ours, theirs = measured.first_from_last.translation, step.translation
-    if not measured.has_scale:
-        length = float(np.linalg.norm(theirs))
-        return (
-            2.0
-            if length == 0.0
-            else float(np.arccos(np.clip(ours @ theirs / length, -1.0, 1.0))) / _DIRECTION_TOLERANCE
-        )
-    tolerated = (
-        _TRANSLATION_TOLERANCE
-        + _DEPTH_TOLERANCE * measured.median_depth
-        + _RELATIVE_TOLERANCE * float(np.linalg.norm(ours))
+    return np.array(
+        [
+            _compute_step_error(measured, step)
+            for measured, step in zip(informative_steps, steps, strict=True)
+        ]
     )
-    # in the first camera frame. The length is the same in the last one.
-    return float(np.linalg.norm(ours - theirs)) / tolerated
+
+
+def _compute_step_error(measured: MeasuredStep, step: Rigid3) -> float:
+    """Return the error of a step. For a single camera only the direction of the translation is
+    compared."""
+    pose, theirs = measured.first_from_last, step.translation
+    radians = _ROTATION_TOLERANCE + _RELATIVE_TOLERANCE * pose.angle()
+    if measured.has_scale:
+        metres = (
+            _TRANSLATION_TOLERANCE
+            + _DEPTH_TOLERANCE * measured.median_depth
+            + _RELATIVE_TOLERANCE * float(np.linalg.norm(pose.translation))
+        )
+        return normalized_pose_error(step, pose, metres, radians)
+    length = float(np.linalg.norm(theirs))
+    cosine = np.clip(pose.translation @ theirs / length, -1.0, 1.0) if length > 0.0 else -1.0
+    return max(math.acos(cosine) / _DIRECTION_TOLERANCE, rotation_error(step, pose) / radians)
 
 
 def _test_conventions(

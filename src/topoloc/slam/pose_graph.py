@@ -80,10 +80,10 @@ def compute_normalized_residuals(
     poses: Sequence[Rigid3], edges: Sequence[Edge]
 ) -> Float[np.ndarray, " e"]:
     """Return the length of each edge's residual, in standard deviations."""
-    lengths = np.empty(len(edges))
-    for k, edge in enumerate(edges):
-        residual = (
-            poses[edge.second] @ poses[edge.first].inverse() @ edge.second_from_first.inverse()
-        ).log()
-        lengths[k] = np.sqrt(residual @ np.linalg.solve(edge.covariance, residual))
-    return lengths
+    squares = [
+        (poses[edge.first] @ poses[edge.second].inverse()).squared_distance(
+            edge.second_from_first.inverse(), edge.covariance
+        )
+        for edge in edges
+    ]
+    return np.sqrt(squares)

@@ -40,6 +40,16 @@ class Tracks:
         """Start tracks at these points."""
         return cls(landmark_ids, points_img, points_img, np.zeros(len(points_img), np.float32))
 
+    @classmethod
+    def empty(cls) -> Tracks:
+        """Return no tracks."""
+        return cls.from_points(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+
+    def median_motion_px(self) -> float:
+        """Return the median distance from the last key frame's pixels, 0 without points."""
+        moved = np.linalg.norm(self.points_img - self.points_ref, axis=1)
+        return float(np.median(moved)) if len(moved) else 0.0
+
     def select(self, rows: np.ndarray) -> Tracks:
         """Return the given rows."""
         return Tracks(
@@ -48,16 +58,6 @@ class Tracks:
             self.points_ref[rows],
             self.sigmas_px[rows],
         )
-
-
-def is_keyframe_due(tracks: Tracks, reference: KeyFrame, measured: MeasuredView) -> bool:
-    """Return whether few points of the last key frame are left, or they moved far."""
-    min_share = 0.7  # of the last key frame's points
-    max_motion = 0.03  # median, as a share of the image width
-    if len(tracks.landmark_ids) < min_share * np.count_nonzero(reference.observations.active):
-        return True
-    motion = np.median(np.linalg.norm(tracks.points_img - tracks.points_ref, axis=1))
-    return bool(motion > max_motion * measured.view.camera.width)
 
 
 @dataclass(eq=False)
@@ -72,9 +72,11 @@ class LastFrame:
 class Step:
     """Hold a pose that enough points agree on.
 
-    `inlier_ratio` is the share of inliers among the points that should be visible.
+    `reference` is the last key frame. `inlier_ratio` is the share of inliers among the points that
+    should be visible.
     """
 
+    reference: KeyFrame
     cam_from_world: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     tracks: Tracks
@@ -95,8 +97,8 @@ class StepEstimator:
     tracks: Tracks
     landmarks: Landmarks
     measured: MeasuredView
-    min_tracked: int = 25
-    patch_half_px: int = 5
+    min_tracked: int
+    patch_half_px: int
 
     def estimate_step(self, predicted: Rigid3) -> Step | None:
         """Estimate the step from a predicted cam_from_world. None if too few points agree."""
@@ -106,7 +108,8 @@ class StepEstimator:
             return None
         should = max(int(np.count_nonzero(self._is_in_image(pose.cam_from_world))), 1)
         inlier_ratio = min(np.count_nonzero(pose.inliers) / should, 1.0)
-        return Step(pose.cam_from_world, pose.covariance, tracks.select(pose.inliers), inlier_ratio)
+        kept = tracks.select(pose.inliers)
+        return Step(self.reference, pose.cam_from_world, pose.covariance, kept, inlier_ratio)
 
     def find_repeated_motions(self, prediction: Prediction) -> list[Rigid3]:
         """Return the motions after which the last image would look the same.
@@ -167,12 +170,9 @@ class StepEstimator:
         return float(np.median(points[:, 2])) if len(points) else 1.0
 
     def is_close(self, a: Rigid3, b: Rigid3) -> bool:
-        """Return whether two cam_from_world are the same within `same_step`."""
+        """Return whether two cam_from_world are nearly the same."""
         limit = 0.04  # maximum difference, as a share of the median depth and in radians
-        away = a @ b.inverse()
-        return bool(
-            np.linalg.norm(away.translation) < limit * self._median_depth() and away.angle() < limit
-        )
+        return a.inverse().is_same(b.inverse(), limit * self._median_depth(), limit)
 
     def _is_in_image(self, cam_from_world: Rigid3) -> np.ndarray:
         camera = self.measured.stereo.camera

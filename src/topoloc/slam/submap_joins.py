@@ -27,8 +27,8 @@ from topoloc.geometry.transform_consensus import (
     propagate_estimate,
 )
 from topoloc.slam.keyframes import KeyFrame, PlaceFeatures
-from topoloc.slam.loop_closure import Link, is_reachable, rank_places
-from topoloc.slam.place_matching import count_repeated_features, match_places
+from topoloc.slam.loop_closure import Link, is_reachable, match_keyframes, rank_places
+from topoloc.slam.place_matching import count_repeated_features
 
 _MIN_INLIERS = 12  # matches of a pair that agree on a pose
 _MIN_ROTATION_TRACE = 1.0  # of a rotation by 90 degrees, beyond which images hardly overlap
@@ -87,9 +87,9 @@ def _is_distinct(link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, 
     """
     max_repeated_share = 0.5  # of the matches
     for end in (link.source, link.target):
-        place = keyframes[end].place
-        if end not in repeated and place is not None:
-            repeated[end] = count_repeated_features(place, keyframes[end].stereo, _MIN_INLIERS)
+        if end not in repeated:
+            keyframe = keyframes[end]
+            repeated[end] = count_repeated_features(keyframe.place, keyframe.stereo, _MIN_INLIERS)
     rivals = max(repeated[link.source], repeated[link.target])
     return rivals < max(max_repeated_share * len(link.match.source_rows), _MIN_INLIERS)
 
@@ -178,21 +178,20 @@ def _match_pairs(
 
     Links within a recording that exceed the camera's maximum speed are skipped.
     """
-    links = []
-    for source, target in (ends for pair in pairs for ends in (pair, pair[::-1])):
-        a, b = keyframes[source].place, keyframes[target].place
-        match = (
-            match_places(a, b, keyframes[target].stereo, _MIN_INLIERS, min_inlier_share=0.3)
-            if a is not None and b is not None
-            else None
+    links = (
+        match_keyframes(source, target, keyframes, _MIN_INLIERS, min_inlier_share=0.3)
+        for pair in pairs
+        for source, target in (pair, pair[::-1])
+    )
+    return [
+        link
+        for link in links
+        if link is not None
+        and (
+            keyframes[link.source].recording != keyframes[link.target].recording
+            or is_reachable(link, keyframes)
         )
-        if match is not None:
-            link = Link(source, target, match)
-            if keyframes[source].recording != keyframes[target].recording or is_reachable(
-                link, keyframes
-            ):
-                links.append(link)
-    return links
+    ]
 
 
 def _order_ends(link: Link, keyframes: Sequence[KeyFrame]) -> list[int]:
@@ -251,19 +250,15 @@ def _is_join_verified(
     num_cells = 4  # across and down an image
     num_seen, num_found, num_covered = 0, 0, 0
     for source, target, rows in _find_overlapping_views(consensus.a_from_b, keyframes, ends):
-        a, b = keyframes[source].place, keyframes[target].place
-        assert a is not None
-        assert b is not None
-        cells = _compute_cells(a, keyframes[source], num_cells)
+        cells = _compute_cells(keyframes[source], num_cells)
         seen, found = (
             np.bincount(cells[rows], minlength=num_cells**2),
             np.zeros(num_cells**2, np.int64),
         )
-        match = match_places(a, b, keyframes[target].stereo, min_known_pose, min_inlier_share=0.0)
-        if match is not None and _is_link_consistent(
-            Link(source, target, match), consensus, keyframes, ends
-        ):
-            found = np.bincount(cells[np.intersect1d(match.source_rows, rows)], minlength=len(seen))
+        link = match_keyframes(source, target, keyframes, min_known_pose, min_inlier_share=0.0)
+        if link is not None and _is_link_consistent(link, consensus, keyframes, ends):
+            again = np.intersect1d(link.match.source_rows, rows)
+            found = np.bincount(cells[again], minlength=len(seen))
         num_seen, num_found, num_covered = (
             num_seen + seen.sum(),
             num_found + found.sum(),
@@ -273,13 +268,11 @@ def _is_join_verified(
     return bool(num_seen >= min_seen_points and enough)
 
 
-def _compute_cells(
-    place: PlaceFeatures, keyframe: KeyFrame, num_cells: int
-) -> Int[np.ndarray, " n"]:
+def _compute_cells(keyframe: KeyFrame, num_cells: int) -> Int[np.ndarray, " n"]:
     """Return the grid cell of each feature in its image."""
     camera = keyframe.stereo.camera
     columns_rows = np.floor(
-        num_cells * place.features.points_img / [camera.width, camera.height]
+        num_cells * keyframe.place.features.points_img / [camera.width, camera.height]
     ).astype(np.int64)
     return np.clip(columns_rows, 0, num_cells - 1) @ [1, num_cells]
 
@@ -345,7 +338,6 @@ def _find_covisible_features(
     max_angle_deg = 15.0
     max_ratio = 1.3  # maximum ratio of two distances from which a point looks the same
     place = source.place
-    assert place is not None
     valid = np.flatnonzero(place.points.valid)
     points = target_from_source.apply(place.points.points_cam[valid])
     pixels, camera = target.stereo.project(points)[:, :2], target.stereo.camera

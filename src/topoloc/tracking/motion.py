@@ -111,18 +111,6 @@ def predict_motion(
     return MotionState(t_ns, state.world_from_cam @ step, velocity, covariance)
 
 
-def squared_mahalanobis(
-    predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
-) -> float:
-    """Return the squared Mahalanobis distance between a measured and the predicted pose.
-
-    `covariance` is that of the right perturbation of the measured pose. The distance follows chi^2
-    with 6 degrees of freedom.
-    """
-    error = (predicted.world_from_cam.inverse() @ world_from_cam).log()
-    return float(error @ np.linalg.solve(predicted.pose_covariance + covariance, error))
-
-
 def update_motion(
     predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> MotionState:

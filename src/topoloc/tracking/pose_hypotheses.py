@@ -20,15 +20,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import structs
 
-from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative
+from topoloc.node_ids import NodeId
 from topoloc.tracking.motion import (
     MotionConfig,
     MotionState,
     predict_motion,
-    squared_mahalanobis,
     start_motion,
     update_motion,
 )
@@ -51,7 +51,7 @@ class Candidate:
     world_from_cam: Rigid3
     covariance: Float[np.ndarray, "6 6"]
     probability: float
-    node_id: int
+    node_id: NodeId
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class _Hypothesis:
     odom_from_cam: Rigid3 | None
     current: MotionState
     weight: float
-    node_id: int
+    node_id: NodeId
     from_best: Rigid3
     candidate_idx: int | None
 
@@ -134,13 +134,13 @@ class PoseHypotheses:
         for one in self._ranked:
             pose = one.current.world_from_cam
             known = next(
-                (k for k, other in enumerate(found) if is_same_pose(other.world_from_cam, pose)),
+                (k for k, other in enumerate(found) if is_same_place(other.world_from_cam, pose)),
                 None,
             )
             if known is None:
                 found.append(Alternative(pose, one.weight, one.node_id))
             else:
-                found[known] = replace(
+                found[known] = structs.replace(
                     found[known], probability=found[known].probability + one.weight
                 )
         return tuple(sorted(found, key=lambda one: -one.probability))
@@ -182,13 +182,16 @@ class PoseHypotheses:
         # Maximum squared Mahalanobis distance of a consistent pose from the prediction
         # (chi^2 with 6 degrees of freedom: 1 in 100,000).
         max_surprise = 33.0
-        return self._compute_gated_distance(predicted, world_from_cam, covariance) <= max_surprise
+        return predicted.world_from_cam.is_same(
+            world_from_cam,
+            covariance=self._gate_covariance(predicted, covariance),
+            max_square=max_surprise,
+        )
 
-    def _compute_gated_distance(
-        self, predicted: MotionState, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
-    ) -> float:
-        slack = (self.prediction_scale**2 - 1.0) * predicted.pose_covariance
-        return squared_mahalanobis(predicted, world_from_cam, covariance + slack)
+    def _gate_covariance(
+        self, predicted: MotionState, covariance: Float[np.ndarray, "6 6"]
+    ) -> Float[np.ndarray, "6 6"]:
+        return self.prediction_scale**2 * predicted.pose_covariance + covariance
 
     def apply_motion(
         self,
@@ -307,13 +310,14 @@ class PoseHypotheses:
             if (
                 updated := self._update_with_candidate(one, 0, candidate, odom_from_cam)
             ) is not None:
-                surprised = math.exp(
-                    -0.5 * self._compute_gated_distance(one.current, pose, covariance)
-                )
+                predicted = one.current.world_from_cam
+                both = one.current.pose_covariance + covariance
+                gate = self._gate_covariance(one.current, covariance)
+                surprised = math.exp(-0.5 * predicted.squared_distance(pose, gate))
                 weight += one.weight * (candidate.probability * surprised) ** new_evidence_ratio
-                spread = float(np.linalg.slogdet(one.current.pose_covariance + covariance)[1])
+                spread = float(np.linalg.slogdet(both)[1])
                 density = math.log(one.weight) - 0.5 * (
-                    squared_mahalanobis(one.current, pose, covariance) + spread
+                    predicted.squared_distance(pose, both) + spread
                 )
                 likeliest = max(likeliest, (density, updated), key=lambda pair: pair[0])
         return [] if likeliest[1] is None else [replace(likeliest[1], weight=weight)]
@@ -329,9 +333,10 @@ class PoseHypotheses:
         if not self.is_consistent(one.current, pose, covariance):
             return None
         state = update_motion(one.current, pose, covariance)
-        likelihood = max(
-            math.exp(-0.5 * squared_mahalanobis(one.current, pose, covariance)), 1e-100
+        square = one.current.world_from_cam.squared_distance(
+            pose, one.current.pose_covariance + covariance
         )
+        likelihood = max(math.exp(-0.5 * square), 1e-100)
         return _Hypothesis(
             state,
             odom_from_cam,
@@ -393,9 +398,9 @@ def _is_same_motion(a: MotionState, b: MotionState) -> bool:
     return float(error @ np.linalg.solve(a.covariance + b.covariance, error)) < 6.0
 
 
-def is_same_pose(a: Rigid3, b: Rigid3) -> bool:
+def is_same_place(a: Rigid3, b: Rigid3) -> bool:
     """Return whether two poses are within 0.25 m and 5 degrees."""
-    return translation_error(a, b) < 0.25 and (a.inverse() @ b).angle() < math.radians(5.0)
+    return a.is_same(b, 0.25, math.radians(5.0))
 
 
 def _relative_odometry(

@@ -14,7 +14,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.tracking.pose_errors import PoseErrors, compute_pose_errors
-from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses, is_same_pose
+from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses, is_same_place
 from topoloc.tracking.tracker_state import StreamFrame
 
 
@@ -188,7 +188,7 @@ def _place_probability(found: Localization) -> float:
 
 
 def _is_known_pose(world_from_cam: Rigid3, found: list[LocalizedPose]) -> bool:
-    return any(is_same_pose(one.result.world_from_cam, world_from_cam) for one in found)
+    return any(is_same_place(one.result.world_from_cam, world_from_cam) for one in found)
 
 
 def reject_jump(found: Localization) -> NotLocalized:

@@ -77,7 +77,9 @@ def test_up_is_where_the_cameras_have_it(tiny_recording: Path, turn: np.ndarray)
     ]
     before = np.array(create_document(topomap, "room")["up"])
     np.testing.assert_allclose(
-        create_document(replace(topomap, summaries=summaries, nodes=nodes), "room")["up"],
+        create_document(
+            replace(topomap.with_first_layer(nodes=nodes), summaries=summaries), "room"
+        )["up"],
         moved.rotation @ before,
         atol=0.1,
     )

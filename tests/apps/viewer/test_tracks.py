@@ -55,7 +55,7 @@ def test_nodes_without_points_or_pictures_are_views_all_the_same(tiny_recording:
     topomap = built_room(tiny_recording)
     first = without_points(topomap.nodes[0])
     for nodes in ([first, *topomap.nodes[1:]], [without_points(node) for node in topomap.nodes]):
-        scene = create_map_scene(replace(topomap, nodes=nodes), "room")
+        scene = create_map_scene(topomap.with_first_layer(nodes=nodes), "room")
         assert len(scene.views) == len(topomap.summaries)
         assert len(scene.views[0].points_img) == 0
         assert scene.views[0].jpeg == b""
@@ -64,12 +64,12 @@ def test_nodes_without_points_or_pictures_are_views_all_the_same(tiny_recording:
 
 def test_pictures_of_one_name_are_told_apart(tiny_recording: Path):
     topomap = built_room(tiny_recording)
+    nodes = [
+        replace(node, summary=replace(node.summary, name="same.png", session_id=row))
+        for row, node in enumerate(topomap.nodes)
+    ]
     twice: TopoMetricMap = replace(
-        topomap,
-        nodes=[
-            replace(node, summary=replace(node.summary, name="same.png", session_id=row))
-            for row, node in enumerate(topomap.nodes)
-        ],
+        topomap.with_first_layer(nodes=nodes),
         summaries=[
             replace(summary, name="same.png", session_id=row)
             for row, summary in enumerate(topomap.summaries)

@@ -38,7 +38,9 @@ def _disturbed(topomap: TopoMetricMap, metres: float, radians: float) -> TopoMet
                 summary=replace(node.summary, world_from_cam=node.summary.world_from_cam @ error),
             )
         )
-    return replace(topomap, nodes=nodes, summaries=[node.summary for node in nodes])
+    return replace(
+        topomap.with_first_layer(nodes=nodes), summaries=[node.summary for node in nodes]
+    )
 
 
 def _rho(topomap: TopoMetricMap) -> float:
@@ -75,7 +77,7 @@ def test_a_map_knows_what_was_measured_when_it_was_built(
     loaded = TopoMetricMap.load(room_map)
     known = Localizer(loaded).context.first.correlated_errors
     assert not measurings
-    unknown = replace(loaded, shared_errors=None)
+    unknown = loaded.with_first_layer(shared_errors=None)
     assert Localizer(unknown).context.first.correlated_errors == pytest.approx(
         known, rel=0.3
     )  # the file's points are rounded
@@ -98,7 +100,9 @@ def test_with_other_settings_it_is_measured_anew(
     assert measurings == [loaded]
     assert (
         rho
-        == Localizer(replace(loaded, shared_errors=None), config).context.first.correlated_errors
+        == Localizer(
+            loaded.with_first_layer(shared_errors=None), config
+        ).context.first.correlated_errors
     )
 
 
@@ -106,24 +110,26 @@ def test_settings_that_it_does_not_depend_on_may_change(
     room_map: Path, measurings: list[TopoMetricMap]
 ):
     loaded = TopoMetricMap.load(room_map)
-    assert loaded.shared_errors is not None
+    assert loaded.first_layer.shared_errors is not None
     assert (
         Localizer(loaded, LocalizerConfig(num_candidates=2)).context.first.correlated_errors
-        == loaded.shared_errors.rho
+        == loaded.first_layer.shared_errors.rho
     )
     assert not measurings
 
 
 def test_of_other_nodes_it_is_measured_anew(room_map: Path, measurings: list[TopoMetricMap]):
     moved = _disturbed(TopoMetricMap.load(room_map), 0.02, 0.005)
-    assert moved.shared_errors is not None
-    assert Localizer(moved).context.first.correlated_errors > moved.shared_errors.rho
+    assert moved.first_layer.shared_errors is not None
+    assert Localizer(moved).context.first.correlated_errors > moved.first_layer.shared_errors.rho
     assert measurings == [moved]
 
 
 def test_a_map_of_one_node_is_taken_to_be_of_middling_quality(tiny_recording: Path):
     topomap = built_room(tiny_recording)
-    single = replace(topomap, nodes=topomap.nodes[:1], summaries=topomap.summaries[:1], edges=[])
+    single = replace(
+        topomap.with_first_layer(nodes=topomap.nodes[:1]), summaries=topomap.summaries[:1], edges=[]
+    )
     assert _rho(single) == WEIGHTS.unknown
 
 

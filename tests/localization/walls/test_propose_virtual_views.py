@@ -340,7 +340,7 @@ def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
     assert (
         loaded.sides.kind == find_feature_type(loaded.kinds[1]).virtual_view_type != loaded.kinds[1]
     )
-    assert loaded.with_feature_type(loaded.kinds[1]).sides is loaded.sides
+    assert loaded.sides_for(loaded.kinds[1]) is loaded.sides
     localizer, learned = (
         Localizer(loaded),
         Localizer(loaded, LocalizerConfig(kinds=(loaded.kinds[1],))),

@@ -34,11 +34,8 @@ def store_coarse(path: Path, target: Path, model: CoarseModel, make_default: boo
 
 
 def _with_model(topomap: TopoMetricMap, model: CoarseModel, make_default: bool) -> TopoMetricMap:
-    models = {name: topomap.coarse_models[name] for name in topomap.coarse_models} | {
-        model.name: model
-    }
+    models = {**topomap.first_layer.coarse_models, model.name: model}
     return replace(
-        topomap,
-        coarse_models=models,
+        topomap.with_first_layer(coarse_models=models),
         default_coarse=model.name if make_default else topomap.default_coarse,
     )

@@ -25,9 +25,10 @@ from topoloc.features.features import Features
 from topoloc.recordings.image_io import to_grey
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import as_monocular
+from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.descriptor_index import Whitening, learn_whitening
 from topoloc.retrieval.shared_vocabulary import SharedVocabulary
-from topoloc.retrieval.vlad import VladConfig, append_positions, learn_words
+from topoloc.retrieval.vlad import append_positions, learn_words
 
 NUM_PICTURES = 160  # of each recording
 NUM_WORDS, DIMENSION = 32, 128

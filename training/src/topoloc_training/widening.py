@@ -27,7 +27,7 @@ def weights_of_map(topomap: TopoMetricMap, backbone: BackboneName) -> Weights:
             nodes.
         MapError: it is damaged.
     """
-    model = topomap.coarse_models.get(NAME)
+    model = topomap.first_layer.coarse_models.get(NAME)
     if model is None:
         raise TrainingError(
             f"the map has no {NAME} to begin with; train one without --weights {MAP}"

@@ -21,8 +21,8 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.search import Trace
 from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.config import VirtualNodesConfig
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.mapping.virtual_nodes import VirtualNodesConfig
 from topoloc.recordings.frame import StereoSequence
 from topoloc_paper.fit.corpus import GAMMAS, AskedPlace, read_rigid
 from topoloc_paper.fit.pictures import darkened, drawn_pictures

@@ -40,7 +40,7 @@ def build_graph(topomap: TopoMetricMap) -> MapGraph:
     for edge in topomap.edges:
         neighbours[edge.source_id].add(edge.target_id)
         neighbours[edge.target_id].add(edge.source_id)
-    nodes = {
+    nodes: dict[int, dict[str, Any]] = {
         s.node_id: {
             "session": s.session_id,
             "name": s.name,
@@ -133,7 +133,9 @@ def _to_geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
             "nobody said where on earth this map lies (topoloc georeference); .graphml needs no"
             " place"
         )
-    places = {s.node_id: _lon_lat_h(topomap, s.world_from_cam) for s in topomap.summaries}
+    places: dict[int, Any] = {
+        s.node_id: _lon_lat_h(topomap, s.world_from_cam) for s in topomap.summaries
+    }
     features = [
         geojson_feature("Point", places[node_id], {"node": node_id} | facts)
         for node_id, facts in graph.nodes.items()

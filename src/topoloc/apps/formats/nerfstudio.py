@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta, Struct
 
-from topoloc import CalibrationError, Camera, RecordingError, Rigid3, TrajectoryError
+from topoloc import CalibrationError, Camera, RecordingError, Rigid3
 from topoloc.plugin import (
     DepthImages,
     Finite,
@@ -48,11 +48,10 @@ def open_nerfstudio(path: Path) -> Recording:
     """Open a folder with a transforms.json, or the file itself; RGB-D where its frames have depth.
 
     Raises:
-        RecordingError: no frames, malformed, depth for some of them only, or a name that leads out
-            of the folder.
+        RecordingError: no frames, malformed, a matrix is no pose, depth for some of them only, or
+            a name that leads out of the folder.
         CalibrationError: a key of the camera is missing or not usable, or a model that is not known
             here.
-        TrajectoryError: a matrix is no pose.
     """
     file = path if path.is_file() else path / FILE_NAME
     data = decode_json(read_text(file, RecordingError), dict[str, Any], RecordingError, str(file))
@@ -69,9 +68,7 @@ def open_nerfstudio(path: Path) -> Recording:
     names = [_with_suffix(file.parent, name) for name, _, _ in named]
     where = [f"{file}, {name}" for name in names]
     frames = [frame for _, frame, _ in named]
-    poses: list[Rigid3 | None] = [
-        _pose(frame, whole.applied_scale, at) for frame, at in zip(frames, where, strict=True)
-    ]
+    poses: list[Rigid3 | None] = [_pose(frame, whole.applied_scale) for frame in frames]
     # The values of the file count first, as in nerfstudio.
     cameras = [_camera(lens | data, at) for (_, _, lens), at in zip(named, where, strict=True)]
     depth = _depth(frames, whole.depth_unit_scale_factor, file, where)
@@ -91,7 +88,7 @@ _Factor = Annotated[float, Meta(gt=1e-12, lt=1e12)]
 
 class _Frame(Struct, frozen=True):
     file_path: str
-    transform_matrix: list[list[Finite]]
+    transform_matrix: Rigid3
     depth_file_path: str | None = None
 
 
@@ -127,11 +124,8 @@ class _Lens(Struct, frozen=True):
     ] = "OPENCV"
 
 
-def _pose(frame: _Frame, scale: float, where: str) -> Rigid3:
-    try:
-        world_from_gl = Rigid3.from_matrix(frame.transform_matrix)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{where}: transform_matrix: {error}") from None
+def _pose(frame: _Frame, scale: float) -> Rigid3:
+    world_from_gl = frame.transform_matrix
     return rigid_from_gl(Rigid3(world_from_gl.rotation, world_from_gl.translation / scale))
 
 

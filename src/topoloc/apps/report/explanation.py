@@ -124,10 +124,12 @@ def _evaluate_pose(tried: TriedProposal, result: Localization | NotLocalized) ->
 def _verdict(
     world_from_cam: Rigid3, probability: float, result: Localization | NotLocalized
 ) -> str:
-    if isinstance(result, Localization) and _is_same(world_from_cam, result.world_from_cam):
+    if isinstance(result, Localization) and world_from_cam.is_same(
+        result.world_from_cam, _SAME_POSITION_M, _SAME_ROTATION
+    ):
         return "the answer"
     if any(
-        _is_same(world_from_cam, other.world_from_cam)
+        world_from_cam.is_same(other.world_from_cam, _SAME_POSITION_M, _SAME_ROTATION)
         for other in getattr(result, "alternatives", ())
     ):
         return "one of the alternatives"
@@ -139,14 +141,6 @@ def _verdict(
         "likely, but its calibration is doubtful"
         if "calibration" in result.detail
         else "likely, but not beyond doubt"
-    )
-
-
-def _is_same(a: Rigid3, b: Rigid3) -> bool:
-    apart = a.inverse() @ b
-    return (
-        bool(np.linalg.norm(apart.translation) < _SAME_POSITION_M)
-        and apart.angle() < _SAME_ROTATION
     )
 
 

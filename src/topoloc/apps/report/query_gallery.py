@@ -88,8 +88,7 @@ def _error_rank(answer: EvaluatedQuery) -> tuple[int, float]:
 
 def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> str:
     result = answer.result
-    node_id = _select_node(answer)
-    node = None if node_id is None else topomap.nodes[topomap.row_of(node_id)]
+    node = _select_node(answer, topomap)
     evidence = f"{result.num_inliers} inliers of {result.num_matches} matches"
     if isinstance(result, Localization):
         sigma = float(np.sqrt(max(np.trace(result.camera_covariance[:3, :3]), 0.0)))
@@ -97,7 +96,7 @@ def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> str:
             f", probability {result.probability:.2f}, its own standard deviation"
             f" {format_length(sigma)}"
         )
-    if answer.nearest_node_id is not None and answer.nearest_node_id != node_id:
+    if answer.nearest_node_id not in (None, node and node.summary.node_id):
         evidence += f"; nearest to the truth is node {answer.nearest_node_id}"
     kind = (
         "good"
@@ -111,14 +110,17 @@ def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> str:
     )
 
 
-def _select_node(answer: EvaluatedQuery) -> int | None:
-    """The node that the pose comes from; without a pose, the one that the picture should have been
-    matched with."""
+def _select_node(answer: EvaluatedQuery, topomap: TopoMetricMap) -> TopoNode | None:
+    """Return the node of the pose, without a pose the nearest one or the first candidate."""
     if isinstance(answer.result, Localization):
-        return answer.result.node_id
-    if answer.nearest_node_id is not None:
-        return answer.nearest_node_id
-    return answer.result.candidates[0].node_id if answer.result.candidates else None
+        node_id = answer.result.node_id
+    elif answer.nearest_node_id is not None:
+        node_id = answer.nearest_node_id
+    elif answer.result.candidates:
+        node_id = answer.result.candidates[0].node_id
+    else:
+        return None
+    return topomap.nodes[topomap.row_of(node_id)]
 
 
 def _describe_result(answer: EvaluatedQuery) -> str:

@@ -46,7 +46,9 @@ def find_tracks(
     )
     matchers = [NodeMatcher(node, topomap.config.features) for node in nodes]
     pairs = [np.zeros((0, 3))]
-    neighbours = topomap.find_neighbours(rows, NUM_NEIGHBOURS)
+    neighbours = topomap.find_neighbours(
+        [node.summary.world_from_cam for node in nodes], NUM_NEIGHBOURS
+    )
     for a, matcher in enumerate(matchers):
         for b in neighbours[a]:
             other = nodes[b]

@@ -14,15 +14,18 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.features.matching import MatchingConfig, match_features
+from topoloc.features.config import MatchingConfig
+from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.integrity_check import find_map_damage
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,8 @@ class Contradiction:
     """Report that node `node_id` is `metres` and `degrees` off the pose found with node
     `other_id`."""
 
-    node_id: int
-    other_id: int
+    node_id: NodeId
+    other_id: NodeId
     metres: float
     degrees: float
 
@@ -85,10 +88,11 @@ def find_contradictions(
         MapError: the map cannot be read.
     """
     config = config or ContradictionsConfig()
-    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    poses = topomap.node_poses
+    errors = topomap.first_layer.shared_errors
     rho = (
-        topomap.shared_errors.rho
-        if topomap.shared_errors is not None
+        errors.rho
+        if errors is not None
         else load_fitted_weights(topomap.kind).shared_errors.unknown
     )
     group, found = list(range(len(topomap.summaries))), []
@@ -103,9 +107,9 @@ def find_contradictions(
             difference = _pose_difference(node, topomap.nodes[other_row], rho, config)
             if difference is None:
                 continue
-            square, metres, radians = difference
+            is_same, metres, radians = difference
             if (
-                square > config.max_square
+                not is_same
                 and metres + topomap.config.lambda_rot * radians
                 > config.min_distance * topomap.config.d_thresh
             ):
@@ -117,11 +121,11 @@ def find_contradictions(
 
 def _pose_difference(
     node: TopoNode, other: TopoNode, rho: float, config: ContradictionsConfig
-) -> tuple[float, float, float] | None:
+) -> tuple[bool, float, float] | None:
     """Compare a node's pose with the one found with the points of another node.
 
-    Return the squared difference in covariances, metres and radians. None if they have too few
-    points in common.
+    Return whether the covariance allows the difference, and the metres and radians. None if they
+    have too few points in common.
     """
     points = LocalMap.of_node(other)
     matches = match_features(node.features.descriptors, points.descriptors, MatchingConfig())
@@ -136,15 +140,10 @@ def _pose_difference(
     )
     if found is None or np.count_nonzero(found.inliers) < config.min_inliers:
         return None
-    error = found.cam_from_world @ node.summary.world_from_cam
-    xi = error.log()
+    poses = found.cam_from_world.inverse(), node.summary.world_from_cam
     covariance = covariance_inflation(int(np.count_nonzero(found.inliers)), rho) * found.covariance
-    translation_error = float(
-        np.linalg.norm(
-            found.cam_from_world.inverse().translation - node.summary.world_from_cam.translation
-        )
-    )
-    return float(xi @ np.linalg.solve(covariance, xi)), translation_error, error.angle()
+    is_same = poses[0].is_same(poses[1], covariance=covariance, max_square=config.max_square)
+    return is_same, translation_error(*poses), rotation_error(*poses)
 
 
 def _merge_groups(group: list[int], a: int, b: int) -> None:

@@ -26,8 +26,9 @@ from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, est
 from topoloc.localization.fitted_weights import CorrelatedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.local_map import LocalMap
-from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
+from topoloc.mapping.nodes import compute_nodes_digest, node_distances
 from topoloc.mapping.topomap import CorrelatedErrors, TopoMetricMap, TopoNode
+from topoloc.node_ids import as_rows
 
 _MEDIAN_CHI_SQUARE_6 = 5.348
 _METHOD = 1  # part of the digest: increase if the same settings give another rho
@@ -59,6 +60,7 @@ def covariance_inflation(num_inliers: int, rho: float) -> float:
 
 def find_correlated_error_share(
     topomap: TopoMetricMap,
+    kind: str,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     weights: CorrelatedErrorWeights,
@@ -66,51 +68,51 @@ def find_correlated_error_share(
     """Return rho of the map, from its file if the digest matches, and measured otherwise.
 
     Args:
+        kind: the feature type.
         guided, pose: settings of query matching and pose estimation.
     """
-    known = topomap.shared_errors
+    known = topomap.layers[kind].shared_errors
     if known is not None and known.digest == _digest(topomap, guided, pose, weights):
         return known.rho
-    return measure_correlated_error_share(topomap, guided, pose, weights)
+    return measure_correlated_error_share(topomap, kind, guided, pose, weights)
 
 
 def measure_stored_error_share(
     topomap: TopoMetricMap,
+    kind: str,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     weights: CorrelatedErrorWeights,
 ) -> CorrelatedErrors:
     """Measure rho and return it with its digest, to be stored in the map."""
-    rho = measure_correlated_error_share(topomap, guided, pose, weights)
+    rho = measure_correlated_error_share(topomap, kind, guided, pose, weights)
     return CorrelatedErrors(rho, _digest(topomap, guided, pose, weights))
 
 
 def measure_correlated_error_share(
     topomap: TopoMetricMap,
+    kind: str,
     guided: GuidedConfig,
     pose: AbsolutePoseConfig,
     weights: CorrelatedErrorWeights,
 ) -> float:
     """Measure rho of the map (see the module docstring)."""
-    poses = NodePoses.of([summary.world_from_cam for summary in topomap.summaries])
+    poses = topomap.node_poses
     lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
-    node_ids = np.unique(
+    nodes = topomap.layers[kind].nodes
+    rows = np.unique(
         np.linspace(0, len(topomap.summaries) - 1, _SETTINGS["num_nodes"]).round().astype(int)
     )
     num_helpers, min_inliers = _SETTINGS["num_helpers"], _SETTINGS["min_inliers"]
     for min_distance in _SETTINGS["min_distances"]:
         rhos = []
-        for node_id in node_ids:
-            node = topomap.nodes[int(node_id)]
+        for row in as_rows(rows):
+            node = nodes[row]
             distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
             order = np.argsort(distances, kind="stable")
             helpers = order[distances[order] > min_distance * d_thresh][:num_helpers]
             rho = _error_share_of_node(
-                node,
-                [topomap.nodes[int(k)] for k in helpers],
-                guided,
-                pose,
-                min_inliers,
+                node, [nodes[int(k)] for k in helpers], guided, pose, min_inliers
             )
             if rho is not None:
                 rhos.append(rho)

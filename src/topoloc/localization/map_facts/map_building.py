@@ -18,6 +18,7 @@ from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
 from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
+from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.slam.pose_checks import check_pose_coverage, check_poses
@@ -89,20 +90,22 @@ def with_map_statistics(
 
     A localizer then reads them instead of measuring them.
     """
-    topomap = replace(topomap, shared_errors=None, other_shared_errors={}, repetitions=None)
-    errors = {kind: _measure_error_share(topomap.with_feature_type(kind)) for kind in topomap.kinds}
-    topomap = replace(topomap, shared_errors=errors.pop(topomap.kind), other_shared_errors=errors)
-    return with_repetitions(topomap, progress)
+    layers = {
+        kind: replace(layer, shared_errors=_measure_error_share(topomap, kind))
+        for kind, layer in topomap.layers.items()
+    }
+    return with_repetitions(replace(topomap, layers=layers, repetitions=None), progress)
 
 
-def _measure_error_share(topomap: TopoMetricMap) -> CorrelatedErrors:
-    """Measure rho of a map for its first feature type."""
-    config_of_type = LocalizerConfig().for_feature_type(find_feature_type(topomap.kind))
+def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
+    """Measure rho of a map for a feature type."""
+    config_of_type = LocalizerConfig().for_feature_type(find_feature_type(kind))
     return measure_stored_error_share(
         topomap,
+        kind,
         config_of_type.guided,
         config_of_type.pose,
-        load_fitted_weights(topomap.kind).shared_errors,
+        load_fitted_weights(kind).shared_errors,
     )
 
 
@@ -110,8 +113,8 @@ def with_repetitions(
     topomap: TopoMetricMap, progress: build.Progress | None = None
 ) -> TopoMetricMap:
     """Return the map with the repetition moves of its nodes."""
-    opened, moves = OpenMap(topomap), dict[int, Float[np.ndarray, "k 4 4"]]()
-    for row, found in enumerate(parallel_map(opened.moves, range(len(opened.node_ids)))):
+    opened, moves = OpenMap(topomap), dict[NodeId, Float[np.ndarray, "k 4 4"]]()
+    for row, found in enumerate(parallel_map(opened.moves, topomap.rows)):
         if len(found):
             moves[opened.node_ids[row]] = found
         if progress is not None:

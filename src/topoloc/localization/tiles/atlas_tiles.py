@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import numpy as np
+from msgspec import structs
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.config import AtlasConfig
@@ -133,13 +133,11 @@ class AtlasTiles:
         world_from_other = self.other_from_world(other_id, tile_id)
         if world_from_other is None:
             return False
-        apart = pose.world_from_cam.inverse() @ world_from_other @ other_pose.world_from_cam
         metres, radians = _join_sigmas(self.atlas.tile(tile_id), pose, self.atlas.tile(other_id))
-        near = float(np.linalg.norm(apart.translation)) < _SAME_METRES + min(
-            _SIGMAS * metres, _SAME_METRES
-        )
-        return near and math.degrees(apart.angle()) < _SAME_DEG + min(
-            _SIGMAS * math.degrees(radians), _SAME_DEG
+        return pose.world_from_cam.is_same(
+            world_from_other @ other_pose.world_from_cam,
+            _SAME_METRES + min(_SIGMAS * metres, _SAME_METRES),
+            math.radians(_SAME_DEG + min(_SIGMAS * math.degrees(radians), _SAME_DEG)),
         )
 
     def with_tile(self, result: R, tile_id: str) -> R:
@@ -148,7 +146,7 @@ class AtlasTiles:
         tile = self.atlas.tile(tile_id)
         if isinstance(result, NotLocalized):
             alternatives = [
-                replace(
+                structs.replace(
                     one,
                     tile=one.tile or tile_id,
                     geopose=one.geopose or self._geopose(one.tile or tile_id, one.world_from_cam),

@@ -20,10 +20,11 @@ from functools import cached_property, partial
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import extract_from_normalized, normalize_image
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.matching import MatchingConfig, match_features, match_pooled
+from topoloc.features.matching import match_features, match_pooled
 from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig
 from topoloc.geometry.camera import Camera
@@ -54,6 +55,7 @@ from topoloc.localization.walls.virtual_view_matching import (
     merge_matches,
     select_nearest_virtual_nodes,
 )
+from topoloc.node_ids import Row
 
 _NEAREST_NEIGHBOR = MatchingConfig(ratio=0.0, mutual=False)
 
@@ -106,7 +108,7 @@ class VirtualViewSearch:
         """Return the camera of the query."""
         return self.search.query.camera
 
-    def virtual_nodes_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[int]:
+    def virtual_nodes_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[Row]:
         """Return the virtual views of the map that show the content of a side view at a pose."""
         # Number of virtual views around a pose whose points are searched in each side
         # view.
@@ -388,8 +390,6 @@ def _is_seen_by_nodes(search: Search, cam_from_world: Rigid3) -> bool:
 
 def _are_near(search: Search, a_from_world: Rigid3, b_from_world: Rigid3) -> bool:
     """Return whether two imprecise proposals are so close that only one is refined."""
-    apart = a_from_world @ b_from_world.inverse()
-    distance = float(
-        np.linalg.norm(a_from_world.inverse().translation - b_from_world.inverse().translation)
+    return a_from_world.inverse().is_same(
+        b_from_world.inverse(), 1.5 * search.map.d_thresh, math.radians(20.0)
     )
-    return distance < 1.5 * search.map.d_thresh and math.degrees(apart.angle()) < 20.0

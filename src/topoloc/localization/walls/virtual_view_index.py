@@ -9,8 +9,10 @@ from topoloc.errors import MapError
 from topoloc.features.features import Features
 from topoloc.localization.local_map import LocalMap
 from topoloc.localization.walls.virtual_view_matching import with_node_id
+from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.node_cache import CachedNodes
-from topoloc.mapping.topomap import TopoMetricMap, VirtualNodes, node_ids_to_rows
+from topoloc.mapping.topomap import TopoMetricMap, VirtualNodes
+from topoloc.node_ids import Row
 from topoloc.retrieval.coarse import Image
 from topoloc.retrieval.vlad import SurfVlad
 
@@ -44,11 +46,11 @@ class VirtualViewIndex:
         """Return the similarity of each virtual view to a view, 0 for those that are not ranked."""
         scores = np.zeros(len(self.positions), np.float32)
         for node in self.coarse.rank(image, features, len(scores)):
-            scores[node.node_id] = node.score
+            scores[node.row] = node.score
         return scores
 
 
-def _load_local_map(sides: VirtualNodes, row: int) -> LocalMap:
+def _load_local_map(sides: VirtualNodes, row: Row) -> LocalMap:
     node = sides.nodes[row]
     assert node.summary.of_node is not None, "a side node is one of a node"
     return with_node_id(LocalMap.of_node(node), node.summary.of_node)

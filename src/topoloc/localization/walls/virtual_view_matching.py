@@ -19,6 +19,7 @@ from topoloc.localization.guided import (
     select_visible_points,
 )
 from topoloc.localization.local_map import LocalMap
+from topoloc.node_ids import NodeId, Row
 
 _CELL_PX = 8
 _MAX_COMPARED_POINTS = 512  # visible points per side that are compared with dense descriptors
@@ -164,7 +165,7 @@ def select_nearest_virtual_nodes(
     centres: Float[np.ndarray, "nodes 3"],
     axes: Float[np.ndarray, "nodes 3"],
     num_nodes: int,
-) -> list[int]:
+) -> list[Row]:
     """Select virtual views with a similar direction whose content lies in the view, central first.
 
     The position of a virtual view is not compared. It shows points well ahead of it, and a camera
@@ -182,10 +183,12 @@ def select_nearest_virtual_nodes(
     )
     off_middle = np.where(looks_alike & np.isfinite(off_middle), off_middle, np.inf)
     return [
-        int(k) for k in np.argsort(off_middle, kind="stable")[:num_nodes] if off_middle[k] < 1.0
+        Row(int(k))
+        for k in np.argsort(off_middle, kind="stable")[:num_nodes]
+        if off_middle[k] < 1.0
     ]
 
 
-def with_node_id(local_map: LocalMap, node_id: int) -> LocalMap:
+def with_node_id(local_map: LocalMap, node_id: NodeId) -> LocalMap:
     """Return the same points with the id of the node whose image shows them."""
     return replace(local_map, node_ids=np.full_like(local_map.node_ids, node_id))

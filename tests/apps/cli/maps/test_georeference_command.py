@@ -14,7 +14,6 @@ from schemas import check_result
 from topoloc.apps.cli import main
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.mapping.contents import get_map_id
 from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -51,7 +50,7 @@ def test_results_of_such_a_map_carry_a_geopose(
     own_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     with TopoMetricMap.load(own_map) as topomap:
-        before = (get_map_id(topomap), topomap.version)
+        before = (topomap.id, topomap.version)
     assert main(["georeference", str(own_map), "--origin", "-33.9,151.2,40,90"]) == 0
     assert "first picture looks to  90.0 degrees" in capsys.readouterr().out
     assert find_map_damage(own_map) == []

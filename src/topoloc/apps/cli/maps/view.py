@@ -78,7 +78,7 @@ class Command:
             _warn_of_other_worlds(results, document["results"])
         else:
             with TopoMetricMap.load(self.map) as topomap:
-                _warn_of_other_maps(results, topomap.resolved_id)
+                _warn_of_other_maps(results, topomap.id)
                 document = create_document(topomap, Path(self.map).stem, results, budget)
         if self.out:
             write_scene_page(Path(self.out), document)

@@ -324,7 +324,7 @@ def _print(evaluation: dict[str, Any]) -> None:
             "false accepts",
             (
                 f"{e['false_accepts']} ({elsewhere}of poses off by more than"
-                f" {EvaluatedQuery.max_translation_m} m or {EvaluatedQuery.max_rotation_deg:g} deg)"
+                f" {EvaluatedQuery.MAX_TRANSLATION} m or {EvaluatedQuery.MAX_ROTATION_DEG:g} deg)"
             ),
         )
     )

@@ -1,4 +1,4 @@
-"""`topoloc evaluate MAP --against-itself`: a map judged without any recording."""
+"""`topoloc evaluate MAP --against-itself`: evaluate a map without a recording."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def evaluate_map_itself(
     outputs: Mapping[str, str | None],
     config: str | None,
 ) -> int:
-    """Prints which parts of a map are weakly held, and where to walk next; writes the files named
-    by `outputs`: json, report.
+    """Print the weak parts of a map and the place of the next recording, and write the files that
+    `outputs` names: json, report.
 
     Raises:
-        UsageError: the map is an atlas, or an output is in the way.
-        TopolocError: from reading the map, asking it, and writing.
+        UsageError: an atlas has several tiles, or an output would replace an input.
+        TopolocError: the map cannot be read, or a file cannot be written.
     """
     check_outputs(list(outputs.values()), [one for one in (path, config) if one])
     localizer_config = read_settings(config).of(LocalizerConfig)
@@ -46,7 +46,7 @@ def evaluate_map_itself(
         raise UsageError("--against-itself evaluates one map: name the file of the tile")
     with localizer.in_tile() as in_tile:
         topomap = in_tile.topomap
-        info = topomap.describe(path)
+        info = topomap.describe(topomap.file.path if topomap.file else path)
         with progress_bar() as progress:
             weak = find_weak_regions(in_tile, progress)
         if json != "-":
