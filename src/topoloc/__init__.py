@@ -11,10 +11,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from topoloc.apps.export.map_export import export
+    from topoloc.apps.export.formats import export
     from topoloc.apps.report.explanation import explain
     from topoloc.apps.service.client import AsyncClient, Client
-    from topoloc.apps.viewer.map_page import view
+    from topoloc.apps.viewer.page import view
     from topoloc.atlas.atlas import Atlas, is_atlas
     from topoloc.atlas.config import AtlasConfig
     from topoloc.atlas.editing import NewTile, add_tiles, read_manifest
@@ -315,7 +315,7 @@ _MODULES = {
     "edit_tile": "topoloc.lifelong.tile_editing",
     "evaluate": "topoloc.evaluation.evaluate",
     "explain": "topoloc.apps.report.explanation",
-    "export": "topoloc.apps.export.map_export",
+    "export": "topoloc.apps.export.formats",
     "find_frames_with_truth": "topoloc.evaluation.query_localization",
     "find_tile_of_recording": "topoloc.lifelong.tile_selection",
     "find_weak_regions": "topoloc.lifelong.weak_regions",
@@ -339,7 +339,7 @@ _MODULES = {
     "tum_text": "topoloc.recordings.trajectory",
     "undo_edit": "topoloc.mapping.edit",
     "update": "topoloc.lifelong.map_files",
-    "view": "topoloc.apps.viewer.map_page",
+    "view": "topoloc.apps.viewer.page",
     "warm_up": "topoloc.tracking.warm_up",
     "with_pose_conventions": "topoloc.recordings.trajectory",
     "with_trajectory": "topoloc.recordings.trajectory",

@@ -24,11 +24,7 @@ def select_frame_camera(
         return of_size(width, height)
     if frame.camera is not None:
         return frame.camera
-    return (
-        UncalibratedCamera.unknown(width, height)
-        if frame.exif_focal_px is None
-        else UncalibratedCamera.from_focal_guess(width, height, frame.exif_focal_px)
-    )
+    return UncalibratedCamera.from_focal_guess(width, height, frame.exif_focal_px)
 
 
 def parse_camera_option(

@@ -202,10 +202,7 @@ def test_ctrl_c_in_mid_build(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("topoloc.mapping.mapping_frames.extract_features", interrupted)
-    assert (
-        complaint("build", recording, target)
-        == "error: interrupted; every file is as it was or whole\n"
-    )
+    assert complaint("build", recording, target) == "error: interrupted; no file is incomplete\n"
 
 
 def test_ctrl_c_in_mid_evaluation(

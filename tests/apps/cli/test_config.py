@@ -57,7 +57,7 @@ def test_a_table_of_a_distribution_that_is_not_installed_names_it(
     read_settings(path)
     monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
     with pytest.raises(
-        ConfigError, match=r"train: comes with topoloc-training, which is not installed$"
+        ConfigError, match=r"train: needs topoloc-training, which is not installed$"
     ):
         read_settings(path)
 

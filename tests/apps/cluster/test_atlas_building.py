@@ -20,10 +20,9 @@ from logging_maker import LoggingMaker
 
 from topoloc.apps.cli import main
 from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
-from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress
-from topoloc.apps.cluster.tiles import Outcome, TileJob
+from topoloc.apps.cluster.tiles import AtlasBuild, Outcome, TileJob, build_on_ray
 from topoloc.atlas.atlas import Atlas, tile_problem
 from topoloc.mapping.build import BuildConfig
 from topoloc.slam.slam import SlamConfig
@@ -273,7 +272,7 @@ def test_a_cluster_of_this_machine_ends_with_the_command(walks: list[Path], tmp_
         said = driver.communicate(timeout=60)[1]
         assert (driver.returncode, said.splitlines()[-1]) == (
             1,
-            "error: interrupted; every file is as it was or whole",
+            "error: interrupted; no file is incomplete",
         )
         assert list(scratch.glob("topoloc*")) == []
         assert subprocess.run(command, env=environment, capture_output=True).returncode == 0

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from topoloc.apps.cluster.atlas_building import TileTask
 from topoloc.apps.cluster.remote import (
     ProgressBoard,
     TaskPayload,
@@ -18,7 +17,7 @@ from topoloc.apps.cluster.remote import (
     _create_reporter,
     run_task,
 )
-from topoloc.apps.cluster.tiles import Outcome, TileJob
+from topoloc.apps.cluster.tiles import Outcome, TileJob, TileTask
 from topoloc.errors import ClusterError, RecordingError
 
 

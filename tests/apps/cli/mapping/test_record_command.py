@@ -170,7 +170,7 @@ def test_no_carla_server_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     pytest.importorskip("carla", reason="CARLA's client (extra carla) is not installed")
-    monkeypatch.setattr("topoloc.apps.formats.capture.carla_capture._CONNECT_S", 0.5)
+    monkeypatch.setattr("topoloc.apps.formats.carla._CONNECT_S", 0.5)
     assert record("carla", tmp_path / "out", "--server", "127.0.0.1:9") == 1
     assert capsys.readouterr().err.splitlines() == [
         "error: no CARLA server answers at 127.0.0.1:9; start CarlaUE4.sh (or its container) first"

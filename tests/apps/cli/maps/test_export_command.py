@@ -27,7 +27,7 @@ def test_what_no_name_says_needs_a_format(room_map: Path, tmp_path: Path, compla
     assert "--format takes colmap, nerfstudio" in complaint(
         "export", room_map, tmp_path / "room.zip"
     )
-    assert "no format of ours" in complaint(
+    assert "unknown format" in complaint(
         "export", room_map, tmp_path / "room.tum", "--format", "fbx"
     )
 

@@ -18,10 +18,9 @@ from topoloc.apps.cli.tile_option import (
     select_world,
 )
 from topoloc.apps.export.formats import ExportFormat, find_export_format, write_scene
-from topoloc.apps.viewer.map_scene import create_map_scene
-from topoloc.apps.viewer.results_scene import create_results_scene
+from topoloc.apps.viewer.map_scene import create_map_scene, create_world_scene
+from topoloc.apps.viewer.result_files import create_results_scene
 from topoloc.apps.viewer.scene import Scene
-from topoloc.apps.viewer.world_scene import create_world_scene
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,8 @@ from topoloc.apps.cli.tile_option import (
     select_world,
 )
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
-from topoloc.apps.viewer.page import write_scene_page
+from topoloc.apps.viewer.page import find_browser, write_scene_page, write_screenshot
 from topoloc.apps.viewer.result_files import read_results
-from topoloc.apps.viewer.screenshot import find_browser, write_screenshot
 from topoloc.apps.viewer.world_document import create_world_document
 
 _DEFAULT_MAX_POINTS = SceneBudget().max_points
