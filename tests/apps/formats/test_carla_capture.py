@@ -242,15 +242,15 @@ def test_a_server_that_does_not_keep_step(
 
 def test_settings_that_make_no_sense():
     with pytest.raises(RecordingError, match="spawn point 7 of 1 in Town00"):
-        list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(start=7)))
+        list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(start=7), SIZE))
     with pytest.raises(ConfigError, match="must be above 0"):
-        list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(spacing=0.0)))
+        list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(spacing=0.0), SIZE))
     with pytest.raises(ConfigError, match="200 degrees"):
-        carla_camera(200.0)
+        carla_camera(200.0, SIZE)
 
 
 def test_the_middle_of_the_picture_looks_straight_on():
-    camera = carla_camera(90.0)
+    camera = carla_camera(90.0, (800, 600))
     np.testing.assert_allclose(camera.img_from_cam(np.array([[1.0, 0.0, 1.0]])), [[799.5, 299.5]])
     assert camera.fx == pytest.approx(400.0)
 

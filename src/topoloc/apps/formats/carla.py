@@ -38,7 +38,6 @@ WEATHERS: dict[Weather, str] = {
     "rain": "HardRainNoon",
 }
 """The weather of the paper by CARLA's names."""
-DEFAULT_SIZE = (800, 600)
 _MAX_DEPTH_M = 1000.0  # range of the depth camera, and value of the sky
 _WARM_UP = 20  # steps until exposure and streamed textures are stable
 _STEP_S = 0.1
@@ -123,7 +122,7 @@ def world_from_carla_transform(transform: Any) -> Rigid3:
         raise RecordingError(f"CARLA gave an invalid pose ({error})") from None
 
 
-def carla_camera(fov_deg: float, size: tuple[int, int] = DEFAULT_SIZE) -> Camera:
+def carla_camera(fov_deg: float, size: tuple[int, int]) -> Camera:
     """Return CARLA's pinhole camera. Raises ConfigError if size or field of view is invalid."""
     width, height = size
     if not (width > 0 and height > 0 and 1.0 <= fov_deg <= 170.0):
@@ -133,7 +132,7 @@ def carla_camera(fov_deg: float, size: tuple[int, int] = DEFAULT_SIZE) -> Camera
 
 
 def carla_frames(
-    carla: Any, client: Any, config: CarlaConfig, size: tuple[int, int] = DEFAULT_SIZE
+    carla: Any, client: Any, config: CarlaConfig, size: tuple[int, int]
 ) -> Iterator[StereoFrame]:
     """Yield the frames along a lane. The server's settings are restored at the end.
 

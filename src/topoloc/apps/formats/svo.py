@@ -23,7 +23,6 @@ from topoloc import (
 from topoloc.plugin import read_ground_truth
 
 SVO_SUFFIXES = frozenset({".svo", ".svo2"})
-_MAX_FAILED = 30  # successive images that a camera may fail to give
 
 
 @dataclass(eq=False)
@@ -106,7 +105,7 @@ def sdk_frames(stop: threading.Event) -> Iterator[StereoFrame]:
         while not stop.is_set():
             if camera.grab() != sl.ERROR_CODE.SUCCESS:
                 failed += 1
-                if failed > _MAX_FAILED:
+                if failed > 30:
                     raise RecordingError("the ZED gives no more images")
                 continue
             yield _retrieve_frame(sl, camera, index, rig)

@@ -29,7 +29,6 @@ from topoloc.apps.report.figure_style import (
 from topoloc.plugin import group_by_recording
 
 STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp")
-_MAX_METRES_IN_CM = 2.0
 
 
 def draw_error_curves(answers: Sequence[EvaluatedQuery]) -> tuple[str, str]:
@@ -39,7 +38,7 @@ def draw_error_curves(answers: Sequence[EvaluatedQuery]) -> tuple[str, str]:
     """
     groups = group_by_recording([a for a in answers if a.world_from_cam is not None])
     metres = [a.translation_m for a in answers if not a.is_false_accept]
-    large = np.nanmax(metres, initial=0.0) > _MAX_METRES_IN_CM
+    large = np.nanmax(metres, initial=0.0) > 2.0
     scale, unit = (1.0, " m") if large else (100.0, " cm")
     translations = {
         name: scale * np.array([a.translation_m for a in group]) for name, group in groups.items()

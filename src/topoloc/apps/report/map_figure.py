@@ -30,7 +30,6 @@ from topoloc.plugin import group_by_recording
 MIN_ASPECT, MAX_ASPECT = 0.3, 0.8
 # A step longer than this many median steps is a gap, over which no line is drawn.
 GAP_STEPS = 6.0
-_TICK_LENGTH, _MAP_WIDTH_INCHES = 0.025, 8.3
 _TRUTH = {"marker": "o", "markerfacecolor": "none", "markersize": 4.5}
 _LOST = {"linestyle": "", "marker": "D", "markerfacecolor": "white", "markersize": 5.5}
 _FALSE = {
@@ -66,7 +65,7 @@ class MapFigure:
     def __enter__(self) -> MapFigure:
         self._stack.enter_context(matplotlib.rc_context(STYLE))
         width, height = self.high - self.low
-        size = (9.0, _MAP_WIDTH_INCHES * height / width + self._extra_height)
+        size = (9.0, 8.3 * height / width + self._extra_height)
         self._figure = Figure(figsize=size, layout="constrained")
         self.axes = self._figure.add_subplot()
         return self
@@ -97,7 +96,7 @@ class MapFigure:
     def draw_nodes(self, topomap: TopoMetricMap) -> None:
         """Draw the edges and the viewing direction of each node."""
         centres = self.flatten(self.nodes)
-        span = _TICK_LENGTH * float((self.high - self.low).max())
+        span = 0.025 * float((self.high - self.low).max())
         looks = centres + span * np.array([pose.rotation[self.axes_idx, 2] for pose in self.nodes])
         edges = [
             (centres[topomap.row_of(edge.source_id)], centres[topomap.row_of(edge.target_id)])

@@ -16,7 +16,7 @@ import topoloc
 from topoloc import Camera
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
-    QUERY_STATUSES,
+    QUERY_ERRORS,
     QueryParameters,
     error_responses,
     result_response,
@@ -33,8 +33,6 @@ MapName = Annotated[
     str, Path(description="name of a map: its file name without .topo", max_length=200)
 ]
 UrlParameters = Annotated[QueryParameters, Query()]
-_MAP_ERRORS = error_responses(401, 404, 422, 429, 503)
-_QUERY_ERRORS = error_responses(*QUERY_STATUSES)
 _PAGE_MODULES = MODULES | {
     f"topoloc/page/{name}": f"page/{name}.js" for name in ("page", "asking", "live", "matches")
 }
@@ -92,7 +90,7 @@ async def maps(request: Request) -> dict[str, list[str]]:
     return {"maps": get_service(request).maps.names()}
 
 
-@router.get("/v1/maps/{map}", responses=_MAP_ERRORS)
+@router.get("/v1/maps/{map}", responses=error_responses(401, 404, 422, 429, 503))
 async def one_map(request: Request, map: MapName) -> JSONResponse:
     """Return the facts of a map, as `topoloc info --json`, and its nodes with their poses."""
     service = get_service(request)
@@ -118,7 +116,7 @@ async def one_map(request: Request, map: MapName) -> JSONResponse:
 @router.post(
     "/v1/maps/{map}/localize",
     responses=result_response("pose or refusal, as a line of `topoloc localize --json`")
-    | _QUERY_ERRORS,
+    | QUERY_ERRORS,
     openapi_extra=IMAGE_BODY,
 )
 async def localize(request: Request, map: MapName, parameters: UrlParameters) -> Response:
@@ -129,7 +127,7 @@ async def localize(request: Request, map: MapName, parameters: UrlParameters) ->
     return Response(result_to_line(result, query.picture.name), media_type="application/json")
 
 
-@router.post("/v1/localize", responses=_QUERY_ERRORS, openapi_extra=IMAGE_BODY)
+@router.post("/v1/localize", responses=QUERY_ERRORS, openapi_extra=IMAGE_BODY)
 async def localize_everywhere(request: Request, parameters: UrlParameters) -> JSONResponse:
     """Localize an image in all maps. `map` names the map of the only pose; it is null if there are
     no poses or several."""
@@ -153,7 +151,7 @@ async def localize_everywhere(request: Request, parameters: UrlParameters) -> JS
             }
         }
     }
-    | _QUERY_ERRORS,
+    | QUERY_ERRORS,
     openapi_extra=IMAGE_BODY,
 )
 async def explain(request: Request, map: MapName, parameters: UrlParameters) -> Response:
@@ -166,7 +164,7 @@ async def explain(request: Request, map: MapName, parameters: UrlParameters) -> 
     return HTMLResponse(text) if as_page else Response(text, media_type="application/json")
 
 
-@router.get("/v1/maps/{map}/scene", responses=_MAP_ERRORS)
+@router.get("/v1/maps/{map}/scene", responses=error_responses(401, 404, 422, 429, 503))
 async def scene(request: Request, map: MapName) -> Response:
     """Return a map for display: points, nodes with their images, and paths. See docs/viewer.md."""
     service = get_service(request)

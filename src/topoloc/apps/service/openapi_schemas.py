@@ -95,8 +95,6 @@ _ERROR_DESCRIPTIONS = {
     429: "too many requests wait; see Retry-After",
     503: "the map or the worker failed, or the time limit is exceeded",
 }
-QUERY_STATUSES = (400, 401, 403, 404, 408, 413, 415, 422, 429, 503)
-"""Error statuses of every route that takes an image."""
 
 
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -104,6 +102,10 @@ def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {
         status: {"model": Error, "description": _ERROR_DESCRIPTIONS[status]} for status in statuses
     }
+
+
+QUERY_ERRORS = error_responses(400, 401, 403, 404, 408, 413, 415, 422, 429, 503)
+"""Errors of every route that takes an image."""
 
 
 def result_response(description: str) -> dict[int | str, dict[str, Any]]:

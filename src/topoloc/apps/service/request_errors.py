@@ -30,25 +30,18 @@ class RequestError(Exception):
         return {"error": " ".join(self.text.split()), "request_id": request_id}
 
 
-# The first class that matches counts. Any other TopolocError is a fault of the request.
-_STATUS: tuple[tuple[type[Exception], int, int | None], ...] = (
-    (MapNotFoundError, 404, None),
-    (ObjectStoreError, 503, 5),
-    (MapError, 503, 30),
-    (WeightsError, 503, 30),
-    (MissingExtraError, 503, 30),
-    (UnreadableImageError, 400, None),
-    (TopolocError, 422, None),
-)
-
-
 def to_request_error(error: Exception) -> RequestError:
     """Convert any error raised during a request."""
     if isinstance(error, RequestError):
         return error
-    for kind, status, retry_after_s in _STATUS:
-        if isinstance(error, kind):
-            return RequestError(status, str(error), retry_after_s)
+    if isinstance(error, MapNotFoundError):
+        return RequestError(404, str(error))
+    if isinstance(error, ObjectStoreError):
+        return RequestError(503, str(error), 5)
+    if isinstance(error, MapError | WeightsError | MissingExtraError):
+        return RequestError(503, str(error), 30)
+    if isinstance(error, TopolocError):
+        return RequestError(400 if isinstance(error, UnreadableImageError) else 422, str(error))
     if isinstance(error, MemoryError):
         return RequestError(503, "out of memory; send a smaller image, or try again later", 5)
     return RequestError(503, "the worker failed at this request; see the log of the service", 1)

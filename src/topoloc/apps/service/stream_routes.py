@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from topoloc.apps.service.map_routes import MapName, UrlParameters
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
-    QUERY_STATUSES,
+    QUERY_ERRORS,
     error_responses,
     result_response,
 )
@@ -62,7 +62,8 @@ async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> 
 @router.post(
     "/v1/maps/{map}/sessions/{session}/pictures",
     responses=result_response("result of a single image, with `state` and the smoothed pose")
-    | error_responses(409, *QUERY_STATUSES),
+    | QUERY_ERRORS
+    | error_responses(409),
     openapi_extra=IMAGE_BODY,
 )
 async def next_picture(

@@ -21,14 +21,14 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.formats.carla import DEFAULT_SIZE, CarlaConfig, carla_client, carla_frames
+from topoloc.apps.formats.carla import CarlaConfig, carla_client, carla_frames
 from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.formats.recording_writer import RecordingWriter
 from topoloc.apps.formats.svo import sdk_frames
 from topoloc.apps.formats.zed import side_by_side_frames
 from topoloc.plugin import parse_calibration
 
-_ZED_SIZE, _MAX_SIDE = (2560, 720), 16384
+_ZED_SIZE = (2560, 720)
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class Command:
         """Open the source and yield its frames."""
         if self.kind == "carla":
             carla, client = carla_client(self.carla.server)
-            yield from carla_frames(carla, client, self.carla, self._size() or DEFAULT_SIZE)
+            yield from carla_frames(carla, client, self.carla, self._size() or (800, 600))
         elif self.kind == "zed" and self.source is None and self.camera is None:
             try:
                 yield from sdk_frames(stop)
@@ -170,7 +170,7 @@ class Command:
             return None
         match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", self.size)
         width, height = (int(match[1]), int(match[2])) if match else (0, 0)
-        if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
+        if not (0 < width <= 16384 and 0 < height <= 16384):
             raise UsageError(f"--size {self.size[:40]} is no WIDTHxHEIGHT")
         return width, height
 
