@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from topoloc.apps.viewer.page import view
     from topoloc.atlas.atlas import Atlas, is_atlas
     from topoloc.atlas.config import AtlasConfig
-    from topoloc.atlas.editing import NewTile, add_tiles, read_manifest
     from topoloc.atlas.location_prior import GeoPositionPrior
     from topoloc.atlas.manifest import Tile
     from topoloc.atlas.map_cache import MapCache
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
         localize_queries,
     )
     from topoloc.evaluation.world_alignment import WorldFit
-    from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
     from topoloc.geometry.camera import Camera
     from topoloc.geometry.geodesy import GeoPoint, GeoPose, Georeference
     from topoloc.geometry.pose_conventions import PoseConventions
@@ -98,11 +96,8 @@ if TYPE_CHECKING:
     from topoloc.recordings.open import open_sequence
     from topoloc.recordings.trajectory import (
         Trajectory,
-        read_trajectory,
-        tum_text,
         with_pose_conventions,
         with_trajectory,
-        write_tum,
     )
     from topoloc.recordings.trajectory_alignment import align_to_trajectory
     from topoloc.slam.slam import SlamConfig, SlamResult, run_slam
@@ -147,7 +142,6 @@ __all__ = [
     "MapUpdate",
     "MemorySequence",
     "MissingExtraError",
-    "NewTile",
     "NodeQuality",
     "NotLocalized",
     "ObjectStoreError",
@@ -190,8 +184,6 @@ __all__ = [
     "WeightsError",
     "WorldFit",
     "__version__",
-    "absolute_trajectory_errors",
-    "add_tiles",
     "align_to_trajectory",
     "build_map",
     "check_camera_calibrations",
@@ -214,20 +206,15 @@ __all__ = [
     "read_depth",
     "read_history",
     "read_image",
-    "read_manifest",
-    "read_trajectory",
-    "relative_drift",
     "result_from_json",
     "run_slam",
     "set_num_threads",
-    "tum_text",
     "undo_edit",
     "update",
     "view",
     "warm_up",
     "with_pose_conventions",
     "with_trajectory",
-    "write_tum",
 ]
 
 _MODULES = {
@@ -264,7 +251,6 @@ _MODULES = {
     "MapUpdate": "topoloc.lifelong.update",
     "MemorySequence": "topoloc.recordings.memory_sequence",
     "MissingExtraError": "topoloc.errors",
-    "NewTile": "topoloc.atlas.editing",
     "NodeQuality": "topoloc.lifelong.weak_regions",
     "NotLocalized": "topoloc.localization.result",
     "ObjectStoreError": "topoloc.errors",
@@ -306,8 +292,6 @@ _MODULES = {
     "WeakRegionsConfig": "topoloc.lifelong.weak_regions",
     "WeightsError": "topoloc.errors",
     "WorldFit": "topoloc.evaluation.world_alignment",
-    "absolute_trajectory_errors": "topoloc.geometry.alignment",
-    "add_tiles": "topoloc.atlas.editing",
     "align_to_trajectory": "topoloc.recordings.trajectory_alignment",
     "build_map": "topoloc.localization.map_facts.map_building",
     "check_camera_calibrations": "topoloc.localization.image_calibration_check",
@@ -330,20 +314,15 @@ _MODULES = {
     "read_depth": "topoloc.recordings.image_io",
     "read_history": "topoloc.mapping.edit",
     "read_image": "topoloc.recordings.image_io",
-    "read_manifest": "topoloc.atlas.editing",
-    "read_trajectory": "topoloc.recordings.trajectory",
-    "relative_drift": "topoloc.geometry.alignment",
     "result_from_json": "topoloc.localization.result",
     "run_slam": "topoloc.slam.slam",
     "set_num_threads": "topoloc.compiled",
-    "tum_text": "topoloc.recordings.trajectory",
     "undo_edit": "topoloc.mapping.edit",
     "update": "topoloc.lifelong.map_files",
     "view": "topoloc.apps.viewer.page",
     "warm_up": "topoloc.tracking.warm_up",
     "with_pose_conventions": "topoloc.recordings.trajectory",
     "with_trajectory": "topoloc.recordings.trajectory",
-    "write_tum": "topoloc.recordings.trajectory",
 }
 
 

@@ -111,6 +111,37 @@ class Atlas:
         return Atlas(store_at(where), add_tiles(where, new_tiles(maps, tile_id, world), replaces))
 
     @staticmethod
+    def add_map(
+        where: str, tile_id: str, path: Path, world: str, recipe: str, replaces: bool = False
+    ) -> Tile:
+        """Add a map file as a tile, and create the atlas if there is none.
+
+        Args:
+            recipe: digest of the map's inputs.
+            replaces: replace a tile of the same id. Otherwise it is an error, unless it has the
+                same recipe.
+
+        Raises:
+            AtlasError: the atlas has a tile of the same id, or it cannot be written.
+            MapError: the map is damaged or empty.
+        """
+        from topoloc.atlas.editing import NewTile, add_tiles
+
+        new = NewTile(tile_id, path, world, recipe)
+        return add_tiles(where, [new], replaces, creates=True).by_id[tile_id]
+
+    @staticmethod
+    def read_manifest(where: str) -> Manifest:
+        """Return the current manifest of an atlas, an empty one if there is no atlas yet.
+
+        Raises:
+            AtlasError: the manifest is damaged, or the store does not answer.
+            MissingExtraError: the store needs an extra that is not installed.
+        """
+        data = store_at(where).manifest()
+        return Manifest() if data is None else Manifest.from_bytes(data, f"{where}/{MANIFEST}")
+
+    @staticmethod
     def remove(where: str, tile_ids: Sequence[str]) -> Atlas:
         """Remove tiles from the atlas there. Raises AtlasError."""
         from topoloc.atlas.editing import remove_tiles

@@ -159,7 +159,7 @@ def test_without_the_extra(export: Make, monkeypatch: pytest.MonkeyPatch):
         ),
         ({"w": 100}, CalibrationError, "of 100x24, but 0.jpg is 32x24"),
         ({"frameTimestamps": [1.0, 0.5, 2.0]}, RecordingError, "do not increase"),
-        ({"frameTimestamps": [1.0]}, RecordingError, "1 frameTimestamps for 3 pictures"),
+        ({"frameTimestamps": [1.0]}, RecordingError, "1 frameTimestamps for 3 images"),
     ],
 )
 def test_what_is_refused(

@@ -25,7 +25,6 @@ from topoloc import (
     localize_out_of_map,
     localize_queries,
     open_sequence,
-    write_tum,
 )
 from topoloc.apps.cli.output import (
     File,
@@ -154,7 +153,7 @@ def _write_results(out: Path, folder: Path, answers: list[EvaluatedQuery]) -> No
             if isinstance(a.result, Localization)
         ]
         trajectory = Trajectory([pose for _, pose in found], [t for t, _ in found])
-        write_tum(out / f"{sequence.name}.tum", trajectory)
+        trajectory.write_tum(out / f"{sequence.name}.tum")
 
 
 def _print(out: Path, evaluation: dict[str, Any], seconds: str, report: str) -> None:

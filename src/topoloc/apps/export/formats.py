@@ -23,7 +23,6 @@ from topoloc import (
     TopoMetricMap,
     Trajectory,
     TrajectoryError,
-    tum_text,
 )
 from topoloc.apps.export.colmap import to_colmap_model
 from topoloc.apps.export.foxglove import to_mcap
@@ -73,7 +72,7 @@ def to_tum(scene: Scene) -> bytes:
             "two poses have the same time: a TUM file holds one stream (--session N exports one"
             " session of a map)"
         )
-    return tum_text(Trajectory([pose for _, pose in timed], times)).encode()
+    return Trajectory([pose for _, pose in timed], times).to_tum().encode()
 
 
 def to_kitti(scene: Scene) -> bytes:

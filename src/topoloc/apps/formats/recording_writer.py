@@ -24,7 +24,6 @@ from topoloc import (
     StereoRig,
     TopolocError,
     Trajectory,
-    tum_text,
 )
 from topoloc.plugin import write_bytes, write_text
 
@@ -102,7 +101,7 @@ class RecordingWriter:
         try:
             if self._truth is not None and frame.world_from_cam is not None:
                 trajectory = Trajectory([frame.world_from_cam], [frame.t_ns])
-                self._truth.write(tum_text(trajectory, header=False))
+                self._truth.write(trajectory.to_tum(header=False))
                 self._truth.flush()
             times.write(f"{Decimal(frame.t_ns).scaleb(-9):.9f}\n")
             times.flush()
@@ -129,7 +128,7 @@ class RecordingWriter:
                 write_text(self.folder / "camera.json", calibration + "\n")
             if frame.world_from_cam is not None:
                 self._truth = (self.folder / "truth.tum").open("x", encoding="utf-8")
-                self._truth.write(tum_text(Trajectory([], [])))
+                self._truth.write(Trajectory([], []).to_tum())
             self._times = (self.folder / "times.txt").open("x", encoding="utf-8")
             return self._times
         except OSError as error:

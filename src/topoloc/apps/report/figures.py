@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, PercentFormatter
 
-from topoloc import EvaluatedQuery
+from topoloc import EvaluatedQuery, Evaluation
 from topoloc.apps.report.figure_style import (
     BAD,
     GREY,
@@ -26,7 +26,6 @@ from topoloc.apps.report.figure_style import (
     recording_colours,
     svg_text,
 )
-from topoloc.plugin import group_by_recording
 
 STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp")
 
@@ -36,7 +35,7 @@ def draw_error_curves(answers: Sequence[EvaluatedQuery]) -> tuple[str, str]:
 
     Returns the figures of translation and rotation.
     """
-    groups = group_by_recording([a for a in answers if a.world_from_cam is not None])
+    groups = Evaluation([a for a in answers if a.world_from_cam is not None]).by_recording
     metres = [a.translation_m for a in answers if not a.is_false_accept]
     large = np.nanmax(metres, initial=0.0) > 2.0
     scale, unit = (1.0, " m") if large else (100.0, " cm")
@@ -53,7 +52,7 @@ def draw_error_curves(answers: Sequence[EvaluatedQuery]) -> tuple[str, str]:
 def draw_errors_along(answers: Sequence[EvaluatedQuery]) -> str:
     """Draw the errors of all queries in order. Marks at the top are queries without a pose."""
     with_truth = [a for a in answers if a.world_from_cam is not None]
-    colours = recording_colours(list(group_by_recording(with_truth)))
+    colours = recording_colours(list(Evaluation(with_truth).by_recording))
     has_lost = not all(a.result.localized for a in with_truth)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 3.9), layout="constrained")

@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from topoloc import EvaluatedQuery, Localization, Rigid3, TopoMetricMap
+from topoloc import EvaluatedQuery, Evaluation, Localization, Rigid3, TopoMetricMap
 from topoloc.apps.report.figure_style import (
     BAD,
     ERROR,
@@ -24,7 +24,6 @@ from topoloc.apps.report.figure_style import (
     recording_colours,
     svg_text,
 )
-from topoloc.plugin import group_by_recording
 
 # Height over width of the map.
 MIN_ASPECT, MAX_ASPECT = 0.3, 0.8
@@ -134,7 +133,7 @@ def draw_map(answers: Sequence[EvaluatedQuery], topomap: TopoMetricMap) -> str:
     """
     with_truth = [a for a in answers if a.world_from_cam is not None]
     nodes = [summary.world_from_cam for summary in topomap.summaries]
-    groups = group_by_recording(with_truth)
+    groups = Evaluation(with_truth).by_recording
     colours = recording_colours(list(groups))
     with MapFigure(nodes, _truths(with_truth), 0.9 + 0.2 * (len(groups) // 2)) as figure:
         figure.draw_nodes(topomap)

@@ -9,6 +9,7 @@ import numpy as np
 
 from topoloc import (
     EvaluatedQuery,
+    Evaluation,
     Image,
     Localization,
     NotLocalized,
@@ -24,7 +25,7 @@ from topoloc.apps.report.match_images import (
     match_with_node,
 )
 from topoloc.apps.report.page_template import render_figure, render_gallery_items
-from topoloc.plugin import NodeMatcher, encode_jpeg, format_length, group_by_recording
+from topoloc.plugin import NodeMatcher, encode_jpeg, format_length
 
 NUM_WORST = 6
 
@@ -36,9 +37,9 @@ def select_worst_queries(
 
     Each recording has an equal share of the places.
     """
-    groups = group_by_recording(
+    groups = Evaluation(
         [a for a in answers if a.world_from_cam is not None or a.is_false_accept]
-    )
+    ).by_recording
     share = max(count // max(len(groups), 1), 1)
     ranked = [
         (rank, answer)
@@ -52,7 +53,7 @@ def select_worst_queries(
 def select_typical_queries(answers: Sequence[EvaluatedQuery]) -> list[EvaluatedQuery]:
     """Return the query with the median error of each recording; without poses the middle one."""
     typical = []
-    for group in group_by_recording(answers).values():
+    for group in Evaluation(list(answers)).by_recording.values():
         localized = [a for a in group if np.isfinite(a.translation_m)]
         chosen = sorted(localized, key=lambda a: a.translation_m) or group
         typical.append(chosen[(len(chosen) - 1) // 2])

@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from topoloc import EvaluatedQuery, TopoMetricMap
+from topoloc import EvaluatedQuery, Evaluation, TopoMetricMap
 from topoloc.apps.report.figures import draw_error_curves, draw_errors_along, draw_stage_times
 from topoloc.apps.report.map_figure import draw_map
 from topoloc.apps.report.page_template import render_page, render_section
@@ -26,7 +26,7 @@ from topoloc.apps.report.report_tables import (
 )
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
 from topoloc.apps.viewer.page import embedded_head, embedded_scene
-from topoloc.plugin import group_by_recording, write_text
+from topoloc.plugin import write_text
 
 _SCENE_BUDGET = SceneBudget(max_points=60_000, max_image_bytes=1_500_000)
 _SCENE = (
@@ -94,7 +94,7 @@ def _render_sections(
     yield render_section("Results", explain_shares(evaluation), table + paragraphs)
     sets = [
         ResultSet(name or "queries", [answer.to_json() for answer in group])
-        for name, group in group_by_recording(answers).items()
+        for name, group in Evaluation(answers).by_recording.items()
     ]
     name = Path(evaluation["map"]["path"]).name
     document = create_document(topomap, name, sets, _SCENE_BUDGET)

@@ -14,8 +14,8 @@ from topoloc import (
     NotLocalized,
     ResultError,
     Rigid3,
+    Trajectory,
     TrajectoryError,
-    read_trajectory,
     result_from_json,
 )
 from topoloc.apps.viewer.document import ResultSet
@@ -33,7 +33,7 @@ def read_results(path: Path) -> list[ResultSet]:
     """
     text = read_text(path, ResultError)
     if not text.lstrip().startswith("{"):
-        return [ResultSet(path.stem, path=read_trajectory(path).world_from_cam)]
+        return [ResultSet(path.stem, path=Trajectory.read(path).world_from_cam)]
     whole = _parse_single_object(text)
     if whole is not None and "localized" not in whole:
         return _read_evaluation(path, whole)

@@ -28,8 +28,9 @@ from topoloc import (
     with_trajectory,
 )
 from topoloc.apps.cli.output import UsageError, open_recording
+from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.formats.metric_scale import estimate_metric_scale
-from topoloc.plugin import Progress, has_scale, scale_poses, split_selection
+from topoloc.plugin import has_scale, scale_poses, split_selection
 
 
 @dataclass(frozen=True)

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 
 from topoloc import (
-    Rigid3,
     SlamConfig,
-    SlamResult,
-    StereoSequence,
     Trajectory,
-    absolute_trajectory_errors,
-    relative_drift,
     run_slam,
-    write_tum,
 )
 from topoloc.apps.cli.output import (
     CameraOption,
@@ -64,52 +56,13 @@ class Command:
         pairs = zip(sequence.t_ns, result.poses[0], strict=True)
         known = [(t_ns, pose) for t_ns, pose in pairs if pose is not None]
         trajectory = Trajectory([pose for _, pose in known], [t_ns for t_ns, _ in known])
-        write_tum(Path(self.out), trajectory)
+        trajectory.write_tum(Path(self.out))
         rate = round(len(sequence) / seconds, 2)
-        facts = describe_slam(sequence, result) | {"frames_per_second": rate}
+        facts = result.to_json(sequence) | {"frames_per_second": rate}
         if self.json != "-":
             _print(self.out, facts)
         write_json(self.json, facts)
         return 0
-
-
-def describe_slam(sequence: StereoSequence, result: SlamResult) -> dict[str, Any]:
-    """Return the facts of a result, with errors if the recording has truth."""
-    poses = result.poses[0]
-    facts: dict[str, Any] = {
-        "num_frames": len(poses),
-        "num_tracked": sum(pose is not None for pose in poses),
-        "num_keyframes": result.num_keyframes,
-        "num_loops": result.num_loops,
-        "num_submaps": result.num_submaps,
-        "num_joined": result.num_joined,
-        "length_m": round(_length([pose for pose in poses if pose is not None]), 3),
-        "disparity_bias_px": round(result.disparity_bias_px[0], 3),
-        "right_residual_px": _median(result.right_residuals_px),
-    }
-    both = [
-        (true, pose)
-        for true, pose in zip(sequence.poses, poses, strict=True)
-        if true is not None and pose is not None
-    ]
-    if both:
-        truth, found = [true for true, _ in both], [pose for _, pose in both]
-        errors, drift = absolute_trajectory_errors(truth, found), relative_drift(truth, found)
-        facts["ate_m"] = float(np.sqrt(np.mean(errors**2)))
-        facts["max_error_m"] = float(errors.max())
-        facts["drift_percent"] = 100.0 * drift.translation if drift else None
-        facts["drift_deg_per_m"] = float(np.rad2deg(drift.rotation)) if drift else None
-    return facts
-
-
-def _length(poses: Sequence[Rigid3]) -> float:
-    positions = np.array([pose.translation for pose in poses]).reshape(-1, 3)
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-
-
-def _median(values: np.ndarray) -> float | None:
-    known = values[np.isfinite(values)]
-    return round(float(np.median(known)), 3) if len(known) else None
 
 
 def _print(out: str, facts: dict[str, Any]) -> None:

@@ -16,7 +16,6 @@ from topoloc import (
     Trajectory,
     UpdateConfig,
     is_atlas,
-    write_tum,
 )
 from topoloc.apps.cli.maps.session_update import SessionUpdateOptions, describe_update
 from topoloc.apps.cli.output import (
@@ -134,9 +133,8 @@ class Command:
                     for t_ns, pose in zip(update.sequence.t_ns, update.sequence.poses, strict=True)
                     if pose is not None
                 ]
-                write_tum(
-                    Path(self.joined),
-                    Trajectory([pose for _, pose in known], [t_ns for t_ns, _ in known]),
+                Trajectory([pose for _, pose in known], [t_ns for t_ns, _ in known]).write_tum(
+                    Path(self.joined)
                 )
             if self.json != "-":
                 print(f"{target}: {describe_update(update.changes)}")
