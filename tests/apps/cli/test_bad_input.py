@@ -187,9 +187,7 @@ def test_outputs_never_replace_inputs_or_folders(
 ):
     assert "it is a folder" in complaint(*command_with_output(command, option, tmp_path))
     target = tmp_path / "room.topo" if command == "build" else room_map
-    assert "named for something else, too" in complaint(
-        *command_with_output(command, option, target)
-    )
+    assert "used twice, too" in complaint(*command_with_output(command, option, target))
 
 
 def test_ctrl_c_in_mid_build(

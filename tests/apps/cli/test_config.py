@@ -170,7 +170,7 @@ def test_bad_settings_are_one_line_before_the_work(
     )
     assert "slam.checks.max_baseline: must be " in refused("slam.checks.max_baseline = -1", *build)
     (tmp_path / "my.toml").write_text("")
-    assert "named for something else" in complaint(
+    assert "used twice" in complaint(
         "slam", tiny_recording, tmp_path / "my.toml", "--config", tmp_path / "my.toml"
     )
 

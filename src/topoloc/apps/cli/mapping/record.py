@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc import CalibrationError, MissingExtraError, StereoFrame, TopolocError
+from topoloc import CalibrationError, ConfigError, MissingExtraError, StereoFrame, TopolocError
 from topoloc.apps.cli.output import (
     File,
     UsageError,
@@ -128,7 +128,10 @@ class Command:
     ) -> Generator[StereoFrame, None, None]:
         """Open the source and yield its frames."""
         if self.kind == "carla":
-            carla, client = carla_client(self.carla.server)
+            try:
+                carla, client = carla_client(self.carla.server)
+            except ConfigError as error:
+                raise UsageError(str(error)) from None
             yield from carla_frames(carla, client, self.carla, self._size() or (800, 600))
         elif self.kind == "zed" and self.source is None and self.camera is None:
             try:

@@ -25,6 +25,7 @@ from topoloc import (
     TopolocError,
     Tracker,
     TrackerConfig,
+    Trajectory,
     UncalibratedCamera,
     UnreadableImageError,
 )
