@@ -20,6 +20,7 @@ import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.trajectory import Trajectory
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_LINES = 86

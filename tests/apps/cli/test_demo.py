@@ -17,6 +17,7 @@ from tiny_world import write_stereo_recording
 from topoloc.apps.cli import demo, main
 from topoloc.demo.recordings import SHIPPED, find_missing_recordings
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.trajectory import Trajectory
 
 SETS = ["day", "night", "other camera", "elsewhere"]
 

@@ -17,6 +17,7 @@ from answers_compared import without_times
 from topoloc.apps.cli import main
 from topoloc.localization.result import Localization, result_from_json
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.trajectory import Trajectory
 
 
 def _printed(capsys: pytest.CaptureFixture[str], *args: object) -> str:

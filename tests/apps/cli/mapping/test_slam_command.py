@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from topoloc.apps.cli import main
+from topoloc.recordings.trajectory import Trajectory
 
 
 def test_slam_writes_a_trajectory_and_says_how_good_it_is(

@@ -16,6 +16,7 @@ from room_stream import room_stream
 from tiny_world import CAMERA
 from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
+from topoloc.recordings.trajectory import Trajectory
 
 NUM_FRAMES = 15
 STATES = {"t_ns", "state", "smoothed", "smoothed_covariance"}
