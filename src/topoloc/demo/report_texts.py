@@ -61,7 +61,7 @@ def describe_night(evaluation: dict[str, Any]) -> str:
         return text + " No pose is wrong."
     return (
         text + f" {false} {'pose is' if false == 1 else 'poses are'} wrong by more than"
-        f" {EvaluatedQuery.max_translation_m:g} m or {EvaluatedQuery.max_rotation_deg:g} degrees."
+        f" {EvaluatedQuery.MAX_TRANSLATION:g} m or {EvaluatedQuery.MAX_ROTATION_DEG:g} degrees."
     )
 
 

@@ -81,7 +81,7 @@ class EvaluatedQuery:
         if self.world_from_cam is None or self.is_in_other_world:
             return True
         return not self.world_from_cam.is_same(
-            self.result.world_from_cam, MAX_TRANSLATION, np.deg2rad(MAX_ROTATION_DEG)
+            self.result.world_from_cam, self.MAX_TRANSLATION, np.deg2rad(self.MAX_ROTATION_DEG)
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -71,8 +71,8 @@ def _error_rank(answer: EvaluatedQuery) -> tuple[int, float]:
     if isinstance(answer.result, NotLocalized):
         return 1, 0.0
     errors = (
-        answer.translation_m / answer.max_translation_m,
-        answer.rotation_deg / answer.max_rotation_deg,
+        answer.translation_m / answer.MAX_TRANSLATION,
+        answer.rotation_deg / answer.MAX_ROTATION_DEG,
     )
     return 2 * answer.is_false_accept, max(errors)
 

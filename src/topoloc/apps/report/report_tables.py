@@ -129,7 +129,7 @@ def explain_shares(evaluation: dict[str, Any]) -> str:
     """Return the definitions of the shares in one or two sentences."""
     false = (
         "A false accept is a pose for an out-of-map image, or a pose with an error of more than"
-        f" {EvaluatedQuery.max_translation_m:g} m or {EvaluatedQuery.max_rotation_deg:g}°."
+        f" {EvaluatedQuery.MAX_TRANSLATION:g} m or {EvaluatedQuery.MAX_ROTATION_DEG:g}°."
     )
     if not evaluation["num_queries"]:
         return false
