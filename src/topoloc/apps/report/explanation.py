@@ -130,7 +130,10 @@ def _verdict(
     ):
         return "the answer"
     others = [] if is_localized else result.alternatives
-    if any(world_from_cam.is_same(other.world_from_cam, *limits) for other in others):
+    if any(
+        world_from_cam.is_same(other.world_from_cam, _SAME_POSITION_M, _SAME_ROTATION)
+        for other in others
+    ):
         return "one of the alternatives"
     if probability < _MIN_PROBABILITY:
         return "rejected: the evidence against it is stronger"

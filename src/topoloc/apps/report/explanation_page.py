@@ -88,13 +88,13 @@ def verdict(explanation: Explanation) -> str:
 def _rank_poses(explanation: Explanation) -> list[EvaluatedPose]:
     """Return the poses to show, the most probable first, one for each node."""
     ranked = sorted(
-        (pose for pose in explanation.poses if pose.num_inliers and pose.node_id >= 0),
+        (pose for pose in explanation.poses if pose.num_inliers and pose.tried.fit.node_id >= 0),
         key=lambda pose: (pose.probability or 0.0, pose.tried.fit.num_inliers),
         reverse=True,
     )
     best = dict[int, EvaluatedPose]()
     for pose in ranked:
-        best.setdefault(pose.node_id, pose)
+        best.setdefault(pose.tried.fit.node_id, pose)
     return list(best.values())[:_MAX_SHOWN]
 
 
@@ -105,12 +105,12 @@ def compared_to_json(
     the node's camera."""
     compared = list[dict[str, Any]]()
     for pose in _rank_poses(explanation):
-        camera = topomap.nodes[topomap.row_of(pose.node_id)].camera
+        camera = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)].camera
         matches = _find_explained_matches(image, pose, topomap)
         pixels = np.column_stack([matches.points_query, matches.points_node]).round(1)[:MAX_MATCHES]
         compared.append(
             {
-                "node": pose.node_id,
+                "node": pose.tried.fit.node_id,
                 "node_size": [camera.width, camera.height],
                 "verdict": pose.verdict,
                 "num_inliers": pose.num_inliers,
@@ -124,7 +124,7 @@ def _find_explained_matches(
     image: Image, pose: EvaluatedPose, topomap: TopoMetricMap
 ) -> NodeMatches:
     """Return the inliers of the pose that lie inside the image of its node."""
-    node, fit = topomap.nodes[topomap.row_of(pose.node_id)], pose.tried.fit
+    node, fit = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)], pose.tried.fit
     scale = image.shape[1] / fit.camera.width
     points_img = fit.features.points_img[fit.inlier_query_idx].astype(np.float64)
     query = (points_img + 0.5) * scale - 0.5
@@ -138,21 +138,21 @@ def _find_explained_matches(
 
 def _render_pose(image: Image, pose: EvaluatedPose, topomap: TopoMetricMap) -> tuple[str, str]:
     """Return the figure and the facts of a pose."""
-    node = topomap.nodes[topomap.row_of(pose.node_id)]
+    node = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)]
     matches = _find_explained_matches(image, pose, topomap)
     pair = draw_pair(image, decode_template(node), matches, node.camera)
     kind = "good" if pose.verdict == "the answer" else "bad"
     facts = (
-        f"<b>node {pose.node_id}, {pose.num_inliers} inliers</b>"
+        f"<b>node {pose.tried.fit.node_id}, {pose.num_inliers} inliers</b>"
         f'<p class="{kind}">{escape(pose.verdict)}</p>'
     )
-    caption = f"left the image, right node {pose.node_id}"
+    caption = f"left the image, right node {pose.tried.fit.node_id}"
     return render_figure(encode_jpeg(pair, JPEG_QUALITY), caption), facts
 
 
 def row_of(pose: EvaluatedPose) -> tuple[str, ...]:
     """Return the cells of a pose in the order of `_COLUMNS`."""
-    node = str(pose.node_id) if pose.node_id >= 0 else ""
+    node = str(pose.tried.fit.node_id) if pose.tried.fit.node_id >= 0 else ""
     first = f"{pose.tried.first.num_inliers} of {len(pose.tried.first.matches)}"
     evidence = ("", "", "", "")
     if pose.tried.hypothesis is not None:
