@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     from topoloc.apps.report.explanation import explain
     from topoloc.apps.service.client import AsyncClient, Client
     from topoloc.apps.viewer.page import view
-    from topoloc.atlas.atlas import Atlas, is_atlas
+    from topoloc.atlas.atlas import Atlas
     from topoloc.atlas.config import AtlasConfig
     from topoloc.atlas.location_prior import GeoPositionPrior
     from topoloc.atlas.manifest import Tile
     from topoloc.atlas.map_cache import MapCache
+    from topoloc.atlas.place import SingleMap, open_place
     from topoloc.atlas.shared_world import SharedWorld
     from topoloc.atlas.tile_fetcher import TileFetcher
     from topoloc.compiled import set_num_threads
@@ -61,7 +62,6 @@ if TYPE_CHECKING:
     from topoloc.lifelong.map_files import merge, prune, update
     from topoloc.lifelong.prune import PruneConfig
     from topoloc.lifelong.tile_comparison import TileJoinConfig
-    from topoloc.lifelong.tile_editing import edit_tile
     from topoloc.lifelong.tile_joining import PairResult, join_tiles
     from topoloc.lifelong.tile_selection import TileSelectionConfig, find_tile_of_recording
     from topoloc.lifelong.update import MapUpdate, UpdateConfig
@@ -155,6 +155,7 @@ __all__ = [
     "Rigid3",
     "ServiceError",
     "SharedWorld",
+    "SingleMap",
     "SkippedChecks",
     "SlamConfig",
     "SlamResult",
@@ -188,7 +189,6 @@ __all__ = [
     "build_map",
     "check_camera_calibrations",
     "check_map",
-    "edit_tile",
     "evaluate",
     "explain",
     "export",
@@ -196,11 +196,11 @@ __all__ = [
     "find_tile_of_recording",
     "find_weak_regions",
     "georeference",
-    "is_atlas",
     "join_tiles",
     "localize_out_of_map",
     "localize_queries",
     "merge",
+    "open_place",
     "open_sequence",
     "prune",
     "read_depth",
@@ -264,6 +264,7 @@ _MODULES = {
     "Rigid3": "topoloc.geometry.rigid",
     "ServiceError": "topoloc.errors",
     "SharedWorld": "topoloc.atlas.shared_world",
+    "SingleMap": "topoloc.atlas.place",
     "SkippedChecks": "topoloc.localization.map_facts.map_building",
     "SlamConfig": "topoloc.slam.slam",
     "SlamResult": "topoloc.slam.slam",
@@ -296,7 +297,6 @@ _MODULES = {
     "build_map": "topoloc.localization.map_facts.map_building",
     "check_camera_calibrations": "topoloc.localization.image_calibration_check",
     "check_map": "topoloc.localization.map_facts.contradictions",
-    "edit_tile": "topoloc.lifelong.tile_editing",
     "evaluate": "topoloc.evaluation.evaluate",
     "explain": "topoloc.apps.report.explanation",
     "export": "topoloc.apps.export.formats",
@@ -304,11 +304,11 @@ _MODULES = {
     "find_tile_of_recording": "topoloc.lifelong.tile_selection",
     "find_weak_regions": "topoloc.lifelong.weak_regions",
     "georeference": "topoloc.mapping.georeference",
-    "is_atlas": "topoloc.atlas.atlas",
     "join_tiles": "topoloc.lifelong.tile_joining",
     "localize_out_of_map": "topoloc.evaluation.query_localization",
     "localize_queries": "topoloc.evaluation.query_localization",
     "merge": "topoloc.lifelong.map_files",
+    "open_place": "topoloc.atlas.place",
     "open_sequence": "topoloc.recordings.open",
     "prune": "topoloc.lifelong.map_files",
     "read_depth": "topoloc.recordings.image_io",

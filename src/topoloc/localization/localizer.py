@@ -112,7 +112,7 @@ class Localizer:
             return opened
 
         if isinstance(source, str | Path):
-            source = open_place(str(source))
+            source = _open_source(str(source))
         self.source = source
         if isinstance(source, TopoMetricMap):
             self._tiles = OneMap(open_map(source))
@@ -313,15 +313,12 @@ class Localizer:
         return self.tile_ids[0]
 
 
-def open_place(where: str) -> TopoMetricMap | Atlas:
-    """Open a map file, or the atlas in a folder or an object store.
+def _open_source(where: str) -> TopoMetricMap | Atlas:
+    """Open a map file or an atlas. The module is loaded here, because an open map does not need
+    it."""
+    from topoloc.atlas.place import open_place
 
-    Raises:
-        MapError: there is none, or it cannot be read.
-    """
-    from topoloc.atlas.atlas import Atlas, is_atlas
-
-    return Atlas.open(where) if is_atlas(where) else TopoMetricMap.load(where)
+    return open_place(where).visit(TopoMetricMap.load, lambda atlas: atlas)
 
 
 def _open_tiles(

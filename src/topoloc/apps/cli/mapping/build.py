@@ -15,7 +15,7 @@ from topoloc import BuildConfig, SlamConfig
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
 from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cli.mapping.recording_pieces import Pieces, SplitOptions, split_recording
-from topoloc.apps.cli.maps.tile_joining import JoinedTiles, join_overlapping_tiles
+from topoloc.apps.cli.maps.atlas import JoinedTiles, join_overlapping_tiles
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -274,18 +274,21 @@ class Command:
 
 
 def _check_atlas(last: str) -> None:
-    """Raise UsageError if the path is neither an atlas nor free for one."""
-    from topoloc import is_atlas
+    """Raise UsageError if something else than an atlas exists at this path."""
+    from topoloc import Atlas, AtlasError
 
-    is_other = (
+    is_taken = "://" not in last and (
         os.path.isfile(last)
         or (os.path.isdir(last) and any(os.scandir(last)))
         or ("@" in last and not os.path.exists(last))
     )
-    if is_other and not is_atlas(last):
+    try:
+        if is_taken:
+            Atlas.open(last)
+    except AtlasError as error:
         raise UsageError(
-            f"the last argument is the atlas to write, but {last} is no atlas; was ATLAS forgotten?"
-        )
+            f"the last argument is the atlas to write; was ATLAS forgotten? {error}"
+        ) from None
 
 
 def _is_positive(text: str) -> bool:
