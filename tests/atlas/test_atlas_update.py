@@ -15,7 +15,7 @@ import pytest
 
 from tiny_world import write_stereo_recording
 from topoloc.apps.cli import main
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, add_tiles, create_atlas, new_tiles
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Tile
@@ -62,7 +62,7 @@ def _updated(capsys: pytest.CaptureFixture[str], status: int, *args: object) -> 
 
 def _map(where: object, tile_id: str) -> bytes:
     atlas = Atlas.open(str(where))
-    assert tile_problem(atlas, atlas.tile(tile_id)) is None
+    assert atlas.find_problem(tile_id) is None
     return atlas.map_path(atlas.tile(tile_id)).read_bytes()
 
 

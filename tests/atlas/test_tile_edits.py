@@ -13,7 +13,7 @@ from uuid import uuid4
 import pytest
 
 from topoloc.apps.cli import main
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.atlas.manifest import Manifest
 from topoloc.atlas.place import edit_tile
@@ -32,7 +32,7 @@ def _done(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
 def _bytes(where: Path, tile_id: str) -> bytes:
     atlas = Atlas.open(str(where))
     tile = atlas.tile(tile_id)
-    assert tile_problem(atlas, tile) is None
+    assert atlas.find_problem(tile.tile_id) is None
     return atlas.map_path(tile).read_bytes()
 
 
@@ -100,7 +100,7 @@ def test_a_kept_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
     assert Manifest.from_bytes(atlas.manifest.to_bytes(), "here").by_id["room"].previous == (kept,)
     path = atlas.store.local_path(kept.name, kept.sha256)
     path.write_bytes(path.read_bytes()[:-1] + b"?")
-    assert "checksum" in (tile_problem(atlas, atlas.tile("room")) or "")
+    assert "checksum" in (atlas.find_problem("room") or "")
     assert "checksum" in complaint("undo", own_atlas, "--tile", "room")
     edit_tile(str(own_atlas), "other", _note)
     undone = edit_tile(str(own_atlas), "other", undo_edit)

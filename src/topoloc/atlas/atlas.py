@@ -197,7 +197,14 @@ class Atlas:
     def find_problem(self, tile_id: str) -> str | None:
         """Return the first difference between a tile's files and their checksums, None if there is
         none. Raises AtlasError: the atlas has no such tile."""
-        return tile_problem(self, self.tile(tile_id))
+        for stored in self.tile(tile_id).files:
+            try:
+                path = self.store.local_path(stored.name, stored.sha256)
+                if path.stat().st_size != stored.num_bytes or sha256_of(path) != stored.sha256:
+                    return f"{stored.name} is not the file that was added: its checksum is another"
+            except AtlasError as error:
+                return str(error)
+        return None
 
     def tile(self, tile_id: str) -> Tile:
         """Return the tile with this id.
@@ -255,15 +262,3 @@ class Atlas:
     def index(self) -> AtlasIndex:
         """Return the index of all tiles with readable global descriptors."""
         return self._opened.index
-
-
-def tile_problem(atlas: Atlas, tile: Tile) -> str | None:
-    """Return the problem with a tile's files, None if they match the manifest."""
-    for stored in tile.files:
-        try:
-            path = atlas.store.local_path(stored.name, stored.sha256)
-            if path.stat().st_size != stored.num_bytes or sha256_of(path) != stored.sha256:
-                return f"{stored.name} is not the file that was added: its checksum is another"
-        except AtlasError as error:
-            return str(error)
-    return None

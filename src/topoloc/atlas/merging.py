@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
-from topoloc.atlas.atlas import Atlas, store_at, tile_problem
+from topoloc.atlas.atlas import Atlas, store_at
 from topoloc.atlas.editing import new_tiles, store_tile
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Manifest, Tile
@@ -55,7 +55,7 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
 
 
 def _copy_files(atlas: Atlas, tile: Tile, store: Store) -> None:
-    problem = tile_problem(atlas, tile)
+    problem = atlas.find_problem(tile.tile_id)
     if problem is not None:
         raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
     for stored in tile.files:

@@ -112,7 +112,9 @@ class Localizer:
             return opened
 
         if isinstance(source, str | Path):
-            source = _open_source(str(source))
+            from topoloc.atlas.place import open_place  # an open map does not need this module
+
+            source = open_place(str(source)).visit(TopoMetricMap.load, lambda atlas: atlas)
         self.source = source
         if isinstance(source, TopoMetricMap):
             self._tiles = OneMap(open_map(source))
@@ -311,14 +313,6 @@ class Localizer:
         if len(self.tile_ids) > 1:
             raise AtlasError("the atlas has several tiles: name the one that is meant")
         return self.tile_ids[0]
-
-
-def _open_source(where: str) -> TopoMetricMap | Atlas:
-    """Open a map file or an atlas. The module is loaded here, because an open map does not need
-    it."""
-    from topoloc.atlas.place import open_place
-
-    return open_place(where).visit(TopoMetricMap.load, lambda atlas: atlas)
 
 
 def _open_tiles(

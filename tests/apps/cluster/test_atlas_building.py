@@ -23,7 +23,7 @@ from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress
 from topoloc.apps.cluster.tiles import AtlasBuild, Outcome, TileJob, build_on_ray
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.mapping.build import BuildConfig
 from topoloc.slam.slam import SlamConfig
 
@@ -42,7 +42,9 @@ def one_by_one(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> d
 def _maps(where: str) -> dict[str, bytes]:
     atlas = Atlas.open(where)
     assert [
-        tile_problem(atlas, tile) for tile in atlas.manifest.tiles if tile_problem(atlas, tile)
+        atlas.find_problem(tile.tile_id)
+        for tile in atlas.manifest.tiles
+        if atlas.find_problem(tile.tile_id)
     ] == []
     return {tile.tile_id: atlas.map_path(tile).read_bytes() for tile in atlas.manifest.tiles}
 
