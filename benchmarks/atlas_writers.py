@@ -22,7 +22,7 @@ from pathlib import Path
 
 import httpx
 
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_tiles, create_atlas, new_tiles
 
 
@@ -78,7 +78,9 @@ def main() -> None:
         }
         missing = expected - {tile.tile_id for tile in atlas.manifest.tiles}
         damaged = [
-            problem for tile in atlas.manifest.tiles if (problem := tile_problem(atlas, tile))
+            problem
+            for tile in atlas.manifest.tiles
+            if (problem := atlas.find_problem(tile.tile_id))
         ]
         print(
             f"{args.writers} writers, {args.times} tiles each, {time.perf_counter() - start:.0f} s:"

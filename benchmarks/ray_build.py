@@ -25,8 +25,7 @@ from pathlib import Path
 from ray.cluster_utils import Cluster
 
 from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
-from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
-from topoloc.apps.cluster.tiles import Outcome, TileJob, derive_tile_ids
+from topoloc.apps.cluster.tiles import AtlasBuild, Outcome, TileJob, build_on_ray, derive_tile_ids
 from topoloc.atlas.atlas import Atlas
 from topoloc.mapping.build import BuildConfig
 

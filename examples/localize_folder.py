@@ -15,7 +15,7 @@ from pathlib import Path
 import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.errors import UnreadableImageError
-from topoloc.recordings.trajectory import Trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory
 
 
 def main(map_file: Path | None, folder: str, out: Path) -> None:
@@ -44,7 +44,7 @@ def main(map_file: Path | None, folder: str, out: Path) -> None:
             reasons[result.reason] += 1
 
     (out / "poses.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    write_tum(out / "poses.tum", Trajectory(poses, times))
+    Trajectory(poses, times).write_tum(out / "poses.tum")
     refused = ", ".join(f"{count} {reason}" for reason, count in reasons.items()) or "none"
     print(
         f"{len(poses)} of {len(lines)} photos localized, not localized: {refused}; written to {out}"

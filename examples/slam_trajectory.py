@@ -15,7 +15,7 @@ import numpy as np
 import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import absolute_trajectory_errors
-from topoloc.recordings.trajectory import Trajectory, with_trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory, with_trajectory
 from topoloc.slam.slam import run_slam
 
 
@@ -31,10 +31,9 @@ def main(recording: str, out: Path) -> None:
 
     # The world of these poses is the camera of the first frame; `evo_traj tum FILE.tum --plot`
     # draws them.
-    write_tum(
-        out,
-        Trajectory([pose for pose in poses if pose is not None], [sequence.t_ns[i] for i in known]),
-    )
+    Trajectory(
+        [pose for pose in poses if pose is not None], [sequence.t_ns[i] for i in known]
+    ).write_tum(out)
     truth = [(sequence.poses[i], poses[i]) for i in known if sequence.poses[i] is not None]
     if truth:
         errors = absolute_trajectory_errors(

@@ -11,6 +11,7 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.result import CandidateNode, Localization, NotLocalized
+from topoloc.mapping.config import MapConfig
 from topoloc.mapping.topomap import Edge, Layer, NodeSummary, TopoMetricMap, TopoNode
 
 TIMES_MS = {
@@ -86,9 +87,7 @@ def two_nodes() -> TopoMetricMap:
     points, roots = np.zeros((0, 3), np.float32), np.zeros((0, 6), np.float32)
     summaries = [NodeSummary(i, "walk", f"{i}.png", i, pose(float(i)), 0) for i in range(2)]
     nodes = [TopoNode(summary, camera, features, points, roots, jpeg) for summary in summaries]
-    return TopoMetricMap(
-        summaries, {"surf": Layer(nodes)}, [Edge(0, 1)], [], {"nodes": {"lambda_rot": 1.0}}, 1.0
-    )
+    return TopoMetricMap(summaries, {"surf": Layer(nodes)}, [Edge(0, 1)], [], MapConfig(), 1.0)
 
 
 MAP_INFO = {
@@ -102,5 +101,5 @@ MAP_INFO = {
     "extent_m": [1.0, 0.1, 0.5],
     "recordings": ["walk"],
     "coarse": ["surf-vlad"],
-    "config": {"max_node_points": 800},
+    "config": {},
 }

@@ -20,7 +20,7 @@ import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.trajectory import read_trajectory
+from topoloc.recordings.trajectory import Trajectory
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_LINES = 86
@@ -102,7 +102,7 @@ def test_localize_folder(run: Run, lab: Path, tmp_path: Path):
         "black.png": "too_few_matches",
         "broken.jpg": "unreadable",
     }
-    assert len(read_trajectory(tmp_path / "answers" / "poses.tum")) == 2
+    assert len(Trajectory.read(tmp_path / "answers" / "poses.tum")) == 2
 
 
 def test_own_camera(run: Run, lab: Path, monkeypatch: pytest.MonkeyPatch):
@@ -147,7 +147,7 @@ def test_slam_trajectory(run: Run, tmp_path: Path):
     printed = run("slam_trajectory", SHIPPED / "map_lap1@0:14")
     assert "14 of 14 frames tracked" in printed
     assert max(_centimetres(printed, "absolute trajectory error")) < 2.0
-    assert len(read_trajectory(tmp_path / "lap.tum")) == 14
+    assert len(Trajectory.read(tmp_path / "lap.tum")) == 14
     where = re.search(r"found at \[(.*?)\] m", printed)
     assert where
     assert np.abs(np.array(where.group(1).split(), float)).max() < 0.01

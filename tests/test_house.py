@@ -35,17 +35,17 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 # down, unless an issue grants an allowance. The goals stand behind the ceilings.
 CEILINGS = {
     "lines.core": 42249,  # goal 30000
-    "lines.apps": 18843,  # goal 15500
+    "lines.apps": 17109,  # goal 15500
     "statements.core": 18339,  # goal 13500
-    "statements.apps": 8565,  # goal 7500
-    "files_over_300": 37,  # goal 20
-    "functions_over_45": 24,  # goal 15
-    "folders_over_20": 8,  # goal 0
-    "one_importer": 113,  # goal 50
+    "statements.apps": 8408,  # goal 7500
+    "files_over_300": 36,  # goal 20
+    "functions_over_45": 19,  # goal 15
+    "folders_over_20": 6,  # goal 0
+    "one_importer": 98,  # goal 50
     "apps.deep_names": 0,  # goal 0
-    "apps.public_names": 171,  # goal: at most 120
+    "apps.public_names": 152,  # goal: at most 120
     "asserts.sum": 129,  # goal 40
-    "branches.map_or_atlas": 35,  # goal 0
+    "branches.map_or_atlas": 0,
     "branches.walls": 23,  # goal 0
     "constants.all": 473,  # goal 474, localization 25
     "constants.core/localization": 57,

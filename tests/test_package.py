@@ -167,7 +167,7 @@ def test_commands_of_other_distributions_are_named_where_they_are_missing(
     assert (answer.returncode, answer.stdout) == (2, "")
     assert (
         answer.stderr
-        == f"error: `topoloc {command}` comes with {distribution}, which is not installed\n"
+        == f"error: `topoloc {command}` needs {distribution}, which is not installed\n"
     )
 
 

@@ -77,7 +77,7 @@ def test_an_atlas_is_made_of_map_files(lab_map: Path, tmp_path: Path):
     assert topoloc.Atlas.create(where, [str(lab_map)]).find_problem("lab") is None
     atlas = topoloc.Atlas.add(where, [str(lab_map)], tile_id="again", world="lab")
     assert list(atlas.manifest.by_id) == ["again", "lab"]
-    assert topoloc.is_atlas(where)
+    assert topoloc.open_place(where).select_tiles() == ["again", "lab"]
     assert topoloc.Atlas.remove(where, ["again"]).history("lab")[0]["edit_id"] == 1
     with pytest.raises(topoloc.AtlasError, match="no tile"):
         atlas.find_problem("cellar")

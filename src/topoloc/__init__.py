@@ -11,16 +11,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from topoloc.apps.export.map_export import export
+    from topoloc.apps.export.formats import export
     from topoloc.apps.report.explanation import explain
     from topoloc.apps.service.client import AsyncClient, Client
-    from topoloc.apps.viewer.map_page import view
-    from topoloc.atlas.atlas import Atlas, is_atlas
+    from topoloc.apps.viewer.page import view
+    from topoloc.atlas.atlas import Atlas
     from topoloc.atlas.config import AtlasConfig
-    from topoloc.atlas.editing import NewTile, add_tiles, read_manifest
     from topoloc.atlas.location_prior import GeoPositionPrior
     from topoloc.atlas.manifest import Tile
     from topoloc.atlas.map_cache import MapCache
+    from topoloc.atlas.place import SingleMap, open_place
     from topoloc.atlas.shared_world import SharedWorld
     from topoloc.atlas.tile_fetcher import TileFetcher
     from topoloc.compiled import set_num_threads
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
         localize_queries,
     )
     from topoloc.evaluation.world_alignment import WorldFit
-    from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
     from topoloc.geometry.camera import Camera
     from topoloc.geometry.geodesy import GeoPoint, GeoPose, Georeference
     from topoloc.geometry.pose_conventions import PoseConventions
@@ -61,7 +60,6 @@ if TYPE_CHECKING:
     from topoloc.geometry.rigid import Rigid3
     from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
     from topoloc.lifelong.map_files import merge, prune, update
-    from topoloc.lifelong.tile_editing import edit_tile
     from topoloc.lifelong.tile_joining import PairResult, join_tiles
     from topoloc.lifelong.tile_selection import find_tile_of_recording
     from topoloc.lifelong.update import MapUpdate
@@ -95,11 +93,8 @@ if TYPE_CHECKING:
     from topoloc.recordings.open import open_sequence
     from topoloc.recordings.trajectory import (
         Trajectory,
-        read_trajectory,
-        tum_text,
         with_pose_conventions,
         with_trajectory,
-        write_tum,
     )
     from topoloc.recordings.trajectory_alignment import align_to_trajectory
     from topoloc.slam.slam import SlamResult, run_slam
@@ -144,7 +139,6 @@ __all__ = [
     "MapUpdate",
     "MemorySequence",
     "MissingExtraError",
-    "NewTile",
     "NodeQuality",
     "NotLocalized",
     "ObjectStoreError",
@@ -157,6 +151,7 @@ __all__ = [
     "Rigid3",
     "ServiceError",
     "SharedWorld",
+    "SingleMap",
     "SkippedChecks",
     "SlamResult",
     "StereoFrame",
@@ -181,13 +176,10 @@ __all__ = [
     "WeightsError",
     "WorldFit",
     "__version__",
-    "absolute_trajectory_errors",
-    "add_tiles",
     "align_to_trajectory",
     "build_map",
     "check_camera_calibrations",
     "check_map",
-    "edit_tile",
     "evaluate",
     "explain",
     "export",
@@ -195,30 +187,25 @@ __all__ = [
     "find_tile_of_recording",
     "find_weak_regions",
     "georeference",
-    "is_atlas",
     "join_tiles",
     "localize_out_of_map",
     "localize_queries",
     "merge",
+    "open_place",
     "open_sequence",
     "prune",
     "read_depth",
     "read_history",
     "read_image",
-    "read_manifest",
-    "read_trajectory",
-    "relative_drift",
     "result_from_json",
     "run_slam",
     "set_num_threads",
-    "tum_text",
     "undo_edit",
     "update",
     "view",
     "warm_up",
     "with_pose_conventions",
     "with_trajectory",
-    "write_tum",
 ]
 
 _MODULES = {
@@ -255,7 +242,6 @@ _MODULES = {
     "MapUpdate": "topoloc.lifelong.update",
     "MemorySequence": "topoloc.recordings.memory_sequence",
     "MissingExtraError": "topoloc.errors",
-    "NewTile": "topoloc.atlas.editing",
     "NodeQuality": "topoloc.lifelong.weak_regions",
     "NotLocalized": "topoloc.localization.result",
     "ObjectStoreError": "topoloc.errors",
@@ -268,6 +254,7 @@ _MODULES = {
     "Rigid3": "topoloc.geometry.rigid",
     "ServiceError": "topoloc.errors",
     "SharedWorld": "topoloc.atlas.shared_world",
+    "SingleMap": "topoloc.atlas.place",
     "SkippedChecks": "topoloc.localization.map_facts.map_building",
     "SlamResult": "topoloc.slam.slam",
     "StereoFrame": "topoloc.recordings.frame",
@@ -291,44 +278,36 @@ _MODULES = {
     "WeakRegions": "topoloc.lifelong.weak_regions",
     "WeightsError": "topoloc.errors",
     "WorldFit": "topoloc.evaluation.world_alignment",
-    "absolute_trajectory_errors": "topoloc.geometry.alignment",
-    "add_tiles": "topoloc.atlas.editing",
     "align_to_trajectory": "topoloc.recordings.trajectory_alignment",
     "build_map": "topoloc.localization.map_facts.map_building",
     "check_camera_calibrations": "topoloc.localization.image_calibration_check",
     "check_map": "topoloc.localization.map_facts.contradictions",
-    "edit_tile": "topoloc.lifelong.tile_editing",
     "evaluate": "topoloc.evaluation.evaluate",
     "explain": "topoloc.apps.report.explanation",
-    "export": "topoloc.apps.export.map_export",
+    "export": "topoloc.apps.export.formats",
     "find_frames_with_truth": "topoloc.evaluation.query_localization",
     "find_tile_of_recording": "topoloc.lifelong.tile_selection",
     "find_weak_regions": "topoloc.lifelong.weak_regions",
     "georeference": "topoloc.mapping.georeference",
-    "is_atlas": "topoloc.atlas.atlas",
     "join_tiles": "topoloc.lifelong.tile_joining",
     "localize_out_of_map": "topoloc.evaluation.query_localization",
     "localize_queries": "topoloc.evaluation.query_localization",
     "merge": "topoloc.lifelong.map_files",
+    "open_place": "topoloc.atlas.place",
     "open_sequence": "topoloc.recordings.open",
     "prune": "topoloc.lifelong.map_files",
     "read_depth": "topoloc.recordings.image_io",
     "read_history": "topoloc.mapping.edit",
     "read_image": "topoloc.recordings.image_io",
-    "read_manifest": "topoloc.atlas.editing",
-    "read_trajectory": "topoloc.recordings.trajectory",
-    "relative_drift": "topoloc.geometry.alignment",
     "result_from_json": "topoloc.localization.result",
     "run_slam": "topoloc.slam.slam",
     "set_num_threads": "topoloc.compiled",
-    "tum_text": "topoloc.recordings.trajectory",
     "undo_edit": "topoloc.mapping.edit",
     "update": "topoloc.lifelong.map_files",
-    "view": "topoloc.apps.viewer.map_page",
+    "view": "topoloc.apps.viewer.page",
     "warm_up": "topoloc.tracking.warm_up",
     "with_pose_conventions": "topoloc.recordings.trajectory",
     "with_trajectory": "topoloc.recordings.trajectory",
-    "write_tum": "topoloc.recordings.trajectory",
 }
 
 

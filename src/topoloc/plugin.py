@@ -25,9 +25,9 @@ if TYPE_CHECKING:
         quote_key,
         suggest_name,
     )
-    from topoloc.evaluation.metrics import format_length, group_by_recording
+    from topoloc.evaluation.metrics import format_length
     from topoloc.features.feature_types import check_available, parse_feature_types
-    from topoloc.features.network_files import NETWORKS, NetworkInfo, cache_folder, read_bytes
+    from topoloc.features.network_files import NetworkInfo, cache_folder, read_bytes
     from topoloc.json_data import Finite, decode_json
     from topoloc.localization.node_matching import NodeMatcher
     from topoloc.mapping.build import Progress
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
         write_folder,
         write_text,
     )
-    from topoloc.recordings.calibration import parse_calibration, parse_intrinsics
+    from topoloc.recordings.calibration import parse_calibration
     from topoloc.recordings.camera_json import read_camera_json
     from topoloc.recordings.format import RecordingFormat
     from topoloc.recordings.image_io import (
@@ -75,7 +75,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MAX_PIXELS",
-    "NETWORKS",
     "Above",
     "AtLeast",
     "Between",
@@ -106,7 +105,6 @@ __all__ = [
     "find_source_path",
     "find_violation",
     "format_length",
-    "group_by_recording",
     "has_scale",
     "image_size",
     "interpolate_poses",
@@ -115,7 +113,6 @@ __all__ = [
     "natural_key",
     "parse_calibration",
     "parse_feature_types",
-    "parse_intrinsics",
     "parse_relative_path",
     "parse_settings",
     "quote_key",
@@ -144,7 +141,6 @@ _MODULES = {
     "EncodedImage": "topoloc.recordings.image_io",
     "Finite": "topoloc.json_data",
     "MAX_PIXELS": "topoloc.recordings.image_io",
-    "NETWORKS": "topoloc.features.network_files",
     "NetworkInfo": "topoloc.features.network_files",
     "NodeMatcher": "topoloc.localization.node_matching",
     "Progress": "topoloc.mapping.build",
@@ -169,7 +165,6 @@ _MODULES = {
     "find_source_path": "topoloc.recordings.recording",
     "find_violation": "topoloc.bounds",
     "format_length": "topoloc.evaluation.metrics",
-    "group_by_recording": "topoloc.evaluation.metrics",
     "has_scale": "topoloc.recordings.recording",
     "image_size": "topoloc.recordings.image_io",
     "interpolate_poses": "topoloc.recordings.trajectory",
@@ -178,7 +173,6 @@ _MODULES = {
     "natural_key": "topoloc.recordings.recording",
     "parse_calibration": "topoloc.recordings.calibration",
     "parse_feature_types": "topoloc.features.feature_types",
-    "parse_intrinsics": "topoloc.recordings.calibration",
     "parse_relative_path": "topoloc.recordings.text_files",
     "parse_settings": "topoloc.bounds",
     "quote_key": "topoloc.bounds",

@@ -16,7 +16,7 @@ import pytest
 from msgspec import structs
 
 from topoloc.atlas import editing
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_tiles, create_atlas, new_tiles, remove_tiles
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.store import Store
@@ -45,7 +45,7 @@ def test_tiles_come_and_go(somewhere: str, room_map: Path, other_map: Path):
     assert add_tiles(somewhere, new_tiles([str(other_map)], "annex")).serial == 2
     assert _tiles(somewhere) == ["annex", "room"]
     read = Atlas.open(somewhere)
-    assert [tile_problem(read, tile) for tile in read.manifest.tiles] == [None, None]
+    assert [read.find_problem(tile.tile_id) for tile in read.manifest.tiles] == [None, None]
     assert read.map_path(read.tile("room")).read_bytes() == room_map.read_bytes()
     assert remove_tiles(somewhere, ["room"]).serial == 3
     assert _tiles(somewhere) == ["annex"]
@@ -143,7 +143,7 @@ def test_a_tile_that_comes_back_is_not_swept(room_map: Path, tmp_path: Path):
     remove_tiles_again = add_tiles(where, new_tiles([str(room_map)], "twin"), grace_s=0.0)
     assert remove_tiles_again.retired == {}
     read = Atlas.open(where)
-    assert [tile_problem(read, tile) for tile in read.manifest.tiles] == [None, None]
+    assert [read.find_problem(tile.tile_id) for tile in read.manifest.tiles] == [None, None]
 
 
 def test_two_writers_at_once_lose_nothing(
@@ -210,10 +210,10 @@ def test_a_file_that_is_not_the_one_that_was_added_is_named(own_atlas: Path):
     tile = read.tile("room")
     path = own_atlas / tile.map.name
     path.write_bytes(path.read_bytes()[:-1] + b"?")
-    assert "checksum" in str(tile_problem(read, tile))
+    assert "checksum" in str(read.find_problem(tile.tile_id))
     path.unlink()
-    assert "missing" in str(tile_problem(read, tile))
-    assert tile_problem(read, read.tile("other")) is None
+    assert "missing" in str(read.find_problem(tile.tile_id))
+    assert read.find_problem("other") is None
 
 
 def test_what_is_no_atlas_is_said_to_be_none(tmp_path: Path, room_map: Path):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from topoloc.apps.cli import main
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins, create_atlas, new_tiles
 from topoloc.atlas.joins import Join
 from topoloc.atlas.merging import merge_atlases
@@ -35,7 +35,7 @@ def test_tiles_of_both_are_there_with_their_files(
     facts = json.loads(capsys.readouterr().out)
     assert [tile["id"] for tile in facts["tiles"]] == ["other", "room"]
     atlas = Atlas.open(str(out))
-    assert [tile_problem(atlas, tile) for tile in atlas.manifest.tiles] == [None, None]
+    assert [atlas.find_problem(tile.tile_id) for tile in atlas.manifest.tiles] == [None, None]
     assert atlas.map_path(atlas.tile("room")).read_bytes() == room_map.read_bytes()
     assert len(Atlas.open(first).manifest.tiles) == 1
 

@@ -15,13 +15,13 @@ import pytest
 
 from tiny_world import write_stereo_recording
 from topoloc.apps.cli import main
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, add_tiles, create_atlas, new_tiles
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Tile
+from topoloc.atlas.place import edit_tile
 from topoloc.errors import AtlasError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.tile_editing import edit_tile
 from topoloc.lifelong.tile_selection import select_tile
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization
@@ -62,7 +62,7 @@ def _updated(capsys: pytest.CaptureFixture[str], status: int, *args: object) -> 
 
 def _map(where: object, tile_id: str) -> bytes:
     atlas = Atlas.open(str(where))
-    assert tile_problem(atlas, atlas.tile(tile_id)) is None
+    assert atlas.find_problem(tile_id) is None
     return atlas.map_path(atlas.tile(tile_id)).read_bytes()
 
 
@@ -129,9 +129,9 @@ def test_a_tile_that_is_named_is_not_sought(
     [
         (["ATLAS", "SEQ", "--tile", "attic"], "has no tile 'attic'", 1),
         (["ATLAS"], "at least one recording", 2),
-        (["ATLAS", "SEQ", "--joined", "poses.tum"], "--joined is of a map", 2),
-        (["MAP", "SEQ", "--tile", "room"], "--tile and --ray are of an atlas", 2),
-        (["MAP", "SEQ", "--ray", "local"], "--tile and --ray are of an atlas", 2),
+        (["ATLAS", "SEQ", "--joined", "poses.tum"], "--joined needs a map file", 2),
+        (["MAP", "SEQ", "--tile", "room"], "--tile and --ray need an atlas", 2),
+        (["MAP", "SEQ", "--ray", "local"], "--tile and --ray need an atlas", 2),
     ],
 )
 def test_what_cannot_be_meant_is_said(
@@ -161,7 +161,8 @@ def test_who_replaced_the_tile_meanwhile_is_not_overwritten(
         _note(path, f"try {len(num_nodes)}")
         return len(num_nodes)
 
-    tile, tries = edit_tile(somewhere, "hall", edit)
+    tries = edit_tile(somewhere, "hall", edit)
+    tile = Atlas.open(somewhere).tile("hall")
     assert (tries, tile.num_nodes, tile.world, tile.recipe) == (2, num_nodes[1], "campus", None)
     assert num_nodes[0] != num_nodes[1]
     assert _notes(somewhere, "hall") == ["try 2"]
@@ -193,8 +194,9 @@ def test_joins_world_and_recipe_stay_what_they_are(somewhere: str, room_map: Pat
     pose = Rigid3(np.eye(3), np.array([3.0, 1.0, 0.0]))
     before = add_joins(somewhere, [Join("hall", "yard", pose, 1e-4 * np.eye(6), 20)], tiles)
     edit_tile(somewhere, "yard", lambda path: _note(path, "one"))
-    tile, _ = edit_tile(somewhere, "hall", lambda path: _note(path, "two"))
+    edit_tile(somewhere, "hall", lambda path: _note(path, "two"))
     after = Atlas.open(somewhere).manifest
+    tile = after.by_id["hall"]
     assert [join.to_json() for join in after.joins] == [join.to_json() for join in before.joins]
     assert {one.in_joint_world.joint for one in after.tiles} == {"hall"}
     assert (tile.recipe, tile.world, _notes(somewhere, "hall")) == ("ab" * 32, "hall", ["two"])

@@ -13,10 +13,10 @@ from uuid import uuid4
 import pytest
 
 from topoloc.apps.cli import main
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.atlas.manifest import Manifest
-from topoloc.lifelong.tile_editing import edit_tile
+from topoloc.atlas.place import edit_tile
 from topoloc.mapping.edit import edit_map, undo_edit
 
 Complaint = Callable[..., str]
@@ -32,7 +32,7 @@ def _done(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
 def _bytes(where: Path, tile_id: str) -> bytes:
     atlas = Atlas.open(str(where))
     tile = atlas.tile(tile_id)
-    assert tile_problem(atlas, tile) is None
+    assert atlas.find_problem(tile.tile_id) is None
     return atlas.map_path(tile).read_bytes()
 
 
@@ -100,25 +100,25 @@ def test_a_kept_file_that_is_gone_or_another_one_costs_no_edit_of_another_tile(
     assert Manifest.from_bytes(atlas.manifest.to_bytes(), "here").by_id["room"].previous == (kept,)
     path = atlas.store.local_path(kept.name, kept.sha256)
     path.write_bytes(path.read_bytes()[:-1] + b"?")
-    assert "checksum" in (tile_problem(atlas, atlas.tile("room")) or "")
+    assert "checksum" in (atlas.find_problem("room") or "")
     assert "checksum" in complaint("undo", own_atlas, "--tile", "room")
     edit_tile(str(own_atlas), "other", _note)
-    undone = edit_tile(str(own_atlas), "other", undo_edit)[1]
+    undone = edit_tile(str(own_atlas), "other", undo_edit)
     assert undone.name == "note"
 
 
 @pytest.mark.parametrize(
     ("args", "said", "status"),
     [
-        (["undo", "ATLAS"], "--tile says which of its maps is meant (other, room)", 2),
+        (["undo", "ATLAS"], "campus is an atlas: select a tile with --tile (other, room)", 2),
         (["undo", "ATLAS", "--tile", "room"], "tile room: nothing to undo: it is as built", 1),
         (["undo", "ATLAS", "--tile", "attic"], "has no tile 'attic'", 1),
-        (["undo", "MAP", "--tile", "room"], "--tile is of an atlas", 2),
-        (["prune", "MAP", "--tile", "room"], "--tile is of an atlas", 2),
-        (["georeference", "ATLAS", "--origin", ORIGIN], "--tile says which", 2),
-        (["view", "MAP", "--tile", "room"], "--tile is of an atlas", 2),
-        (["export", "MAP", "out.ply", "--tile", "room"], "--tile is of an atlas", 2),
-        (["export", "ATLAS", "out.ply", "--session", "0"], "--session is of maps", 2),
+        (["undo", "MAP", "--tile", "room"], "is a map file and has no tile 'room'", 1),
+        (["prune", "MAP", "--tile", "room"], "is a map file and has no tile 'room'", 1),
+        (["georeference", "ATLAS", "--origin", ORIGIN], "select a tile with --tile", 2),
+        (["view", "MAP", "--tile", "room"], "is a map file and has no tile 'room'", 1),
+        (["export", "MAP", "out.ply", "--tile", "room"], "is a map file and has no tile", 1),
+        (["export", "ATLAS", "out.ply", "--session", "0"], "not of an atlas", 2),
         (["view", "ATLAS", "--tile", "attic"], "has no tile 'attic'", 1),
         (["follow", "ATLAS", "0", "--ros", "1"], "--ros publishes poses of one world", 2),
     ],

@@ -31,11 +31,11 @@ def _row(
 @pytest.mark.parametrize(
     ("night", "said"),
     [
-        (_row("night", 40, 40), "100 % get a pose, by day 100 %; the median error is 1.20 cm and 0.30 degrees instead of 1.20 cm"),  # noqa: E501
-        (_row("night", 40, 30), '75 % get a pose, by day 100 %; the median error is 1.20 cm and 0.30 degrees instead of 1.20 cm and 0.30 '  # noqa: E501
-         'degrees. 10 are answered with "not localized" (10 not in map). No pose is wrong.'),
-        (_row("night", 40, 0), '0 % get a pose, by day 100 %. 40 are answered with "not localized" (40 not in map). No pose is wrong.'),  # noqa: E501
-        (_row("night", 40, 39, false=1), '1 is answered with "not localized" (1 not in map). 1 pose is '  # noqa: E501
+        (_row("night", 40, 40), "100 % of 40 images get a pose, by day 100 %; the median error is 1.20 cm and 0.30 degrees instead of 1.20 cm"),  # noqa: E501
+        (_row("night", 40, 30), '75 % of 40 images get a pose, by day 100 %; the median error is 1.20 cm and 0.30 degrees instead of 1.20 cm and 0.30 '  # noqa: E501
+         'degrees. 10 are not localized (10 not in map). No pose is wrong.'),
+        (_row("night", 40, 0), '0 % of 40 images get a pose, by day 100 %. 40 are not localized (40 not in map). No pose is wrong.'),  # noqa: E501
+        (_row("night", 40, 39, false=1), '1 is not localized (1 not in map). 1 pose is '
          'wrong by more than 0.5 m or 10 degrees.'),
     ],
     ids=["as by day", "some lost", "all lost", "one wrong"],
@@ -44,9 +44,7 @@ def test_the_cost_of_the_night_is_told_as_it_is(night: dict[str, Any], said: str
     assert said in describe_night({"recordings": [_row("day", 20, 20), night]})
 
 
-@pytest.mark.parametrize(
-    ("false", "said"), [(0, "none is given a pose"), (2, "2 wrongly get a pose")]
-)
+@pytest.mark.parametrize(("false", "said"), [(0, "none gets a pose"), (2, "2 wrongly get a pose")])
 def test_wrong_acceptances_are_told(false: int, said: str):
     evaluation = {
         "num_elsewhere": 30,

@@ -314,7 +314,7 @@ def test_the_command_line(
 def test_what_cannot_be_meant_is_said(own: Path, complaint: Callable[..., str]):
     assert "has no tile 'attic'" in complaint("atlas", "join", own, "attic")
     assert "--join belongs to create and add" in complaint("atlas", "info", own, "--join", status=2)
-    assert "--config sets the cluster on which" in complaint(
+    assert "--config belongs to join" in complaint(
         "atlas", "info", own, "--config", "few.toml", status=2
     )
 

@@ -184,9 +184,7 @@ def test_what_is_of_recordings_is_not_taken_beside_it(
     )
     assert "or --against-itself" in complaint("evaluate", path, status=2)
     before = path.read_bytes()
-    assert "named for something else" in complaint(
-        "evaluate", path, "--against-itself", "--json", path
-    )
+    assert "used twice" in complaint("evaluate", path, "--against-itself", "--json", path)
     assert path.read_bytes() == before
 
 

@@ -16,10 +16,8 @@ from topoloc.recordings.trajectory import (
     Trajectory,
     interpolate_poses,
     match_frame_poses,
-    read_trajectory,
     with_pose_conventions,
     with_trajectory,
-    write_tum,
 )
 
 SECOND = 1_000_000_000
@@ -35,7 +33,7 @@ def test_tum_times_are_exact(tmp_path: Path):
         f"# a comment\n\n{tum_line('1403715273.262142976', pose(0))}\n{tum_line('1403715273.262142977', pose(1))}"  # noqa: E501
         " # last\n"
     )
-    trajectory = read_trajectory(path)
+    trajectory = Trajectory.read(path)
     assert trajectory.t_ns == [1403715273262142976, 1403715273262142977]
     assert_same_pose(trajectory.world_from_cam[1], pose(1))
 
@@ -45,13 +43,13 @@ def test_nanoseconds_are_told_by_their_size(tmp_path: Path):
     path.write_text(
         f"{tum_line('1403715273262142976.000000', pose(0))}\n{tum_line('1403715273312143104', pose(1))}\n"  # noqa: E501
     )
-    assert read_trajectory(path).t_ns == [1403715273262142976, 1403715273312143104]
+    assert Trajectory.read(path).t_ns == [1403715273262142976, 1403715273312143104]
 
 
 def test_kitti_rows(tmp_path: Path):
     path = tmp_path / "a.txt"
     path.write_text(f"{kitti_row(pose(0))}\n{kitti_row(pose(1))}\n")
-    trajectory = read_trajectory(path)
+    trajectory = Trajectory.read(path)
     assert trajectory.t_ns is None
     assert_same_pose(trajectory.world_from_cam[1], pose(1))
 
@@ -66,11 +64,11 @@ def test_what_is_written_is_read_again(
 ):
     folder = tmp_path_factory.mktemp("trip")
     poses = [Rigid3.exp(xi) for xi in np.random.default_rng(seed).normal(size=(len(times), 6))]
-    write_tum(folder / "a.tum", Trajectory(poses, sorted(times)))
+    Trajectory(poses, sorted(times)).write_tum(folder / "a.tum")
     np.savetxt(folder / "a.txt", [pose.matrix()[:3].ravel() for pose in poses], fmt="%.12e")
-    assert read_trajectory(folder / "a.tum").t_ns == sorted(times)
+    assert Trajectory.read(folder / "a.tum").t_ns == sorted(times)
     for name in ("a.tum", "a.txt"):
-        for one, other in zip(read_trajectory(folder / name).world_from_cam, poses, strict=True):
+        for one, other in zip(Trajectory.read(folder / name).world_from_cam, poses, strict=True):
             assert_same_pose(one, other)
     assert sorted(path.name for path in folder.iterdir()) == ["a.tum", "a.txt"]
 
@@ -79,12 +77,12 @@ def test_writing_replaces_the_file_or_leaves_it(tmp_path: Path):
     path = tmp_path / "a.tum"
     path.write_text("old")
     with pytest.raises(TrajectoryError, match="times"):
-        write_tum(path, Trajectory([pose(0)]))
+        Trajectory([pose(0)]).write_tum(path)
     assert path.read_text() == "old"
-    write_tum(path, Trajectory([pose(0)], [7]))
-    assert read_trajectory(path).t_ns == [7]
+    Trajectory([pose(0)], [7]).write_tum(path)
+    assert Trajectory.read(path).t_ns == [7]
     with pytest.raises(TopolocError, match="cannot write"):
-        write_tum(tmp_path / "nowhere" / "a.tum", Trajectory([pose(0)], [7]))
+        Trajectory([pose(0)], [7]).write_tum(tmp_path / "nowhere" / "a.tum")
 
 
 @pytest.mark.parametrize(
@@ -108,15 +106,15 @@ def test_bad_lines_are_named(tmp_path: Path, lines: list[str], says: str):
     path = tmp_path / "bad.tum"
     path.write_text("\n".join(lines))
     with pytest.raises(TrajectoryError, match=r"bad\.tum.*" + says):
-        read_trajectory(path)
+        Trajectory.read(path)
 
 
 def test_missing_and_binary_files(tmp_path: Path):
     with pytest.raises(TrajectoryError, match="no such"):
-        read_trajectory(tmp_path / "gone.tum")
+        Trajectory.read(tmp_path / "gone.tum")
     (tmp_path / "binary.tum").write_bytes(b"\xff\xfe\x00\x81" * 9)
     with pytest.raises(TrajectoryError, match=r"binary\.tum"):
-        read_trajectory(tmp_path / "binary.tum")
+        Trajectory.read(tmp_path / "binary.tum")
 
 
 def test_poses_between_are_interpolated_and_gaps_are_not():
@@ -188,7 +186,7 @@ def test_euroc_trajectory_in_nanoseconds(euroc: Path, tmp_path: Path):
 def test_times_beyond_all_clocks_are_refused_at_once(tmp_path: Path):
     (tmp_path / "a.tum").write_text(f"1e999999999999 {tum_line('0', pose(0)).partition(' ')[2]}\n")
     with pytest.raises(TrajectoryError, match=r"line 1.*not a time"):
-        read_trajectory(tmp_path / "a.tum")
+        Trajectory.read(tmp_path / "a.tum")
 
 
 @pytest.mark.parametrize("turned", [1.0, -1.0])
@@ -199,9 +197,9 @@ def test_rotations_of_kitti_rows_are_made_exact(tmp_path: Path, turned: float):
     (tmp_path / "a.txt").write_text(" ".join(f"{value:.12f}" for value in row.ravel()) + "\n")
     if turned < 0:
         with pytest.raises(TrajectoryError, match="line 1: not a rotation"):
-            read_trajectory(tmp_path / "a.txt")
+            Trajectory.read(tmp_path / "a.txt")
         return
-    rotation = read_trajectory(tmp_path / "a.txt").world_from_cam[0].rotation
+    rotation = Trajectory.read(tmp_path / "a.txt").world_from_cam[0].rotation
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(rotation, pose(1).rotation, atol=2e-3)
 
@@ -210,15 +208,15 @@ def test_clocks_that_differ_are_said_and_mended(tmp_path: Path):
     poses = [Rigid3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(20)]
     frames = [1_700_000_000_000_000_000 + 100_000_000 * k for k in range(20)]
     late, in_microseconds = tmp_path / "late.tum", tmp_path / "microseconds.tum"
-    write_tum(late, Trajectory(poses, [time + 5_000_000_000_000 for time in frames]))
-    write_tum(in_microseconds, Trajectory(poses, frames))
+    Trajectory(poses, [time + 5_000_000_000_000 for time in frames]).write_tum(late)
+    Trajectory(poses, frames).write_tum(in_microseconds)
     rows = [line.split() for line in in_microseconds.read_text().splitlines()[1:]]
     in_microseconds.write_text(
         "\n".join(" ".join([str(int(float(row[0]) * 1e6)), *row[1:]]) for row in rows)
     )
     for path, option in ((late, "shift=5000"), (in_microseconds, "clock=1000")):
         with pytest.raises(TrajectoryError, match=f"--poses {option}"):
-            match_frame_poses(read_trajectory(path), frames, path)
+            match_frame_poses(Trajectory.read(path), frames, path)
         found = with_trajectory(recording_of(frames), path, PoseConventions.of(option)).poses
         assert sum(pose is not None for pose in found) >= 18
         assert all(
@@ -269,7 +267,7 @@ def recording_of(t_ns: list[int]) -> Recording:
 def test_read_at_once_or_line_by_line_it_is_the_same(tmp_path: Path, lines: list[str]):
     (tmp_path / "a.tum").write_text("\n".join(lines) + "\n")
     whole, by_lines = (
-        read_trajectory(tmp_path / "a.tum"),
+        Trajectory.read(tmp_path / "a.tum"),
         trajectory._trajectory_from_rows(tmp_path / "a.tum"),
     )
     assert whole.t_ns == by_lines.t_ns
@@ -281,12 +279,11 @@ def test_read_at_once_or_line_by_line_it_is_the_same(tmp_path: Path, lines: list
 def test_exact_times_are_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A million lines take seconds only where they are not gone through one by one."""
     poses = [pose(index) for index in range(5)]
-    write_tum(
-        tmp_path / "a.tum",
-        Trajectory(poses, [1_700_000_000_123_456_789 + index for index in range(5)]),
+    Trajectory(poses, [1_700_000_000_123_456_789 + index for index in range(5)]).write_tum(
+        tmp_path / "a.tum"
     )
     monkeypatch.setattr(trajectory, "_trajectory_from_rows", None)
-    read = read_trajectory(tmp_path / "a.tum")
+    read = Trajectory.read(tmp_path / "a.tum")
     assert read.t_ns == [1_700_000_000_123_456_789 + index for index in range(5)]
     for one, other in zip(poses, read.world_from_cam, strict=True):
         assert_same_pose(one, other)

@@ -231,7 +231,7 @@ def test_a_tile_of_an_atlas_learns_alone(
         for tile in atlas.manifest.tiles
     }
     assert known == {"room": ["surf-vlad"], "hall": ["cnn-nn", "surf-vlad"]}
-    assert "--tile says which" in complaint(*words, status=2)
-    assert "--out is of a map" in complaint(
+    assert "select a tile with --tile" in complaint(*words, status=2)
+    assert "--out needs a map file" in complaint(
         *words, "--tile", "hall", "--out", str(tmp_path / "out.topo"), status=2
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from topoloc import Camera, QueryError, StereoFrame, TopoMetricMap, UncalibratedCamera
-from topoloc.plugin import parse_calibration, parse_intrinsics
+from topoloc.plugin import parse_calibration
 
 CameraOfSize = Callable[[int, int], Camera | UncalibratedCamera]
 """A function from image width and height to a camera model."""
@@ -24,11 +24,7 @@ def select_frame_camera(
         return of_size(width, height)
     if frame.camera is not None:
         return frame.camera
-    return (
-        UncalibratedCamera.unknown(width, height)
-        if frame.exif_focal_px is None
-        else UncalibratedCamera.from_focal_guess(width, height, frame.exif_focal_px)
-    )
+    return UncalibratedCamera.from_focal_guess(width, height, frame.exif_focal_px)
 
 
 def parse_camera_option(
@@ -47,7 +43,7 @@ def parse_camera_option(
         return _rescaled_camera(topomap.nodes[0].camera)
     if text == "unknown":
         return UncalibratedCamera.unknown
-    calibration = parse_calibration(text) if allow_files else parse_intrinsics(text)
+    calibration = parse_calibration(text, allow_files)
     return lambda width, height: calibration(width, height).camera
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from topoloc.atlas.global_descriptors import GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index import AtlasIndex
@@ -21,6 +21,7 @@ from topoloc.mapping.edit import read_history
 _OBJECT_STORES = "topoloc.apps.stores.object_store"
 """Module of `ObjectStore`. It is imported by name, because obstore is an optional extra and the
 module belongs to the apps."""
+T = TypeVar("T")
 
 
 def store_at(where: str) -> Store:
@@ -33,11 +34,6 @@ def store_at(where: str) -> Store:
     if "://" in where:
         return importlib.import_module(_OBJECT_STORES).ObjectStore(where)
     return FolderStore(Path(where))
-
-
-def is_atlas(where: str) -> bool:
-    """Return whether the path or address is an atlas, not a map."""
-    return "://" in where or os.path.isfile(Path(where) / MANIFEST)
 
 
 def absolute_address(where: str) -> str:
@@ -111,6 +107,37 @@ class Atlas:
         return Atlas(store_at(where), add_tiles(where, new_tiles(maps, tile_id, world), replaces))
 
     @staticmethod
+    def add_map(
+        where: str, tile_id: str, path: Path, world: str, recipe: str, replaces: bool = False
+    ) -> Tile:
+        """Add a map file as a tile, and create the atlas if there is none.
+
+        Args:
+            recipe: digest of the map's inputs.
+            replaces: replace a tile of the same id. Otherwise it is an error, unless it has the
+                same recipe.
+
+        Raises:
+            AtlasError: the atlas has a tile of the same id, or it cannot be written.
+            MapError: the map is damaged or empty.
+        """
+        from topoloc.atlas.editing import NewTile, add_tiles
+
+        new = NewTile(tile_id, path, world, recipe)
+        return add_tiles(where, [new], replaces, creates=True).by_id[tile_id]
+
+    @staticmethod
+    def read_manifest(where: str) -> Manifest:
+        """Return the current manifest of an atlas, an empty one if there is no atlas yet.
+
+        Raises:
+            AtlasError: the manifest is damaged, or the store does not answer.
+            MissingExtraError: the store needs an extra that is not installed.
+        """
+        data = store_at(where).manifest()
+        return Manifest() if data is None else Manifest.from_bytes(data, f"{where}/{MANIFEST}")
+
+    @staticmethod
     def remove(where: str, tile_ids: Sequence[str]) -> Atlas:
         """Remove tiles from the atlas there. Raises AtlasError."""
         from topoloc.atlas.editing import remove_tiles
@@ -138,10 +165,46 @@ class Atlas:
         """Its address from any working directory."""
         return absolute_address(self.store.where)
 
+    @property
+    def name(self) -> str:
+        """Return the last part of its address."""
+        return self.store.where.rstrip("/").rpartition("/")[2] or "atlas"
+
+    def select_tiles(self, tile_id: str | None = None) -> list[str]:
+        """Return the id of the named tile, or the ids of all tiles. Raises AtlasError: there is no
+        such tile."""
+        return list(self.manifest.by_id) if tile_id is None else [self.tile(tile_id).tile_id]
+
+    def title(self, tile_id: str) -> str:
+        """Return the address of the atlas with the id of a tile."""
+        return f"{self.store.where}, tile {tile_id}"
+
+    def edit(self, tile_id: str, edit: Callable[[Path], T]) -> T:
+        """Edit the map of a tile and return the result of `edit`. Raises as `edit_tile`."""
+        from topoloc.atlas.place import edit_tile
+
+        return edit_tile(self.store.where, tile_id, edit)
+
+    def report(self, facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+        """Return facts of tiles, by id, as one JSON object."""
+        tiles = [{"tile_id": tile_id} | one for tile_id, one in facts.items()]
+        return {"atlas": self.store.where, "tiles": tiles}
+
+    def visit(self, on_map: Callable[[str], T], on_atlas: Callable[[Atlas], T]) -> T:
+        """Return the result of `on_atlas`, called with this atlas. See `SingleMap.visit`."""
+        return on_atlas(self)
+
     def find_problem(self, tile_id: str) -> str | None:
         """Return the first difference between a tile's files and their checksums, None if there is
         none. Raises AtlasError: the atlas has no such tile."""
-        return tile_problem(self, self.tile(tile_id))
+        for stored in self.tile(tile_id).files:
+            try:
+                path = self.store.local_path(stored.name, stored.sha256)
+                if path.stat().st_size != stored.num_bytes or sha256_of(path) != stored.sha256:
+                    return f"{stored.name} is not the file that was added: its checksum is another"
+            except AtlasError as error:
+                return str(error)
+        return None
 
     def tile(self, tile_id: str) -> Tile:
         """Return the tile with this id.
@@ -199,15 +262,3 @@ class Atlas:
     def index(self) -> AtlasIndex:
         """Return the index of all tiles with readable global descriptors."""
         return self._opened.index
-
-
-def tile_problem(atlas: Atlas, tile: Tile) -> str | None:
-    """Return the problem with a tile's files, None if they match the manifest."""
-    for stored in tile.files:
-        try:
-            path = atlas.store.local_path(stored.name, stored.sha256)
-            if path.stat().st_size != stored.num_bytes or sha256_of(path) != stored.sha256:
-                return f"{stored.name} is not the file that was added: its checksum is another"
-        except AtlasError as error:
-            return str(error)
-    return None

@@ -258,16 +258,6 @@ def _restore_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) 
             store_tile(one, store)
 
 
-def read_manifest(where: str) -> Manifest:
-    """Return the manifest of an atlas as it is now; an empty one where no atlas is there yet.
-
-    Raises:
-        AtlasError: the manifest is damaged, or the store does not answer.
-        MissingExtraError: the store needs an extra that is not installed.
-    """
-    return _read(store_at(where), creates=True)[1]
-
-
 class _TileChangedError(Exception):
     """Signal that another writer changed the tile first."""
 

@@ -20,8 +20,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
-from topoloc.atlas.atlas import Atlas, is_atlas
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
+from topoloc.atlas.place import open_place
 from topoloc.atlas.watched_atlas import WatchedAtlas
 from topoloc.errors import MapError, MapNotFoundError
 from topoloc.mapping.node_cache import set_node_cache_size
@@ -109,10 +110,12 @@ class MapCache(Generic[M]):
         for source in sources:
             if "://" not in source and not os.path.exists(source):
                 raise MapError(f"{source}: no such map")
-        self.atlases = [
-            WatchedAtlas(source) for source in dict.fromkeys(sources) if is_atlas(source)
-        ]
-        self._files = [Path(source) for source in sources if not is_atlas(source)]
+        self.atlases, self._files = list[WatchedAtlas](), list[Path]()
+        for source in dict.fromkeys(sources):
+            open_place(source).visit(
+                lambda path: self._files.append(Path(path)),
+                lambda atlas: self.atlases.append(WatchedAtlas(atlas.store.where)),
+            )
         self.names()
 
     @staticmethod

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
-from topoloc.atlas.atlas import Atlas, is_atlas, store_at, tile_problem
+from topoloc.atlas.atlas import Atlas, store_at
 from topoloc.atlas.editing import new_tiles, store_tile
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Manifest, Tile
+from topoloc.atlas.place import open_place
 from topoloc.atlas.store import Store
 from topoloc.errors import AtlasError
 
@@ -30,18 +31,22 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
     if store.manifest() is not None:
         raise AtlasError(f"{where} is an atlas already; a merged one is new")
     tiles, joins = dict[str, Tile](), list[Join]()
+
+    def store_map(path: str) -> dict[str, Tile]:
+        (new,) = new_tiles([path])
+        added = {new.tile_id: store_tile(new, store)}
+        _check_same(path, tiles, added)
+        return added
+
+    def store_atlas(atlas: Atlas) -> dict[str, Tile]:
+        _check_same(atlas.store.where, tiles, atlas.manifest.by_id)
+        for tile in atlas.manifest.tiles:
+            _copy_files(atlas, tile, store)
+        joins.extend(atlas.manifest.joins)
+        return atlas.manifest.by_id
+
     for source in sources:
-        if not is_atlas(source):
-            (new,) = new_tiles([source])
-            added = {new.tile_id: store_tile(new, store)}
-            _check_same(source, tiles, added)
-        else:
-            atlas = Atlas.open(source)
-            added = atlas.manifest.by_id
-            _check_same(source, tiles, added)
-            for tile in added.values():
-                _copy_files(atlas, tile, store)
-            joins += atlas.manifest.joins
+        added = open_place(source).visit(store_map, store_atlas)
         tiles = _with_unique_worlds(tiles, added) | tiles
     after = Manifest().with_tiles(tiles, time.time(), joins)
     if not store.commit(None, after.to_bytes()):
@@ -50,7 +55,7 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
 
 
 def _copy_files(atlas: Atlas, tile: Tile, store: Store) -> None:
-    problem = tile_problem(atlas, tile)
+    problem = atlas.find_problem(tile.tile_id)
     if problem is not None:
         raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
     for stored in tile.files:

@@ -1,5 +1,4 @@
-"""What the demo says of its own results, on the terminal and in the report: computed, so that it
-stays true whatever comes out."""
+"""Texts of the demo's results for the terminal and the report, computed from the evaluation."""
 
 from __future__ import annotations
 
@@ -13,20 +12,19 @@ DAY, NIGHT = "day", "night"
 _ABOUT = {
     "day": "a third lap, the light of the map",
     "night": "no daylight, few lamps, chairs and things moved",
-    "other camera": "one camera, a lens 1.4 times as long, 800x600; things moved",
-    "elsewhere": "another building, a street, pictures of nothing at all",
+    "other camera": "one camera, a focal length 1.4 times as long, 800x600; things moved",
+    "elsewhere": "another building, a street, images without content",
 }
 
 
 def create_report_texts(evaluation: dict[str, Any]) -> ReportTexts:
-    """The words of the demo's report."""
+    """Return the texts of the demo's report."""
     m = evaluation["map"]
     return ReportTexts(
-        title="One room, mapped by day: what does it know by night?",
+        title="One room, mapped by day, localized by night",
         subtitle=(
-            f"A lab of 5 x 4 m, walked through twice with a stereo camera ({m['length_m']:.0f} m,"
-            f" {m['num_nodes']} nodes, {m['bytes'] / 1e6:.1f} MB). Each query is one picture,"
-            " alone."
+            f"A lab of 5 x 4 m, recorded twice with a stereo camera ({m['length_m']:.0f} m,"
+            f" {m['num_nodes']} nodes, {m['bytes'] / 1e6:.1f} MB). Each query is a single image."
         ),
         paragraphs=[describe_night(evaluation), describe_out_of_map(evaluation), _RENDERED],
         about=_ABOUT,
@@ -35,20 +33,19 @@ def create_report_texts(evaluation: dict[str, Any]) -> ReportTexts:
 
 
 _RENDERED = (
-    "The lab is rendered, so that every true pose is known exactly: its camera has noise,"
-    " vignetting and an exposure that is never quite right, but no error of calibration. The"
-    " paper's figure is from a real room of about this size, so it says what scale to expect, not"
-    " who is better."
+    "The lab is rendered, so every true pose is known exactly. Its camera has noise, vignetting and"
+    " an imperfect exposure, but no calibration error. The paper's figure is from a real room of"
+    " about this size. It shows the expected scale, and is no comparison."
 )
 
 
 def describe_night(evaluation: dict[str, Any]) -> str:
-    """What the night costs against the day."""
+    """Compare the night with the day."""
     rows = {row["name"]: row for row in evaluation["recordings"]}
     day, night = rows[DAY], rows[NIGHT]
     text = (
-        f"What the night costs: of {night['num_queries']} pictures {_format_share(night)} get a"
-        f" pose, by day {_format_share(day)}"
+        f"By night, {_format_share(night)} of {night['num_queries']} images get a pose, by day"
+        f" {_format_share(day)}"
     )
     if night["num_localized"] and day["num_localized"]:
         text += f"; the median error is {_format_error(night)} instead of {_format_error(day)}"
@@ -58,7 +55,7 @@ def describe_night(evaluation: dict[str, Any]) -> str:
             f"{count} {reason.replace('_', ' ')}"
             for reason, count in night["not_localized"].items()
         )
-        text += f' {lost} {"is" if lost == 1 else "are"} answered with "not localized" ({reasons}).'
+        text += f" {lost} {'is' if lost == 1 else 'are'} not localized ({reasons})."
     false = night["false_accepts"]
     if false == 0:
         return text + " No pose is wrong."
@@ -69,13 +66,11 @@ def describe_night(evaluation: dict[str, Any]) -> str:
 
 
 def describe_out_of_map(evaluation: dict[str, Any]) -> str:
-    """What happens to pictures that were not taken here."""
-    num, accepted = (
-        evaluation["num_elsewhere"],
-        sum(row["false_accepts"] for row in evaluation["recordings"] if not row["num_queries"]),
-    )
-    said = "none is given a pose" if accepted == 0 else f"{accepted} wrongly get a pose"
-    return f"Of {num} pictures that were taken elsewhere, or show nothing, {said}."
+    """Count the poses of out-of-map images."""
+    rows = [row for row in evaluation["recordings"] if not row["num_queries"]]
+    accepted = sum(row["false_accepts"] for row in rows)
+    outcome = "none gets a pose" if accepted == 0 else f"{accepted} wrongly get a pose"
+    return f"Of {evaluation['num_elsewhere']} out-of-map images, {outcome}."
 
 
 def _format_share(row: dict[str, Any]) -> str:

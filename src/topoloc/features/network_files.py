@@ -58,6 +58,11 @@ class NetworkInfo:
         return NETWORKS[name]
 
     @staticmethod
+    def known() -> list[NetworkInfo]:
+        """Return all known networks."""
+        return list(NETWORKS.values())
+
+    @staticmethod
     def of_file(path: Path) -> NetworkInfo:
         """Return the network of an ONNX file, which is run on a small picture. Raises as
         `open_network`."""

@@ -49,9 +49,11 @@ class UncalibratedCamera:
         return UncalibratedCamera(width, height, MIN_FOCAL * side, MAX_FOCAL * side)
 
     @staticmethod
-    def from_focal_guess(width: int, height: int, focal: float) -> UncalibratedCamera:
+    def from_focal_guess(width: int, height: int, focal: float | None) -> UncalibratedCamera:
         """Return a camera with a range around an approximate focal length (pixels), such as that of
-        EXIF data."""
+        EXIF data. If it is None, return `unknown`."""
+        if focal is None:
+            return UncalibratedCamera.unknown(width, height)
         return UncalibratedCamera(
             width, height, focal / FOCAL_GUESS_TOLERANCE, focal * FOCAL_GUESS_TOLERANCE
         )

@@ -112,7 +112,9 @@ class Localizer:
             return opened
 
         if isinstance(source, str | Path):
-            source = open_place(str(source))
+            from topoloc.atlas.place import open_place  # an open map does not need this module
+
+            source = open_place(str(source)).visit(TopoMetricMap.load, lambda atlas: atlas)
         self.source = source
         if isinstance(source, TopoMetricMap):
             self._tiles = OneMap(open_map(source))
@@ -311,17 +313,6 @@ class Localizer:
         if len(self.tile_ids) > 1:
             raise AtlasError("the atlas has several tiles: name the one that is meant")
         return self.tile_ids[0]
-
-
-def open_place(where: str) -> TopoMetricMap | Atlas:
-    """Open a map file, or the atlas in a folder or an object store.
-
-    Raises:
-        MapError: there is none, or it cannot be read.
-    """
-    from topoloc.atlas.atlas import Atlas, is_atlas
-
-    return Atlas.open(where) if is_atlas(where) else TopoMetricMap.load(where)
 
 
 def _open_tiles(

@@ -57,9 +57,7 @@ class FeatureTypeContext:
         """
         opened = OpenMap(topomap, coarse or config.coarse, kind)
         c, weights = config.for_feature_type(opened.kind), weights or _select_weights(opened)
-        rho = find_correlated_error_share(
-            topomap, kind, c.guided, c.pose, weights.shared_errors
-        )
+        rho = find_correlated_error_share(topomap, kind, c.guided, c.pose, weights.shared_errors)
         return FeatureTypeContext(opened, c, weights, rho)
 
 

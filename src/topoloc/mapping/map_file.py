@@ -276,13 +276,14 @@ class MapFile:
 def check_header(path: Path) -> int:
     """Check the 100-byte header of a map file and return its schema version. Raises MapError,
     MapVersionError."""
+    if os.path.exists(path) and not os.path.isfile(path):
+        hint = "a folder" if os.path.isdir(path) else "a pipe or a device"
+        hint = "an atlas" if os.path.isfile(path / "atlas.json") else hint
+        raise MapError(f"{path} is no map but {hint}")
     try:
         with path.open("rb") as file:
             header = file.read(100)
             num_bytes = file.seek(0, os.SEEK_END)
-    except IsADirectoryError:
-        hint = "an atlas" if (path / "atlas.json").is_file() else "a folder"
-        raise MapError(f"{path} is no map but {hint}") from None
     except (OSError, ValueError) as error:  # ValueError: the name contains a null character
         raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from error
     if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):

@@ -29,15 +29,15 @@ CalibrationForSize = Callable[[int, int], CameraCalibration]
 _SIZE_TOLERANCE, _SCALE_TOLERANCE = 0.12, 0.08
 
 
-def parse_calibration(text: str | Path) -> CalibrationForSize:
-    """Read a calibration from a file or from four numbers ``fx,fy,cx,cy``.
+def parse_calibration(text: str | Path, allow_files: bool = True) -> CalibrationForSize:
+    """Read a calibration from four numbers ``fx,fy,cx,cy`` (pixels), or from a file if allowed.
 
     Raises:
         CalibrationError: the text is neither, or the file is not usable. Names the file.
     """
     path = Path(text)
-    if "," in str(text) and not path.exists():
-        return parse_intrinsics(str(text))
+    if not allow_files or ("," in str(text) and not path.exists()):
+        return _parse_intrinsics(str(text))
     if path.suffix.lower() in YAML_SUFFIXES:
         read_calibration_yaml(path, 1000, 1000)  # raises errors before the first image is read
         return lambda width, height: read_calibration_yaml(path, width, height)
@@ -45,7 +45,7 @@ def parse_calibration(text: str | Path) -> CalibrationForSize:
     return lambda width, height: camera_calibration
 
 
-def parse_intrinsics(text: str) -> CalibrationForSize:
+def _parse_intrinsics(text: str) -> CalibrationForSize:
     """Return the pinhole calibration of four numbers ``fx,fy,cx,cy`` (pixels). Raises
     CalibrationError."""
     try:

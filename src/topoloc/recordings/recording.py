@@ -68,6 +68,31 @@ class Recording:
     cameras: list[Camera] | None = None
     has_scale: bool = True
 
+    @staticmethod
+    def with_cameras(
+        name: str,
+        root: Path,
+        names: list[str],
+        t_ns: list[int],
+        poses: list[Rigid3 | None],
+        cameras: list[Camera],
+        depth: DepthImages | None = None,
+        has_scale: bool = True,
+    ) -> Recording:
+        """Return a recording with a camera for each frame, which may be the same for all."""
+        one = cameras[0] if len(set(cameras)) == 1 else None
+        return Recording(
+            name,
+            root,
+            names,
+            t_ns,
+            poses,
+            one,
+            depth=depth,
+            cameras=cameras if one is None else None,
+            has_scale=has_scale,
+        )
+
     def __len__(self) -> int:
         return len(self.names)
 

@@ -59,16 +59,39 @@ class Trajectory:
         """
         return Trajectory(LazyPoses(rows, pose_from_quaternion), t_ns)
 
+    @staticmethod
+    def read(path: Path) -> Trajectory:
+        """Read a TUM file (8 columns) or KITTI rows (12 columns). TUM times are in seconds, or in
+        nanoseconds if they are large.
 
-def read_trajectory(path: Path) -> Trajectory:
-    """Read a TUM file (8 columns) or KITTI rows (12 columns). TUM times are in seconds, or in
-    nanoseconds if they are large.
+        Raises:
+            TrajectoryError: the file is missing or empty, the number of columns is wrong, a number
+                is NaN, a rotation is invalid, or times do not increase. Names the line.
+        """
+        return _read_numeric_trajectory(path) or _trajectory_from_rows(path)
 
-    Raises:
-        TrajectoryError: the file is missing or empty, the number of columns is wrong, a number is
-            NaN, a rotation is invalid, or times do not increase. Names the line.
-    """
-    return _read_numeric_trajectory(path) or _trajectory_from_rows(path)
+    def to_tum(self, header: bool = True) -> str:
+        """Return the lines of a TUM file.
+
+        Args:
+            header: begin with the comment that names the columns.
+
+        Raises:
+            TrajectoryError: the trajectory has no times.
+        """
+        if self.t_ns is None:
+            raise TrajectoryError("a TUM file needs times, and these poses have none")
+        rows = map(tum_line, self.t_ns, self.world_from_cam)
+        return "".join(f"{line}\n" for line in [*([TUM_HEADER] if header else []), *rows])
+
+    def write_tum(self, path: Path) -> None:
+        """Write a TUM file atomically.
+
+        Raises:
+            TrajectoryError: the trajectory has no times.
+            TopolocError: the file cannot be written.
+        """
+        write_text(path, self.to_tum())
 
 
 def _read_numeric_trajectory(path: Path) -> Trajectory | None:
@@ -126,32 +149,6 @@ def read_asl_poses(path: Path) -> Trajectory:
         if len(tokens) < 8:
             raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, a pose has 8")
     return _timed_trajectory(path, rows, (1, 2, 3, 5, 6, 7, 4))
-
-
-def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a TUM file atomically.
-
-    Raises:
-        TrajectoryError: the trajectory has no times.
-        TopolocError: the file cannot be written.
-    """
-    if trajectory.t_ns is None:
-        raise TrajectoryError(f"{path}: a TUM file needs times, and these poses have none")
-    write_text(path, tum_text(trajectory))
-
-
-def tum_text(trajectory: Trajectory, header: bool = True) -> str:
-    """Return the lines of a TUM file of a trajectory with times.
-
-    Args:
-        header: begin with the comment that names the columns.
-    """
-    assert trajectory.t_ns is not None
-    rows = (
-        tum_line(t_ns, pose)
-        for t_ns, pose in zip(trajectory.t_ns, trajectory.world_from_cam, strict=True)
-    )
-    return "".join(f"{line}\n" for line in ([TUM_HEADER] if header else []) + list(rows))
 
 
 def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
@@ -223,7 +220,7 @@ def with_trajectory(
     Raises:
         TrajectoryError: the file is malformed, or matches no frame.
     """
-    trajectory, conventions = read_trajectory(path), conventions or PoseConventions()
+    trajectory, conventions = Trajectory.read(path), conventions or PoseConventions()
     if (
         trajectory.t_ns is None
         and isinstance(sequence, SequenceView)
@@ -301,7 +298,7 @@ def read_ground_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> lis
     """
     for path in (tum, *kitti_rows):
         if path.is_file():
-            return match_frame_poses(read_trajectory(path), t_ns, path)
+            return match_frame_poses(Trajectory.read(path), t_ns, path)
     return [None] * len(t_ns)
 
 

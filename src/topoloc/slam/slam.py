@@ -13,11 +13,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import RecordingError
+from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import MeasuredView, measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
@@ -82,6 +84,44 @@ class SlamResult:
             SequenceView(sequence, list(range(len(sequence))), poses, tuple(apart))
             for sequence, poses, apart in zip(sequences, self.poses, self.apart, strict=True)
         ]
+
+    def to_json(self, sequence: StereoSequence) -> dict[str, Any]:
+        """Return statistics of the first recording, and its errors if it has ground truth."""
+        poses = self.poses[0]
+        facts: dict[str, Any] = {
+            "num_frames": len(poses),
+            "num_tracked": sum(pose is not None for pose in poses),
+            "num_keyframes": self.num_keyframes,
+            "num_loops": self.num_loops,
+            "num_submaps": self.num_submaps,
+            "num_joined": self.num_joined,
+            "length_m": round(_length([pose for pose in poses if pose is not None]), 3),
+            "disparity_bias_px": round(self.disparity_bias_px[0], 3),
+            "right_residual_px": _median(self.right_residuals_px),
+        }
+        both = [
+            (true, pose)
+            for true, pose in zip(sequence.poses, poses, strict=True)
+            if true is not None and pose is not None
+        ]
+        if both:
+            truth, found = [true for true, _ in both], [pose for _, pose in both]
+            errors, drift = absolute_trajectory_errors(truth, found), relative_drift(truth, found)
+            facts["ate_m"] = float(np.sqrt(np.mean(errors**2)))
+            facts["max_error_m"] = float(errors.max())
+            facts["drift_percent"] = 100.0 * drift.translation if drift else None
+            facts["drift_deg_per_m"] = float(np.rad2deg(drift.rotation)) if drift else None
+        return facts
+
+
+def _length(poses: Sequence[Rigid3]) -> float:
+    positions = np.array([pose.translation for pose in poses]).reshape(-1, 3)
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+def _median(values: np.ndarray) -> float | None:
+    known = values[np.isfinite(values)]
+    return round(float(np.median(known)), 3) if len(known) else None
 
 
 def run_slam(

@@ -187,9 +187,7 @@ def test_outputs_never_replace_inputs_or_folders(
 ):
     assert "it is a folder" in complaint(*command_with_output(command, option, tmp_path))
     target = tmp_path / "room.topo" if command == "build" else room_map
-    assert "named for something else, too" in complaint(
-        *command_with_output(command, option, target)
-    )
+    assert "used twice, too" in complaint(*command_with_output(command, option, target))
 
 
 def test_ctrl_c_in_mid_build(
@@ -202,10 +200,7 @@ def test_ctrl_c_in_mid_build(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("topoloc.mapping.mapping_frames.extract_features", interrupted)
-    assert (
-        complaint("build", recording, target)
-        == "error: interrupted; every file is as it was or whole\n"
-    )
+    assert complaint("build", recording, target) == "error: interrupted; no file is incomplete\n"
 
 
 def test_ctrl_c_in_mid_evaluation(

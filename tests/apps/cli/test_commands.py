@@ -19,7 +19,7 @@ from topoloc.apps.cli import main
 from topoloc.apps.cli.queries.localize import Localizer
 from topoloc.geometry.alignment import translation_error
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.trajectory import Trajectory, read_trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory
 
 EVALUATION = {
     "num_queries",
@@ -109,9 +109,8 @@ def test_inverse_poses_are_named_and_mended(
         tmp_path / "inverse.tum",
         str(tmp_path / "a.topo"),
     )
-    write_tum(
-        inverse,
-        Trajectory([pose.inverse() for pose in truth.poses if pose is not None], truth.t_ns),
+    Trajectory([pose.inverse() for pose in truth.poses if pose is not None], truth.t_ns).write_tum(
+        inverse
     )
     build = [
         "build",
@@ -161,7 +160,7 @@ def test_localize_writes_what_the_interface_says(
         assert all(
             isinstance(node, int) and isinstance(score, float) for node, score in line["candidates"]
         )
-    found = read_trajectory(trajectory)
+    found = Trajectory.read(trajectory)
     assert found.t_ns == [number * 100_000_000 for number in range(len(lines))]
     for line, pose, (_, truth) in zip(lines, found.world_from_cam, unseen_views(), strict=True):
         np.testing.assert_allclose(
@@ -195,7 +194,7 @@ def test_single_photos_keep_their_order_in_the_trajectory(
         == 0
     )
     assert [line["query"] for line in _lines(results)] == photos
-    found = read_trajectory(trajectory)
+    found = Trajectory.read(trajectory)
     assert found.t_ns == [0, 1_000_000_000, 2_000_000_000]
     for pose, number in zip(found.world_from_cam, (4, 0, 2), strict=True):
         assert translation_error(pose, unseen_views()[number][1]) < 0.02

@@ -56,7 +56,7 @@ def test_a_table_of_a_distribution_that_is_not_installed_names_it(
     read_settings(path)
     monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
     with pytest.raises(
-        ConfigError, match=r"train: comes with topoloc-training, which is not installed$"
+        ConfigError, match=r"train: needs topoloc-training, which is not installed$"
     ):
         read_settings(path)
 
@@ -165,7 +165,7 @@ def test_bad_settings_are_one_line_before_the_work(
         "train.cnn_fc.training.held_out = 1", "train", room_map, "--coarse", "cnn-fc"
     )
     (tmp_path / "my.toml").write_text("")
-    assert "named for something else" in complaint(
+    assert "used twice" in complaint(
         "build", tiny_recording, tmp_path / "my.toml", "--config", tmp_path / "my.toml"
     )
 

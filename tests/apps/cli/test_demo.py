@@ -17,7 +17,7 @@ from tiny_world import write_stereo_recording
 from topoloc.apps.cli import demo, main
 from topoloc.demo.recordings import SHIPPED, find_missing_recordings
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.trajectory import read_trajectory
+from topoloc.recordings.trajectory import Trajectory
 
 SETS = ["day", "night", "other camera", "elsewhere"]
 
@@ -74,7 +74,7 @@ def test_the_demo_maps_asks_and_reports(
     assert [line["query"].partition("/")[0] for line in lines] == ["day"] * 9 + ["night"] * 3 + [
         "other camera"
     ] * 2 + ["elsewhere"] * 11
-    found = read_trajectory(out / "day.tum")
+    found = Trajectory.read(out / "day.tum")
     assert found.t_ns == [number * 100_000_000 for number in range(9)]
     page = (out / "report.html").read_text()
     assert "What the night costs: of 3 pictures 100 % get a pose" in page

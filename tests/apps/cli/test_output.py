@@ -50,7 +50,7 @@ def test_devices_are_not_replaced_by_files():
 
 
 def test_one_path_is_not_two_outputs(tmp_path: Path):
-    with pytest.raises(TopolocError, match="named for something else"):
+    with pytest.raises(TopolocError, match="used twice"):
         check_outputs(
             [
                 str(tmp_path / "a"),

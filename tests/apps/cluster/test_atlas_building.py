@@ -20,11 +20,10 @@ from logging_maker import LoggingMaker
 
 from topoloc.apps.cli import main
 from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
-from topoloc.apps.cluster.atlas_building import AtlasBuild, build_on_ray
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress
-from topoloc.apps.cluster.tiles import Outcome, TileJob
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.apps.cluster.tiles import AtlasBuild, Outcome, TileJob, build_on_ray
+from topoloc.atlas.atlas import Atlas
 from topoloc.mapping.build import BuildConfig
 
 Complaint = Callable[..., str]
@@ -42,7 +41,9 @@ def one_by_one(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> d
 def _maps(where: str) -> dict[str, bytes]:
     atlas = Atlas.open(where)
     assert [
-        tile_problem(atlas, tile) for tile in atlas.manifest.tiles if tile_problem(atlas, tile)
+        atlas.find_problem(tile.tile_id)
+        for tile in atlas.manifest.tiles
+        if atlas.find_problem(tile.tile_id)
     ] == []
     return {tile.tile_id: atlas.map_path(tile).read_bytes() for tile in atlas.manifest.tiles}
 
@@ -272,7 +273,7 @@ def test_a_cluster_of_this_machine_ends_with_the_command(walks: list[Path], tmp_
         said = driver.communicate(timeout=60)[1]
         assert (driver.returncode, said.splitlines()[-1]) == (
             1,
-            "error: interrupted; every file is as it was or whole",
+            "error: interrupted; no file is incomplete",
         )
         assert list(scratch.glob("topoloc*")) == []
         assert subprocess.run(command, env=environment, capture_output=True).returncode == 0

@@ -12,7 +12,7 @@ import pytest
 
 from tiny_world import write_stereo_recording
 from topoloc.apps.cli import main
-from topoloc.atlas.atlas import Atlas, tile_problem
+from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import create_atlas, new_tiles, remove_tiles
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.build import BuildConfig
@@ -51,7 +51,7 @@ def _manifest(where: Path) -> dict[str, Any]:
 
 def _maps(where: Path) -> dict[str, bytes]:
     atlas = Atlas.open(str(where))
-    assert [tile_problem(atlas, tile) for tile in atlas.manifest.tiles] == [None] * len(
+    assert [atlas.find_problem(tile.tile_id) for tile in atlas.manifest.tiles] == [None] * len(
         atlas.manifest.tiles
     )
     return {tile.tile_id: atlas.map_path(tile).read_bytes() for tile in atlas.manifest.tiles}

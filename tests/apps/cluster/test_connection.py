@@ -32,7 +32,7 @@ def ray():
         ("somewhere", "HOST:PORT, auto or local"),
         ("127.0.0.1:", "HOST:PORT, auto or local"),
         ("127.0.0.1:99999", "HOST:PORT, auto or local"),
-        ("ray://127.0.0.1:10001", "no client of Ray"),
+        ("ray://127.0.0.1:10001", "Ray clients are not supported"),
     ],
 )
 def test_addresses_that_are_none(
@@ -110,7 +110,7 @@ def test_what_is_written_past_python_is_not_seen(capfd: pytest.CaptureFixture[st
 def test_options_of_a_cluster_alone(
     option: list[str], tiny_recording: Path, tmp_path: Path, complaint: Complaint
 ):
-    assert "belong to --ray" in complaint(
+    assert "need --ray" in complaint(
         "build", tiny_recording, tmp_path / "room.topo", *option, status=2
     )
 
@@ -121,7 +121,7 @@ def test_names_that_no_world_and_no_two_tiles_have(
     assert "can be called 'the campus'" in complaint(
         "build", tiny_recording, tmp_path / "campus", "--ray", "auto", "--world", "the campus"
     )
-    assert "named twice" in complaint(
+    assert "given twice" in complaint(
         "build", tiny_recording, tiny_recording, tmp_path / "campus", "--ray", "auto"
     )
 

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from topoloc.apps.cluster.atlas_building import TileTask
 from topoloc.apps.cluster.remote import (
     ProgressBoard,
     TaskPayload,
@@ -18,7 +17,7 @@ from topoloc.apps.cluster.remote import (
     _create_reporter,
     run_task,
 )
-from topoloc.apps.cluster.tiles import Outcome, TileJob
+from topoloc.apps.cluster.tiles import Outcome, TileJob, TileTask
 from topoloc.errors import ClusterError, RecordingError
 
 
@@ -60,7 +59,7 @@ def test_paths_days_and_threads_are_the_drivers(tmp_path: Path):
 
 
 def test_another_version_of_topoloc():
-    with pytest.raises(ClusterError, match=r"has topoloc \S+, and 9\.9 asks it"):
+    with pytest.raises(ClusterError, match=r"has topoloc \S+, but the driver has 9\.9"):
         run_task(b"of another version", TaskRequirements(1, "9.9"), None, 0)
 
 

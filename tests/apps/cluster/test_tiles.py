@@ -10,7 +10,6 @@ import pytest
 
 from topoloc.apps.cluster.tiles import TileJob, build_tile, derive_tile_ids
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.editing import read_manifest
 from topoloc.errors import AtlasError, RecordingError
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -66,7 +65,7 @@ def test_tiles_are_called_as_their_recordings(recordings: list[str], ids: list[s
     "recordings", [["hall", "yard", "hall"], ["hall", "./hall"], ["a b", "a+b"]]
 )
 def test_a_recording_that_is_named_twice(recordings: list[str]):
-    with pytest.raises(AtlasError, match="named twice"):
+    with pytest.raises(AtlasError, match="given twice"):
         derive_tile_ids(recordings)
 
 
@@ -101,12 +100,12 @@ def test_what_was_made_otherwise_is_replaced_only_when_it_is_said(job: TileJob, 
     refused = build_tile(otherwise, where, False, _nothing)
     assert refused.state == "failed"
     assert "--replace" in (refused.reason or "")
-    assert read_manifest(where).by_id["room"].recipe == job.digest()
+    assert Atlas.read_manifest(where).by_id["room"].recipe == job.digest()
     assert build_tile(otherwise, where, True, _nothing).state == "built"
-    assert read_manifest(where).by_id["room"].recipe == otherwise.digest()
+    assert Atlas.read_manifest(where).by_id["room"].recipe == otherwise.digest()
     elsewhere = replace(otherwise, world="campus")
     assert build_tile(elsewhere, where, True, _nothing).state == "built"
-    assert read_manifest(where).by_id["room"].world == "campus"
+    assert Atlas.read_manifest(where).by_id["room"].world == "campus"
 
 
 @pytest.mark.parametrize(

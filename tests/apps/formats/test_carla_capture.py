@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from topoloc.apps.formats.capture.carla_capture import (
+from topoloc.apps.formats.carla import (
     CarlaConfig,
     carla_camera,
     carla_client,
     carla_frames,
     world_from_carla_transform,
 )
-from topoloc.apps.formats.capture.recording_writer import RecordingWriter
+from topoloc.apps.formats.recording_writer import RecordingWriter
 from topoloc.errors import ConfigError, RecordingError
 from topoloc.recordings.open import open_sequence
 
@@ -158,14 +158,12 @@ class StandInWorld:
 
 
 CONFIG = CarlaConfig(
-    length_m=100.0,
-    spacing_m=1.0,
-    lane_offset_m=2.0,
-    width=8,
-    height=6,
-    timeout_s=0.2,
+    length=100.0,
+    spacing=1.0,
+    lane_offset=2.0,
     weather="rain",
 )
+SIZE = (8, 6)
 
 
 def client_of(world: StandInWorld) -> SimpleNamespace:
@@ -175,7 +173,7 @@ def client_of(world: StandInWorld) -> SimpleNamespace:
 def test_a_way_is_recorded(tmp_path: Path):
     world = StandInWorld()
     with RecordingWriter(tmp_path / "out") as writer:
-        for frame in carla_frames(carla, client_of(world), CONFIG):
+        for frame in carla_frames(carla, client_of(world), CONFIG, SIZE):
             assert world.settings.synchronous_mode
             writer.write(frame)
     read = open_sequence(tmp_path / "out")
@@ -188,8 +186,8 @@ def test_a_way_is_recorded(tmp_path: Path):
     last = read[9]
     assert last.rig is not None
     assert last.right is not None
-    assert last.rig.baseline == pytest.approx(CONFIG.baseline_m)
-    assert last.rig.left == carla_camera(CONFIG)
+    assert last.rig.baseline == pytest.approx(CONFIG.baseline)
+    assert last.rig.left == carla_camera(CONFIG.fov, SIZE)
     assert last.image[3, 3].tolist()[1:] == [
         (100 + 20 + 9) % 256,
         0,
@@ -208,7 +206,7 @@ def test_a_way_is_recorded(tmp_path: Path):
 
 
 def test_depth_is_in_metres():
-    frame = next(carla_frames(carla, client_of(StandInWorld()), CONFIG))
+    frame = next(carla_frames(carla, client_of(StandInWorld()), CONFIG, SIZE))
     assert frame.depth is not None
     assert math.isnan(frame.depth.depth[0, 0])
     red, green, blue = 58, (100 + 20) % 256, 2
@@ -219,7 +217,7 @@ def test_depth_is_in_metres():
 
 def test_ended_early_the_server_is_left_as_it_was():
     world = StandInWorld()
-    frames = carla_frames(carla, client_of(world), CONFIG)
+    frames = carla_frames(carla, client_of(world), CONFIG, SIZE)
     next(frames)
     frames.close()  # pyright: ignore[reportAttributeAccessIssue]
     assert not world.settings.synchronous_mode
@@ -229,32 +227,35 @@ def test_ended_early_the_server_is_left_as_it_was():
 @pytest.mark.parametrize(
     ("world", "said"),
     [
-        (StandInWorld(num_silent=123), "no picture of step 123 for 0.2 s"),
-        (StandInWorld(late=1), "is another client ticking it"),
+        (StandInWorld(num_silent=123), "no image of step 123 within 0.2 s"),
+        (StandInWorld(late=1), "does another client run steps"),
     ],
 )
-def test_a_server_that_does_not_keep_step(world: StandInWorld, said: str):
+def test_a_server_that_does_not_keep_step(
+    world: StandInWorld, said: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("topoloc.apps.formats.carla._ANSWER_S", 0.2)
     with pytest.raises(RecordingError, match=said):
-        list(carla_frames(carla, client_of(world), CONFIG))
+        list(carla_frames(carla, client_of(world), CONFIG, SIZE))
     assert not world.settings.synchronous_mode
 
 
 def test_settings_that_make_no_sense():
     with pytest.raises(RecordingError, match="spawn point 7 of 1 in Town00"):
-        list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(start=7)))
+        list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(start=7), SIZE))
     with pytest.raises(ConfigError, match="must be above 0"):
-        list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(spacing_m=0.0)))
+        list(carla_frames(carla, client_of(StandInWorld()), CarlaConfig(spacing=0.0), SIZE))
     with pytest.raises(ConfigError, match="200 degrees"):
-        carla_camera(CarlaConfig(fov_deg=200.0))
+        carla_camera(200.0, SIZE)
 
 
 def test_the_middle_of_the_picture_looks_straight_on():
-    camera = carla_camera(CarlaConfig(width=800, height=600, fov_deg=90.0))
+    camera = carla_camera(90.0, (800, 600))
     np.testing.assert_allclose(camera.img_from_cam(np.array([[1.0, 0.0, 1.0]])), [[799.5, 299.5]])
     assert camera.fx == pytest.approx(400.0)
 
 
 def test_no_server_is_one_line(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("topoloc.apps.formats.capture.carla_capture._CONNECT_S", 0.5)
+    monkeypatch.setattr("topoloc.apps.formats.carla._CONNECT_S", 0.5)
     with pytest.raises(RecordingError, match=r"no CARLA server answers at 127\.0\.0\.1:9"):
-        carla_client(CarlaConfig(host="127.0.0.1", port=9))
+        carla_client("127.0.0.1:9")

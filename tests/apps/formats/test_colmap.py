@@ -103,7 +103,7 @@ def test_pictures_cameras_and_poses(model: Make, binary: bool):
 def test_pictures_that_lie_elsewhere(model: Make, tmp_path: Path):
     root = model()
     (root / "images").rename(tmp_path / "photos")
-    with pytest.raises(RecordingError, match="name their folder with --images"):
+    with pytest.raises(RecordingError, match="use --images FOLDER"):
         open_sequence(root)
     assert open_sequence(root, images=tmp_path / "photos")[0].image.shape == (HEIGHT, WIDTH)
     with pytest.raises(RecordingError, match="takes no images"):

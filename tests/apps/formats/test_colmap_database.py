@@ -79,11 +79,11 @@ def test_a_model_beside_it_counts(database: Make, tmp_path: Path):
     ("change", "said"),
     [
         ("UPDATE images SET name = '/etc/passwd' WHERE name = '10.png'", "passwd"),
-        ("UPDATE images SET camera_id = 77", "of a camera that is missing"),
-        ("UPDATE cameras SET params = x'00'", "a camera that is none"),
+        ("UPDATE images SET camera_id = 77", "the camera of 9.5.png is missing"),
+        ("UPDATE cameras SET params = x'00'", "an invalid camera"),
         ("UPDATE cameras SET model = 99", "camera 1: unknown camera model 'number 99'"),
-        ("UPDATE cameras SET width = 'wide'", "a camera that is none"),
-        ("DELETE FROM images", "no picture in this database"),
+        ("UPDATE cameras SET width = 'wide'", "an invalid camera"),
+        ("DELETE FROM images", "no image in this database"),
         ("DROP TABLE cameras", "no database of COLMAP, or damaged"),
     ],
 )

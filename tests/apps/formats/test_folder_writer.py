@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tiny_recordings import assert_same_pose, pose
-from topoloc.apps.formats.capture.recording_writer import RecordingWriter
+from topoloc.apps.formats.recording_writer import RecordingWriter
 from topoloc.errors import RecordingError, TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
@@ -100,7 +100,7 @@ def test_readable_after_each_frame(tmp_path: Path):
 def test_what_is_there_is_never_overwritten(tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/thesis.tex").write_text("x")
-    with pytest.raises(TopolocError, match=r"holds other things, such as thesis\.tex"):
+    with pytest.raises(TopolocError, match=r"is not empty and has thesis\.tex"):
         RecordingWriter(tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
     with pytest.raises(TopolocError, match="cannot write"):
@@ -110,7 +110,7 @@ def test_what_is_there_is_never_overwritten(tmp_path: Path):
 def test_a_frame_that_fails_leaves_nothing_of_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from topoloc.apps.formats.capture import recording_writer
+    from topoloc.apps.formats import recording_writer
 
     written, write_bytes = [], recording_writer.write_bytes
 

@@ -200,7 +200,7 @@ def _matrix(value: Any) -> Callable[[dict[str, Any]], None]:
         (
             lambda data: data["frames"][1].pop("depth_file_path"),
             RecordingError,
-            "3 frames but 2 with a depth_file_path",
+            "only 2 of 3 frames have a depth_file_path",
         ),
         (
             lambda data: data["frames"][1].pop("transform_matrix"),

@@ -134,7 +134,7 @@ def test_without_the_extra(export: Make, monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize(
     ("changes", "error", "says"),
     [
-        ({"poses": []}, RecordingError, "0 poses for 3 pictures"),
+        ({"poses": []}, RecordingError, "0 poses for 3 images"),
         (
             {"poses": [[0, 0, 0, 0, 1, 2, 3]] * 3},
             TrajectoryError,
@@ -155,11 +155,11 @@ def test_without_the_extra(export: Make, monkeypatch: pytest.MonkeyPatch):
         (
             {"perFrameIntrinsicCoeffs": [[1, 2, 3, 4]]},
             CalibrationError,
-            "1 perFrameIntrinsicCoeffs for 3 pictures",
+            "1 perFrameIntrinsicCoeffs for 3 images",
         ),
         ({"w": 100}, CalibrationError, "of 100x24, but 0.jpg is 32x24"),
         ({"frameTimestamps": [1.0, 0.5, 2.0]}, RecordingError, "do not increase"),
-        ({"frameTimestamps": [1.0]}, RecordingError, "1 frameTimestamps for 3 pictures"),
+        ({"frameTimestamps": [1.0]}, RecordingError, "1 frameTimestamps for 3 images"),
     ],
 )
 def test_what_is_refused(

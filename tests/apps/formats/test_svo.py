@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from topoloc.apps.formats.capture.recording_writer import RecordingWriter
-from topoloc.apps.formats.capture.zed_capture import sdk_frames
+from topoloc.apps.formats.recording_writer import RecordingWriter
+from topoloc.apps.formats.svo import sdk_frames
 from topoloc.errors import MissingExtraError, RecordingError
 from topoloc.recordings.open import find_format, open_sequence
 from topoloc.recordings.recording import as_monocular
@@ -102,7 +102,7 @@ def test_without_the_sdk_it_is_said_how_to_export(tmp_path: Path, monkeypatch: p
     with pytest.raises(
         MissingExtraError,
         match=(
-            r"pyzed of Stereolabs' ZED SDK; without it export .* left/ and right/ with a"
+            r"pyzed of Stereolabs' ZED SDK, .* export .* left/ and right/ with a"
             r" camera\.json"
         ),
     ):
@@ -132,7 +132,7 @@ def test_frames_in_any_order(tmp_path: Path):
 def test_a_file_that_the_sdk_cannot_open(tmp_path: Path):
     path = tmp_path / "broken.svo"
     path.write_bytes(b"svo")
-    with pytest.raises(RecordingError, match="the ZED SDK cannot open it"):
+    with pytest.raises(RecordingError, match=r"the ZED SDK cannot open .*broken"):
         open_sequence(path)
 
 
@@ -142,7 +142,7 @@ def test_a_zed_that_is_plugged_in(tmp_path: Path):
     with RecordingWriter(tmp_path / "out") as writer:
         for _ in range(NUM_FRAMES):
             writer.write(next(frames))
-    with pytest.raises(RecordingError, match="gives no more pictures"):
+    with pytest.raises(RecordingError, match="gives no more images"):
         next(frames)
     read = open_sequence(tmp_path / "out")
     assert read.t_ns == [10**18 + index * 66_000_000 for index in range(NUM_FRAMES)]

@@ -16,7 +16,7 @@ from topoloc.geometry.rig import rectify
 from topoloc.geometry.rigid import exp_so3
 from topoloc.recordings.open import find_format, open_sequence
 from topoloc.recordings.recording import as_monocular
-from topoloc.recordings.trajectory import Trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory
 
 VGA = (672, 376)
 LEFT = "fx=350.1\nfy=350.2\ncx=331.0\ncy=189.7\nk1=-0.17\nk2=0.027\np1=0.0004\np2=-0.0003\nk3=0\n"
@@ -82,8 +82,8 @@ def test_a_real_recording_side_by_side(shared: Path, tmp_path: Path):
     conf = f"[LEFT_CAM_VGA]\n{numbers}[RIGHT_CAM_VGA]\n{numbers}[STEREO]\nBaseline={1000 * rig.baseline!r}\n"  # noqa: E501
     (tmp_path / "SN7.conf").write_text(conf)
     t_ns = open_sequence(path).t_ns
-    write_tum(
-        tmp_path / "lab.tum", Trajectory([pose for pose in lab.poses if pose is not None], t_ns)
+    Trajectory([pose for pose in lab.poses if pose is not None], t_ns).write_tum(
+        tmp_path / "lab.tum"
     )
     sequence = open_sequence(path)
     for index, frame in enumerate(frames):
@@ -140,10 +140,10 @@ def test_the_section_goes_by_the_size_of_the_picture(size: tuple[int, int], tmp_
     other = next(its for its in RESOLUTIONS if its != size)
     with pytest.raises(
         CalibrationError,
-        match=rf"no calibration of {RESOLUTIONS[other]} \({other[0]}x{other[1]}\).* it has {name}$",
+        match=rf"calibration of {RESOLUTIONS[other]} \({other[0]}x{other[1]}\).* only of {name}$",
     ):
         read_conf(path, other)
-    with pytest.raises(CalibrationError, match="a ZED has no pictures of 640x480"):
+    with pytest.raises(CalibrationError, match="a ZED has no images of 640x480"):
         read_conf(path, (640, 480))
 
 
@@ -160,9 +160,7 @@ def test_a_rectified_video_with_a_camera_json(film: Path, tmp_path: Path):
         '{"width": 640, "height": 376, "fx": 260, "fy": 260, "cx": 336, "cy": 188, "baseline":'
         " 0.12}"
     )
-    with pytest.raises(
-        CalibrationError, match=r"of 640x376, but each half of walk\.avi is 672x376"
-    ):
+    with pytest.raises(CalibrationError, match=r"of 640x376, but each half is 672x376"):
         open_sequence(film, "zed", camera=elsewhere)
 
 
@@ -180,9 +178,8 @@ def test_a_calibration_that_is_named(film: Path, tmp_path: Path):
 
 def test_several_calibrations(film: Path, tmp_path: Path, complaint: Callable[..., str]):
     (tmp_path / "sn2.conf").write_text(CONF)
-    assert (
-        "several calibrations beside it (SN10028.conf, sn2.conf); --camera names one"
-        in complaint("slam", film, tmp_path / "o.tum")
+    assert "several calibrations beside it (SN10028.conf, sn2.conf); use --camera" in complaint(
+        "slam", film, tmp_path / "o.tum"
     )
 
 
@@ -196,7 +193,7 @@ def test_several_calibrations(film: Path, tmp_path: Path, complaint: Callable[..
         ("Baseline=119.97", "Baseline=-4", "STEREO baseline of -4 mm"),
         ("Baseline=119.97\n", "", "STEREO: baseline is missing"),
         ("[STEREO]", "[REPEATED]", "STEREO: baseline is missing"),
-        ("[LEFT_CAM_VGA]", "no section", "not a calibration of Stereolabs' form"),
+        ("[LEFT_CAM_VGA]", "no section", "not a calibration of Stereolabs"),
         ("[RIGHT_CAM_VGA]", "[RIGHT_CAM_2K]", "no calibration of VGA"),
     ],
 )
@@ -214,5 +211,5 @@ def test_a_video_of_one_picture_is_not_side_by_side(tmp_path: Path):
     picture = np.zeros((360, 320), np.uint8)
     path = write_side_by_side(tmp_path / "plain.avi", [(picture, picture)])
     assert find_format(path) == "video"
-    with pytest.raises(RecordingError, match="640x360 pixels are not two pictures side by side"):
+    with pytest.raises(RecordingError, match="640x360 pixels are not two images side by side"):
         open_sequence(path, "zed")

@@ -45,7 +45,7 @@ def test_first_poses_that_lead_nowhere_new_are_told_so(localizer: Localizer):
         for picture, _ in unseen_views()
         for pose in explain(never_clear, picture, CAMERA).poses
     ]
-    assert "the same as one that was found already" in verdicts
+    assert "the same as an earlier pose" in verdicts
     assert verdicts.count("the answer") == len(unseen_views())
 
 

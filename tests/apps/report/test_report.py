@@ -121,7 +121,7 @@ def test_a_picture_that_is_gone_leaves_a_gap(tmp_path: Path):
         raise UnreadableImageError("far.png: no such picture")
 
     without = EvaluatedQuery("far", MIXED[10].result, MIXED[10].world_from_cam, 0, "walk", gone)
-    assert "picture cannot be read any more" in _write(tmp_path / "report.html", [without])
+    assert "image cannot be read any more" in _write(tmp_path / "report.html", [without])
 
 
 def test_many_marks_become_one_picture(page: str, monkeypatch: pytest.MonkeyPatch):
@@ -137,14 +137,14 @@ def _night(answers: list[EvaluatedQuery]) -> list[EvaluatedQuery]:
 def test_each_recording_has_its_row_its_colour_and_its_curve(tmp_path: Path):
     night = _night([answer("n0", 0.2, 0.03, 1.0), answer("n1", 0.3, 0.05, 2.0), lost("n2", 0.6)])
     page = _write(tmp_path / "report.html", [*GOOD, *night, elsewhere("mars", accepted=False)])
-    rows = re.findall(r"<tr><td><i.*?</tr>", page, re.DOTALL)
+    rows = re.findall(r"<tr><td[^>]*><i.*?</tr>", page, re.DOTALL)
     assert [re.sub(r"<[^>]*>", " ", row).split()[0] for row in rows] == ["walk", "night", "moon"]
     assert all(text in rows[0] for text in ("9 of 9", "0.50 cm, 0.10°", "100 %"))
     assert all(
         text in rows[1]
         for text in ("night &amp; rain", "2 of 3", "4.00 cm, 1.50°", "67 %", ">0</span> of 3")
     )
-    assert "images from elsewhere" in rows[2]
+    assert "out-of-map images" in rows[2]
     colours = [re.findall(r"background:(#\w+)", row) for row in rows]
     assert colours[0] != colours[1]
     assert colours[2] == []

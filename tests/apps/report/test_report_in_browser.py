@@ -69,7 +69,7 @@ def test_the_scene_holds_every_answer(browser: Any, report: Path):
             "mars (not localized)",
         } <= set(shown)
         page.get_by_label("Go to").select_option("far")
-        assert "Wrongly placed" in page.inner_text("[data-part=details]")
+        assert "Wrong pose" in page.inner_text("[data-part=details]")
         page.get_by_label("Go to").select_option("moon")
         assert "this pose is false" in page.inner_text("[data-part=details]")
 

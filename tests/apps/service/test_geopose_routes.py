@@ -212,5 +212,5 @@ def test_a_map_without_a_place_on_earth_is_a_409(client: httpx.Client, view: Pat
         ROUTE, params={"map": "room"}, json=_version_2(view, camera), headers={"accept": ACCEPT}
     )
     assert answer.status_code == 409
-    assert "earth" in answer.json()["ERROR"]
+    assert "georeferenced" in answer.json()["ERROR"]
     assert client.get(ROUTE).json() == {"status": "running"}

@@ -17,7 +17,7 @@ from answers_compared import without_times
 from topoloc.apps.cli import main
 from topoloc.localization.result import Localization, result_from_json
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.trajectory import read_trajectory
+from topoloc.recordings.trajectory import Trajectory
 
 
 def _printed(capsys: pytest.CaptureFixture[str], *args: object) -> str:
@@ -61,7 +61,7 @@ def test_forms_and_bare_pictures_are_answered_alike_and_near_the_truth(
     assert without_times(form.text) == without_times(bare.text)
     result = result_from_json(form.text)
     assert isinstance(result, Localization)
-    truth = read_trajectory(queries / "truth.tum").world_from_cam[2]
+    truth = Trajectory.read(queries / "truth.tum").world_from_cam[2]
     assert np.linalg.norm(result.world_from_cam.translation - truth.translation) < 0.05
 
 
@@ -86,7 +86,7 @@ def test_cameras_by_their_names(client: httpx.Client, view: Path, camera: str, c
 def test_a_prior_and_a_time_limit_are_heard(
     client: httpx.Client, queries: Path, view: Path, camera: str
 ):
-    pose = read_trajectory(queries / "truth.tum").world_from_cam[2]
+    pose = Trajectory.read(queries / "truth.tum").world_from_cam[2]
     prior = json.dumps(
         {"translation": pose.translation.tolist(), "quat_wxyz": pose.quat_wxyz().tolist()}
     )

@@ -11,7 +11,7 @@ import httpx
 import jsonschema
 import pytest
 
-from topoloc.apps.service.query_request import QueryParameters
+from topoloc.apps.service.openapi_schemas import QueryParameters
 
 
 @pytest.fixture(scope="module")

@@ -188,10 +188,10 @@ def test_the_token_is_asked_for(room_map: Path, tmp_path: Path, browser: Any):
     with running(room_map, "--token-file", tmp_path / "token") as service:
         page = browser.new_page()
         page.goto(f"{service.url}/")
-        page.get_by_label("This service asks for a token").fill("wrong-token-of-some-length")
+        page.get_by_label("This service needs a token").fill("wrong-token-of-some-length")
         page.keyboard.press("Enter")
         page.wait_for_selector("#answer h2.bad")
-        page.get_by_label("This service asks for a token").fill(TOKEN)
+        page.get_by_label("This service needs a token").fill(TOKEN)
         page.keyboard.press("Enter")
         page.wait_for_selector("#scene canvas")
         assert page.locator("#token-field").is_hidden()

@@ -100,7 +100,7 @@ def test_streams_end_when_nobody_uses_them_and_there_are_not_too_many(
             with pytest.raises(ConnectionClosed) as closed:
                 socket.recv(10)
             assert closed.value.rcvd is not None
-            assert "no picture" in closed.value.rcvd.reason
+            assert "no image" in closed.value.rcvd.reason
     finally:
         for socket in sockets:
             socket.close()

@@ -16,7 +16,7 @@ from topoloc.apps.viewer.result_files import read_results
 from topoloc.errors import TopolocError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative, Localization, NotLocalized
-from topoloc.recordings.trajectory import Trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory
 from topoloc.tracking.stream_result import StreamedPose
 
 FOUND = Localization(
@@ -73,8 +73,8 @@ def test_an_evaluation_has_its_recordings_and_its_truth(tmp_path: Path):
 
 
 def test_a_trajectory_is_a_path(tmp_path: Path):
-    write_tum(
-        tmp_path / "walk.tum", Trajectory([Rigid3.identity(), FOUND.world_from_cam], [0, 10**9])
+    Trajectory([Rigid3.identity(), FOUND.world_from_cam], [0, 10**9]).write_tum(
+        tmp_path / "walk.tum"
     )
     (walk,) = read_results(tmp_path / "walk.tum")
     assert (walk.name, len(walk.answers)) == ("walk", 0)

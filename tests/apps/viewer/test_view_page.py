@@ -17,7 +17,7 @@ import pytest
 
 from in_browser import CONTRASTS, UNNAMED, WIDTHS, chromium, opened
 from topoloc.apps.cli import main
-from topoloc.apps.viewer import screenshot
+from topoloc.apps.viewer import page as viewer_page
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.result import Alternative, Localization, NotLocalized
 
@@ -94,12 +94,12 @@ def test_an_answer_that_is_chosen_is_shown_with_its_ellipsoid_and_the_truth(
         assert np.linalg.norm(_centres(page, "answer") - shown.found.translation) < 1e-5
         assert np.linalg.norm(_centres(page, "truth") - shown.true.translation) < 1e-5
         said = page.inner_text("[data-part=details]")
-        assert "Off the truth by 5.0 cm" in said
+        assert "Error: 5.0 cm" in said
         assert "probability 0.97" in said
         page.get_by_label("Go to").select_option("twice.png (not localized)")
         centres = _centres(page, "alternative")
         np.testing.assert_allclose(centres, [pose.translation for pose in shown.others], atol=1e-5)
-        assert "several places that look alike" in page.inner_text("[data-part=details]")
+        assert "Several similar places" in page.inner_text("[data-part=details]")
 
 
 def test_the_ellipsoid_is_that_of_the_cameras_own_position(browser: Any, shown: Shown):
@@ -160,7 +160,7 @@ def test_a_layer_goes_and_comes(browser: Any, shown: Shown):
         box.uncheck()
         page.wait_for_timeout(200)
         assert page.locator("canvas").screenshot() != before
-        page.get_by_label("their pictures").check()
+        page.get_by_label("their images").check()
         page.wait_for_function(
             f"{VIEWER}.stage.scene.children.some((one) => one.children.some((two) =>"
             " two.material?.map?.image))"
@@ -171,8 +171,8 @@ def test_a_picture_of_the_page(
     shown: Shown, room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     try:
-        screenshot.find_browser()
-    except screenshot.TopolocError as error:
+        viewer_page.find_browser()
+    except viewer_page.TopolocError as error:
         pytest.skip(str(error))
     assert main(["view", str(room_map), "--screenshot", str(tmp_path / "room.png")]) == 0
     assert "room.png" in capsys.readouterr().out

@@ -12,8 +12,8 @@ import tyro
 
 from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, progress_bar, write_json
 from topoloc.apps.cli.settings_file import read_settings
-from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
-from topoloc.atlas.atlas import is_atlas
+from topoloc.apps.cli.tile_option import TileOption, select_tile
+from topoloc.atlas.place import open_place
 from topoloc.mapping.integrity_check import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel
@@ -57,18 +57,20 @@ class Command:
     """All other settings: a TOML file, as `topoloc config train` prints it."""
 
     def run(self) -> int:
-        if self.out is not None and is_atlas(self.map):
-            raise UsageError("--out is of a map: a tile gets its coarse localizer itself")
+        place = open_place(self.map)
+        tile_id = select_tile(place, self.tile)
+        if self.out is not None and tile_id:
+            raise UsageError("--out needs a map file: a tile gets its coarse localizer itself")
         if self.checkpoint is not None and self.coarse != "cnn-fc":
             raise UsageError("--checkpoint is for cnn-fc; the others are done in one go")
         check_outputs(
-            [self.out or (None if is_atlas(self.map) else self.map), self.json, self.checkpoint],
+            [self.out or (None if tile_id else self.map), self.json, self.checkpoint],
             inputs=[path for path in (self.weights, self.config) if path is not None],
         )
         config = read_settings(self.config).of(CoarseTrainingConfig)
         start = time.perf_counter()
-        facts, model = edit_map_or_tile(
-            self.map, self.tile, lambda path: self._trained(path, Path(self.out or path), config)
+        facts, model = place.edit(
+            tile_id, lambda path: self._trained(path, Path(self.out or path), config)
         )
         facts |= {"seconds": round(time.perf_counter() - start, 1), "default": self.default}
         if self.json != "-":

@@ -25,7 +25,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.recordings.atomic import write_bytes, write_text
 from topoloc.recordings.frame import Image
 from topoloc.recordings.image_io import to_grey
-from topoloc.recordings.trajectory import Trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory
 from topoloc_worlds.shots import Shot
 
 SETTINGS = "world.json"
@@ -115,7 +115,7 @@ def prepare(
     write_text(
         folder / "times.txt", "".join(f"{Decimal(t).scaleb(-9):.9f}\n" for t in trajectory.t_ns)
     )
-    write_tum(folder / "truth.tum", trajectory)
+    trajectory.write_tum(folder / "truth.tum")
     if layout.baseline is not None:
         write_text(folder / "calib.txt", _calib(layout.camera, layout.baseline))
     else:

@@ -11,35 +11,34 @@ from topoloc.apps.cli.output import UsageError
 from topoloc.apps.cli.settings_file import all_tables, settings_text
 
 _HEADER = """\
-# The settings of topoloc {version} that are no options of its commands, with their defaults.
-# Keep the lines that you change, and give the file to a command: --config FILE. Behind a value: what it may be.
-# `# key =` is not set (None)."""  # noqa: E501
+# Settings of topoloc {version} beside the options of its commands, with their defaults and bounds.
+# Keep the lines that you change, and use the file with a command: --config FILE.
+# `# key =` is not set (None)."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc config` takes."""
+    """Arguments of `topoloc config`."""
 
     command: Annotated[
         tyro.conf.Positional[str | None],
         tyro.conf.arg(metavar="COMMAND", help_behavior_hint="(default: all)"),
     ] = None
-    """Only what this command reads: build, slam, localize, evaluate, explain or train."""
+    """Only the settings of this command: build, slam, localize, evaluate, explain or train."""
 
     def run(self) -> int:
         from topoloc import __version__
 
+        commands_of = {name: commands for name, (_, _, commands) in all_tables().items()}
         tables = [
             name
-            for name, (_, _, commands) in all_tables().items()
+            for name, commands in commands_of.items()
             if self.command is None or self.command in commands
         ]
         if not tables:
-            known = dict.fromkeys(
-                command for _, _, commands in all_tables().values() for command in commands
+            known = ", ".join(
+                dict.fromkeys(c for commands in commands_of.values() for c in commands)
             )
-            raise UsageError(
-                f"{self.command} has no settings beside its options; {', '.join(known)} have"
-            )
+            raise UsageError(f"{self.command} has no settings beside its options; {known} have")
         print(_HEADER.format(version=__version__) + "\n\n" + settings_text(tables), end="")
         return 0

@@ -1,4 +1,4 @@
-"""topoloc demo: the whole pipeline on the built-in world."""
+"""topoloc demo: the whole pipeline on the built-in lab."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from topoloc import (
     localize_out_of_map,
     localize_queries,
     open_sequence,
-    write_tum,
 )
 from topoloc.apps.cli.output import (
     File,
@@ -46,17 +45,15 @@ OUT_OF_MAP = "elsewhere"
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc demo` takes."""
+    """Arguments of `topoloc demo`."""
 
     out: Annotated[str, tyro.conf.arg(metavar="DIR")] = "topoloc-demo"
-    """Where map, results, trajectories and report.html are written."""
+    """Output folder of map, results, trajectories and report.html."""
     recordings: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="DIR", help_behavior_hint="(default: those that topoloc brings along)"
-        ),
+        tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: the shipped ones)"),
     ] = None
-    """Take the recordings from here, as `topoloc simulate demo` renders them."""
+    """Recordings of `topoloc simulate demo` instead of the shipped ones."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
 
@@ -82,15 +79,13 @@ class Command:
             report = f"none; {missing}"
         write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
         if self.json != "-":
-            seconds = (
-                f"{time.perf_counter() - start:.0f} s in all, {mapped - start:.0f} s of them until"
-                " the map was there"
-            )
+            end = time.perf_counter()
+            seconds = f"{end - start:.0f} s in all, {mapped - start:.0f} s of them for the map"
             _print(out, evaluation, seconds, report)
         return 0
 
     def _find_recordings(self) -> Path:
-        """The folder of the recordings, whole."""
+        """Return the folder of the recordings. Raises TopolocError if some are missing."""
         folder = Path(self.recordings) if self.recordings else SHIPPED
         if not folder.is_dir():
             raise TopolocError(
@@ -98,13 +93,10 @@ class Command:
                 " into it"
             )
         if missing := find_missing_recordings(folder):
-            what = (
-                "this installation of topoloc lacks the demo's recordings"
-                if folder == SHIPPED
-                else f"{folder} lacks recordings"
-            )
+            place = "this installation of topoloc" if folder == SHIPPED else folder
             raise TopolocError(
-                f"{what} ({', '.join(missing)}); `topoloc simulate demo DIR` renders them"
+                f"{place} lacks recordings ({', '.join(missing)}); `topoloc simulate demo DIR`"
+                " renders them"
             )
         return folder
 
@@ -126,7 +118,7 @@ def _open(folder: Path, role: Role) -> list[StereoSequence]:
 
 
 def _build_lab_map(folder: Path, path: Path, progress: Progress) -> TopoMetricMap:
-    """Build the map and open it from its file, as everybody else will."""
+    """Build and save the map, and open it from its file."""
     build_map(_open(folder, "map"), progress=progress).save(path)
     return TopoMetricMap.load(path)
 
@@ -134,7 +126,7 @@ def _build_lab_map(folder: Path, path: Path, progress: Progress) -> TopoMetricMa
 def _localize_queries(
     topomap: TopoMetricMap, folder: Path, progress: Progress
 ) -> list[EvaluatedQuery]:
-    """Every query of the lab, then every picture of somewhere else."""
+    """Localize all queries of the lab, then all out-of-map images."""
     localizer = Localizer(topomap)
     answers: list[EvaluatedQuery] = []
     for sequence in _open(folder, "queries"):
@@ -149,7 +141,7 @@ def _label(sequence: StereoSequence) -> str:
 
 
 def _write_results(out: Path, folder: Path, answers: list[EvaluatedQuery]) -> None:
-    """One JSON line a query, and the poses found in each recording as a trajectory."""
+    """Write one JSON line for each query, and the poses of each recording as a trajectory."""
     lines = [json.dumps(a.result.to_json(f"{a.recording}/{a.query}")) for a in answers]
     write_text(out / "results.jsonl", "\n".join(lines) + "\n")
     groups = Evaluation(answers).by_recording
@@ -160,10 +152,8 @@ def _write_results(out: Path, folder: Path, answers: list[EvaluatedQuery]) -> No
             for a in groups[_label(sequence)]
             if isinstance(a.result, Localization)
         ]
-        write_tum(
-            out / f"{sequence.name}.tum",
-            Trajectory([pose for _, pose in found], [t for t, _ in found]),
-        )
+        trajectory = Trajectory([pose for _, pose in found], [t for t, _ in found])
+        trajectory.write_tum(out / f"{sequence.name}.tum")
 
 
 def _print(out: Path, evaluation: dict[str, Any], seconds: str, report: str) -> None:

@@ -27,24 +27,24 @@ BUILD_FEATURES = Annotated[
     str | None,
     tyro.conf.arg(
         metavar="surf|sift|learned|both|KIND[,KIND]",
-        help_behavior_hint="(default: both where a network is here)",
+        help_behavior_hint="(default: both if a network is installed)",
     ),
 ]
 QUERY_FEATURES = Annotated[
     str | None,
     tyro.conf.arg(
         metavar="surf|learned|both|KIND[,KIND]",
-        help_behavior_hint="(default: all that the map holds)",
+        help_behavior_hint="(default: all of the map)",
     ),
 ]
 
 
 def select_build_features(config: BuildConfig, features: str | None) -> BuildConfig:
-    """The configuration with the kinds of features that the option names, the first one first.
+    """Return the configuration with the feature types of the option.
 
     Raises:
-        UsageError: an unknown kind, or one that is named twice.
-        MissingExtraError, WeightsError: what a kind that is wanted needs is not here.
+        UsageError: a type is unknown or given twice.
+        MissingExtraError, WeightsError: a type is not available on this machine.
     """
     kinds = config.kinds
     if features is not None:

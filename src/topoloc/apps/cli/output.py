@@ -1,5 +1,4 @@
-"""What the commands share: kinds of options, output paths checked before the work, progress on a
-terminal, tables, results written."""
+"""Common parts of the commands: options, checks of output paths, progress, tables, JSON output."""
 
 from __future__ import annotations
 
@@ -18,24 +17,35 @@ import tyro
 from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequence
 from topoloc.plugin import recording_notes, remove_stale_files, write_text
 
-# Given or not: no `--no-...`, and no "(default: False)" in the help.
+# A switch: no `--no-...`, and no "(default: False)" in the help.
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
-# A path that may be left out.
+# An optional path.
 File = Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
-# The format of the recordings.
 Format = Annotated[
-    str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: recognised)")
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME",
+        help_behavior_hint="(default: recognised)",
+        help="Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio, record3d,"
+        " colmap, rosbag, mcap, zed, video or folder.",
+    ),
 ]
-# The calibration of the recordings.
 CameraOption = Annotated[
     str | None,
     tyro.conf.arg(
-        metavar="FILE|fx,fy,cx,cy", help_behavior_hint="(default: that of the recording)"
+        metavar="FILE|fx,fy,cx,cy",
+        help_behavior_hint="(default: that of the recording)",
+        help="Calibration that replaces the recordings' own: camera.json, OpenCV's or Kalibr's"
+        " YAML, SN*.conf, or `fx,fy,cx,cy`.",
     ),
 ]
-# Which topic of a bag is what.
 Topics = Annotated[
-    str | None, tyro.conf.arg(metavar="ROLE=TOPIC,...", help_behavior_hint="(default: guessed)")
+    str | None,
+    tyro.conf.arg(
+        metavar="ROLE=TOPIC,...",
+        help_behavior_hint="(default: guessed)",
+        help="Topics of a bag: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom.",
+    ),
 ]
 # A Ray cluster.
 RayOption = Annotated[
@@ -59,8 +69,7 @@ def open_recording(
     topics: str | None = None,
     images: str | None = None,
 ) -> StereoSequence:
-    """`open_sequence`; what is to be known of the recording is said in a line each on stderr.
-    Raises as that does."""
+    """Open a recording and print its notes on standard error. See `open_sequence` for errors."""
     sequence = open_sequence(path, format, camera, images, topics)
     for note in recording_notes(sequence):
         print(f"warning: {note}", file=sys.stderr)
@@ -68,20 +77,19 @@ def open_recording(
 
 
 class UsageError(TopolocError):
-    """The command was called in a way that cannot be meant: exit status 2."""
+    """The arguments of a command are wrong: exit status 2."""
 
 
 def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> None:
-    """Hold that the files a command is to write can be written, so that it fails before the work
-    and not after.
+    """Check before the work that the output files can be written.
 
     Args:
-        outputs: paths; None and ``-`` are no files.
+        outputs: paths; None and ``-`` are ignored.
         inputs: files that must not be overwritten.
 
     Raises:
-        TopolocError: the folder is missing or read-only, the path is no regular file, or it is
-            named for two things.
+        TopolocError: the folder is missing or read-only, the path is no regular file, or a file is
+            used twice.
     """
     taken = {Path(path).resolve() for path in inputs}
     for path in (Path(output) for output in outputs if output not in (None, "-")):
@@ -89,20 +97,19 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> 
             raise TopolocError(f"cannot write {path}: folder {path.parent} does not exist")
         if path.is_dir():
             raise TopolocError(f"cannot write {path}: it is a folder")
-        if path.exists() and not path.is_file():  # a device would be replaced by a file of its name
+        if path.exists() and not path.is_file():  # a device would be replaced by a file
             raise TopolocError(f"cannot write {path}: it is no regular file")
         if not os.access(path.parent, os.W_OK):
             raise TopolocError(f"cannot write {path}: folder {path.parent} is read-only")
         if path.resolve() in taken:
-            raise TopolocError(f"cannot write {path}: this file is named for something else, too")
+            raise TopolocError(f"cannot write {path}: this file is used twice")
         remove_stale_files(path)
         taken.add(path.resolve())
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Ctrl-C or too little memory inside a compiled function come out of it as a SystemError; here
-    they become what they were."""
+    """Restore KeyboardInterrupt and MemoryError, which compiled functions raise as SystemError."""
     try:
         yield
     except Exception as error:
@@ -118,8 +125,7 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def catch_stop_signals() -> Iterator[threading.Event]:
-    """Ctrl-C and SIGTERM set the event, at which work that could go on for ever ends in good order;
-    a second one interrupts it."""
+    """Set the event at the first Ctrl-C or SIGTERM. A second one interrupts the work."""
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
@@ -127,7 +133,7 @@ def catch_stop_signals() -> Iterator[threading.Event]:
         stop.set()
         signal.signal(number, before[signal.Signals(number)])
 
-    if threading.current_thread() is not threading.main_thread():  # only there can signals be heard
+    if threading.current_thread() is not threading.main_thread():  # only it receives signals
         yield stop
         return
     for number in before:
@@ -140,7 +146,7 @@ def catch_stop_signals() -> Iterator[threading.Event]:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """OpenCV, FAISS and the loader of shared libraries have words of their own for it."""
+    """Return whether an error of OpenCV, FAISS or the library loader means too little memory."""
     text = str(error)
     words = (
         "Insufficient memory",
@@ -154,8 +160,7 @@ def _is_out_of_memory(error: Exception) -> bool:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """A callable (stage, done, total) that draws one bar a stage where stderr is a terminal, and
-    nothing elsewhere."""
+    """Yield a callable (stage, done, total) that draws a bar for each stage on a terminal."""
     if not sys.stderr.isatty():
         yield lambda stage, done, total: None
         return
@@ -175,7 +180,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
         TextColumn("{task.fields[speed]}"),
         TimeRemainingColumn(),
     )
-    # Lines printed meanwhile go above the bar; where stdout is a file they must stay in that file.
+    # Printed lines go above the bar, except if stdout is a file.
     with Progress(
         *columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()
     ) as progress:
@@ -193,8 +198,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def import_report_writer() -> Callable[..., None]:
-    """`write_report`, of the extra `report`. Raises MissingExtraError where that is not
-    installed."""
+    """Return `write_report`. Raises MissingExtraError if the extra `report` is not installed."""
     try:
         from topoloc.apps.report.report import write_report
     except ModuleNotFoundError as error:
@@ -212,7 +216,7 @@ def print_warning(text: str) -> None:
 
 
 def print_fields(facts: Sequence[tuple[str, str]]) -> None:
-    """Names and values, one pair a line, the values in one column."""
+    """Print names and values, one pair on each line, in two columns."""
     width = max(len(name) for name, _ in facts)
     for name, value in facts:
         print(f"{name:<{width}}  {value}".rstrip())
@@ -221,8 +225,7 @@ def print_fields(facts: Sequence[tuple[str, str]]) -> None:
 def print_recordings(
     evaluation: dict[str, Any], published: Sequence[tuple[str, float, float]] = ()
 ) -> None:
-    """Print the rows of an evaluation (`summarize`), then what others published: (name, metres,
-    degrees)."""
+    """Print the recordings of an evaluation, then published results (name, metres, degrees)."""
     rows = [_COLUMNS, *(_row(recording) for recording in evaluation["recordings"])]
     rows += [
         (name, "", _error(metres, degrees), "", "", "", "") for name, metres, degrees in published
@@ -257,12 +260,12 @@ def _error(metres: float, degrees: float) -> str:
 
 
 def print_waiting() -> None:
-    """On standard error: another process edits the map, and this one waits for it."""
+    """Print that another process edits the map and this one waits."""
     print("another process edits this map; waiting for it ...", file=sys.stderr, flush=True)
 
 
 def write_json(path: str | None, data: Any) -> None:
-    """Write `data` to the file of `--json`; `-` is standard output, None nowhere."""
+    """Write `data` to the file of `--json`. `-` is standard output."""
     if path == "-":
         json.dump(data, sys.stdout, indent=1)
         print()

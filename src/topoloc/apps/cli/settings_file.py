@@ -1,5 +1,4 @@
-"""Settings as TOML: what `topoloc config` prints and `--config FILE` reads, both from the
-configurations as they are declared."""
+"""Settings as TOML, printed by `topoloc config` and read by `--config FILE`."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ from topoloc.plugin import (
 
 T = TypeVar("T")
 
-# table of the file: module and class of its configuration, and the commands that it is for; more
-# come with other distributions
+# table of the file -> module and class of its configuration, and the commands that read it
 _QUERY_COMMANDS = ("localize", "evaluate", "explain", "serve", "follow")
 TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "build": ("topoloc.mapping.build", "BuildConfig", ("build",)),
@@ -59,23 +57,22 @@ _MAX_FILE_BYTES = 1_000_000
 
 
 class Settings:
-    """The configurations that a file sets; of all others the defaults."""
+    """The configurations of a file, and the defaults of all others."""
 
     def __init__(self, configs: dict[type, Any]) -> None:
         self._configs = configs
 
     def of(self, kind: type[T]) -> T:
-        """The configuration of this class."""
+        """Return the configuration of this class."""
         return self._configs[kind] if kind in self._configs else kind()
 
 
 def read_settings(path: str | None) -> Settings:
-    """What the TOML file of `--config` says; None says nothing. Tables of other commands are read,
-    too, and left aside.
+    """Read the TOML file of `--config`, with the tables of all commands. None is an empty file.
 
     Raises:
-        ConfigError: no such file, not TOML, or a key that is unknown, of the wrong type or out of
-            its bounds; file and key are named.
+        ConfigError: the file is missing or not TOML, or a key is unknown or has an invalid value.
+            The text names file and key.
     """
     if path is None:
         return Settings({})
@@ -83,12 +80,10 @@ def read_settings(path: str | None) -> Settings:
         configs = []
         for name, table in drop_removed_settings(_parse_file(path), source=f"{path}: ").items():
             if name not in all_tables():
-                is_missing = name in PLUGIN_PACKAGES and name not in all_commands()
-                unknown = f"no such table{suggest_name(name, all_tables())}"
-                raise ConfigError(
-                    f"{quote_key(name)}:"
-                    f" {f'comes with {PLUGIN_PACKAGES[name]}, which is not installed' if is_missing else unknown}"  # noqa: E501
-                )
+                problem = f"no such table{suggest_name(name, all_tables())}"
+                if name in PLUGIN_PACKAGES and name not in all_commands():
+                    problem = f"needs {PLUGIN_PACKAGES[name]}, which is not installed"
+                raise ConfigError(f"{quote_key(name)}: {problem}")
             kind = config_class(name)
             configs.append(parse_settings(kind, table, name, default=kind()))
     except ConfigError as error:
@@ -97,22 +92,24 @@ def read_settings(path: str | None) -> Settings:
 
 
 def all_tables() -> dict[str, tuple[str, str, tuple[str, ...]]]:
-    """Our tables and those that other distributions bring, as `TABLES`; a name of ours is ours."""
+    """Return the tables of all distributions. Plug-ins cannot replace tables of topoloc."""
     return TABLES | load_plugins("topoloc.settings") | TABLES
 
 
 def config_class(table: str) -> type:
-    """The configuration that a table of the file sets."""
+    """Return the class of a table's configuration."""
     module, name, _ = all_tables()[table]
     return getattr(importlib.import_module(module), name)
 
 
 def with_option(config: T, key: str, value: Any, option: str) -> T:
-    """The configuration with an option of the command line at `key` ("nodes.d_thresh"), unless that
-    is None: was not given.
+    """Return the configuration with the value of a command line option, if it is not None.
+
+    Args:
+        key: path of the setting, such as "nodes.d_thresh".
 
     Raises:
-        UsageError: out of bounds; names the option.
+        UsageError: the value is out of bounds. The text names the option.
     """
     if value is None:
         return config
@@ -125,12 +122,12 @@ def with_option(config: T, key: str, value: Any, option: str) -> T:
 
 
 def settings_text(tables: Sequence[str]) -> str:
-    """The TOML of these tables: every setting with its default, what it means and its bounds."""
+    """Return the TOML of these tables: every setting with its default, meaning and bounds."""
     return "\n".join("\n".join(_format_table(config_class(table)(), table)) for table in tables)
 
 
 def _format_table(config: Any, key: str, note: str = "") -> Iterator[str]:
-    """A table and those in it."""
+    """Yield the lines of a table and its nested tables."""
     kinds, notes = field_annotations(type(config)), read_field_docs(type(config))
     nested = [name for name in kinds if is_dataclass(getattr(config, name))]
     yield from _format_comment(" ".join(filter(None, (_class_summary(type(config)), note))))
@@ -154,7 +151,7 @@ def _format_comment(text: str) -> list[str]:
 
 
 def _class_summary(kind: type) -> str:
-    """The first paragraph of a class's docstring."""
+    """Return the first paragraph of a class's docstring."""
     return " ".join((inspect.getdoc(kind) or "").partition("\n\n")[0].split())
 
 
@@ -168,14 +165,14 @@ def _to_toml(value: Any) -> str:
 
 @cache
 def read_field_docs(kind: type) -> dict[str, str]:
-    """The docstrings of a dataclass's fields, each in one line."""
+    """Return the docstrings of a dataclass's fields, each in one line."""
     if not is_dataclass(kind):
         return {}
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     assert isinstance(body, ast.ClassDef)
-    meanings = {
-        name: text for base in kind.__bases__ for name, text in read_field_docs(base).items()
-    }
+    meanings = dict[str, str]()
+    for base in kind.__bases__:
+        meanings |= read_field_docs(base)
     for item, after in zip(body.body, body.body[1:], strict=False):
         if (
             isinstance(item, ast.AnnAssign)
@@ -193,12 +190,8 @@ def _parse_file(path: str) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(error.strerror or "cannot be read") from None
     if len(content) > _MAX_FILE_BYTES:
-        raise ConfigError(f"larger than {_MAX_FILE_BYTES} bytes, no file of settings")
+        raise ConfigError(f"larger than {_MAX_FILE_BYTES} bytes, too large for settings")
     try:
         return tomllib.loads(content.decode())
-    except (
-        ValueError,
-        RecursionError,
-        # tomllib's own error is a ValueError, as are those of bad UTF-8 and of numbers too long
-    ) as error:
+    except (ValueError, RecursionError) as error:  # also invalid UTF-8 and numbers too long
         raise ConfigError(f"not TOML ({error})") from None

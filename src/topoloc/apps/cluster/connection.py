@@ -1,8 +1,6 @@
-"""A Ray cluster that this process is a driver of: one that runs already, or one of this machine's
-processors for as long as it is needed.
+"""Connect this process to a Ray cluster, or start a temporary one on this machine.
 
-Ray is the extra `cluster`; it is imported here and in functions alone, when somebody asks for a
-cluster.
+Ray is the extra `cluster`. It is imported inside functions only.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ _TOKEN_VARIABLES = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
 def import_ray() -> Any:
-    """Ray. Raises MissingExtraError."""
+    """Import Ray. Raises MissingExtraError."""
     try:
         import ray
     except ModuleNotFoundError as error:
@@ -41,14 +39,17 @@ def import_ray() -> Any:
 
 @contextmanager
 def connect_to_cluster(address: str) -> Iterator[Any]:
-    """Ray, connected to the cluster at `address` (HOST:PORT; `auto`: the one that runs on this
-    machine, or that RAY_ADDRESS names; `local`: one of this machine's processors, which ends with
-    the block). Tasks that still run when the block ends are ended. Inside of a block of the same
-    address it is that one's connection.
+    """Connect to a cluster and return Ray. Running tasks are cancelled when the block ends.
+
+    A nested block with the same address uses the same connection.
+
+    Args:
+        address: HOST:PORT; `auto` for the cluster of this machine or of RAY_ADDRESS; `local` for a
+            temporary one of this machine's processors.
 
     Raises:
         MissingExtraError: Ray is not installed.
-        ClusterError: nothing answers there, it is no Ray, or one of another version.
+        ClusterError: no Ray cluster of this version answers.
     """
     ray = import_ray()
     if address in _CONNECTED:
@@ -68,13 +69,12 @@ def connect_to_cluster(address: str) -> Iterator[Any]:
         try:
             with _silence_stderr():
                 ray.init(**options, log_to_driver=False, logging_level="error")
-        except Exception as error:  # of many classes, which are no API; the text says what it was
+        except Exception as error:  # of many classes, which are no API
             ray.shutdown()
             raise ClusterError(_failure_reason(address, error)) from error
         at_end.callback(ray.shutdown)
-        if (
-            threading.current_thread() is threading.main_thread()
-        ):  # Ray's own handler prints where it was
+        # Ray's own handler prints a stack trace
+        if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, _raise_interrupt)
             at_end.callback(signal.signal, signal.SIGTERM, before or signal.SIG_DFL)
         _CONNECTED.append(address)
@@ -83,22 +83,22 @@ def connect_to_cluster(address: str) -> Iterator[Any]:
 
 
 def _raise_interrupt(number: int, _: object) -> None:
-    """SIGTERM ends the work as Ctrl-C does: in good order."""
+    """Handle SIGTERM like Ctrl-C."""
     raise KeyboardInterrupt
 
 
 def _check_address(address: str) -> None:
-    """Ray itself would try for a minute, and tell of it at length."""
+    """Check an address. Ray itself would try for a minute and print long messages."""
     if address in (LOCAL, AUTO):
         return
     if "://" in address:
         raise ClusterError(
-            f"--ray {address}: no client of Ray is used here; run the command on a machine of the"
+            f"--ray {address}: Ray clients are not supported; run the command on a machine of the"
             " cluster, with HOST:PORT or auto"
         )
     host, colon, port = address.rpartition(":")
     if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ClusterError(f"--ray {address[:80]}: a cluster is named by HOST:PORT, auto or local")
+        raise ClusterError(f"--ray {address[:80]}: use HOST:PORT, auto or local")
     try:
         socket.create_connection((host.strip("[]"), int(port)), _CONNECT_TIMEOUT_S).close()
     except (OSError, UnicodeError) as error:
@@ -111,26 +111,23 @@ def _failure_reason(address: str, error: Exception) -> str:
     text = " ".join(str(error).split())
     if "ersion mismatch" in text:
         return (
-            f"the Ray cluster at {address} is of another version:"
+            f"the Ray cluster at {address} has another version:"
             f" {text.partition('mismatch')[2].strip(' :!.')[:300]}"
         )
     if "Could not find any running Ray instance" in text:
         return (
-            "no Ray cluster runs on this machine; `ray start --head` starts one, and --ray local"
-            " takes this machine's processors"
+            "no Ray cluster runs on this machine; start one with `ray start --head`, or use --ray"
+            " local"
         )
-    told = f"no Ray cluster answers at {address}: {text[:300] or type(error).__name__}"
-    return (
-        told
-        if "RAY_AUTH_MODE" in os.environ
-        else f"{told}; one with a token needs RAY_AUTH_MODE=token and it, as on its machines"
-    )
+    reason = f"no Ray cluster answers at {address}: {text[:300] or type(error).__name__}"
+    if "RAY_AUTH_MODE" in os.environ:
+        return reason
+    return f"{reason}; a cluster with a token needs RAY_AUTH_MODE=token and the token"
 
 
 @contextmanager
 def _silence_stderr() -> Iterator[None]:
-    """The C++ part of Ray writes to standard error past all of Python; what matters of it is in the
-    error that follows."""
+    """Drop the messages of Ray's C++ part. The Python error that follows contains the reason."""
     try:
         kept = os.dup(2)
     except OSError:  # closed by the caller
@@ -149,14 +146,14 @@ def _silence_stderr() -> Iterator[None]:
 
 @contextmanager
 def _create_token() -> Iterator[None]:
-    """A cluster of our own answers to us alone. Without this Ray would leave a token in the user's
-    home, which later ones ask for."""
+    """Protect a temporary cluster with a token. Otherwise Ray would store one in the user's home,
+    which later clusters require."""
     if any(name in os.environ for name in _TOKEN_VARIABLES):
         yield
         return
     os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     try:
         yield
-    finally:  # the mode was set by Ray meanwhile
+    finally:  # Ray has set the mode
         for name in _TOKEN_VARIABLES:
             os.environ.pop(name, None)

@@ -1,8 +1,6 @@
-"""What runs on the cluster's machines: a task a job, and a board on which the tasks write how far
-they are.
+"""Code that runs on the cluster's machines: one task for each job, and a board of their progress.
 
-This module loads nothing heavy by itself, so that the threads of the numeric libraries are said
-before any of them is loaded.
+This module imports no numeric library, because the number of threads must be set before.
 """
 
 from __future__ import annotations
@@ -28,8 +26,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 @dataclass(frozen=True)
 class TaskPayload:
-    """A job. `folder` is the driver's, where relative paths begin; `epoch` its
-    SOURCE_DATE_EPOCH."""
+    """A job, and the working folder and SOURCE_DATE_EPOCH of the driver."""
 
     job: Job[Any]
     folder: str
@@ -38,32 +35,32 @@ class TaskPayload:
 
 @dataclass(frozen=True)
 class TaskRequirements:
-    """What is said before the work is unpacked: threads it may use, and the driver's version of
-    topoloc."""
+    """The number of threads and the driver's version of topoloc, known before unpickling."""
 
     num_threads: int
     version: str = field(default_factory=lambda: version("topoloc"))
 
 
 def run_task(packed: bytes, terms: TaskRequirements, board: Any, number: int) -> bytes:
-    """A pickled `TaskPayload` is done; returns the job's outcome, pickled. `number` is that of the
-    job on the board.
+    """Run the job of a pickled `TaskPayload` and return its pickled outcome.
+
+    Args:
+        number: the job's number on the board.
 
     Raises:
         ClusterError: this machine has another version of topoloc.
-        TopolocError: as of the job.
+        TopolocError: raised by the job.
     """
     if terms.version != version("topoloc"):
+        own = version("topoloc")
         raise ClusterError(
-            f"{platform.node()} has topoloc {version('topoloc')}, and {terms.version} asks it"
+            f"{platform.node()} has topoloc {own}, but the driver has {terms.version}"
         )
     os.environ |= dict.fromkeys(_THREAD_VARIABLES, str(terms.num_threads))
     work: TaskPayload = pickle.loads(packed)
     try:
         os.chdir(work.folder)
-    except (
-        OSError
-    ):  # then whole paths are found all the same, and others are not looked for elsewhere
+    except OSError:  # absolute paths still work, and relative ones must not match by chance
         os.chdir("/")
     os.environ.pop("SOURCE_DATE_EPOCH", None)
     if work.epoch is not None:
@@ -75,14 +72,14 @@ def run_task(packed: bytes, terms: TaskRequirements, board: Any, number: int) ->
 
 
 def _create_reporter(board: Any, number: int) -> Progress:
-    """Writes on the board now and then; whether anybody reads it does not matter here."""
+    """Return a function that writes progress to the board, if there is one."""
     if board is None:
         return lambda stage, done, total: None
     return throttle_progress(lambda *line: board.write.remote(number, line))
 
 
 def throttle_progress(report: Progress) -> Progress:
-    """Tells of each stage when it begins and when it ends, and in between a few times a second."""
+    """Report the begin and the end of each stage, and progress a few times a second."""
     last = [("", 0.0)]
 
     def report_throttled(stage: str, done: int, total: int) -> None:
@@ -97,27 +94,24 @@ def throttle_progress(report: Progress) -> Progress:
 
 
 class ProgressBoard:
-    """How far each job is, for the eyes of the driver; an actor."""
+    """Progress of each job, for display by the driver; an actor."""
 
     def __init__(self) -> None:
         self._lines: dict[int, tuple[str, int, int]] = {}
 
     def write(self, number: int, line: tuple[str, int, int]) -> None:
-        """Of a job: stage, steps done, steps in all."""
+        """Set the progress of a job: stage, steps done, steps in all."""
         self._lines[number] = line
 
     def read(self) -> dict[int, tuple[str, int, int]]:
-        """All lines, by the numbers of the jobs."""
+        """Return the progress of all jobs by number."""
         return self._lines
 
 
 def create_progress_board(ray: Any) -> Any:
-    """A `ProgressBoard` beside the driver; it begins empty again where it is lost."""
+    """Start a `ProgressBoard` on the driver's machine. It restarts empty if it is lost."""
     near = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
         ray.get_runtime_context().get_node_id(), soft=True
     )
-    return (
-        ray.remote(ProgressBoard)
-        .options(num_cpus=0, max_restarts=-1, scheduling_strategy=near)
-        .remote()
-    )
+    options = {"num_cpus": 0, "max_restarts": -1, "scheduling_strategy": near}
+    return ray.remote(ProgressBoard).options(**options).remote()

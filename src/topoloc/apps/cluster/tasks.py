@@ -1,9 +1,8 @@
-"""Work of any kind on a Ray cluster, as its driver sees it: jobs are handed out, one task each, and
-what became of them is heard.
+"""Run jobs on a Ray cluster, one task each, and collect their outcomes.
 
-What a job needs and makes travels by files that all machines see; through here go settings,
-progress and small outcomes. Whoever dies is begun again: a worker by Ray, the driver by its user,
-so that a job should find what it has done already.
+Jobs read and write files that all machines share. Only settings, progress and small outcomes pass
+through the driver. Ray restarts a lost worker and the user restarts the driver, so a job should
+recognize work that it has done before.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from topoloc import TopolocError
@@ -38,27 +36,25 @@ Outcome_co = TypeVar("Outcome_co", covariant=True)
 
 @runtime_checkable
 class Job(Protocol[Outcome_co]):
-    """A piece of work. It is pickled, and so is its outcome, which is small."""
+    """A piece of work. It and its small outcome are pickled."""
 
     @property
     def name(self) -> str:
-        """What Ray's own pages call it."""
+        """Name on Ray's dashboard."""
         ...
 
     def run(self, progress: Progress) -> Outcome_co:
-        """Do it, in a worker whose folder and SOURCE_DATE_EPOCH are the driver's. It may be begun
-        again from the start."""
+        """Run the job, with the folder and SOURCE_DATE_EPOCH of the driver. It may run again."""
         ...
 
     def failure_outcome(self, reason: str) -> Outcome_co:
-        """The outcome, where `run` raised a TopolocError or its worker could not say anything any
-        more."""
+        """Return the outcome after a TopolocError of `run` or the loss of the worker."""
         ...
 
 
 @dataclass(frozen=True)
 class JobProgress:
-    """A job that is being done: the stage it is in, and how much of it is done."""
+    """Progress of a running job: its stage, steps done and steps in all."""
 
     stage: str
     done: int
@@ -66,7 +62,7 @@ class JobProgress:
 
 
 OnJobState = Callable[[int, T | JobProgress], None]
-"""Called with a job's number and what is known of it now: its outcome, or how far it is."""
+"""Called with a job's number and its outcome or progress."""
 
 
 def run_on_ray(
@@ -77,35 +73,29 @@ def run_on_ray(
     is_live: bool = False,
     lines: Sequence[str] | None = None,
 ) -> list[T]:
-    """What became of each job, in their order.
+    """Run the jobs and return their outcomes in order.
 
     Args:
-        address: of the cluster, as `connect_to_cluster` takes it; inside of a block of that with
-            the same address, it is the same connection.
-        show: is told of each job that is finished, and with `is_live` several times a second of
-            those that are being done.
-        lines: a name for each job; those of one name are done one after the other, in their order.
-            None: all side by side.
+        address: cluster, as for `connect_to_cluster`.
+        show: called for each finished job, and with `is_live` several times a second for each
+            running job.
+        lines: a name for each job. Jobs of the same name run one after the other, in order.
+            Default: all jobs may run in parallel.
 
     Raises:
-        MissingExtraError, ClusterError: as of `connect_to_cluster`.
+        MissingExtraError, ClusterError: see `connect_to_cluster`.
     """
     config, show = config or ClusterConfig(), show or (lambda number, state: None)
-    with (
-        redirect_stdout(io.StringIO()),
-        connect_to_cluster(address) as ray,
-    ):  # Ray prints there of workers that died, which are begun again
+    # Ray prints messages about restarted workers
+    with redirect_stdout(io.StringIO()), connect_to_cluster(address) as ray:
         _warn_few_cpus(ray, config.cpus_per_recording)
         board = create_progress_board(ray) if is_live else None
         queues = _group_queues(len(jobs), lines)
         running = {_submit_job(ray, jobs, queue[0], config, board): queue for queue in queues}
         outcomes: dict[int, T] = {}
         while running:
-            done, _ = (
-                ray.wait(list(running), num_returns=len(running), timeout=_POLL_INTERVAL_S)
-                if is_live
-                else ray.wait(list(running))
-            )
+            limits = {"num_returns": len(running), "timeout": _POLL_INTERVAL_S} if is_live else {}
+            done, _ = ray.wait(list(running), **limits)
             for ref in done:
                 queue = running.pop(ref)
                 number = queue.popleft()
@@ -121,14 +111,17 @@ def run_on_ray(
 def run_locally(
     jobs: Sequence[Job[T]], show: OnJobState[T] | None = None, is_live: bool = False
 ) -> list[T]:
-    """As `run_on_ray`, in this process, one after the other."""
-
+    """Run the jobs in this process, one after the other. See `run_on_ray`."""
     show = show or (lambda number, state: None)
     outcomes = list[T]()
     for number, job in enumerate(jobs):
-        tell = partial(_report_running, show, number) if is_live else _ignore_progress
+
+        def report(stage: str, done: int, total: int, number: int = number) -> None:
+            if is_live:
+                show(number, JobProgress(stage, done, total))
+
         try:
-            outcome = job.run(throttle_progress(tell))
+            outcome = job.run(throttle_progress(report))
         except TopolocError as error:
             outcome = job.failure_outcome(" ".join(str(error).split()))
         outcomes.append(outcome)
@@ -136,16 +129,8 @@ def run_locally(
     return outcomes
 
 
-def _report_running(show: OnJobState[Any], number: int, stage: str, done: int, total: int) -> None:
-    show(number, JobProgress(stage, done, total))
-
-
-def _ignore_progress(stage: str, done: int, total: int) -> None:
-    pass
-
-
 def _group_queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]]:
-    """The numbers of the jobs, in queues of which each is done one after the other."""
+    """Return queues of job numbers. Jobs of one queue run one after the other."""
     if lines is None:
         return [deque([number]) for number in range(num_jobs)]
     queues = dict[str, deque[int]]()
@@ -155,14 +140,14 @@ def _group_queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]
 
 
 def _warn_few_cpus(ray: Any, wanted: int) -> None:
-    """A cluster may grow as it is asked; one that does not would let the jobs wait for ever."""
+    """Warn if no machine is large enough. Unless the cluster grows, the jobs would wait forever."""
     most = max(
         (node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0
     )
     if most < wanted:
         print(
-            f"warning: no machine of the cluster has {wanted} processors for a task now, {most:g}"
-            " at most",
+            f"warning: a task needs {wanted} processors, but no machine of the cluster has more"
+            f" than {most:g}",
             file=sys.stderr,
         )
 
@@ -183,7 +168,7 @@ def _submit_job(
 
 
 def _get_outcome(ray: Any, ref: Any, job: Job[T]) -> T:
-    """What the task says; where it cannot say anything any more, why not."""
+    """Return the outcome of a task, or a failure if it was lost."""
     try:
         return pickle.loads(ray.get(ref))
     except ray.exceptions.RayError as error:
@@ -195,7 +180,7 @@ def _get_outcome(ray: Any, ref: Any, job: Job[T]) -> T:
 
 
 def _poll_progress(ray: Any, board: Any, outcomes: dict[int, T], show: OnJobState[T]) -> None:
-    """Where the board, which is only for the eye, does not answer, the work goes on."""
+    """Show the progress. If the board does not answer, the work continues."""
     with suppress(ray.exceptions.RayError):
         for number, (stage, done, total) in ray.get(board.read.remote(), timeout=5.0).items():
             if number not in outcomes:

@@ -1,9 +1,7 @@
-"""One recording becomes one tile of an atlas, wherever that is done: nothing here knows of a
-cluster.
+"""Build the tiles of an atlas from recordings, on this machine or on a Ray cluster.
 
-Whoever is killed in the middle is simply called again. What was made is told by the manifest alone:
-a tile remembers the digest of all that decided what its map looks like, and what is there already
-is not made twice.
+A job that was interrupted is called again. A tile stores the digest of everything that determines
+its map, so existing tiles are recognized. Maps do not pass through the driver.
 """
 
 from __future__ import annotations
@@ -15,38 +13,39 @@ import re
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from topoloc import AtlasError, NewTile, Tile, TopolocError, TopoMetricMap, add_tiles, read_manifest
+from topoloc import Atlas, AtlasError, Tile, TopolocError, TopoMetricMap
+from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.remote import Progress
-from topoloc.plugin import check_tile_id, temporary_folder
+from topoloc.apps.cluster.tasks import OnJobState, run_on_ray
+from topoloc.plugin import absolute_address, check_tile_id, temporary_folder
 
 State = Literal["built", "recognised", "updated", "there", "failed"]
 
 
 @runtime_checkable
 class MapMaker(Protocol):
-    """Makes the map of a recording; it may be pickled."""
+    """Builds the map of a recording. It may be pickled."""
 
     def make(self, progress: Progress) -> tuple[TopoMetricMap, list[str]]:
-        """The map, and where its poses come from. Raises TopolocError."""
+        """Return the map and the source of its poses. Raises TopolocError."""
         ...
 
     def digest(self) -> str:
-        """Of all that decides what the map looks like. Raises TopolocError."""
+        """Return the digest of everything that determines the map. Raises TopolocError."""
         ...
 
 
 @dataclass(frozen=True)
 class TileJob:
-    """A recording, the id of the tile that becomes of it, the world that it is in, and what makes
-    its map.
+    """A recording, the id and the world of its tile, and the builder of its map.
 
     Raises:
-        AtlasError: no tile, or no world, can be called so.
+        AtlasError: the id or the world is invalid.
     """
 
     recording: str
@@ -59,18 +58,21 @@ class TileJob:
         check_tile_id(self.world)
 
     def digest(self) -> str:
-        """Of all that decides what the tile looks like, 64 hexadecimal digits. Raises
+        """Return the digest of everything that determines the tile, 64 hexadecimal digits. Raises
         TopolocError."""
         return sha256(f"{self.maker.digest()} {self.world}".encode()).hexdigest()
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a recording: `reason` says why it failed, `notes` are lines that are to be
-    known beside, `changes` what its session changed of a tile that was there.
+    """The outcome of a recording.
 
-    `seconds` are those on the clock, `cpu_seconds` those of all its threads on a processor; `host`
-    is the machine that did it.
+    Attributes:
+        reason: reason of a failure.
+        notes: messages to show.
+        seconds, cpu_seconds: elapsed time, and processor time of all threads.
+        host: machine of the work.
+        changes: changes of a tile that was updated.
     """
 
     recording: str
@@ -86,24 +88,71 @@ class Outcome:
     changes: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
+        """Return the outcome as JSON, without `changes` if there are none."""
         data = asdict(self) | {
             "notes": list(self.notes),
             "seconds": round(self.seconds, 3),
             "cpu_seconds": round(self.cpu_seconds, 3),
         }
-        return (
-            data
-            if self.changes is not None
-            else {name: value for name, value in data.items() if name != "changes"}
-        )
+        return {
+            name: value for name, value in data.items() if name != "changes" or value is not None
+        }
+
+
+@dataclass(frozen=True)
+class AtlasBuild:
+    """Recordings and the atlas of their tiles. See `build_tile` for `replaces`."""
+
+    jobs: Sequence[TileJob]
+    atlas: str
+    replaces: bool = False
+    config: ClusterConfig = field(default_factory=ClusterConfig)
+
+
+@dataclass(frozen=True)
+class TileTask:
+    """The `Job` that builds a tile from a recording."""
+
+    job: TileJob
+    atlas: str
+    replaces: bool
+
+    @property
+    def name(self) -> str:
+        """Name on Ray's dashboard."""
+        return f"build {self.job.tile_id}"
+
+    def run(self, progress: Progress) -> Outcome:
+        """Build the tile."""
+        return build_tile(self.job, self.atlas, self.replaces, progress)
+
+    def failure_outcome(self, reason: str) -> Outcome:
+        """Return the outcome of a lost worker."""
+        return Outcome(self.job.recording, self.job.tile_id, "failed", reason)
+
+
+def build_on_ray(
+    build: AtlasBuild, address: str, show: OnJobState[Outcome] | None = None, is_live: bool = False
+) -> list[Outcome]:
+    """Build all tiles on a cluster and return the outcomes in order.
+
+    Args:
+        address, show, is_live: see `run_on_ray`.
+
+    Raises:
+        MissingExtraError, ClusterError: see `connect_to_cluster`.
+        AtlasError: the address holds no atlas, or its store does not answer.
+    """
+    Atlas.read_manifest(build.atlas)  # fails before the cluster is used
+    tasks = [TileTask(job, absolute_address(build.atlas), build.replaces) for job in build.jobs]
+    return run_on_ray(tasks, address, build.config, show, is_live)
 
 
 def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> Outcome:
-    """The recording mapped and its tile in the atlas, which is made where there is none; or why
-    not.
+    """Build the tile of a recording and add it to the atlas, which is created if necessary.
 
     Args:
-        replaces: a tile of the same id that was made otherwise is replaced, else it is a failure.
+        replaces: replace a tile of the same id with another digest. If False, it is a failure.
     """
     return run_tile_work(
         job.recording, job.tile_id, lambda: _build_tile(job, atlas, replaces, progress)
@@ -111,86 +160,76 @@ def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> 
 
 
 def run_tile_work(recording: str, tile_id: str, work: Callable[[], tuple[State, Tile]]) -> Outcome:
-    """What becomes of a recording by this work, which says it, with the tile as it is then; or why
-    nothing does."""
-    started, cpu_started, said = time.monotonic(), time.process_time(), io.StringIO()
+    """Run the work on a tile and return its outcome, also if it fails. Messages on standard error
+    become notes."""
+    started, cpu_started, messages = time.monotonic(), time.process_time(), io.StringIO()
     state, reason, tile = "failed", None, None
-    with contextlib.redirect_stderr(said):
+    with contextlib.redirect_stderr(messages):
         try:
             state, tile = work()
         except TopolocError as error:
             reason = " ".join(str(error).split())
         except MemoryError:
             reason = "out of memory"
-        except Exception as error:  # a bug: the others go on, and all of it is told
+        except Exception as error:  # a bug; the other jobs continue
             traceback.print_exc()
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:500]
-    done = Outcome(
-        recording, tile_id, state, reason, tuple(said.getvalue().splitlines()), host=platform.node()
-    )
+    notes = tuple(messages.getvalue().splitlines())
+    done = Outcome(recording, tile_id, state, reason, notes, host=platform.node())
     if tile is not None:
         done = replace(
             done, tile_id=tile.tile_id, num_nodes=tile.num_nodes, num_bytes=tile.map.num_bytes
         )
-    return replace(
-        done, seconds=time.monotonic() - started, cpu_seconds=time.process_time() - cpu_started
-    )
+    seconds, cpu_seconds = time.monotonic() - started, time.process_time() - cpu_started
+    return replace(done, seconds=seconds, cpu_seconds=cpu_seconds)
 
 
 def _build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tuple[State, Tile]:
     recipe = job.digest()
-    before = read_manifest(atlas)
+    before = Atlas.read_manifest(atlas)
     if made := [tile for tile in before.tiles if tile.recipe == recipe]:
         return "there", made[0]
     if job.tile_id in before.by_id and not replaces:
         raise AtlasError(
-            f"the atlas has a tile {job.tile_id} already, which was made otherwise; --replace"
-            " replaces it"
+            f"the atlas has another tile {job.tile_id} already; use --replace to replace it"
         )
     topomap, _ = job.maker.make(progress)
     with temporary_folder("topoloc-tile-") as folder:
         path = folder / "tile.topo"
         topomap.save(path)
-        after = add_tiles(
-            atlas, [NewTile(job.tile_id, path, job.world, recipe)], replaces, creates=True
-        )
-    return "built", after.by_id[job.tile_id]
+        return "built", Atlas.add_map(atlas, job.tile_id, path, job.world, recipe, replaces)
 
 
 def derive_tile_ids(recordings: Sequence[str]) -> list[str]:
-    """Ids for the tiles of recordings: their names, with as many folders above as tell them apart.
+    """Return tile ids from the recordings' names, with parent folders until they are unique.
 
     Raises:
-        AtlasError: a recording is named twice.
+        AtlasError: a recording is given twice.
     """
     paths = [_path_parts(recording) for recording in recordings]
     for recording, words in zip(recordings, paths, strict=True):
         if paths.count(words) > 1:
             raise AtlasError(
-                f"recording {recording} is named twice, or its tile would be called as another"
-                " one's"
+                f"recording {recording} is given twice, or its tile would have the id of another"
             )
     ids, depth = [""] * len(paths), 1
     left = set(range(len(paths)))
     while left:
         named = {k: "_".join(paths[k][-depth:])[-100:].lstrip("_.-") for k in left}
-        done = {
-            k
-            for k in left
-            if (list(named.values()).count(named[k]) == 1 and named[k] not in ids) or depth > 100
-        }
+        taken = [*named.values(), *ids]
+        done = {k for k in left if taken.count(named[k]) == 1 or depth > 100}
         for k in done:
             ids[k] = named[k]
             check_tile_id(ids[k])
         left, depth = left - done, depth + 1
     if len(set(ids)) < len(ids):
-        raise AtlasError("the recordings' names are too long to tell their tiles apart")
+        raise AtlasError("the recordings' names are too long for unique tile ids")
     return ids
 
 
 def _path_parts(recording: str) -> list[str]:
-    """The parts of a recording's path, each of letters that an id may have; the frames that are
-    chosen of it belong to the last one."""
+    """Return the parts of a recording's path in characters of ids. The last one includes the
+    selected frames."""
     folder, at, selection = recording.rpartition("@")
     chosen = bool(at) and re.fullmatch(r"[-0-9:,/]+", selection) is not None
     parts = list(Path(folder if chosen else recording).parts) or [""]

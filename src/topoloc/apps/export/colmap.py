@@ -1,5 +1,6 @@
-"""COLMAP's sparse model as text: cameras, images with their key points, points with their tracks,
-and rigs and frames as 3.12 and later have them. https://colmap.github.io/format.html
+"""COLMAP's sparse model as text, with the rigs and frames of version 3.12.
+
+https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -9,35 +10,33 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from topoloc import Rigid3, TopolocError
+from topoloc import Camera, Rigid3, TopolocError
 from topoloc.apps.viewer.scene import Scene, View
 
 _HALF_PIXEL = 0.5  # the centre of COLMAP's top-left pixel
 
 
 def to_colmap_model(scene: Scene) -> dict[str, bytes]:
-    """The files of a model, by their names.
+    """Return the files of a model by their names.
 
     Raises:
         TopolocError: a view has no camera.
     """
-    ids = _camera_ids(scene.views)
+    ids, cameras = _find_cameras(scene.views)
     images, frames = [], []
     for number, view in enumerate(scene.views, 1):
         camera_id, pose = ids[number - 1], _format_pose(view.world_from_cam.inverse())
+        points_img = (view.points_img + _HALF_PIXEL).tolist()
         key_points = (
             f"{x:.6f} {y:.6f} {row + 1 if row >= 0 else -1}"
-            for (x, y), row in zip(
-                (view.points_img + _HALF_PIXEL).tolist(), view.point_rows.tolist(), strict=True
-            )
+            for (x, y), row in zip(points_img, view.point_rows.tolist(), strict=True)
         )
         images += [f"{number} {pose} {camera_id} {_image_name(view)}", " ".join(key_points)]
         frames.append(f"{number} {camera_id} {pose} 1 CAMERA {camera_id} {number}")
-    known = sorted(set(ids))
     return {
         "cameras.txt": _format_file(
             "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-            [_format_camera(k, scene.views[ids.index(k)]) for k in known],
+            [_format_camera(camera, number) for camera, number in cameras.items()],
         ),
         "images.txt": _format_file(
             "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, and a line of POINTS2D[] as (X,"
@@ -50,7 +49,7 @@ def to_colmap_model(scene: Scene) -> dict[str, bytes]:
         ),
         "rigs.txt": _format_file(
             "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]",
-            [f"{k} 1 CAMERA {k}" for k in known],
+            [f"{number} 1 CAMERA {number}" for number in cameras.values()],
         ),
         "frames.txt": _format_file(
             "FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], NUM_DATA_IDS,"
@@ -64,33 +63,30 @@ def _format_file(columns: str, lines: Iterable[str]) -> bytes:
     return "\n".join([f"# {columns}", *lines, ""]).encode()
 
 
-def _camera_ids(views: Iterable[View]) -> list[int]:
-    """From 1, one for each camera that is different, in the order of the views."""
-    known: dict[object, int] = {}
+def _find_cameras(views: Iterable[View]) -> tuple[list[int], dict[Camera, int]]:
+    """Return the camera id of each view, from 1, and the ids of the distinct cameras."""
+    known: dict[Camera, int] = {}
     ids = []
     for view in views:
         if view.camera is None:
             raise TopolocError(f"{view.name}: a COLMAP model needs its camera, which is not known")
         ids.append(known.setdefault(view.camera, len(known) + 1))
-    return ids
+    return ids, known
 
 
-def _format_camera(camera_id: int, view: View) -> str:
-    assert view.camera is not None
-    model, width, height, params = view.camera.to_colmap()
+def _format_camera(camera: Camera, camera_id: int) -> str:
+    model, width, height, params = camera.to_colmap()
     return f"{camera_id} {model} {width} {height} {' '.join(map(repr, params))}"
 
 
 def _image_name(view: View) -> str:
-    """COLMAP reads a name up to the first blank."""
+    """Return a name without blanks, at which COLMAP would cut it."""
     return re.sub(r"\s", "_", view.name) or "_"
 
 
 def _format_pose(cam_from_world: Rigid3) -> str:
-    return " ".join(
-        repr(value)
-        for value in (*cam_from_world.quat_wxyz().tolist(), *cam_from_world.translation.tolist())
-    )
+    values = (*cam_from_world.quat_wxyz().tolist(), *cam_from_world.translation.tolist())
+    return " ".join(map(repr, values))
 
 
 def _format_points(scene: Scene) -> list[str]:

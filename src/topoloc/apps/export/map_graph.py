@@ -1,5 +1,4 @@
-"""A map's graph for other programs: nodes, the ways between them, junctions; GraphML, or GeoJSON of
-a map that knows its place on earth."""
+"""The graph of a map for other programs: GraphML, or GeoJSON of a georeferenced map."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from topoloc import GeoreferenceError, Rigid3, TopolocError, TopoMetricMap
-from topoloc.apps.export.text_formats import geojson_feature
+from topoloc.apps.export.formats import coordinates, geojson_feature
 from topoloc.plugin import write_bytes
 
 _TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
@@ -21,12 +20,11 @@ _TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
 
 @dataclass(frozen=True, eq=False)
 class MapGraph:
-    """`nodes` by their ids and `edges` by the ids of the node that one leaves and the one that one
-    comes to, with what is known of each.
+    """`nodes` by their ids and `edges` by the ids of source and target, each with its facts.
 
-    Of a node: session, world_from_cam (x, y, z in metres; qw, qx, qy, qz), points, ways out,
-    whether it is a junction: more than two neighbours. Of a way: metres, source_from_target (x, y,
-    z, qw, qx, qy, qz), the times that mapping pictures went it.
+    Facts of a node: session, name, world_from_cam (x, y, z in metres; qw, qx, qy, qz), number of
+    points, number of outgoing edges, and whether it is a junction with more than two neighbours.
+    Facts of an edge: metres, source_from_target, and how often mapping images traversed it.
     """
 
     nodes: dict[int, dict[str, Any]]
@@ -34,7 +32,7 @@ class MapGraph:
 
 
 def build_graph(topomap: TopoMetricMap) -> MapGraph:
-    """The graph of a map. Times are those of the place images that the map keeps."""
+    """Return the graph of a map. Traversals are counted from its place images."""
     poses = {summary.node_id: summary.world_from_cam for summary in topomap.summaries}
     out, neighbours = Counter(edge.source_id for edge in topomap.edges), defaultdict(set)
     for edge in topomap.edges:
@@ -46,8 +44,9 @@ def build_graph(topomap: TopoMetricMap) -> MapGraph:
             "name": s.name,
             **_pose(s.world_from_cam),
             "points": s.num_points,
+            "ways_out": out[s.node_id],
+            "is_junction": len(neighbours[s.node_id]) > 2,
         }
-        | {"ways_out": out[s.node_id], "is_junction": len(neighbours[s.node_id]) > 2}
         for s in topomap.summaries
     }
     walked = _count_traversals(topomap)
@@ -61,11 +60,11 @@ def build_graph(topomap: TopoMetricMap) -> MapGraph:
 
 
 def write_graph(topomap: TopoMetricMap, path: Path) -> None:
-    """Write the graph as the ending of the name says: .graphml, or .geojson.
+    """Write the graph in the format of the suffix: .graphml, or .geojson.
 
     Raises:
-        TopolocError: another ending, or the file cannot be written.
-        GeoreferenceError: GeoJSON of a map of which nobody said where on earth it lies.
+        TopolocError: another suffix, or the file cannot be written.
+        GeoreferenceError: GeoJSON of a map that is not georeferenced.
     """
     graph, ending = build_graph(topomap), path.suffix.lower()
     if ending == ".graphml":
@@ -77,7 +76,7 @@ def write_graph(topomap: TopoMetricMap, path: Path) -> None:
 
 
 def _count_traversals(topomap: TopoMetricMap) -> Counter[tuple[int, int]]:
-    """How often the mapping pictures of a session, one after the other, went from node to node."""
+    """Count the changes from node to node between successive mapping images of a session."""
     last, walked = dict[int, int](), Counter[tuple[int, int]]()
     for image in topomap.place_images:
         before = last.get(image.session_id)
@@ -95,46 +94,35 @@ def _pose(a_from_b: Rigid3) -> dict[str, float]:
 def _to_graphml(graph: MapGraph) -> bytes:
     root = ElementTree.Element("graphml", xmlns="http://graphml.graphdrawing.org/xmlns")
     for of, entries in (("node", graph.nodes), ("edge", graph.edges)):
-        first = next(iter(entries.values()), {})
-        for name, value in first.items():
-            attributes = {
-                "id": f"{of}_{name}",
-                "for": of,
-                "attr.name": name,
-                "attr.type": _TYPES[type(value)],
-            }
-            ElementTree.SubElement(root, "key", attributes)
+        for name, value in next(iter(entries.values()), {}).items():
+            attributes = {"id": f"{of}_{name}", "for": of, "attr.name": name}
+            ElementTree.SubElement(root, "key", attributes | {"attr.type": _TYPES[type(value)]})
     top = ElementTree.SubElement(root, "graph", id="map", edgedefault="directed")
     for node_id, facts in graph.nodes.items():
         _add_attributes(ElementTree.SubElement(top, "node", id=f"n{node_id}"), "node", facts)
     for (source, target), facts in graph.edges.items():
-        _add_attributes(
-            ElementTree.SubElement(top, "edge", source=f"n{source}", target=f"n{target}"),
-            "edge",
-            facts,
-        )
+        edge = ElementTree.SubElement(top, "edge", source=f"n{source}", target=f"n{target}")
+        _add_attributes(edge, "edge", facts)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
 def _add_attributes(element: ElementTree.Element, of: str, facts: dict[str, Any]) -> None:
     for name, value in facts.items():
-        text = (
-            str(value).lower()
-            if isinstance(value, bool)
-            else "".join(c for c in str(value) if c.isprintable())
-        )
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        text = "".join(c for c in text if c.isprintable())
         ElementTree.SubElement(element, "data", key=f"{of}_{name}").text = text
 
 
 def _to_geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
-    if topomap.georeference is None:
+    georeference = topomap.georeference
+    if georeference is None:
         raise GeoreferenceError(
-            "nobody said where on earth this map lies (topoloc georeference); .graphml needs no"
-            " place"
+            "the map is not georeferenced (topoloc georeference); .graphml needs no position"
         )
     places: dict[int, Any] = {
-        s.node_id: _lon_lat_h(topomap, s.world_from_cam) for s in topomap.summaries
+        s.node_id: coordinates(georeference.geopose(s.world_from_cam).position)
+        for s in topomap.summaries
     }
     features = [
         geojson_feature("Point", places[node_id], {"node": node_id} | facts)
@@ -147,9 +135,3 @@ def _to_geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
         for (source, target), facts in graph.edges.items()
     ]
     return json.dumps({"type": "FeatureCollection", "features": features}).encode()
-
-
-def _lon_lat_h(topomap: TopoMetricMap, world_from_cam: Rigid3) -> list[float]:
-    assert topomap.georeference is not None
-    position = topomap.georeference.geopose(world_from_cam).position
-    return [round(position.lon, 9), round(position.lat, 9), round(position.h, 4)]

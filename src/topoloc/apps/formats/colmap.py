@@ -1,14 +1,14 @@
-"""A COLMAP model, text or binary, as a recording of single pictures with poses: its cameras, where
-they stood, in the model's own unit.
+"""A COLMAP model, text or binary, as a recording of single images with poses.
 
-Read by pycolmap (the extra `colmap`), which knows all versions of the files. Pictures come in the
-order of their names. A name that is a number is the picture's time in seconds (nanoseconds above
-1e12), so that a trajectory fits by time; else pictures are 1 s apart. A model made of pictures
-alone has no metric scale (`Recording.has_scale`); `align_to_trajectory` gives it one.
+pycolmap (the extra `colmap`) reads all versions of the files. Images are in the order of their
+names. If the names are numbers, they are times in seconds (nanoseconds above 1e12), so that a
+trajectory fits by time. Otherwise images are 1 s apart. A model from images only has no metric
+scale (`Recording.has_scale`).
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,7 +35,7 @@ _MAX_SECONDS = 10**12
 
 
 def can_open(path: Path) -> bool:
-    """Whether this folder is a model, or holds one where COLMAP puts it."""
+    """Return whether this folder is a model, or has one in a subfolder of COLMAP."""
     return _find_model(path) is not None
 
 
@@ -43,13 +43,11 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
     """Open a model.
 
     Args:
-        images: the folder of the pictures that the model names; sought as `images` beside the model
-            or above it where None.
+        images: folder of the images. Default: `images` beside the model or above it.
 
     Raises:
-        RecordingError: no model, damaged, without a picture that has a pose, or no folder of its
-            pictures.
-        CalibrationError: a camera of a model that is not known here.
+        RecordingError: there is no model, it is damaged or has no pose, or the images are missing.
+        CalibrationError: a camera model is unknown.
         MissingExtraError: pycolmap is not installed.
     """
     model = _find_model(path)
@@ -59,32 +57,20 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
         (folder for folder in _image_folders(path, model) if folder.is_dir()), None
     )
     if root is None or not root.is_dir():
-        raise RecordingError(
-            f"{path}: the pictures of this model are needed, too; name their folder with --images"
-        )
+        raise RecordingError(f"{path}: the images of this model are missing; use --images FOLDER")
     read = _read_model(model)
     posed = sorted(
         (image for image in read.images.values() if image.has_pose),
         key=lambda image: natural_key(image.name),
     )
     if not posed:
-        raise RecordingError(f"{model}: no picture of this model has a pose")
+        raise RecordingError(f"{model}: no image of this model has a pose")
     names = [parse_relative_path(image.name, str(model), RecordingError) for image in posed]
     cameras = {number: _camera(camera, model) for number, camera in read.cameras.items()}
     of_images = [cameras[image.camera_id] for image in posed]
     poses: list[Rigid3 | None] = [_world_from_cam(image, model) for image in posed]
-    same = len(set(of_images)) == 1
-    of_frames = (None, of_images) if not same else (of_images[0], None)
-    return Recording(
-        path.resolve().name,
-        root,
-        names,
-        times_from_names(names),
-        poses,
-        of_frames[0],
-        cameras=of_frames[1],
-        has_scale=False,
-    )
+    name, t_ns = path.resolve().name, times_from_names(names)
+    return Recording.with_cameras(name, root, names, t_ns, poses, of_images, has_scale=False)
 
 
 def _find_model(path: Path) -> Path | None:
@@ -124,17 +110,14 @@ def _read_model(model: Path) -> Any:
             read = pycolmap.Reconstruction(str(model))
             "".join(image.name for image in read.images.values())  # one that is no text raises here
             return read
-        except (
-            Exception
-        ) as error:  # ValueError, IndexError, RuntimeError: whatever the files make of its C++
-            raise RecordingError(
-                f"{model}: damaged, or no model of COLMAP ({' '.join(str(error).split())[:120]})"
-            ) from None
+        except Exception as error:  # of many classes, for damaged files
+            reason = " ".join(str(error).split())[:120]
+            raise RecordingError(f"{model}: damaged, or no model of COLMAP ({reason})") from None
 
 
 @contextmanager
 def _silence_log(pycolmap: Any) -> Iterator[None]:
-    """No messages of its log on stderr beside the error that says it."""
+    """Silence its log on stderr, which repeats the error."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3
     try:
@@ -144,8 +127,7 @@ def _silence_log(pycolmap: Any) -> Iterator[None]:
 
 
 def _check_counts(model: Path) -> None:
-    """Hold that binary files have room for what their counts announce: pycolmap would read on past
-    the end without end."""
+    """Check that binary files are long enough for their counts. pycolmap would read on forever."""
     for name, length_of in _RECORD_LENGTHS.items():
         file = model / f"{name}.bin"
         if not file.is_file():
@@ -163,25 +145,23 @@ def _check_counts(model: Path) -> None:
             fits = False
         if not fits:
             raise RecordingError(
-                f"{file}: damaged, or no model of COLMAP (it ends before what it announces)"
+                f"{file}: damaged, or no model of COLMAP (it is too short for its counts)"
             )
 
 
 def _image_length(data: bytes, at: int) -> int:
-    end = data.index(b"\0", at + 64)  # after number, rotation, position and camera comes the name
+    end = data.index(b"\0", at + 64)  # the name follows number, rotation, position and camera
     return end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0] - at
 
 
 def _point_length(data: bytes, at: int) -> int:
-    return (
-        51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
-    )  # number, position, colour and error; then the track
+    # number, position, colour and error, then the track
+    return 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
 
 
 def _frame_length(data: bytes, at: int) -> int:
-    return (
-        68 + 16 * struct.unpack_from("<I", data, at + 64)[0]
-    )  # two numbers and a pose; then what it consists of
+    # two numbers and a pose, then the data ids
+    return 68 + 16 * struct.unpack_from("<I", data, at + 64)[0]
 
 
 def _rig_length(data: bytes, at: int) -> int:
@@ -189,7 +169,7 @@ def _rig_length(data: bytes, at: int) -> int:
     if count > len(data):
         raise ValueError("more sensors than bytes")
     end = at + (16 if count else 8)
-    for _ in range(max(count, 1) - 1):  # beside the first each sensor may have a pose
+    for _ in range(max(count, 1) - 1):  # all sensors but the first may have a pose
         end += 65 if struct.unpack_from("<B", data, end + 8)[0] else 9
     return end - at
 
@@ -224,15 +204,9 @@ def _world_from_cam(image: Any, model: Path) -> Rigid3:
 
 
 def times_from_names(names: list[str]) -> list[int]:
-    """Nanoseconds: the pictures' names where these are increasing numbers, else their places in the
-    list as seconds."""
+    """Return nanoseconds: the names if they are increasing numbers, else positions as seconds."""
     stems = [PurePath(name).stem for name in names]
-    if all(
-        len(stem) <= 24
-        and stem.replace(".", "", 1).isascii()
-        and stem.replace(".", "", 1).isdigit()
-        for stem in stems
-    ):
+    if all(re.fullmatch(r"(?=.{1,24}$)([0-9]*\.?[0-9]+|[0-9]+\.)", stem) for stem in stems):
         whole = [stem.partition(".") for stem in stems]
         is_ns = max(int(seconds or 0) for seconds, _, _ in whole) > _MAX_SECONDS
         t_ns = [

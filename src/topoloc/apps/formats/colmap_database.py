@@ -1,7 +1,7 @@
-"""A COLMAP database as a recording of single pictures: their names and calibrations, without poses.
+"""A COLMAP database as a recording of single images with calibrations, without poses.
 
-It is what COLMAP has before it makes a model: where poses come from elsewhere (``--trajectory``),
-no model is needed. Read with SQLite; the tables are those of COLMAP's `database.cc`.
+COLMAP writes it before a model. With poses of another source (``--trajectory``) it is sufficient.
+The SQLite tables are those of COLMAP's `database.cc`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MAX_PARAMS, _MAX_ROWS = 64, 10_000_000
 
 
 def can_open(path: Path) -> bool:
-    """Whether this is a database, or a folder with one that holds no model."""
+    """Return whether this is a database, or a folder with a database and no model."""
     if path.is_dir():
         return (path / _NAME).is_file() and not colmap.can_open(path)
     return path.suffix == ".db" and path.is_file()
@@ -46,49 +46,38 @@ def open_colmap_database(path: Path, images: Path | None = None) -> Recording:
     """Open a database.
 
     Args:
-        images: the folder of its pictures; sought as `images` beside the database where None.
+        images: folder of the images. Default: `images` beside the database.
 
     Raises:
-        RecordingError: no database of COLMAP, damaged, without pictures, or no folder of them.
-        CalibrationError: a camera of a model that is not known here.
+        RecordingError: the file is no database of COLMAP or damaged, or the images are missing.
+        CalibrationError: a camera model is unknown.
     """
     file = path / _NAME if path.is_dir() else path
     root = images or file.parent / "images"
     if not root.is_dir():
         raise RecordingError(
-            f"{path}: the pictures of this database are needed, too; name their folder with"
-            " --images"
+            f"{path}: the images of this database are missing; use --images FOLDER"
         )
     cameras, camera_id_by_image = _read_database(file)
     if not camera_id_by_image:
-        raise RecordingError(f"{file}: no picture in this database")
+        raise RecordingError(f"{file}: no image in this database")
     names = sorted(
         (parse_relative_path(name, str(file), RecordingError) for name in camera_id_by_image),
         key=natural_key,
     )
     if missing := next((name for name in names if camera_id_by_image[name] not in cameras), None):
-        raise RecordingError(f"{file}: damaged, {missing} is of a camera that is missing")
+        raise RecordingError(f"{file}: damaged, the camera of {missing} is missing")
     of_frames = [cameras[camera_id_by_image[name]] for name in names]
     poses: list[Rigid3 | None] = [None] * len(names)
-    one, each = (of_frames[0], None) if len(set(of_frames)) == 1 else (None, of_frames)
-    return Recording(
-        file.resolve().parent.name,
-        root,
-        names,
-        colmap.times_from_names(names),
-        poses,
-        one,
-        cameras=each,
-    )
+    name, t_ns = file.resolve().parent.name, colmap.times_from_names(names)
+    return Recording.with_cameras(name, root, names, t_ns, poses, of_frames)
 
 
 def _read_database(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
-    """The cameras by their numbers, and the number of each picture's camera by the picture's
-    name."""
+    """Return the cameras by number, and the number of the camera of each image by its name."""
     try:
-        with closing(
-            sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
-        ) as database:
+        uri = f"{file.resolve().as_uri()}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(uri, uri=True)) as database:
             database.execute("PRAGMA trusted_schema = OFF")
             database.text_factory = lambda data: data.decode(errors="replace")
             cameras = database.execute(
@@ -97,28 +86,21 @@ def _read_database(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
             images = database.execute(
                 f"SELECT name, camera_id FROM images LIMIT {_MAX_ROWS}"
             ).fetchall()
-    except (
-        sqlite3.Error,
-        UnicodeDecodeError,
-        MemoryError,
-    ) as error:  # the second of an error's text, which quotes what is damaged
-        raise RecordingError(
-            f"{file}: no database of COLMAP, or damaged ({' '.join(str(error).split())[:120]})"
-        ) from None
+    # UnicodeDecodeError: the message of an error may quote damaged data
+    except (sqlite3.Error, UnicodeDecodeError, MemoryError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise RecordingError(f"{file}: no database of COLMAP, or damaged ({reason})") from None
     if not all(isinstance(name, str) and isinstance(number, int) for name, number in images):
-        raise RecordingError(f"{file}: damaged, a picture without a name or a camera")
+        raise RecordingError(f"{file}: damaged, an image without a name or a camera")
     return {row[0]: _camera(row, file) for row in cameras}, dict(images)
 
 
 def _camera(row: tuple[Any, ...], file: Path) -> Camera:
     number, model, width, height, params = row
-    whole = (
-        isinstance(number, int)
-        and all(isinstance(value, int) for value in (model, width, height))
-        and isinstance(params, bytes)
-    )
-    if not whole or len(params) % 8 or len(params) > 8 * _MAX_PARAMS:
-        raise RecordingError(f"{file}: damaged, a camera that is none")
+    are_ints = all(isinstance(value, int) for value in (number, model, width, height))
+    is_valid = are_ints and isinstance(params, bytes)
+    if not is_valid or len(params) % 8 or len(params) > 8 * _MAX_PARAMS:
+        raise RecordingError(f"{file}: damaged, an invalid camera")
     name = _CAMERA_MODELS[model] if 0 <= model < len(_CAMERA_MODELS) else f"number {model}"
     try:
         return Camera.from_colmap(

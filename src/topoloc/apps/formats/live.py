@@ -1,9 +1,7 @@
-"""Pictures of a camera that is running now: a webcam, an RTSP or HTTP stream, a GStreamer pipeline,
-by OpenCV.
+"""Images of a running camera by OpenCV: a webcam, an RTSP or HTTP stream, a GStreamer pipeline.
 
-A thread reads the source all the time and keeps the newest picture only, so that who is slower than
-the camera gets each picture late by one picture at most, and misses others. Who wants them all (a
-recording) makes the thread wait instead.
+A thread reads the source and keeps only the newest image, so a slow consumer skips images but has
+no delay. For a recording the thread waits instead, and no image is lost.
 """
 
 from __future__ import annotations
@@ -28,8 +26,8 @@ _CLOSE_TIMEOUT_S = 1.0
 
 
 def is_live(source: str) -> bool:
-    """Whether this names a live source and no file: a device number or ``/dev/video0``, a URL, a
-    pipeline with `` ! ``."""
+    """Return whether this is a live source and no file: a device number or ``/dev/video0``, a URL,
+    or a pipeline with `` ! ``."""
     if _URL.fullmatch(source) or " ! " in source or source.startswith("/dev/video"):
         return True
     return bool(_DEVICE.fullmatch(source)) and not os.path.exists(source)
@@ -37,8 +35,8 @@ def is_live(source: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class LiveImage:
-    """A picture as it arrived: grey (H, W) or RGB (H, W, 3), uint8; `t_ns` is the clock's time
-    then, nanoseconds; `number` counts all that the source gave, also those that nobody took."""
+    """An image, grey (H, W) or RGB (H, W, 3), uint8. `t_ns` is the clock's time of its arrival,
+    nanoseconds. `number` counts all images of the source, with the skipped ones."""
 
     image: Image
     t_ns: int
@@ -85,7 +83,7 @@ class LiveSource:
             yield picture
 
     def close(self) -> None:
-        """Let the source go. A read that hangs is left to its own time limit."""
+        """Close the source. A read that hangs ends at its own time limit."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
@@ -96,14 +94,14 @@ class LiveSource:
         with self._changed:
             while self._latest is None and not self._is_ended and not self.stop.is_set():
                 if time.monotonic() - since > self.stall_s:
-                    raise RecordingError(f"{self.source}: no picture for {self.stall_s:g} s")
+                    raise RecordingError(f"{self.source}: no image for {self.stall_s:g} s")
                 self._changed.wait(_WAIT_S)
             picture, self._latest = self._latest, None
             self._changed.notify_all()
         return None if self.stop.is_set() else picture
 
     def _read_loop(self) -> None:
-        """The thread: reads until the source ends or is closed."""
+        """Read until the source ends or is closed; runs in the thread."""
         last_ns = 0
         while not self._is_closed:
             is_read, pixels = self._capture.read()
@@ -124,29 +122,23 @@ class LiveSource:
 
 
 def _open_capture(source: str, size: tuple[int, int] | None, stall_s: float) -> Any:
-    """An OpenCV capture. Raises RecordingError."""
+    """Open an OpenCV capture. Raises RecordingError."""
     is_pipeline = " ! " in source
     if is_pipeline and not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
         raise RecordingError(
-            f"{source}: OpenCV is built without GStreamer here; rtsp://, http:// and device numbers"
-            " go without"
+            f"{source}: this OpenCV has no GStreamer; use rtsp://, http:// or a device number"
         )
     with silence_opencv():
         if is_pipeline:
             capture = cv2.VideoCapture(source, cv2.CAP_GSTREAMER)
         elif _URL.fullmatch(source):
-            limit_ms = round(1e3 * stall_s)
-            limits = [
-                cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
-                limit_ms,
-                cv2.CAP_PROP_READ_TIMEOUT_MSEC,
-                2 * limit_ms,
-            ]
-            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+            ms = round(1e3 * stall_s)
+            limits = {cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC: 2 * ms}
+            flat = [number for pair in limits.items() for number in pair]
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, flat)
         else:
-            capture = cv2.VideoCapture(
-                int(source) if source.isdigit() and not os.path.exists(source) else source
-            )
+            is_number = source.isdigit() and not os.path.exists(source)
+            capture = cv2.VideoCapture(int(source) if is_number else source)
         if capture.isOpened() and size is not None:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])

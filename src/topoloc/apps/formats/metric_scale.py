@@ -1,5 +1,4 @@
-"""The unit of a model made of pictures alone, in metres: a number, or distances between two of its
-pictures that were measured."""
+"""The metric scale of a model from images only: a number, or measured distances of two cameras."""
 
 from __future__ import annotations
 
@@ -13,20 +12,20 @@ import numpy as np
 from topoloc import Rigid3, StereoSequence, TrajectoryError
 
 _DISTANCE = re.compile(r"(?P<one>[^,=]+),(?P<other>[^,=]+)=\s*(?P<metres>[0-9.eE+-]+)\s*m?")
-_SCALE_TOLERANCE = 0.05  # of the scale; more than that is no error of a measuring tape
+_SCALE_TOLERANCE = 0.05  # of the scale; larger than errors of a measuring tape
 _MIN_DISTANCE = 1e-9
 
 
 def estimate_metric_scale(texts: Sequence[str], sequence: StereoSequence) -> float:
-    """Metres of a unit of the recording's poses.
+    """Return the metres in a unit of the recording's poses.
 
     Args:
-        texts: one number, or distances between the cameras of two pictures:
+        texts: one number, or distances between the cameras of two images:
             ``IMG_0001.jpg,IMG_0042.jpg=3.2m``.
 
     Raises:
-        TrajectoryError: none of these, a picture is not there or has no pose, or the distances do
-            not agree.
+        TrajectoryError: a text is malformed, an image is missing or has no pose, or the distances
+            do not agree.
     """
     if len(texts) == 1 and "=" not in texts[0]:
         return _positive_number(
@@ -50,28 +49,24 @@ def _units_and_metres(text: str, sequence: StereoSequence) -> tuple[float, float
     match = _DISTANCE.fullmatch(text.strip())
     if match is None:
         raise TrajectoryError(
-            f"{text[:80]!r} is no distance between two pictures, such as IMAGE_A,IMAGE_B=3.2m"
+            f"{text[:80]!r} is no distance between two images, such as IMAGE_A,IMAGE_B=3.2m"
         )
     metres = _positive_number(match["metres"], f"{text[:80]!r}: the distance must be above 0 m")
     one, other = (_find_pose(match[name].strip(), sequence) for name in ("one", "other"))
     units = float(np.linalg.norm(one.translation - other.translation))
     if units < _MIN_DISTANCE:
-        raise TrajectoryError(f"{text[:80]!r}: both pictures were taken in one place")
+        raise TrajectoryError(f"{text[:80]!r}: both images have the same position")
     return units, metres
 
 
 def _find_pose(name: str, sequence: StereoSequence) -> Rigid3:
-    """By the picture's whole name, else by the end of it, with or without its suffix."""
+    """Find an image by its name, else by its file name with or without suffix."""
     names = sequence.names
-    rows = [row for row, its in enumerate(names) if its == name]
-    rows = rows or [
-        row for row, its in enumerate(names) if name in (PurePath(its).name, PurePath(its).stem)
+    rows = [row for row, other in enumerate(names) if other == name] or [
+        row for row, other in enumerate(map(PurePath, names)) if name in (other.name, other.stem)
     ]
     if len(rows) != 1:
-        raise TrajectoryError(
-            f"{sequence.name}: {'no picture is' if not rows else f'{len(rows)} pictures are'} named"
-            f" {name[:80]}"
-        )
+        raise TrajectoryError(f"{sequence.name}: {len(rows)} images are named {name[:80]}")
     pose = sequence.poses[rows[0]]
     if pose is None:
         raise TrajectoryError(f"{sequence.name}: {name[:80]} has no pose")

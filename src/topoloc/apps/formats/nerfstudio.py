@@ -1,12 +1,10 @@
-"""nerfstudio's ``transforms.json``, as its own tools, Polycam by way of them, and many phone
-programs write it.
+"""nerfstudio's ``transforms.json``, written by its tools, Polycam's export and many phone programs.
 
-``transform_matrix`` is world_from_cam of a camera that looks along -z with y up (OpenGL's axes), in
-metres where the program knows them; `applied_scale` is taken out again. `fl_x fl_y cx cy w h` and
-the distortion of OpenCV stand in the file or in each frame; as in COLMAP the centre of the top-left
-pixel is (0.5, 0.5). Depth is along z, of the picture's view, in units of `depth_unit_scale_factor`
-metres: 0.001 where the file says nothing, as nerfstudio's loader takes it. Frames come by name, as
-there, and have no times: 10 a second.
+``transform_matrix`` is world_from_cam with OpenGL's camera axes (y up, z back), in metres if the
+program knows them; `applied_scale` is removed. `fl_x fl_y cx cy w h` and the distortion of OpenCV
+stand in the file or in each frame. As in COLMAP the centre of the top-left pixel is (0.5, 0.5).
+Depth is along z, with the view of the image, in units of `depth_unit_scale_factor` metres (default
+0.001, as in nerfstudio). Frames are in the order of their names and have no times: 10 a second.
 """
 
 from __future__ import annotations
@@ -34,24 +32,23 @@ from topoloc.plugin import (
 FILE_NAME = "transforms.json"
 EXPECTED_FILES = "transforms.json of nerfstudio"
 DEPTH_UNIT = 0.001
-"""Metres: nerfstudio's own default of `depth_unit_scale_factor`."""
+"""Metres: nerfstudio's default of `depth_unit_scale_factor`."""
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
 """Axes of OpenCV (y down, z forward) from those of OpenGL (y up, z back), of one camera."""
 
 
 def can_open(path: Path) -> bool:
-    """Whether this is a transforms.json, or a folder with one."""
+    """Return whether this is a transforms.json, or a folder with one."""
     return path.name == FILE_NAME if path.is_file() else (path / FILE_NAME).is_file()
 
 
 def open_nerfstudio(path: Path) -> Recording:
-    """Open a folder with a transforms.json, or the file itself; RGB-D where its frames have depth.
+    """Open a folder with a transforms.json, or the file itself. Frames with depth are RGB-D.
 
     Raises:
-        RecordingError: no frames, malformed, a matrix is no pose, depth for some of them only, or
-            a name that leads out of the folder.
-        CalibrationError: a key of the camera is missing or not usable, or a model that is not known
-            here.
+        RecordingError: there are no frames, only some have depth, the file is malformed, a matrix
+            is no pose, or a name leads out of the folder.
+        CalibrationError: a key of the camera is missing or invalid, or its model is unknown.
     """
     file = path if path.is_file() else path / FILE_NAME
     data = decode_json(read_text(file, RecordingError), dict[str, Any], RecordingError, str(file))
@@ -69,17 +66,15 @@ def open_nerfstudio(path: Path) -> Recording:
     where = [f"{file}, {name}" for name in names]
     frames = [frame for _, frame, _ in named]
     poses: list[Rigid3 | None] = [_pose(frame, whole.applied_scale) for frame in frames]
-    # The values of the file count first, as in nerfstudio.
+    # Keys of the file take precedence, as in nerfstudio.
     cameras = [_camera(lens | data, at) for (_, _, lens), at in zip(named, where, strict=True)]
     depth = _depth(frames, whole.depth_unit_scale_factor, file, where)
     name, t_ns = file.parent.resolve().name, times_from_rate(len(names))
-    if len(set(cameras)) == 1:
-        return Recording(name, file.parent, names, t_ns, poses, cameras[0], depth=depth)
-    return Recording(name, file.parent, names, t_ns, poses, None, depth=depth, cameras=cameras)
+    return Recording.with_cameras(name, file.parent, names, t_ns, poses, cameras, depth=depth)
 
 
 def rigid_from_gl(world_from_gl: Rigid3) -> Rigid3:
-    """world_from_cam with OpenCV's camera axes, of one with OpenGL's."""
+    """Convert a pose from OpenGL's camera axes to OpenCV's."""
     return Rigid3(world_from_gl.rotation @ CV_FROM_GL, world_from_gl.translation)
 
 
@@ -138,7 +133,7 @@ def _camera(data: dict[str, Any], where: str) -> Camera:
         if lens.camera_model in ("OPENCV_FISHEYE", "fisheye"):
             return Camera.from_colmap("OPENCV_FISHEYE", w, h, (*params, k1, k2, k3, k4))
         if k4 != 0.0:  # OpenCV's model has no fourth radial coefficient, its k4 is a divisor
-            raise CalibrationError("a fourth radial coefficient is not known here")
+            raise CalibrationError("a fourth radial coefficient is not supported")
         if k3 != 0.0:
             full = (*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
             return Camera.from_colmap("FULL_OPENCV", w, h, full)
@@ -155,8 +150,7 @@ def _depth(frames: list[_Frame], unit: float, file: Path, where: list[str]) -> D
         return None
     if len(names) != len(frames):
         raise RecordingError(
-            f"{file}: {len(frames)} frames but {len(names)} with a depth_file_path; all of them"
-            " need one, or none"
+            f"{file}: only {len(names)} of {len(frames)} frames have a depth_file_path"
         )
     paths = [
         file.parent / parse_relative_path(name, f"{at}: depth_file_path", RecordingError)
@@ -166,7 +160,7 @@ def _depth(frames: list[_Frame], unit: float, file: Path, where: list[str]) -> D
 
 
 def _with_suffix(folder: Path, name: str) -> str:
-    """Blender's scenes name their pictures without the suffix, which is .png."""
+    """Add the suffix .png, which Blender's scenes omit."""
     return name if PurePath(name).suffix or os.path.exists(folder / name) else f"{name}.png"
 
 

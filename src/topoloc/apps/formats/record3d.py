@@ -1,10 +1,10 @@
 """Record3D's export of an iPhone's or iPad's recording as EXR and JPG: ``rgb/0.jpg``,
 ``depth/0.exr``, ``metadata.json``.
 
-`poses` are rows qx qy qz qw tx ty tz, world_from_cam with ARKit's axes (y up, z back), metres; `K`
-is a 3x3 matrix column by column, `perFrameIntrinsicCoeffs` rows fx fy cx cy, both of pictures of
-`w` x `h`; depth is in metres, of the picture's view and coarser. Where pictures are of another size
-than `w` x `h`, as LiDAR's finer ones are, the calibration is that of `w` x `h` scaled.
+`poses` has rows qx qy qz qw tx ty tz, world_from_cam with ARKit's axes (y up, z back), metres. `K`
+is a 3x3 matrix by columns, `perFrameIntrinsicCoeffs` has rows fx fy cx cy, both for images of `w` x
+`h`. For images of another size, such as those with LiDAR, the calibration is scaled. Depth is in
+metres with the view of the image, at a lower resolution.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _RATE_HZ = 60
 
 
 def can_open(path: Path) -> bool:
-    """Whether this is such a folder, or holds one."""
+    """Return whether this is such a folder, or has one."""
     return _find_root(path) is not None
 
 
 def open_record3d(path: Path) -> Recording:
-    """Open an export; single pictures with poses where it has no depth.
+    """Open an export. Without depth, it has single images with poses.
 
     Raises:
-        RecordingError: metadata.json is malformed, or poses, times, pictures and depth differ in
-            number.
-        CalibrationError: the intrinsics are missing or not usable.
+        RecordingError: metadata.json is malformed, or the numbers of poses, times, images and depth
+            images differ.
+        CalibrationError: the intrinsics are missing or invalid.
         TrajectoryError: a row of the poses is no pose.
     """
     root = _find_root(path)
@@ -57,34 +57,25 @@ def open_record3d(path: Path) -> Recording:
     data = decode_json(read_text(file, RecordingError), _Metadata, RecordingError, str(file))
     images = list_images(root / "rgb")
     if len(data.poses) != len(images):
-        raise RecordingError(f"{file}: {len(data.poses)} poses for {len(images)} pictures")
+        raise RecordingError(f"{file}: {len(data.poses)} poses for {len(images)} images")
     poses: list[Rigid3 | None] = [
         _pose(row, f"{file}, pose {k}") for k, row in enumerate(data.poses)
     ]
-    cameras = _cameras(data, images, file)
-    same = len(set(cameras)) == 1
-    return Recording(
+    return Recording.with_cameras(
         path.resolve().name,
         root,
-        [picture.relative_to(root).as_posix() for picture in images],
+        [image.relative_to(root).as_posix() for image in images],
         _times(data, len(images), file),
         poses,
-        cameras[0] if same else None,
+        _cameras(data, images, file),
         depth=_depth(root, images),
-        cameras=None if same else cameras,
     )
 
 
 def _find_root(path: Path) -> Path | None:
     candidates = (path, path / _FOLDER, path / "EXR")
-    return next(
-        (
-            folder
-            for folder in candidates
-            if (folder / "rgb").is_dir() and (folder / FILE_NAME).is_file()
-        ),
-        None,
-    )
+    found = (one for one in candidates if (one / "rgb").is_dir() and (one / FILE_NAME).is_file())
+    return next(found, None)
 
 
 _Four = tuple[Finite, Finite, Finite, Finite]
@@ -110,7 +101,7 @@ def _pose(row: tuple[float, ...], where: str) -> Rigid3:
 
 
 def _cameras(data: _Metadata, images: list[Path], file: Path) -> list[Camera]:
-    """The camera of each picture, of the size that the pictures are of."""
+    """Return the camera of each image, at the size of the images."""
     w, h = int(data.w), int(data.h)
     width, height = image_size(images[0])
     if abs(width * h - height * w) > max(w, h, width, height):
@@ -122,30 +113,21 @@ def _cameras(data: _Metadata, images: list[Path], file: Path) -> list[Camera]:
         numbers = [(data.K[0], data.K[4], data.K[6], data.K[7])] * len(images)
     if len(numbers) != len(images):
         raise CalibrationError(
-            f"{file}: {len(numbers)} perFrameIntrinsicCoeffs for {len(images)} pictures"
+            f"{file}: {len(numbers)} perFrameIntrinsicCoeffs for {len(images)} images"
         )
-    return [_camera(row, (w, h), (width, height), file) for row in numbers]
-
-
-def _camera(
-    numbers: _Four,
-    calibrated_size: tuple[int, int],
-    size: tuple[int, int],
-    file: Path,
-) -> Camera:
     try:
-        return Camera.pinhole(*calibrated_size, *numbers).rescaled(*size)
+        return [Camera.pinhole(w, h, *row).rescaled(width, height) for row in numbers]
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from None
 
 
 def _times(data: _Metadata, count: int, file: Path) -> list[int]:
-    """Nanoseconds; by the frame rate where the export has no times."""
+    """Return nanoseconds, from the frame rate if the export has no times."""
     seconds = data.frameTimestamps
     if not seconds:
         return times_from_rate(count, round(data.fps) if data.fps >= 1.0 else _RATE_HZ)
     if len(seconds) != count:
-        raise RecordingError(f"{file}: {len(seconds)} frameTimestamps for {count} pictures")
+        raise RecordingError(f"{file}: {len(seconds)} frameTimestamps for {count} images")
     if np.any(np.diff(seconds) <= 0.0):
         raise RecordingError(f"{file}: frameTimestamps do not increase from frame to frame")
     return [round(second * 1e9) for second in seconds]
@@ -155,14 +137,11 @@ def _depth(root: Path, images: list[Path]) -> DepthImages | None:
     folder = root / "depth"
     if not folder.is_dir():
         return None
-    paths = sorted(
-        (file for file in folder.iterdir() if file.suffix.lower() == ".exr"),
-        key=lambda file: natural_key(file.name),
-    )
-    if [file.stem for file in paths] != [picture.stem for picture in images]:
+    files = (file for file in folder.iterdir() if file.suffix.lower() == ".exr")
+    paths = sorted(files, key=lambda file: natural_key(file.name))
+    if [file.stem for file in paths] != [image.stem for image in images]:
         raise RecordingError(
-            f"{folder}: {len(paths)} EXR files, but {len(images)} pictures in rgb/; every picture"
-            " needs its partner"
+            f"{folder}: {len(paths)} EXR files do not match the {len(images)} images in rgb/"
         )
     return DepthImages(paths, 1.0, None, Rigid3.identity())
 

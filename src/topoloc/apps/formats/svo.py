@@ -1,8 +1,9 @@
-"""Stereolabs' SVO files, through their SDK: rectified pairs, with the calibration that goes with
-them."""
+"""Rectified stereo of Stereolabs' SDK: SVO files and connected ZED cameras."""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,7 @@ SVO_SUFFIXES = frozenset({".svo", ".svo2"})
 
 @dataclass(eq=False)
 class SvoRecording:
-    """A StereoSequence in an SVO file. Frames are decoded in their order; to ask for another one
-    seeks."""
+    """A StereoSequence in an SVO file. Access out of order seeks."""
 
     name: str
     path: Path
@@ -38,7 +38,7 @@ class SvoRecording:
     camera: Any
     with_right: bool = True
     names: list[str] = field(default_factory=list)
-    # Of the frame that the SDK gives next; shared by all views of this recording.
+    # Index of the SDK's next frame, shared by all views of this recording.
     _position: list[int] = field(default_factory=lambda: [-1], repr=False)
 
     def __post_init__(self) -> None:
@@ -48,7 +48,7 @@ class SvoRecording:
         return len(self.t_ns)
 
     def monocular(self) -> SvoRecording:
-        """The same recording without the right pictures."""
+        """Return the recording without the right images."""
         return replace(self, with_right=False)
 
     def __getitem__(self, index: int) -> StereoFrame:
@@ -67,77 +67,95 @@ class SvoRecording:
             self._position[0] = -1
             raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
         self._position[0] = index + 1
-        view = self.sdk.VIEW
-        frame = StereoFrame(
-            self.names[index],
-            self.t_ns[index],
-            self._retrieve_view(view.LEFT),
-            self.rig.left,
-            world_from_cam=self.poses[index],
-        )
-        return (
-            replace(frame, right=self._retrieve_view(view.RIGHT), rig=self.rig)
-            if self.with_right
-            else frame
-        )
-
-    def _retrieve_view(self, view: Any) -> Image:
-        return retrieve_image(self.sdk, self.camera, view)
+        frame = _retrieve_frame(self.sdk, self.camera, index, self.rig, self.with_right)
+        return replace(frame, t_ns=self.t_ns[index], world_from_cam=self.poses[index])
 
 
 def open_svo(path: Path) -> SvoRecording:
-    """Open an SVO file. It is gone through once for its times. Truth is ``NAME.tum`` beside it.
+    """Open an SVO file and read its times. Truth is ``NAME.tum`` beside it.
 
     Raises:
         MissingExtraError: Stereolabs' SDK is not installed.
-        RecordingError: the SDK cannot open it, or it has no frame.
+        RecordingError: the SDK cannot open the file, or it has no frame.
     """
-    try:
-        sl = sdk("an SVO file")
-    except MissingExtraError:
-        raise MissingExtraError(
-            f"{path}: SVO files need pyzed of Stereolabs' ZED SDK; without it export the rectified"
-            " pairs on a machine that has it (its sample svo_export, mode 2) into left/ and right/"
-            " with a camera.json"
-        ) from None
-    settings = sl.InitParameters()
-    settings.set_from_svo_file(str(path))
-    settings.svo_real_time_mode = False
-    settings.depth_mode = sl.DEPTH_MODE.NONE
-    settings.coordinate_units = sl.UNIT.METER
-    camera = sl.Camera()
-    status = camera.open(settings)
-    if status != sl.ERROR_CODE.SUCCESS:
-        raise RecordingError(f"{path}: the ZED SDK cannot open it ({status})")
+    hint = (
+        "; or export the rectified pairs on a machine with the SDK (its sample svo_export, mode 2)"
+        " to left/ and right/ with a camera.json"
+    )
+    sl, camera = _open_camera(path, hint)
     t_ns = []
     while camera.grab() == sl.ERROR_CODE.SUCCESS:
-        t_ns.append(int(camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds()))
+        t_ns.append(_time_ns(sl, camera))
     if not t_ns:
         raise RecordingError(f"{path}: no frame of it can be decoded")
     poses = read_ground_truth(path.with_suffix(".tum"), [], t_ns)
     return SvoRecording(path.name, path, t_ns, poses, rig_from_sdk(camera), sl, camera)
 
 
-def sdk(what: str) -> Any:
-    """Stereolabs' package. Raises MissingExtraError, which says that `what` needs it."""
+def sdk_frames(stop: threading.Event) -> Iterator[StereoFrame]:
+    """Yield rectified pairs of the first connected ZED until `stop` is set.
+
+    Raises:
+        MissingExtraError: Stereolabs' SDK is not installed.
+        RecordingError: there is no ZED, or it gives no more images.
+    """
+    sl, camera = _open_camera(None)
+    try:
+        rig, index, failed = rig_from_sdk(camera), 0, 0
+        while not stop.is_set():
+            if camera.grab() != sl.ERROR_CODE.SUCCESS:
+                failed += 1
+                if failed > 30:
+                    raise RecordingError("the ZED gives no more images")
+                continue
+            yield _retrieve_frame(sl, camera, index, rig)
+            index, failed = index + 1, 0
+    finally:
+        camera.close()
+
+
+def _open_camera(path: Path | None, hint: str = "") -> tuple[Any, Any]:
+    """Return the SDK and an open SVO file, or the first connected camera if `path` is None."""
+    source = "a ZED" if path is None else path
     try:
         import pyzed.sl as sl  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtraError(
-            f"{what} needs pyzed of Stereolabs' ZED SDK, which is not installed"
+            f"{source} needs pyzed of Stereolabs' ZED SDK, which is not installed{hint}"
         ) from None
-    return sl
+    settings = sl.InitParameters()
+    if path is not None:
+        settings.set_from_svo_file(str(path))
+        settings.svo_real_time_mode = False
+    settings.depth_mode, settings.coordinate_units = sl.DEPTH_MODE.NONE, sl.UNIT.METER
+    camera = sl.Camera()
+    status = camera.open(settings)
+    if status != sl.ERROR_CODE.SUCCESS:
+        raise RecordingError(f"the ZED SDK cannot open {source} ({status})")
+    return sl, camera
 
 
-def retrieve_image(sdk: Any, camera: Any, view: Any) -> Image:
-    """What a camera of the SDK saw last, RGB."""
-    picture = sdk.Mat()
-    camera.retrieve_image(picture, view)
-    return cv2.cvtColor(picture.get_data(), cv2.COLOR_BGRA2RGB)
+def _retrieve_frame(
+    sdk: Any, camera: Any, index: int, rig: StereoRig, with_right: bool = True
+) -> StereoFrame:
+    """Return the images that the SDK has grabbed."""
+
+    def retrieve(view: Any) -> Image:
+        image = sdk.Mat()
+        camera.retrieve_image(image, view)
+        return cv2.cvtColor(image.get_data(), cv2.COLOR_BGRA2RGB)
+
+    left = retrieve(sdk.VIEW.LEFT)
+    frame = StereoFrame(f"{index:06d}", _time_ns(sdk, camera), left, rig.left)
+    return replace(frame, right=retrieve(sdk.VIEW.RIGHT), rig=rig) if with_right else frame
+
+
+def _time_ns(sdk: Any, camera: Any) -> int:
+    return int(camera.get_timestamp(sdk.TIME_REFERENCE.IMAGE).get_nanoseconds())
 
 
 def rig_from_sdk(camera: Any) -> StereoRig:
-    """Of the rectified pictures, which the SDK gives; metres."""
+    """Return the rig of the rectified images; metres."""
     configuration = camera.get_camera_information().camera_configuration
     parameters, size = configuration.calibration_parameters, configuration.resolution
     left = parameters.left_cam

@@ -1,9 +1,7 @@
-"""Recordings of Stereolabs' ZED cameras: side-by-side video, as every ZED gives it as a USB camera,
-and ``.svo`` through their SDK.
+"""Recordings of Stereolabs' ZED cameras: side-by-side images of a USB camera, and ``.svo`` files.
 
-The left picture is the left half. The pictures are as the sensor has them, distorted; the
-calibration is Stereolabs' ``SN*.conf`` beside the video (or a camera.json of one half with a
-baseline, where the halves are rectified already).
+The left image is the left half. Both are distorted. The calibration is Stereolabs' ``SN*.conf``
+beside the video. Rectified halves have a camera.json of one half with a baseline instead.
 """
 
 from __future__ import annotations
@@ -11,6 +9,7 @@ from __future__ import annotations
 import configparser
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,17 +18,19 @@ import numpy as np
 from topoloc import (
     CalibrationError,
     Camera,
+    Image,
     RecordingError,
     Rigid3,
     StereoFrame,
     StereoRig,
     StereoSequence,
 )
+from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.formats.svo import SVO_SUFFIXES, open_svo
 from topoloc.plugin import RecordingFormat, Video, read_camera_json, read_text
 
 EXPECTED_FILES = "a video of left and right side by side with SN*.conf beside it, or .svo"
-# Stereolabs' names of the sizes of one picture.
+# Stereolabs' names of the image sizes.
 RESOLUTIONS = {
     (2208, 1242): "2K",
     (1920, 1080): "FHD",
@@ -38,13 +39,12 @@ RESOLUTIONS = {
     (960, 600): "SVGA",
     (672, 376): "VGA",
 }
-_MIN_ASPECT_RATIO = 2.5  # width to height of two pictures side by side; a single one is 1.8 at most
+_MIN_ASPECT_RATIO = 2.5  # of two images side by side; that of a single one is 1.8 at most
 _CONF_NAME = re.compile(r"sn\d+\.conf", re.IGNORECASE)
 
 
 def can_open(path: Path) -> bool:
-    """Whether this is an SVO file, or a video as wide as two pictures that has an SN*.conf beside
-    it."""
+    """Return whether this is an SVO file, or a side-by-side video with an SN*.conf beside it."""
     if not path.is_file():
         return False
     if path.suffix.lower() in SVO_SUFFIXES:
@@ -60,7 +60,7 @@ def can_open(path: Path) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class SideBySideVideo:
-    """A StereoSequence of the two halves of each frame of a video."""
+    """A StereoSequence of the two halves of a video."""
 
     video: Video
     rig: StereoRig
@@ -86,16 +86,13 @@ class SideBySideVideo:
         return len(self.video)
 
     def monocular(self) -> SideBySideVideo:
-        """The same recording without the right halves."""
+        """Return the recording without the right halves."""
         return replace(self, with_right=False)
 
     def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame. Raises as `Video` does."""
+        """Read one frame. See `Video` for errors."""
         frame = self.video[index]
-        width = self.rig.left.width
-        left, right = (
-            np.ascontiguousarray(half) for half in (frame.image[:, :width], frame.image[:, width:])
-        )
+        left, right = _split_halves(frame.image)
         frame = replace(frame, image=left, camera=self.rig.left)
         return replace(frame, right=right, rig=self.rig) if self.with_right else frame
 
@@ -104,56 +101,85 @@ def open_zed(path: Path, calibration: str | Path | None = None) -> StereoSequenc
     """Open a side-by-side video or an SVO file. Truth is ``NAME.tum`` beside ``NAME.mp4``.
 
     Args:
-        calibration: of a video, the SN*.conf, or a camera.json of one half with a baseline
-            (metres); by default those beside it.
+        calibration: SN*.conf of a video, or a camera.json of one half with a baseline (metres). By
+            default the one beside the video.
 
     Raises:
-        RecordingError: no video, or not of two pictures side by side.
-        CalibrationError: no calibration, several, of another resolution, or not usable.
+        RecordingError: the file is no video of two images side by side.
+        CalibrationError: there is no calibration, or several, or it is invalid.
         TrajectoryError: the truth is malformed or fits no frame.
-        MissingExtraError: an SVO file, and Stereolabs' SDK is not installed.
+        MissingExtraError: Stereolabs' SDK for an SVO file is not installed.
     """
     if path.suffix.lower() in SVO_SUFFIXES:
         return open_svo(path)
     video = Video.open(path)
     width, height = video.size
-    if not is_side_by_side(width, height):
-        raise RecordingError(f"{path}: {width}x{height} pixels are not two pictures side by side")
+    if not _is_side_by_side(width, height):
+        raise RecordingError(f"{path}: {width}x{height} pixels are not two images side by side")
     file = _find_calibration_file(path) if calibration is None else Path(calibration)
-    rig = read_rig(file, (width // 2, height))
-    if (rig.left.width, rig.left.height) != (width // 2, height):
-        raise CalibrationError(
-            f"{file}: of {rig.left.width}x{rig.left.height}, but each half of {path.name} is"
-            f" {width // 2}x{height}"
-        )
-    return SideBySideVideo(video, rig)
+    return SideBySideVideo(video, _read_rig(file, (width // 2, height)))
 
 
-def is_side_by_side(width: int, height: int) -> bool:
-    """Whether a picture of so many pixels can be two."""
+def side_by_side_frames(source: LiveSource, calibration: Path) -> Iterator[StereoFrame]:
+    """Yield both halves of each image of a live source, distorted.
+
+    Args:
+        calibration: Stereolabs' SN*.conf, or a camera.json of one half with a baseline.
+
+    Raises:
+        RecordingError: the images are not two side by side, or the source stalls.
+        CalibrationError: the calibration is invalid or of another resolution.
+    """
+    rig: StereoRig | None = None
+    for picture in source:
+        height, width = picture.image.shape[:2]
+        if not _is_side_by_side(width, height):
+            raise RecordingError(
+                f"{source.source}: {width}x{height} pixels are not two images side by side; use"
+                " --size to request another size"
+            )
+        rig = rig or _read_rig(calibration, (width // 2, height))
+        left, right = _split_halves(picture.image)
+        yield StereoFrame(f"{picture.number:06d}", picture.t_ns, left, rig.left, right, rig)
+
+
+def _is_side_by_side(width: int, height: int) -> bool:
     return width % 2 == 0 and width >= _MIN_ASPECT_RATIO * height
 
 
-def read_rig(path: Path, size: tuple[int, int]) -> StereoRig:
-    """The pair of an SN*.conf for halves of this size, or of a camera.json with a baseline. Raises
-    CalibrationError."""
-    return _read_rectified_rig(path) if path.suffix.lower() == ".json" else read_conf(path, size)
+def _split_halves(image: Image) -> tuple[np.ndarray, np.ndarray]:
+    width = image.shape[1] // 2
+    return np.ascontiguousarray(image[:, :width]), np.ascontiguousarray(image[:, width:])
+
+
+def _read_rig(path: Path, size: tuple[int, int]) -> StereoRig:
+    """Return the rig of halves of this size. Raises CalibrationError."""
+    is_json = path.suffix.lower() == ".json"
+    rig = read_camera_json(path).rig if is_json else read_conf(path, size)
+    if rig is None:
+        raise CalibrationError(f"{path}: no baseline (metres) between the two images")
+    if (rig.left.width, rig.left.height) != size:
+        raise CalibrationError(
+            f"{path}: of {rig.left.width}x{rig.left.height}, but each half is {size[0]}x{size[1]}"
+        )
+    return rig
 
 
 def read_conf(path: Path, size: tuple[int, int]) -> StereoRig:
-    """The pair of Stereolabs' SN*.conf for pictures of this size: lengths in mm, the rotation (RX,
-    CV, RZ) a vector in radians.
+    """Return the rig of Stereolabs' SN*.conf for images of this size.
+
+    The file has lengths in mm and the rotation vector (RX, CV, RZ) in radians.
 
     Raises:
-        CalibrationError: missing, not of this form, without this resolution, or a number that is
-            missing or makes no sense.
+        CalibrationError: the file is missing or malformed, lacks this resolution, or a number is
+            missing or invalid.
     """
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     try:
         parser.read_string(read_text(path, CalibrationError, "no such calibration"))
     except configparser.Error as error:
         raise CalibrationError(
-            f"{path}: not a calibration of Stereolabs' form ({' '.join(str(error).split())[:100]})"
+            f"{path}: not a calibration of Stereolabs ({' '.join(str(error).split())[:100]})"
         ) from None
     conf = {name.upper().strip(): dict(parser[name]) for name in parser.sections()}
     there = [name.removeprefix("LEFT_CAM_") for name in conf if name.startswith("LEFT_CAM_")]
@@ -161,31 +187,25 @@ def read_conf(path: Path, size: tuple[int, int]) -> StereoRig:
     resolution = RESOLUTIONS.get(size)
     if resolution is None:
         known = ", ".join(f"{width}x{height}" for width, height in RESOLUTIONS)
-        raise CalibrationError(f"{path}: a ZED has no pictures of {shown}; its sizes are {known}")
+        raise CalibrationError(f"{path}: a ZED has no images of {shown}; its sizes are {known}")
     if resolution not in there or f"RIGHT_CAM_{resolution}" not in conf:
         raise CalibrationError(
-            f"{path}: no calibration of {resolution} ({shown}), which the pictures are; it has"
-            f" {', '.join(there) or 'none'}"
+            f"{path}: no calibration of {resolution} ({shown}), only of"
+            f" {', '.join(there) or 'nothing'}"
         )
     left, right = (
         _camera(path, conf, f"{side}_CAM_{resolution}", size) for side in ("LEFT", "RIGHT")
     )
     stereo = conf.get("STEREO", {})
     baseline = _number(path, stereo, "STEREO", "baseline")
+
+    def of_resolution(axis: str, default: float) -> float:
+        return _number(path, stereo, "STEREO", f"{axis}_{resolution.lower()}", default)
+
     across = [
-        _number(
-            path,
-            stereo,
-            "STEREO",
-            f"{axis}_{resolution.lower()}",
-            _number(path, stereo, "STEREO", axis, 0.0),
-        )
-        for axis in ("ty", "tz")
+        of_resolution(axis, _number(path, stereo, "STEREO", axis, 0.0)) for axis in ("ty", "tz")
     ]
-    turn = [
-        _number(path, stereo, "STEREO", f"{axis}_{resolution.lower()}", 0.0)
-        for axis in ("rx", "cv", "rz")
-    ]
+    turn = [of_resolution(axis, 0.0) for axis in ("rx", "cv", "rz")]
     if not baseline > 0.0:
         raise CalibrationError(f"{path}: STEREO baseline of {baseline:g} mm")
     translation = -np.array([baseline, *across]) / 1000.0
@@ -228,26 +248,17 @@ def _number(
     return number
 
 
-def _read_rectified_rig(path: Path) -> StereoRig:
-    rig = read_camera_json(path).rig
-    if rig is None:
-        raise CalibrationError(
-            f"{path}: no baseline (metres), which two pictures side by side need"
-        )
-    return rig
-
-
 def _find_calibration_file(path: Path) -> Path:
     confs = _list_conf_files(path.parent)
     if len(confs) > 1:
         raise CalibrationError(
             f"{path}: several calibrations beside it ({', '.join(conf.name for conf in confs)});"
-            " --camera names one"
+            " use --camera"
         )
     if not confs and not (path.parent / "camera.json").is_file():
         raise CalibrationError(
-            f"{path}: no SN*.conf beside it; Stereolabs has that of each camera by its serial"
-            " number, --camera names it"
+            f"{path}: no SN*.conf beside it; get it from Stereolabs by the serial number, and use"
+            " --camera"
         )
     return confs[0] if confs else path.parent / "camera.json"
 

@@ -1,11 +1,10 @@
-"""Why a picture got this answer, or none: what was tried, what spoke for it, and what would
-help."""
+"""Explain a result: the tried pose proposals, their evidence, and advice."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,27 +24,33 @@ from topoloc import (
 
 _MIN_FEATURES, _MIN_PROBABILITY = 150, 0.5
 _DARKER, _BRIGHTER = 0.6, 1.7  # times the light of the nearest session
-_MAX_VIEW_ANGLE_DEG, _MAX_NODE_DISTANCE = (
-    25.0,
-    4.0,
-)  # from the nearest node: degrees, and so many D_thresh
+# From the nearest node: degrees, and multiples of D_thresh.
+_MAX_VIEW_ANGLE_DEG, _MAX_NODE_DISTANCE = 25.0, 4.0
 _SAME_POSITION_M, _SAME_ROTATION = 0.3, math.radians(3.0)
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedPose:
-    """One first pose and what became of it. `probability` is that of it against "nowhere"
-    alone."""
+    """A pose proposal and its outcome. `probability` compares it with "nowhere in the map" only."""
 
     tried: TriedProposal
     probability: float | None
     verdict: str
 
+    @property
+    def node_id(self) -> int:
+        """The node with the most inliers, -1 without inliers."""
+        return self.tried.fit.node_id
+
+    @property
+    def num_inliers(self) -> int:
+        """Number of inliers."""
+        return self.tried.fit.num_inliers
+
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """`advice` is what would help, the most telling first; `poses` are in the order in which they
-    were tried."""
+    """`poses` are in the order in which they were tried. The most important `advice` is first."""
 
     result: Localization | NotLocalized
     num_features: dict[str, int]
@@ -56,21 +61,18 @@ class Explanation:
 
     @property
     def best(self) -> EvaluatedPose | None:
-        """What has most for it."""
-        likely = [pose for pose in self.poses if pose.probability is not None]
+        """The pose with the highest odds, else the one with the most inliers."""
+        weighed = [(p.tried.hypothesis.log_odds, p) for p in self.poses if p.tried.hypothesis]
+        if weighed:
+            return max(weighed, key=lambda pair: pair[0])[1]
         found = [pose for pose in self.poses if pose.tried.world_from_cam]
-        by_odds = max(
-            likely,
-            key=lambda pose: pose.tried.hypothesis.log_odds if pose.tried.hypothesis else -math.inf,
-            default=None,
-        )
-        return by_odds or max(found, key=lambda pose: pose.tried.fit.num_inliers, default=None)
+        return max(found, key=lambda pose: pose.num_inliers, default=None)
 
 
 def explain(
     localizer: Localizer, image: Image, camera: Camera | UncalibratedCamera | None
 ) -> Explanation:
-    """Localize a picture, and say why it came out so. Raises as `Localizer.localize` does."""
+    """Localize an image and explain the result. Raises the errors of `Localizer.localize`."""
     trace = Trace()
     result = localizer.localize(image, camera, trace=trace)
     poses = [_evaluate_pose(tried, result) for tried in trace.tried]
@@ -80,18 +82,17 @@ def explain(
         for session in localizer.topomap.sessions
         if session.light is not None
     }
-    unsaid = Explanation(result, num_features, Illumination.of_image(image), lights, poses, [])
-    advice = list(dict.fromkeys(_collect_advice(unsaid, localizer)))
-    return Explanation(result, num_features, unsaid.light, lights, poses, advice)
+    facts = Explanation(result, num_features, Illumination.of_image(image), lights, poses, [])
+    return replace(facts, advice=list(dict.fromkeys(_collect_advice(facts, localizer))))
 
 
 def explanation_to_json(name: str, explanation: Explanation) -> dict[str, Any]:
-    """The result of the picture of this name with all that was tried for it, as JSON."""
+    """Return the result for the image `name`, with all tried proposals and the advice, as JSON."""
     poses = [
         {
             "source": pose.tried.source,
             "features": pose.tried.features,
-            "node": pose.tried.fit.node_id if pose.tried.fit.node_id >= 0 else None,
+            "node": pose.node_id if pose.node_id >= 0 else None,
             "num_first_matches": len(pose.tried.first.matches),
             "num_first_inliers": pose.tried.first.num_inliers,
             "probability": pose.probability,
@@ -109,94 +110,76 @@ def explanation_to_json(name: str, explanation: Explanation) -> dict[str, Any]:
 def _evaluate_pose(tried: TriedProposal, result: Localization | NotLocalized) -> EvaluatedPose:
     if tried.hypothesis is not None:
         probability = tried.hypothesis.probability
-        return EvaluatedPose(
-            tried, probability, _verdict(tried.hypothesis.world_from_cam, probability, result)
-        )
+        verdict = _verdict(tried.hypothesis.world_from_cam, probability, result)
+        return EvaluatedPose(tried, probability, verdict)
     if tried.world_from_cam is None:
-        return EvaluatedPose(
-            tried, None, f"no pose: the {len(tried.fit.matches)} matches agree on none"
-        )
-    if tried.refined is None and tried.source != "walls":
-        return EvaluatedPose(tried, None, "the same as one that was found already")
-    return EvaluatedPose(tried, None, "hopeless: far too little of what must be in view was found")
+        verdict = f"no pose: the {len(tried.fit.matches)} matches agree on none"
+    elif tried.refined is None and tried.source != "walls":
+        verdict = "the same as an earlier pose"
+    else:
+        verdict = "rejected: too few of the points that must be visible were found"
+    return EvaluatedPose(tried, None, verdict)
 
 
 def _verdict(
     world_from_cam: Rigid3, probability: float, result: Localization | NotLocalized
 ) -> str:
-    if isinstance(result, Localization) and world_from_cam.is_same(
+    is_localized = isinstance(result, Localization)
+    if is_localized and world_from_cam.is_same(
         result.world_from_cam, _SAME_POSITION_M, _SAME_ROTATION
     ):
         return "the answer"
+    others = [] if is_localized else result.alternatives
     if any(
         world_from_cam.is_same(other.world_from_cam, _SAME_POSITION_M, _SAME_ROTATION)
-        for other in getattr(result, "alternatives", ())
+        for other in others
     ):
         return "one of the alternatives"
     if probability < _MIN_PROBABILITY:
-        return "lost: more speaks against it than for it"
-    if isinstance(result, Localization):
-        return "lost: the answer has more for it"
-    return (
-        "likely, but its calibration is doubtful"
-        if "calibration" in result.detail
-        else "likely, but not beyond doubt"
-    )
+        return "rejected: the evidence against it is stronger"
+    if is_localized:
+        return "less probable than the answer"
+    doubtful = "calibration" in result.detail
+    return "likely, but its calibration is doubtful" if doubtful else "likely, but not certain"
 
 
 def _collect_advice(explanation: Explanation, localizer: Localizer) -> Iterator[str]:
-    """What would help, in words."""
-    result = explanation.result
-    if isinstance(result, Localization) and result.calibration_doubt is not None:
+    result, best = explanation.result, explanation.best
+    refused = isinstance(result, NotLocalized)
+    if not refused and result.calibration_doubt is not None:
         yield f"The calibration is doubtful: {result.calibration_doubt}."
-    if isinstance(result, NotLocalized) and result.detail:
+    if refused and result.detail:
         yield f"{result.detail[0].upper()}{result.detail[1:]}."
-    yield from _advice_on_alternatives(result)
-    yield from _advice_on_image(explanation)
-    best = explanation.best
-    if best is not None and best.tried.hypothesis is not None:
-        evidence = best.tried.hypothesis.evidence
-        if (
-            isinstance(result, NotLocalized)
-            and best.tried.hypothesis.probability < _MIN_PROBABILITY
-        ):
-            found = (
-                f"{evidence.num_found} of the {evidence.num_visible} points that must be in view"
-                " there"
-            )
-            yield (
-                f"The likeliest place is near node {best.tried.fit.node_id}, but only {found}"
-                " were found."
-            )
-            yield (
-                "It may be elsewhere, changed, or seen from a side or in a light that the map does"
-                " not hold."
-            )
-        yield from _advice_on_viewpoint(best.tried.hypothesis.world_from_cam, localizer)
-    elif isinstance(result, NotLocalized):
-        yield (
-            "No part of the map looks enough like this picture: it may be of somewhere else, or of"
-            " something that changed."
-        )
-    for kind, lacking in localizer.unavailable_types.items():
-        yield f"The map's features {kind}, made for other light, were not asked: {lacking}."
-    if (
-        isinstance(result, NotLocalized)
-        and len(localizer.topomap.kinds) == 1
-        and not localizer.unavailable_types
-    ):
-        yield (
-            f"The map holds features {localizer.topomap.kind} alone; `topoloc build --features"
-            " both` sees in more kinds of light."
-        )
-
-
-def _advice_on_alternatives(result: Localization | NotLocalized) -> Iterator[str]:
-    if isinstance(result, NotLocalized) and len(result.alternatives) > 1:
+    if refused and len(result.alternatives) > 1:
         nodes = " and ".join(str(other.node_id) for other in result.alternatives[:3])
         yield (
-            f"The place repeats itself: nodes {nodes} look alike. A stream (`--stream`) or a rough"
-            " prior pose tells them apart."
+            f"Nodes {nodes} look alike. Use a stream (`--stream`) or an approximate pose as prior."
+        )
+    yield from _advice_on_image(explanation)
+    hypothesis = None if best is None else best.tried.hypothesis
+    if best is not None and hypothesis is not None:
+        if refused and hypothesis.probability < _MIN_PROBABILITY:
+            evidence = hypothesis.evidence
+            yield (
+                f"The most likely place is near node {best.node_id}, but only {evidence.num_found}"
+                f" of the {evidence.num_visible} points that must be visible were found."
+            )
+            yield (
+                "The image may be out of the map. Or the place changed, or the map lacks this view"
+                " or light."
+            )
+        yield from _advice_on_viewpoint(hypothesis.world_from_cam, localizer)
+    elif refused:
+        yield (
+            "No part of the map is similar enough to this image. The image may be out of the map,"
+            " or the place changed."
+        )
+    for kind, reason in localizer.unavailable_types.items():
+        yield f"The map's features {kind}, for other light, were not used: {reason}."
+    if refused and len(localizer.topomap.kinds) == 1 and not localizer.unavailable_types:
+        yield (
+            f"The map has {localizer.topomap.kind} features only. `topoloc build --features both`"
+            " works in more kinds of light."
         )
 
 
@@ -204,7 +187,7 @@ def _advice_on_image(explanation: Explanation) -> Iterator[str]:
     for kind, count in explanation.num_features.items():
         if count < _MIN_FEATURES:
             yield (
-                f"Only {count} features ({kind}) were found: the picture is blurred, blank or very"
+                f"Only {count} features ({kind}) were found: the image is blurred, blank or very"
                 " dark."
             )
     if explanation.session_lights:
@@ -213,7 +196,7 @@ def _advice_on_image(explanation: Explanation) -> Iterator[str]:
             explanation.session_lights.items(),
             key=lambda pair: abs(math.log((pair[1].level + 0.02) / (grey + 0.02))),
         )
-        ratio = (explanation.light.level + 0.02) / (nearest.level + 0.02)
+        ratio = (grey + 0.02) / (nearest.level + 0.02)
         if ratio < _DARKER or ratio > _BRIGHTER:
             word = "darker" if ratio < 1.0 else "brighter"
             greys = f"mean grey {grey:.2f}; nearest is session {name} with {nearest.level:.2f}"
@@ -221,17 +204,18 @@ def _advice_on_image(explanation: Explanation) -> Iterator[str]:
 
 
 def _advice_on_viewpoint(world_from_cam: Rigid3, localizer: Localizer) -> Iterator[str]:
-    """How far the pose is from what the map has seen."""
+    """Compare the pose with the nodes of the map."""
     opened = localizer.context.first.map
     nodes, d_thresh = opened.node_poses, opened.d_thresh
-    ways = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
+    distances = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
+    nearest, reach = float(distances.min()), _MAX_NODE_DISTANCE * d_thresh
     cosines = nodes.rotations[:, :, 2] @ world_from_cam.rotation[:, 2]
-    near = ways < max(_MAX_NODE_DISTANCE * d_thresh, float(ways.min()) * 1.5)
-    turn = math.degrees(math.acos(min(1.0, float(cosines[near].max()))))
-    if float(ways.min()) > _MAX_NODE_DISTANCE * d_thresh:
+    near = distances < max(reach, 1.5 * nearest)
+    angle = math.degrees(math.acos(min(1.0, float(cosines[near].max()))))
+    if nearest > reach:
         yield (
-            f"It was taken {ways.min():.1f} m from the nearest node; nodes here are about"
+            f"It was taken {nearest:.1f} m from the nearest node. The nodes are about"
             f" {d_thresh:.1f} m apart."
         )
-    if turn > _MAX_VIEW_ANGLE_DEG:
-        yield f"It looks {turn:.0f} degrees away from any view that the map holds there."
+    if angle > _MAX_VIEW_ANGLE_DEG:
+        yield f"Its viewing direction is {angle:.0f} degrees from any view of the map there."

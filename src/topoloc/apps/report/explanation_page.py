@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,24 @@ import numpy as np
 from topoloc import Image, Localization, TopoMetricMap
 from topoloc.apps.report.explanation import EvaluatedPose, Explanation
 from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, decode_template, draw_pair
-from topoloc.apps.report.page_template import render_page
+from topoloc.apps.report.page_template import (
+    render_figure,
+    render_gallery_items,
+    render_page,
+    render_section,
+    render_table,
+)
 from topoloc.plugin import encode_jpeg, write_text
 
 _POSES_TEXT = (
-    "Of each first pose: points were sought where the map expects them, and weighed. Found counts"
-    " those of all that must be in view."
+    "Each row is a pose proposal. Found counts the map points that were found again, of all that"
+    " must be visible from the pose."
 )
+_PAIRS_TEXT = "Left the image, right the node. Lines are matches that agree with the pose."
+_NO_PAIRS_TEXT = "No part of the map gave a pose. The node is the most similar one."
 _MAX_SHOWN, MAX_MATCHES = 3, 300
 _COLUMNS = (
-    "tried",
+    "proposal",
     "features",
     "near node",
     "first inliers",
@@ -29,48 +36,47 @@ _COLUMNS = (
     "by chance",
     "unguided",
     "probability",
-    "what became of it",
+    "verdict",
 )
 
 
 def write_explanation(
     path: Path, name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap
 ) -> None:
-    """Write the page, at once or not at all. Raises TopolocError where the file cannot be
-    written."""
+    """Write the page atomically. Raises TopolocError if the file cannot be written."""
     write_text(path, explanation_page(name, image, explanation, topomap))
 
 
 def explanation_page(
     name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap
 ) -> str:
-    """The page, HTML."""
-    title = f"Why {name} {'is here' if explanation.result.localized else 'was not localized'}"
-    advice = (
-        "".join(f"<li>{escape(line)}</li>" for line in explanation.advice)
-        or "<li>Nothing is amiss.</li>"
-    )
-    table = (
-        '<div class="wide" tabindex="0" role="region" aria-label="What was'
-        f' tried">{_render_table(explanation)}</div>'
-    )
-    sections = (
-        '<section style="margin-top:-48px"><h2>What would'
-        f" help</h2><ul>{advice}</ul></section><section><h2>What it was compared"
-        f" with</h2><p>{_shown_text(explanation)}</p>{_render_pairs(image, explanation, topomap)}</section><section><h2>What"  # noqa: E501
-        f" was tried</h2><p>{_POSES_TEXT}</p>{table}</section>"
-    )
-    return render_page(title, verdict(explanation), sections)
+    """Return the page as HTML."""
+    advice = "".join(f"<li>{escape(line)}</li>" for line in explanation.advice)
+    shown = _rank_poses(explanation)
+    items = [_render_pose(image, pose, topomap) for pose in shown]
+    if not items and explanation.result.candidates:
+        node = topomap.nodes[topomap.row_of(explanation.result.candidates[0].node_id)]
+        pair = encode_jpeg(draw_pair(image, decode_template(node)), JPEG_QUALITY)
+        caption = f"left the image, right node {node.summary.node_id}"
+        items = [(render_figure(pair, caption), "")]
+    rows = [[escape(cell) for cell in row_of(pose)] for pose in explanation.poses]
+    table = render_table(_COLUMNS, rows, "tried", "What was tried")
+    pairs_text = _PAIRS_TEXT if shown else _NO_PAIRS_TEXT
+    sections = [
+        render_section("Advice", "", f"<ul>{advice or '<li>No problem was found.</li>'}</ul>"),
+        render_section("Comparison with the map", pairs_text, render_gallery_items(items)),
+        render_section("What was tried", _POSES_TEXT, table),
+    ]
+    outcome = "was localized" if explanation.result.localized else "was not localized"
+    return render_page(f"Why {name} {outcome}", verdict(explanation), "".join(sections))
 
 
 def verdict(explanation: Explanation) -> str:
-    """The result in one sentence."""
+    """Return the result in one or two sentences."""
     result = explanation.result
     if not isinstance(result, Localization):
-        return (
-            f"Not localized: {result.reason.replace('_', ' ')}. {len(explanation.poses)} poses were"
-            " looked into."
-        )
+        reason = result.reason.replace("_", " ")
+        return f"Not localized: {reason}. {len(explanation.poses)} pose proposals were tried."
     x, y, z = result.world_from_cam.translation
     sigmas = f"{100.0 * result.position_sigma_m:.1f} cm, {result.rotation_sigma_deg:.2f} deg"
     return (
@@ -80,53 +86,36 @@ def verdict(explanation: Explanation) -> str:
 
 
 def _rank_poses(explanation: Explanation) -> list[EvaluatedPose]:
-    """The poses that are shown, the likeliest first, each node once."""
-    with_pose = [pose for pose in explanation.poses if pose.tried.fit.node_id >= 0]
-    with_pose.sort(
-        key=lambda pose: (pose.probability or 0.0, pose.tried.fit.num_inliers), reverse=True
+    """Return the poses to show, the most probable first, one for each node."""
+    ranked = sorted(
+        (pose for pose in explanation.poses if pose.num_inliers and pose.tried.fit.node_id >= 0),
+        key=lambda pose: (pose.probability or 0.0, pose.tried.fit.num_inliers),
+        reverse=True,
     )
-    return list({pose.tried.fit.node_id: pose for pose in reversed(with_pose)}.values())[::-1][
-        :_MAX_SHOWN
-    ]
-
-
-def _shown_text(explanation: Explanation) -> str:
-    if not _rank_poses(explanation):
-        return (
-            "No pose came of any part of the map; beside it stands the node that looks most"
-            " like it."
-        )
-    return "Left the picture, right the node of the map. Lines join what the pose explains."
-
-
-def _render_pairs(image: Image, explanation: Explanation, topomap: TopoMetricMap) -> str:
-    articles = [_render_pose(image, pose, topomap) for pose in _rank_poses(explanation)]
-    if not articles and explanation.result.candidates:
-        node = topomap.nodes[topomap.row_of(explanation.result.candidates[0].node_id)]
-        pair = draw_pair(image, decode_template(node))
-        articles = [_render_figure(pair, f"left the picture, right node {node.summary.node_id}")]
-    return '<div class="queries">' + "".join(articles) + "</div>"
+    best = dict[int, EvaluatedPose]()
+    for pose in ranked:
+        best.setdefault(pose.tried.fit.node_id, pose)
+    return list(best.values())[:_MAX_SHOWN]
 
 
 def compared_to_json(
     image: Image, explanation: Explanation, topomap: TopoMetricMap
 ) -> list[dict[str, Any]]:
-    """The likeliest poses as the page shows them; rows of `matches` are a pixel of the picture and
-    one of the node's camera."""
+    """Return the poses that the page shows. A row of `matches` is a pixel of the image and one of
+    the node's camera."""
     compared = list[dict[str, Any]]()
     for pose in _rank_poses(explanation):
-        node, matches = (
-            topomap.nodes[topomap.row_of(pose.tried.fit.node_id)],
-            _find_explained_matches(image, pose, topomap),
-        )
+        camera = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)].camera
+        matches = _find_explained_matches(image, pose, topomap)
         pixels = np.column_stack([matches.points_query, matches.points_node]).round(1)[:MAX_MATCHES]
-        facts = {
-            "node": pose.tried.fit.node_id,
-            "node_size": [node.camera.width, node.camera.height],
-            "verdict": pose.verdict,
-        }
         compared.append(
-            facts | {"num_inliers": pose.tried.fit.num_inliers, "matches": pixels.tolist()}
+            {
+                "node": pose.tried.fit.node_id,
+                "node_size": [camera.width, camera.height],
+                "verdict": pose.verdict,
+                "num_inliers": pose.num_inliers,
+                "matches": pixels.tolist(),
+            }
         )
     return compared
 
@@ -134,80 +123,44 @@ def compared_to_json(
 def _find_explained_matches(
     image: Image, pose: EvaluatedPose, topomap: TopoMetricMap
 ) -> NodeMatches:
-    """What the pose explains, as far as its node would see it."""
+    """Return the inliers of the pose that lie inside the image of its node."""
     node, fit = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)], pose.tried.fit
     scale = image.shape[1] / fit.camera.width
-    query = (fit.features.points_img[fit.inlier_query_idx].astype(np.float64) + 0.5) * scale - 0.5
+    points_img = fit.features.points_img[fit.inlier_query_idx].astype(np.float64)
+    query = (points_img + 0.5) * scale - 0.5
     points = fit.local_map.points_world[fit.inlier_point_idx]
     seen = node.camera.img_from_cam(node.summary.world_from_cam.inverse().apply(points))
-    inside = (
-        np.isfinite(seen).all(axis=1)
-        & (seen >= 0).all(axis=1)
-        & (seen < [node.camera.width, node.camera.height]).all(axis=1)
-    )
-    return NodeMatches(
-        query[inside], seen[inside], np.full(int(inside.sum()), pose.verdict == "the answer")
-    )
+    size = [node.camera.width, node.camera.height]
+    inside = np.isfinite(seen).all(axis=1) & ((seen >= 0) & (seen < size)).all(axis=1)
+    is_answer = np.full(int(inside.sum()), pose.verdict == "the answer")
+    return NodeMatches(query[inside], seen[inside], is_answer)
 
 
-def _render_pose(image: Image, pose: EvaluatedPose, topomap: TopoMetricMap) -> str:
+def _render_pose(image: Image, pose: EvaluatedPose, topomap: TopoMetricMap) -> tuple[str, str]:
+    """Return the figure and the facts of a pose."""
     node = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)]
-    pair = draw_pair(
-        image,
-        decode_template(node),
-        _find_explained_matches(image, pose, topomap),
-        node.camera,
-    )
+    matches = _find_explained_matches(image, pose, topomap)
+    pair = draw_pair(image, decode_template(node), matches, node.camera)
     kind = "good" if pose.verdict == "the answer" else "bad"
-    node_id = node.summary.node_id
     facts = (
-        f'<div class="facts"><b>node {node_id}, {pose.tried.fit.num_inliers} inliers</b><p'
-        f' class="{kind}">{escape(pose.verdict)}</p></div>'
+        f"<b>node {pose.tried.fit.node_id}, {pose.num_inliers} inliers</b>"
+        f'<p class="{kind}">{escape(pose.verdict)}</p>'
     )
-    figure = _render_figure(pair, f"left the image, right node {node_id}")
-    return f"<article>{figure}{facts}</article>"
-
-
-def _render_figure(pair: Image, caption: str) -> str:
-    data = base64.b64encode(encode_jpeg(pair, JPEG_QUALITY)).decode("ascii")
-    return (
-        f'<figure><img alt="{caption}"'
-        f' src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'
-    )
-
-
-def _render_table(explanation: Explanation) -> str:
-    head = "".join(f"<th>{name}</th>" for name in _COLUMNS)
-    rows = [zip(_COLUMNS, row_of(pose), strict=True) for pose in explanation.poses]
-    body = "".join(
-        "<tr>"
-        + "".join(f'<td data-column="{name}">{escape(cell)}</td>' for name, cell in row)
-        + "</tr>"
-        for row in rows
-    )
-    return f'<table class="tried folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
+    caption = f"left the image, right node {pose.tried.fit.node_id}"
+    return render_figure(encode_jpeg(pair, JPEG_QUALITY), caption), facts
 
 
 def row_of(pose: EvaluatedPose) -> tuple[str, ...]:
-    """What `_COLUMNS` name, as text."""
-    evidence = pose.tried.hypothesis.evidence if pose.tried.hypothesis is not None else None
+    """Return the cells of a pose in the order of `_COLUMNS`."""
     node = str(pose.tried.fit.node_id) if pose.tried.fit.node_id >= 0 else ""
     first = f"{pose.tried.first.num_inliers} of {len(pose.tried.first.matches)}"
-    if evidence is None:
-        return pose.tried.source, pose.tried.features, node, first, "", "", "", "", pose.verdict
-    found, unguided = (
-        f"{evidence.num_found} of {evidence.num_visible}",
-        f"{evidence.num_inliers} of {evidence.num_matches}",
-    )
-    probability = "" if pose.probability is None else f"{pose.probability:.2f}"
-    return (
-        pose.tried.source,
-        pose.tried.features,
-        node,
-        first,
-        found,
-        str(evidence.num_by_chance),
-        unguided,
-        probability,
-        pose.verdict,
-    )
+    evidence = ("", "", "", "")
+    if pose.tried.hypothesis is not None:
+        e = pose.tried.hypothesis.evidence
+        evidence = (
+            f"{e.num_found} of {e.num_visible}",
+            str(e.num_by_chance),
+            f"{e.num_inliers} of {e.num_matches}",
+            "" if pose.probability is None else f"{pose.probability:.2f}",
+        )
+    return (pose.tried.source, pose.tried.features, node, first, *evidence, pose.verdict)

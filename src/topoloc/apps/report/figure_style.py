@@ -1,5 +1,4 @@
-"""What the figures of a report share: colours, type, and the way from a matplotlib figure to SVG
-text inside a page."""
+"""Common style of the figures of a report, and their conversion to SVG text."""
 
 from __future__ import annotations
 
@@ -12,8 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, GREY, NODE, ERROR, BAD = "#1f2a37", "#6b7786", "#9db2ca", "#f0a202", "#d1345b"
-# One colour a recording, told apart also by people who see no red or no green; none is near ERROR
-# or BAD.
+# One colour for each recording, distinct for colour-blind readers too, and from ERROR and BAD.
 RECORDING_COLOURS = (
     "#0f8b8d",
     "#5b4fc7",
@@ -24,8 +22,7 @@ RECORDING_COLOURS = (
     "#3d4b5c",
     "#12724a",
 )
-# Beyond so many marks a figure's points become one picture inside it: a page must stay small
-# whatever the number of queries.
+# With more marks, the points of a figure become one image inside it, which bounds its size.
 MAX_MARKS = 2000
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",
@@ -49,14 +46,15 @@ STYLE: dict[Any, Any] = {
 
 
 def recording_colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour for each recording, the same in all figures of a page; they come round again after
-    the last."""
+    """Return a colour for each recording, the same in all figures of a page."""
     return {name: RECORDING_COLOURS[i % len(RECORDING_COLOURS)] for i, name in enumerate(names)}
 
 
 def svg_text(figure: Figure, title: str) -> str:
-    """The figure as an `svg` element without a header; names inside are made from the title, so
-    that figures on one page do not mix."""
+    """Return the figure as an `svg` element without a header.
+
+    Ids inside depend on the title, so those of several figures on a page differ.
+    """
     import matplotlib
 
     buffer = io.StringIO()

@@ -1,13 +1,11 @@
-"""The error curves and times of a report, each as SVG text that can stand inside a page;
-`map_figure.py` draws the map.
+"""The error curves and times of a report as SVG text. `map_figure.py` draws the map.
 
-Drawn with matplotlib's figures directly, not through pyplot: nothing global is touched, and the
-same answers give the same bytes.
+The figures do not use pyplot, so no global state changes and the same results give the same bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import matplotlib
@@ -17,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, PercentFormatter
 
-from topoloc import EvaluatedQuery, NotLocalized
+from topoloc import EvaluatedQuery, Evaluation
 from topoloc.apps.report.figure_style import (
     BAD,
     GREY,
@@ -28,24 +26,19 @@ from topoloc.apps.report.figure_style import (
     recording_colours,
     svg_text,
 )
-from topoloc.plugin import group_by_recording
 
 STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp")
 
 
 def draw_error_curves(answers: Sequence[EvaluatedQuery]) -> tuple[str, str]:
-    """Which share of the queries with truth is within a given error, one line a recording:
-    translation and rotation, a figure each."""
-    groups = group_by_recording([a for a in answers if a.world_from_cam is not None])
-    everything = [a for group in groups.values() for a in group]
-    metres = (
-        max(
-            (a.translation_m for a in everything if a.result.localized and not a.is_false_accept),
-            default=0.0,
-        )
-        > 2.0
-    )
-    scale, unit = (1.0, " m") if metres else (100.0, " cm")
+    """Draw the share of queries within an error, one line for each recording.
+
+    Returns the figures of translation and rotation.
+    """
+    groups = Evaluation([a for a in answers if a.world_from_cam is not None]).by_recording
+    metres = [a.translation_m for a in answers if not a.is_false_accept]
+    large = np.nanmax(metres, initial=0.0) > 2.0
+    scale, unit = (1.0, " m") if large else (100.0, " cm")
     translations = {
         name: scale * np.array([a.translation_m for a in group]) for name, group in groups.items()
     }
@@ -57,66 +50,24 @@ def draw_error_curves(answers: Sequence[EvaluatedQuery]) -> tuple[str, str]:
 
 
 def draw_errors_along(answers: Sequence[EvaluatedQuery]) -> str:
-    """The errors of query after query; those without a pose are marked at the top."""
+    """Draw the errors of all queries in order. Marks at the top are queries without a pose."""
     with_truth = [a for a in answers if a.world_from_cam is not None]
-    groups = group_by_recording(with_truth)
-    colours = recording_colours(list(groups))
-    numbers = np.arange(len(with_truth))
-    lost = np.array([isinstance(a.result, NotLocalized) for a in with_truth])
+    colours = recording_colours(list(Evaluation(with_truth).by_recording))
+    has_lost = not all(a.result.localized for a in with_truth)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 3.9), layout="constrained")
         panels = figure.subplots(2, 1, sharex=True)
-        curves = (
-            ("translation", [a.translation_m for a in with_truth], _format_length),
-            ("rotation", [a.rotation_deg for a in with_truth], _format_angle),
+        translations = np.array([a.translation_m for a in with_truth])
+        rotations = np.array([a.rotation_deg for a in with_truth])
+        _draw_errors(panels[0], with_truth, translations, colours, _format_length)
+        _draw_errors(panels[1], with_truth, rotations, colours, lambda degrees: f"{degrees:g}°")
+        panels[0].set_title("translation error")
+        panels[1].set_title("rotation error")
+        panels[1].set(
+            xlabel="query" + (" (red marks: no pose)" if has_lost else ""),
+            xlim=(-0.5, max(len(with_truth) - 0.5, 0.5)),
         )
-        for axes, (title, errors, label) in zip(panels, curves, strict=True):
-            values = np.maximum(np.array(errors), 1e-5)
-            axes.set_yscale("log")
-            for name, colour in colours.items():
-                own = np.array([a.recording == name for a in with_truth])
-                axes.plot(
-                    numbers,
-                    np.where(own, values, np.nan),
-                    "-",
-                    color=colour,
-                    linewidth=0.8,
-                    alpha=0.5,
-                )
-                axes.plot(
-                    numbers[own],
-                    values[own],
-                    ".",
-                    color=colour,
-                    markersize=4,
-                    rasterized=len(numbers) > MAX_MARKS,
-                )
-            axes.set_ylim(*_powers_of_ten(values))
-            axes.yaxis.set_major_formatter(
-                FuncFormatter(lambda value, _, label=label: label(value))
-            )
-            axes.yaxis.set_minor_formatter(NullFormatter())
-            axes.set_title(f"{title} error")
-            for start in (
-                i for i, (a, b) in enumerate(pairwise(with_truth), 1) if a.recording != b.recording
-            ):
-                axes.axvline(start - 0.5, color=GREY, linewidth=0.8, linestyle=":")
-            if lost.any():  # an empty line, not clipped, would upset the layout
-                marks = numbers[lost]
-                axes.plot(
-                    marks,
-                    np.ones(len(marks)),
-                    "|",
-                    color=BAD,
-                    transform=axes.get_xaxis_transform(),
-                    clip_on=False,
-                    markersize=8,
-                )
-        panels[-1].set(
-            xlabel="query" + (" (red marks: no pose)" if lost.any() else ""),
-            xlim=(-0.5, max(len(numbers) - 0.5, 0.5)),
-        )
-        if len(groups) > 1:
+        if len(colours) > 1:
             handles = [
                 panels[0].plot([], [], ".-", color=colour, label=name)[0]
                 for name, colour in colours.items()
@@ -125,31 +76,49 @@ def draw_errors_along(answers: Sequence[EvaluatedQuery]) -> str:
         return svg_text(figure, "errors along the recordings")
 
 
+def _draw_errors(
+    axes: Axes,
+    answers: Sequence[EvaluatedQuery],
+    errors: Float[np.ndarray, " n"],
+    colours: dict[str, str],
+    label: Callable[[float], str],
+) -> None:
+    numbers, values = np.arange(len(answers)), np.maximum(errors, 1e-5)
+    axes.set_yscale("log")
+    for name, colour in colours.items():
+        own = np.array([a.recording == name for a in answers])
+        line = np.where(own, values, np.nan)
+        axes.plot(numbers, line, "-", color=colour, linewidth=0.8, alpha=0.5)
+        many = len(numbers) > MAX_MARKS
+        axes.plot(numbers[own], values[own], ".", color=colour, markersize=4, rasterized=many)
+    axes.set_ylim(*_powers_of_ten(values))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: label(value)))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    for start, (a, b) in enumerate(pairwise(answers), 1):
+        if a.recording != b.recording:
+            axes.axvline(start - 0.5, color=GREY, linewidth=0.8, linestyle=":")
+    lost = numbers[[not a.result.localized for a in answers]]
+    if len(lost):  # an empty line, not clipped, would upset the layout
+        at_top = {"transform": axes.get_xaxis_transform(), "clip_on": False}
+        axes.plot(lost, np.ones(len(lost)), "|", color=BAD, markersize=8, **at_top)
+
+
 def draw_stage_times(answers: Sequence[EvaluatedQuery]) -> str:
-    """Milliseconds of each stage: the median as a bar, a line up to what 95 % of the queries stay
-    below."""
+    """Draw the milliseconds of each stage: a bar to the median, a line to the 95 % quantile."""
     names = {stage for a in answers for stage in a.result.times_ms}
-    stages = (
-        [stage for stage in STAGES if stage in names]
-        + sorted(names - {*STAGES, "total"})
-        + [s for s in ("total",) if s in names]
-    )
-    times = [np.array([a.result.times_ms.get(stage, 0.0) for a in answers]) for stage in stages]
-    medians, highs = (
-        [float(np.median(t)) for t in times],
-        [float(np.percentile(t, 95)) for t in times],
-    )
+    last = [stage for stage in ("total",) if stage in names]
+    known = [stage for stage in STAGES if stage in names]
+    stages = [*known, *sorted(names - {*known, *last}), *last]
+    times = [[a.result.times_ms.get(stage, 0.0) for a in answers] for stage in stages]
+    medians = [float(np.median(t)) for t in times]
+    highs = [float(np.percentile(t, 95)) for t in times]
     rows = np.arange(len(stages))[::-1]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 0.6 + 0.32 * len(stages)), layout="constrained")
         axes = figure.add_subplot()
         axes.grid(visible=False, axis="y")
-        axes.barh(
-            rows,
-            medians,
-            height=0.55,
-            color=[INK if stage == "total" else RECORDING_COLOURS[0] for stage in stages],
-        )
+        colours = [INK if stage == "total" else RECORDING_COLOURS[0] for stage in stages]
+        axes.barh(rows, medians, height=0.55, color=colours)
         axes.hlines(rows, medians, highs, color=GREY, linewidth=1.2)
         for row, median, high in zip(rows, medians, highs, strict=True):
             axes.annotate(
@@ -167,25 +136,25 @@ def draw_stage_times(answers: Sequence[EvaluatedQuery]) -> str:
 
 
 def _draw_curves(errors: dict[str, Float[np.ndarray, " _"]], label: str, unit: str) -> str:
-    """Cumulative curves of the errors of each recording, NaN where there is no pose."""
+    """Draw cumulative curves of the errors of each recording. NaN is a query without a pose."""
     colours = recording_colours(list(errors))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(4.6, 2.9 + 0.2 * len(errors)), layout="constrained")
         axes = figure.add_subplot()
         found = {name: np.sort(values[np.isfinite(values)]) for name, values in errors.items()}
-        # as wide as the middle of the recordings' tails: one bad recording must not squeeze the
-        # others to the left edge
+        # the median of the recordings' tails: one bad recording must not squeeze the others
         tails = [1.5 * float(np.percentile(values, 95)) for values in found.values() if len(values)]
         limit = max(float(np.median(tails)), 1e-3) if tails else 1.0
         for name, values in found.items():
-            _draw_curve(
-                axes,
-                values,
-                len(errors[name]),
-                limit,
-                colours[name],
-                f"{name}: " if len(errors) > 1 else "",
-                unit,
+            prefix = f"{name}: " if len(errors) > 1 else ""
+            text = _curve_label(values, len(errors[name]), limit, unit)
+            drawn = values[values <= limit]
+            shares = np.arange(1, len(drawn) + 1) / len(errors[name])
+            last = shares[-1] if len(shares) else 0.0
+            x, y = np.r_[0.0, drawn, limit], np.r_[0.0, shares, last]
+            style = {"where": "post", "color": colours[name], "linewidth": 1.8}
+            axes.step(
+                x if len(values) else [], y if len(values) else [], label=prefix + text, **style
             )
         axes.set(
             xlabel=label, ylabel="queries within this error", xlim=(0.0, limit), ylim=(0.0, 1.03)
@@ -195,38 +164,17 @@ def _draw_curves(errors: dict[str, Float[np.ndarray, " _"]], label: str, unit: s
         return svg_text(figure, f"cumulative {label.partition(' (')[0]}")
 
 
-def _draw_curve(
-    axes: Axes,
-    found: Float[np.ndarray, " n"],
-    num_queries: int,
-    limit: float,
-    colour: str,
-    name: str,
-    unit: str,
-) -> None:
-    """One curve; what lies beyond the right edge is named in the legend instead of drawn."""
+def _curve_label(found: Float[np.ndarray, " n"], num_queries: int, limit: float, unit: str) -> str:
+    """Return the median, and the number of errors beyond the right edge."""
     if len(found) == 0:
-        axes.plot([], [], color=colour, label=f"{name}none of {num_queries} localized")
-        return
-    drawn = found[found <= limit]
-    shares = np.arange(1, len(drawn) + 1) / num_queries
-    last = shares[-1] if len(shares) else 0.0
-    beyond = (
-        f", {len(found) - len(drawn)} of {num_queries} beyond" if len(found) > len(drawn) else ""
-    )
-    median = f"{name}median {float(np.median(found)):.3g}{unit}{beyond}"
-    axes.step(
-        np.r_[0.0, drawn, limit],
-        np.r_[0.0, shares, last],
-        where="post",
-        color=colour,
-        linewidth=1.8,
-        label=median,
-    )
+        return f"none of {num_queries} localized"
+    num_beyond = int((found > limit).sum())
+    beyond = f", {num_beyond} of {num_queries} beyond" if num_beyond else ""
+    return f"median {float(np.median(found)):.3g}{unit}{beyond}"
 
 
 def _powers_of_ten(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Powers of ten around the finite values."""
+    """Return the powers of ten around the finite values."""
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
         return 1e-3, 1.0
@@ -238,7 +186,3 @@ def _format_length(metres: float) -> str:
     if metres < 0.01:
         return f"{1e3 * metres:g} mm"
     return f"{100 * metres:g} cm" if metres < 1.0 else f"{metres:g} m"
-
-
-def _format_angle(degrees: float) -> str:
-    return f"{degrees:g}°"

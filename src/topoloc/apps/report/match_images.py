@@ -1,8 +1,7 @@
-"""A query beside the map node it belongs to, with lines between what was matched: why a pose was
-found, or why not.
+"""A query beside its map node, with lines between matches.
 
-The localizer keeps no matches, so they are made once more here, with one node alone: by the guided
-step of `localization/guided.py` where there is a pose, and by appearance where there is none.
+The localizer keeps no matches, so they are computed again with one node: by guided matching if
+there is a pose, else by appearance.
 """
 
 from __future__ import annotations
@@ -17,27 +16,23 @@ from topoloc import Camera, EvaluatedQuery, Image, Localization, MapError, TopoN
 from topoloc.apps.viewer.map_scene import decode_jpeg
 from topoloc.plugin import NodeMatcher
 
-# Pictures are shown, and matched, no wider than this.
+# Images are shown and matched at these widths or less.
 IMAGE_WIDTH_PX = 480
 MAX_MATCHING_WIDTH_PX = 960
 MAX_LINES = 45
 MAX_REPROJECTION_ERROR_PX = 8.0
 JPEG_QUALITY = 78
-# A picture of another size than the one it is made from, or shown beside: names of its own for its
-# sides.
+# An image with dimensions of its own, independent of `Image` in the same signature.
 ImageArray = UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width 3"]
 _GAP_PX = 6
-_INLIER_COLOUR, _OUTLIER_COLOUR, _BACKGROUND_COLOUR = (
-    (38, 208, 180),
-    (219, 72, 102),
-    (17, 22, 29),
-)  # RGB
+# RGB
+_INLIER_COLOUR, _OUTLIER_COLOUR, _BACKGROUND_COLOUR = (38, 208, 180), (219, 72, 102), (17, 22, 29)
 
 
 @dataclass(frozen=True, eq=False)
 class NodeMatches:
-    """Row k: pixel in the query, pixel in the node's camera, and whether the pose found (or,
-    without one, the truth) explains both."""
+    """Row k: pixel in the query, pixel in the node's camera, and whether both agree with the pose
+    (without a pose, with the truth)."""
 
     points_query: Float[np.ndarray, "n 2"]
     points_node: Float[np.ndarray, "n 2"]
@@ -47,10 +42,10 @@ class NodeMatches:
 def match_with_node(
     answer: EvaluatedQuery, image: Image, camera: Camera, matcher: NodeMatcher
 ) -> NodeMatches:
-    """Matches of a query's picture (of `camera`) with one node.
+    """Return the matches of a query with one node.
 
-    With a pose: those that it explains. Without: all that look alike, told apart by the truth;
-    where there is none, all disagree.
+    With a pose: its inliers. Without a pose: all matches by appearance, of which those that agree
+    with the truth are inliers.
     """
     image, scaled, scale = _downscale(image, camera)
     query = matcher.extract_features(image)
@@ -65,24 +60,18 @@ def match_with_node(
     is_inlier = np.zeros(len(points_query), dtype=bool)
     if cam_from_world is not None and len(is_inlier):
         seen = scaled.img_from_cam(cam_from_world.apply(matcher.points_world[matches.train_idx]))
-        is_inlier = (
-            np.linalg.norm(seen - points_query, axis=1)
-            <= MAX_REPROJECTION_ERROR_PX * scaled.width / 640.0
-        )  # NaN does not
-    if isinstance(answer.result, Localization):
-        points_query, points_node, is_inlier = (
-            points_query[is_inlier],
-            points_node[is_inlier],
-            is_inlier[is_inlier],
-        )
-    return NodeMatches(points_query / scale, points_node, is_inlier)
+        limit = MAX_REPROJECTION_ERROR_PX * scaled.width / 640.0
+        is_inlier = np.linalg.norm(seen - points_query, axis=1) <= limit  # False for NaN
+    is_shown = is_inlier if answer.result.localized else slice(None)
+    points_query, points_node = points_query[is_shown] / scale, points_node[is_shown]
+    return NodeMatches(points_query, points_node, is_inlier[is_shown])
 
 
 def decode_template(node: TopoNode) -> UInt8[np.ndarray, "h w 3"]:
     """Return the image of a node, RGB. Raises MapError if it is damaged."""
     image = decode_jpeg(node.template_jpeg)
     if image is None:
-        raise MapError("the map is damaged: a mapping image is no picture")
+        raise MapError("the map is damaged: a mapping image cannot be decoded")
     return image
 
 
@@ -92,32 +81,24 @@ def draw_pair(
     matches: NodeMatches | None = None,
     node_camera: Camera | None = None,
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """The two pictures side by side, equally high, RGB; lines between matches, at most `MAX_LINES`
-    of them.
+    """Return both images side by side at one height, RGB, with at most `MAX_LINES` matches.
 
     Args:
-        template: the node's picture; without one the query stands alone.
-        node_camera: what the node's pixels are pixels of, where the template is smaller.
+        template: image of the node; without it only the query is drawn.
+        node_camera: camera of the node's pixels, as the template may be smaller.
     """
     left, left_scale = _resize_to_width(query, IMAGE_WIDTH_PX)
     if template is None:
         return left
     height = left.shape[0]
     width = max(1, round(template.shape[1] * height / template.shape[0]))
-    shrinks = height < template.shape[0]
-    right = cv2.resize(
-        _to_rgb(template),
-        (width, height),
-        interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC,
-    )
-    canvas = np.empty((height, left.shape[1] + _GAP_PX + width, 3), np.uint8)
-    canvas[:] = _BACKGROUND_COLOUR
-    canvas[:, : left.shape[1]] = left
-    canvas[:, left.shape[1] + _GAP_PX :] = right
+    method = cv2.INTER_AREA if height < template.shape[0] else cv2.INTER_CUBIC
+    right = cv2.resize(_to_rgb(template), (width, height), interpolation=method)
+    gap = np.full((height, _GAP_PX, 3), _BACKGROUND_COLOUR, np.uint8)
+    canvas = np.hstack([left, gap, right])
     if matches is not None and node_camera is not None and len(matches.is_inlier):
-        chosen = np.unique(
-            np.linspace(0, len(matches.is_inlier) - 1, MAX_LINES).round().astype(int)
-        )
+        rows = np.linspace(0, len(matches.is_inlier) - 1, MAX_LINES)
+        chosen = np.unique(rows.round().astype(int))
         starts = left_scale * (matches.points_query[chosen] + 0.5) - 0.5
         to_right = np.array([width / node_camera.width, height / node_camera.height])
         ends = to_right * (matches.points_node[chosen] + 0.5) - 0.5 + [left.shape[1] + _GAP_PX, 0]
@@ -126,7 +107,7 @@ def draw_pair(
 
 
 def _downscale(image: Image, camera: Camera) -> tuple[ImageArray, Camera, float]:
-    """The picture and its camera no wider than `MAX_MATCHING_WIDTH_PX`, and the scale."""
+    """Return the image and its camera at `MAX_MATCHING_WIDTH_PX` or less, and the scale."""
     height, width = image.shape[:2]
     scale = min(1.0, MAX_MATCHING_WIDTH_PX / width)
     if scale == 1.0:
@@ -151,16 +132,15 @@ def _draw_lines(
     ends: Float[np.ndarray, "n 2"],
     is_inlier: Bool[np.ndarray, " n"],
 ) -> None:
-    """Half-transparent lines, the disagreeing ones below; dots at both ends."""
+    """Draw half-transparent lines, outliers first, and dots at both ends."""
     lines = canvas.copy()
     order = np.argsort(is_inlier, kind="stable")
     starts_px, ends_px = np.rint(starts).astype(int).tolist(), np.rint(ends).astype(int).tolist()
-    pixels = [(starts_px[i], ends_px[i], bool(is_inlier[i])) for i in order]
-    for start, end, is_right in pixels:
-        cv2.line(lines, start, end, _INLIER_COLOUR if is_right else _OUTLIER_COLOUR, 1, cv2.LINE_AA)
+    colours = {True: _INLIER_COLOUR, False: _OUTLIER_COLOUR}
+    pixels = [(starts_px[i], ends_px[i], colours[bool(is_inlier[i])]) for i in order]
+    for start, end, colour in pixels:
+        cv2.line(lines, start, end, colour, 1, cv2.LINE_AA)
     cv2.addWeighted(lines, 0.5, canvas, 0.5, 0.0, dst=canvas)
-    for start, end, is_right in pixels:
+    for start, end, colour in pixels:
         for point in (start, end):
-            cv2.circle(
-                canvas, point, 2, _INLIER_COLOUR if is_right else _OUTLIER_COLOUR, -1, cv2.LINE_AA
-            )
+            cv2.circle(canvas, point, 2, colour, -1, cv2.LINE_AA)

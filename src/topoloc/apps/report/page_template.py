@@ -1,7 +1,9 @@
-"""What all pages to show have around them: head, style by light and by dark, title."""
+"""Common parts of all pages: head, style, sections, cards, tables and images."""
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Iterable, Sequence
 from html import escape
 from importlib import resources
 
@@ -9,28 +11,78 @@ from topoloc.apps.viewer.page import static_text
 
 
 def page_style() -> str:
-    """The style sheet."""
-    return static_text("theme.css") + resources.files("topoloc.apps.report").joinpath(
-        "report.css"
-    ).read_text(encoding="utf-8")
+    """Return the style sheet."""
+    own = resources.files("topoloc.apps.report").joinpath("report.css")
+    return static_text("theme.css") + own.read_text(encoding="utf-8")
 
 
 def render_page(title: str, subtitle: str, body: str, head: str = "") -> str:
-    """A self-contained page as text.
+    """Return a self-contained page.
 
     Args:
-        title: plain text, as the subtitle.
-        body: HTML; `head` what the page's head needs beside the style.
+        title: plain text, like the subtitle.
+        body: HTML.
+        head: HTML that the page's head needs beside the style.
     """
-    meta = (
-        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-    )
-    header = (
-        "<header><div"
-        f' class="page"><h1>{escape(title)}</h1><p>{escape(subtitle)}</p></div></header>'
-    )
+    title, subtitle = escape(title), escape(subtitle)
     return (
-        "<!DOCTYPE html>\n<html"
-        f' lang="en"><head>{meta}\n<title>{escape(title)}</title>\n<style>\n{page_style()}</style>{head}</head><body>\n{header}\n<div'  # noqa: E501
-        f' class="page">{body}<footer>Written by topoloc.</footer></div></body></html>\n'
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport"'
+        f' content="width=device-width, initial-scale=1">\n<title>{title}</title>\n'
+        f"<style>\n{page_style()}</style>{head}</head><body>\n"
+        f'<header><div class="page"><h1>{title}</h1><p>{subtitle}</p></div></header>\n'
+        f'<div class="page">{body}<footer>Written by topoloc.</footer></div></body></html>\n'
     )
+
+
+def render_section(title: str, explanation: str, content: str) -> str:
+    """Return a section of HTML. An empty explanation is left out."""
+    paragraph = f"<p>{explanation}</p>" if explanation else ""
+    return f"<section><h2>{title}</h2>{paragraph}{content}</section>"
+
+
+def render_cards(cards: Iterable[tuple[str, str, str]]) -> str:
+    """Return cards of (kind, value, text). The kind is good, bad or empty."""
+    inner = "".join(
+        f'<div class="card {kind}"><b>{value}</b><span>{text}</span></div>'
+        for kind, value, text in cards
+    )
+    return f'<div class="cards">{inner}</div>'
+
+
+def render_table(
+    columns: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", label: str = ""
+) -> str:
+    """Return a table that folds on narrow screens. Each cell carries the name of its column.
+
+    Args:
+        rows: cells as HTML.
+        kind: further CSS class of the table.
+        label: name of the scrollable region for screen readers.
+    """
+    head = "".join(f"<th>{name}</th>" for name in columns)
+    body = "".join(f"<tr>{_render_cells(columns, row)}</tr>" for row in rows)
+    region = f' tabindex="0" role="region" aria-label="{label}"' if label else ""
+    table = f'<table class="{kind} folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody>'
+    return f'<div class="wide"{region}>{table}</table></div>'
+
+
+def _render_cells(columns: Sequence[str], row: Sequence[str]) -> str:
+    cells = zip(columns, row, strict=True)
+    return "".join(f'<td data-column="{escape(name)}">{cell}</td>' for name, cell in cells)
+
+
+def render_figure(jpeg: bytes | None, caption: str) -> str:
+    """Return an image with its caption; without an image, the caption alone."""
+    caption, image = escape(caption), ""
+    if jpeg is not None:
+        data = base64.b64encode(jpeg).decode("ascii")
+        image = f'<img loading="lazy" alt="{caption}" src="data:image/jpeg;base64,{data}">'
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
+
+
+def render_gallery_items(items: Iterable[tuple[str, str]]) -> str:
+    """Return a gallery of (figure, facts), both HTML."""
+    articles = "".join(
+        f'<article>{figure}<div class="facts">{facts}</div></article>' for figure, facts in items
+    )
+    return f'<div class="queries">{articles}</div>'

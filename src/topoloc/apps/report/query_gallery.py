@@ -1,9 +1,7 @@
-"""The part of a report that shows single queries: the worst, and a typical one of each recording,
-each beside its node."""
+"""The part of a report with single queries: the worst and the typical ones, beside their nodes."""
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from html import escape
 
@@ -11,6 +9,7 @@ import numpy as np
 
 from topoloc import (
     EvaluatedQuery,
+    Evaluation,
     Image,
     Localization,
     NotLocalized,
@@ -25,7 +24,8 @@ from topoloc.apps.report.match_images import (
     draw_pair,
     match_with_node,
 )
-from topoloc.plugin import NodeMatcher, encode_jpeg, format_length, group_by_recording
+from topoloc.apps.report.page_template import render_figure, render_gallery_items
+from topoloc.plugin import NodeMatcher, encode_jpeg, format_length
 
 NUM_WORST = 6
 
@@ -33,15 +33,13 @@ NUM_WORST = 6
 def select_worst_queries(
     answers: Sequence[EvaluatedQuery], count: int = NUM_WORST
 ) -> list[EvaluatedQuery]:
-    """False accepts first, then queries without a pose that should have one, then the largest
-    errors.
+    """Return false accepts first, then queries without a pose, then the largest errors.
 
-    Where there are several recordings each gets its share of the places, so that a hard one does
-    not hide the others.
+    Each recording has an equal share of the places.
     """
-    groups = group_by_recording(
+    groups = Evaluation(
         [a for a in answers if a.world_from_cam is not None or a.is_false_accept]
-    )
+    ).by_recording
     share = max(count // max(len(groups), 1), 1)
     ranked = [
         (rank, answer)
@@ -53,26 +51,18 @@ def select_worst_queries(
 
 
 def select_typical_queries(answers: Sequence[EvaluatedQuery]) -> list[EvaluatedQuery]:
-    """Of each recording the query with the median error; the middle one where none was
-    localized."""
+    """Return the query with the median error of each recording; without poses the middle one."""
     typical = []
-    for group in group_by_recording(answers).values():
-        localized = sorted(
-            (a for a in group if np.isfinite(a.translation_m)), key=lambda a: a.translation_m
-        )
-        chosen = localized or group
+    for group in Evaluation(list(answers)).by_recording.values():
+        localized = [a for a in group if np.isfinite(a.translation_m)]
+        chosen = sorted(localized, key=lambda a: a.translation_m) or group
         typical.append(chosen[(len(chosen) - 1) // 2])
     return typical
 
 
 def render_gallery(answers: Sequence[EvaluatedQuery], topomap: TopoMetricMap) -> str:
-    """HTML of these queries, each with its picture, its node's, the matches between them, and what
-    came of it."""
-    return (
-        '<div class="queries">'
-        + "".join(_render_query(answer, topomap) for answer in answers)
-        + "</div>"
-    )
+    """Return the queries as HTML, each with its image, its node, their matches and the result."""
+    return render_gallery_items(_render_query(answer, topomap) for answer in answers)
 
 
 def _error_rank(answer: EvaluatedQuery) -> tuple[int, float]:
@@ -80,34 +70,32 @@ def _error_rank(answer: EvaluatedQuery) -> tuple[int, float]:
         return 2 * answer.is_false_accept, 0.0
     if isinstance(answer.result, NotLocalized):
         return 1, 0.0
-    return 2 * answer.is_false_accept, max(
+    errors = (
         answer.translation_m / answer.MAX_TRANSLATION,
         answer.rotation_deg / answer.MAX_ROTATION_DEG,
     )
+    return 2 * answer.is_false_accept, max(errors)
 
 
-def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> str:
+def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> tuple[str, str]:
+    """Return the figure and the facts of a query."""
     result = answer.result
     node = _select_node(answer, topomap)
     evidence = f"{result.num_inliers} inliers of {result.num_matches} matches"
     if isinstance(result, Localization):
         sigma = float(np.sqrt(max(np.trace(result.camera_covariance[:3, :3]), 0.0)))
         evidence += (
-            f", probability {result.probability:.2f}, its own standard deviation"
+            f", probability {result.probability:.2f}, reported standard deviation"
             f" {format_length(sigma)}"
         )
     if answer.nearest_node_id not in (None, node and node.summary.node_id):
         evidence += f"; nearest to the truth is node {answer.nearest_node_id}"
-    kind = (
-        "good"
-        if result.localized != (answer.world_from_cam is None) and not answer.is_false_accept
-        else "bad"
-    )
+    is_right = result.localized == (answer.world_from_cam is not None)
+    kind = "good" if is_right and not answer.is_false_accept else "bad"
     title = escape(f"{answer.recording}/{answer.query}" if answer.recording else answer.query)
-    return (
-        f'<article>{_render_images(answer, node, topomap)}<div class="facts"><b>{title}</b>'
-        f'<p class="{kind}">{_describe_result(answer)}</p><p>{evidence}</p></div></article>'
-    )
+    description = _describe_result(answer)
+    facts = f'<b>{title}</b><p class="{kind}">{description}</p><p>{evidence}</p>'
+    return _render_images(answer, node, topomap), facts
 
 
 def _select_node(answer: EvaluatedQuery, topomap: TopoMetricMap) -> TopoNode | None:
@@ -125,64 +113,36 @@ def _select_node(answer: EvaluatedQuery, topomap: TopoMetricMap) -> TopoNode | N
 
 def _describe_result(answer: EvaluatedQuery) -> str:
     if isinstance(answer.result, NotLocalized):
-        reason = answer.result.reason.replace("_", " ")
-        return (
-            f"rightly rejected: {reason}"
-            if answer.world_from_cam is None
-            else f"not localized: {reason}"
-        )
+        outcome = "rightly rejected" if answer.world_from_cam is None else "not localized"
+        return f"{outcome}: {answer.result.reason.replace('_', ' ')}"
     if answer.world_from_cam is None:
-        return "false accept: this image was not taken here"
+        return "false accept: this image is out of the map"
     error = f"{format_length(answer.translation_m)}, {answer.rotation_deg:.2f}°"
     return f"false accept: off by {error}" if answer.is_false_accept else f"off by {error}"
 
 
 def _render_images(answer: EvaluatedQuery, node: TopoNode | None, topomap: TopoMetricMap) -> str:
-    image = _load_query_image(answer)
+    try:
+        image = answer.read_image() if answer.read_image else None
+    except UnreadableImageError:
+        image = None
     if image is None:
-        shown, caption = (
-            node.template_jpeg if node else None,
-            "the query's picture cannot be read any more",
-        )
-    elif node is None:
-        shown, caption = (
-            encode_jpeg(draw_pair(image, None), JPEG_QUALITY),
-            "query; no node to compare it with",
-        )
-    else:
-        pair = draw_pair(
-            image,
-            decode_template(node),
-            _find_matches(answer, image, node, topomap),
-            node.camera,
-        )
-        shown = encode_jpeg(pair, JPEG_QUALITY)
-        caption = f"left the query, right node {node.summary.node_id}"
-    return f"<figure>{_img_tag(shown, caption)}<figcaption>{caption}</figcaption></figure>"
+        jpeg = node.template_jpeg if node else None
+        return render_figure(jpeg, "the query's image cannot be read any more")
+    if node is None:
+        pair = draw_pair(image, None)
+        return render_figure(encode_jpeg(pair, JPEG_QUALITY), "query, without a node to compare")
+    matches = _find_matches(answer, image, node, topomap)
+    pair = draw_pair(image, decode_template(node), matches, node.camera)
+    caption = f"left the query, right node {node.summary.node_id}"
+    return render_figure(encode_jpeg(pair, JPEG_QUALITY), caption)
 
 
 def _find_matches(
     answer: EvaluatedQuery, image: Image, node: TopoNode, topomap: TopoMetricMap
 ) -> NodeMatches | None:
-    """Matches to draw; None where the node has no points or the camera is not known."""
+    """Return matches to draw; None if the node has no points or the camera is unknown."""
     if answer.camera is None or node.summary.num_points == 0:
         return None
     matcher = NodeMatcher(node, topomap.config.features)
     return match_with_node(answer, image, answer.camera, matcher)
-
-
-def _load_query_image(answer: EvaluatedQuery) -> Image | None:
-    """The query's picture, read again; None where it cannot be had any more."""
-    try:
-        return answer.read_image() if answer.read_image else None
-    except UnreadableImageError:
-        return None
-
-
-def _img_tag(jpeg: bytes | None, alt_text: str) -> str:
-    if jpeg is None:
-        return ""
-    return (
-        f'<img loading="lazy" src="data:image/jpeg;base64,{base64.b64encode(jpeg).decode("ascii")}"'
-        f' alt="{escape(alt_text)}">'
-    )

@@ -1,5 +1,4 @@
-"""An evaluation as one self-contained page: numbers, the map from above, error curves, times, and
-single queries to look at."""
+"""An evaluation as one self-contained page: numbers, map, error curves, times, single queries."""
 
 from __future__ import annotations
 
@@ -9,10 +8,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from topoloc import EvaluatedQuery, TopoMetricMap
+from topoloc import EvaluatedQuery, Evaluation, TopoMetricMap
 from topoloc.apps.report.figures import draw_error_curves, draw_errors_along, draw_stage_times
 from topoloc.apps.report.map_figure import draw_map
-from topoloc.apps.report.page_template import render_page
+from topoloc.apps.report.page_template import render_page, render_section
 from topoloc.apps.report.query_gallery import (
     render_gallery,
     select_typical_queries,
@@ -27,36 +26,36 @@ from topoloc.apps.report.report_tables import (
 )
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
 from topoloc.apps.viewer.page import embedded_head, embedded_scene
-from topoloc.plugin import group_by_recording, write_text
+from topoloc.plugin import write_text
 
 _SCENE_BUDGET = SceneBudget(max_points=60_000, max_image_bytes=1_500_000)
 _SCENE = (
-    "Turn it by mouse, finger or arrow keys. Each recording's pictures stand where they were found;"
-    " of one that is chosen the ellipsoid holds its position in 95 of 100 cases, and what is dashed"
-    " is the truth."
+    "Turn the map with mouse, finger or arrow keys. The images of each recording stand at their"
+    " estimated poses. The ellipsoid of a selected image contains its position with a probability"
+    " of 95 %. Dashed lines show the truth."
 )
 _MAP = (
-    "Seen from above. A tick at a node shows where its camera looked; lines lead from true to"
+    "Seen from above. A tick shows the viewing direction of a node. Lines lead from true to"
     " estimated positions."
 )
 _CURVES = (
-    "The height of a curve is the share of all queries whose error is at most that much; it ends"
-    " where no more queries have a pose."
+    "A curve shows the share of all queries with at most this error. It ends at the share of"
+    " queries with a pose."
 )
 _TYPICAL = (
-    "Of each recording the query with the median error, and the node of the map that its pose comes"
-    " from. Lines join what was matched: green what the pose explains, red what it does not."
+    "The query with the median error of each recording, and the node of its pose. Matches that"
+    " agree with the pose are green, others are red."
 )
 _WORST = (
-    "False accepts first, then queries without a pose, then the largest errors; each recording has"
-    " its share of the places. Where there is no pose, lines show what looks alike: green what is"
-    " right by the truth, red what is wrong."
+    "False accepts first, then queries without a pose, then the largest errors. Each recording has"
+    " an equal share of the places. Without a pose, the lines are matches by appearance: green if"
+    " they agree with the truth, red if not."
 )
-_NO_WORST = "There are none: no image from elsewhere was given a pose."
-_ALONG = "Every query in the order of its recording; errors on a logarithmic scale."
+_NO_WORST = "There are none: no out-of-map image has a pose."
+_ALONG = "Every query in the order of its recording. The axis of the errors is logarithmic."
 _TIMES = (
-    "Bars are medians; the line ends where 95 % of the queries are done. The total includes what"
-    " lies between the stages."
+    "Bars are medians. The line ends at the 95 % quantile. The total includes the time between the"
+    " stages."
 )
 
 
@@ -67,32 +66,20 @@ def write_report(
     topomap: TopoMetricMap,
     texts: ReportTexts | None = None,
 ) -> None:
-    """Write the page, at once or not at all; the same answers give the same bytes.
+    """Write the page atomically. The same results give the same bytes.
 
     Args:
-        evaluation: what `summarize` says of the answers, with what `topoloc info` says of the map
-            under "map".
+        evaluation: `Evaluation.to_json`, with `TopoMetricMap.describe` under "map".
 
     Raises:
         TopolocError: the file cannot be written.
     """
-    write_text(path, _render_page(evaluation, answers, topomap, texts or ReportTexts()))
-
-
-def _render_page(
-    evaluation: dict[str, Any],
-    answers: list[EvaluatedQuery],
-    topomap: TopoMetricMap,
-    texts: ReportTexts,
-) -> str:
-    recordings = (
-        ", ".join(row["name"] for row in evaluation["recordings"] if row["name"]) or "no recordings"
-    )
+    texts = texts or ReportTexts()
+    names = [row["name"] for row in evaluation["recordings"] if row["name"]]
     title = texts.title or f"Localization in {Path(evaluation['map']['path']).name}"
-    body = "\n".join(
-        [render_headline_cards(evaluation), *_render_sections(evaluation, answers, topomap, texts)]
-    )
-    return render_page(title, texts.subtitle or f"Asked about: {recordings}", body, embedded_head())
+    subtitle = texts.subtitle or f"Queries: {', '.join(names) or 'no recordings'}"
+    body = "\n".join(_render_sections(evaluation, answers, topomap, texts))
+    write_text(path, render_page(title, subtitle, body, embedded_head()))
 
 
 def _render_sections(
@@ -101,71 +88,40 @@ def _render_sections(
     topomap: TopoMetricMap,
     texts: ReportTexts,
 ) -> Iterator[str]:
-    paragraphs = "".join(
-        f'<p class="lead">{escape(paragraph)}</p>' for paragraph in texts.paragraphs
-    )
-    yield _render_section(
-        "Results",
-        explain_shares(evaluation),
-        render_recordings_table(evaluation, texts) + paragraphs,
-    )
-    yield _render_section(
-        "The place", _SCENE, embedded_scene(_scene_document(evaluation, answers, topomap))
-    )
-    yield _render_section("The map from above", _MAP, _scrollable(draw_map(answers, topomap)))
-    if evaluation["num_localized"]:
-        yield _render_section(
-            "How large are the errors?",
-            _CURVES,
-            f'<div class="halves">{"".join(draw_error_curves(answers))}</div>',
-        )
-    if len(evaluation["recordings"]) > 1:
-        yield _render_section(
-            "What the queries look like",
-            _TYPICAL,
-            render_gallery(select_typical_queries(answers), topomap),
-        )
-    worst = select_worst_queries(answers)
-    yield _render_section(
-        "The worst queries",
-        _WORST if worst else _NO_WORST,
-        render_gallery(worst, topomap) if worst else "",
-    )
-    if evaluation["num_queries"]:
-        yield _render_section(
-            "Where do errors occur?", _ALONG, _scrollable(draw_errors_along(answers))
-        )
-    if evaluation["median_times_ms"]:
-        yield _render_section(
-            "Where does the time go?", _TIMES, _scrollable(draw_stage_times(answers))
-        )
-    yield _render_section("All the numbers", "", render_number_tables(evaluation))
-    config = escape(json.dumps(evaluation["map"]["config"], indent=1, sort_keys=True))
-    yield (
-        "<section><details><summary>The configuration that the map was built"
-        f" with</summary><pre>{config}</pre></details></section>"
-    )
-
-
-def _scene_document(
-    evaluation: dict[str, Any], answers: list[EvaluatedQuery], topomap: TopoMetricMap
-) -> dict[str, Any]:
-    """The map, and the answers of each recording."""
+    yield render_headline_cards(evaluation)
+    paragraphs = "".join(f'<p class="lead">{escape(text)}</p>' for text in texts.paragraphs)
+    table = render_recordings_table(evaluation, texts)
+    yield render_section("Results", explain_shares(evaluation), table + paragraphs)
     sets = [
         ResultSet(name or "queries", [answer.to_json() for answer in group])
-        for name, group in group_by_recording(answers).items()
+        for name, group in Evaluation(answers).by_recording.items()
     ]
-    return create_document(topomap, Path(evaluation["map"]["path"]).name, sets, _SCENE_BUDGET)
-
-
-def _render_section(title: str, explanation: str, content: str) -> str:
-    return (
-        f"<section><h2>{title}</h2>"
-        + (f"<p>{explanation}</p>" if explanation else "")
-        + f"{content}</section>"
+    name = Path(evaluation["map"]["path"]).name
+    document = create_document(topomap, name, sets, _SCENE_BUDGET)
+    yield render_section("The place", _SCENE, embedded_scene(document))
+    yield render_section("The map from above", _MAP, _scrollable(draw_map(answers, topomap)))
+    if evaluation["num_localized"]:
+        curves = f'<div class="halves">{"".join(draw_error_curves(answers))}</div>'
+        yield render_section("Error curves", _CURVES, curves)
+    if len(evaluation["recordings"]) > 1:
+        gallery = render_gallery(select_typical_queries(answers), topomap)
+        yield render_section("Typical queries", _TYPICAL, gallery)
+    worst = select_worst_queries(answers)
+    gallery = render_gallery(worst, topomap) if worst else ""
+    yield render_section("The worst queries", _WORST if worst else _NO_WORST, gallery)
+    if evaluation["num_queries"]:
+        figure = _scrollable(draw_errors_along(answers))
+        yield render_section("Errors along the recordings", _ALONG, figure)
+    if evaluation["median_times_ms"]:
+        yield render_section("Times", _TIMES, _scrollable(draw_stage_times(answers)))
+    yield render_section("All numbers", "", render_number_tables(evaluation))
+    config = escape(json.dumps(evaluation["map"]["config"], indent=1, sort_keys=True))
+    yield (
+        "<section><details><summary>The settings of the map</summary>"
+        f"<pre>{config}</pre></details></section>"
     )
 
 
 def _scrollable(figure: str) -> str:
-    """A figure that is scrolled, not shrunk beyond reading, on a narrow screen."""
+    """Wrap a figure that scrolls on a narrow screen."""
     return f'<div class="wide">{figure}</div>'

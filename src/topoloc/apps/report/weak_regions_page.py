@@ -1,164 +1,173 @@
-"""How firmly a map is held as one self-contained page."""
+"""The weak regions of a map as one self-contained page."""
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from matplotlib.lines import Line2D
+
 from topoloc import NodeQuality, TopoMetricMap, WeakRegion, WeakRegions
-from topoloc.apps.report.page_template import render_page
-from topoloc.apps.report.weak_regions_figure import draw_weak_regions
+from topoloc.apps.report.figure_style import BAD, ERROR, GREY
+from topoloc.apps.report.map_figure import MapFigure
+from topoloc.apps.report.page_template import (
+    render_cards,
+    render_figure,
+    render_gallery_items,
+    render_page,
+    render_section,
+    render_table,
+)
 from topoloc.plugin import write_text
 
 REASON_TEXTS = {
-    "not_held": "not held by the rest of the map",
+    "not_held": "not localized by the rest of the map",
     "few_landmarks": "few landmarks",
-    "one_direction": "nobody looks back",
-    "single_session": "one session alone",
+    "one_direction": "no opposite view",
+    "single_session": "one session only",
 }
-_METHOD_TEXT = (
-    "Each node is asked of the rest of the map as a picture would be, as if nobody had stood there:"
-    " it cannot be found by itself. What the rest localizes with few inliers, or not at all, is"
-    " weakly held."
+_METHOD = (
+    "Each node is hidden and localized in the rest of the map, like a query. A node is weak if the"
+    " rest of the map finds few inliers or no pose."
 )
-_MAP = "Seen from above. A tick shows where a node looks."
-_WEAKEST = "The nodes that the rest of the map holds least, by the inliers that it finds in them."
+_MAP = "Seen from above. A tick shows the viewing direction of a node."
+_WEAKEST = "The nodes with the fewest inliers in the rest of the map."
 _MAX_REGIONS, _MAX_IMAGES = 20, 6
-_COLUMNS = ("why", "nodes", "around (m)", "first picture", "last picture")
+_COLUMNS = ("reason", "nodes", "around (m)", "first image", "last image")
+# Marker, colour, size and label of a node by its most severe reason. A hollow marker has no
+# opposite view.
+_MARKS: dict[str | None, tuple[str, str, float, str]] = {
+    None: ("o", "#2f6db5", 5.0, "localized by the rest of the map"),
+    "single_session": ("o", "#7fa7d6", 5.0, "seen by one session only"),
+    "few_landmarks": ("s", ERROR, 6.0, "few landmarks"),
+    "not_held": ("D", BAD, 6.5, "not localized by the rest of the map"),
+}
 
 
 def write_weak_regions(
     path: Path, weak: WeakRegions, topomap: TopoMetricMap, info: dict[str, Any]
 ) -> None:
-    """Write the page, at once or not at all; the same map gives the same bytes.
+    """Write the page atomically. The same map gives the same bytes.
 
     Args:
-        info: what `topoloc info` says of the map.
+        info: `TopoMetricMap.describe` of the map.
 
     Raises:
         TopolocError: the file cannot be written.
     """
-    body = "\n".join(
-        [
-            _render_cards(weak),
-            _render_section(
-                "Where to walk next",
-                _METHOD_TEXT,
-                f'<p class="lead">{escape(weak.suggest_next_recording())}</p>',
-            ),
-            _render_section(
-                "The map from above",
-                _MAP,
-                f'<div class="wide">{draw_weak_regions(weak, topomap)}</div>',
-            ),
-            _render_section("Weak parts", "", _render_regions_table(weak.parts)),
-            _render_section(
-                "The weakest nodes", _WEAKEST, _render_images(weak.weakest[:_MAX_IMAGES], topomap)
-            ),
-        ]
-    )
+    advice = f'<p class="lead">{escape(weak.suggest_next_recording())}</p>'
+    figure = f'<div class="wide">{draw_weak_regions(weak, topomap)}</div>'
+    images = _render_images(weak.weakest[:_MAX_IMAGES], topomap)
+    sections = [
+        _render_cards(weak),
+        render_section("Where to record next", _METHOD, advice),
+        render_section("The map from above", _MAP, figure),
+        render_section("Weak regions", "", _render_regions(weak.parts)),
+        render_section("The weakest nodes", _WEAKEST, images),
+    ]
+    title = f"Weak regions of {Path(info['path']).name}"
     sessions = ", ".join(dict.fromkeys(weak.session_names.values()))
-    write_text(
-        path, render_page(f"How firmly {Path(info['path']).name} is held", f"Of {sessions}", body)
-    )
+    write_text(path, render_page(title, f"Sessions: {sessions}", "\n".join(sections)))
+
+
+def draw_weak_regions(weak: WeakRegions, topomap: TopoMetricMap) -> str:
+    """Draw the nodes by their weakness and the edges of a map from above, as SVG text."""
+    poses = [node.world_from_cam for node in weak.nodes]
+    with MapFigure(poses, [], 1.1) as figure:
+        figure.draw_nodes(topomap)
+        return figure.to_svg("weak regions of the map", _draw_marks(figure, weak), 3)
+
+
+def _draw_marks(figure: MapFigure, weak: WeakRegions) -> list[Line2D]:
+    """Draw the nodes and return the handles of the legend."""
+    handles = list[Line2D]()
+    ring = {"linestyle": "", "markeredgewidth": 1.4, "markerfacecolor": "white"}
+    for order, (reason, (marker, colour, size, label)) in enumerate(_MARKS.items()):
+        style = {"marker": marker, "color": colour, "markersize": size, "linestyle": ""}
+        marked = [node for node in weak.nodes if _worst_reason(node, weak) == reason]
+        for is_ring in (False, True):
+            drawn = [
+                node.world_from_cam
+                for node in marked
+                if ("one_direction" in node.reasons) == is_ring
+            ]
+            figure.plot(drawn, zorder=3 + order, **style | (ring if is_ring else {}))
+        if marked:
+            handles.append(Line2D([], [], label=label, **style))
+    if weak.count("one_direction"):
+        style = ring | {"marker": "o", "color": GREY, "markersize": 5.0}
+        handles.append(Line2D([], [], label="hollow: no opposite view", **style))
+    return handles
+
+
+def _worst_reason(node: NodeQuality, weak: WeakRegions) -> str | None:
+    """Return the most severe reason. In a map of one session, `single_session` is no reason."""
+    ignored = "single_session" if len(weak.session_names) < 2 else None
+    shown = [reason for reason in reversed(_MARKS) if reason not in (None, ignored)]
+    return next((reason for reason in shown if reason in node.reasons), None)
 
 
 def _render_cards(weak: WeakRegions) -> str:
-    num_held = len(weak.queried_nodes) - weak.count("not_held")
-    shown = [
-        (
-            "good" if num_held == len(weak.queried_nodes) else "bad",
-            f"{num_held} of {len(weak.queried_nodes)}",
-            "nodes held by the rest of the map",
-        )
-    ]
-    shown.append(("", str(weak.count("few_landmarks")), "nodes of few landmarks"))
-    shown.append(
-        (
-            "",
-            str(weak.count("one_direction")),
-            f"of {len(weak.nodes)} nodes where nobody looks back",
-        )
+    num_queried = len(weak.queried_nodes)
+    num_held = num_queried - weak.count("not_held")
+    return render_cards(
+        [
+            (
+                "good" if num_held == num_queried else "bad",
+                f"{num_held} of {num_queried}",
+                "nodes localized by the rest of the map",
+            ),
+            ("", str(weak.count("few_landmarks")), "nodes with few landmarks"),
+            (
+                "",
+                str(weak.count("one_direction")),
+                f"of {len(weak.nodes)} nodes without an opposite view",
+            ),
+            ("", str(weak.count("single_session")), "nodes seen by one session only"),
+        ]
     )
-    shown.append(("", str(weak.count("single_session")), "nodes seen by one session alone"))
-    inner = "".join(
-        f'<div class="card {kind}"><b>{value}</b><span>{text}</span></div>'
-        for kind, value, text in shown
-    )
-    return f'<div class="cards">{inner}</div>'
 
 
-def _render_regions_table(parts: Sequence[WeakRegion]) -> str:
+def _render_regions(parts: Sequence[WeakRegion]) -> str:
     if not parts:
         return "<p>There are none.</p>"
-    body = "".join(_render_region_row(part) for part in parts[:_MAX_REGIONS])
-    more = (
-        f"<p>{len(parts) - _MAX_REGIONS} smaller ones are not shown.</p>"
-        if len(parts) > _MAX_REGIONS
-        else ""
-    )
-    head = "".join(f"<th>{name}</th>" for name in _COLUMNS)
-    table = f'<table class="folds"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
-    return (
-        f'<div class="wide" tabindex="0" role="region" aria-label="Weak parts">{table}</div>{more}'
-    )
-
-
-def _render_region_row(part: WeakRegion) -> str:
-    around = ", ".join(f"{value:.1f}" for value in part.centre.round(1) + 0.0)
-    cells = (
-        REASON_TEXTS[part.reason],
-        str(len(part.nodes)),
-        around,
-        part.nodes[0].name,
-        part.nodes[-1].name,
-    )
-    return (
-        "<tr>"
-        + "".join(
-            f'<td data-column="{name}">{escape(cell)}</td>'
-            for name, cell in zip(_COLUMNS, cells, strict=True)
+    rows = [
+        (
+            REASON_TEXTS[part.reason],
+            str(len(part.nodes)),
+            ", ".join(f"{value:.1f}" for value in part.centre.round(1) + 0.0),
+            escape(part.nodes[0].name),
+            escape(part.nodes[-1].name),
         )
-        + "</tr>"
-    )
+        for part in parts[:_MAX_REGIONS]
+    ]
+    num_hidden = len(parts) - len(rows)
+    more = f"<p>{num_hidden} smaller ones are not shown.</p>" if num_hidden else ""
+    return render_table(_COLUMNS, rows, label="Weak regions") + more
 
 
 def _render_images(nodes: Sequence[NodeQuality], topomap: TopoMetricMap) -> str:
     if not nodes:
-        return "<p>None was asked.</p>"
-    return (
-        '<div class="queries">' + "".join(_render_image(node, topomap) for node in nodes) + "</div>"
+        return "<p>No node was tested.</p>"
+    return render_gallery_items(
+        (
+            render_figure(
+                topomap.nodes[topomap.row_of(node.node_id)].template_jpeg,
+                f"node {node.node_id}, {node.name}",
+            ),
+            _render_facts(node),
+        )
+        for node in nodes
     )
 
 
-def _render_image(node: NodeQuality, topomap: TopoMetricMap) -> str:
-    assert node.answer is not None, "it was asked"
-    data = base64.b64encode(topomap.nodes[topomap.row_of(node.node_id)].template_jpeg).decode(
-        "ascii"
-    )
-    caption = escape(f"node {node.node_id}, {node.name}")
-    said = (
-        f"{node.answer.num_inliers} inliers without itself"
-        if node.answer.is_localized
-        else "not localized without itself"
-    )
-    if node.answer.is_wrong:
-        said = "found elsewhere without itself"
-    why = ", ".join(REASON_TEXTS[reason] for reason in node.reasons) or "not weak"
-    facts = f'<div class="facts"><b>{said}, {node.num_landmarks} landmarks</b><p>{why}</p></div>'
-    picture = (
-        f'<figure><img alt="{caption}"'
-        f' src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'
-    )
-    return f"<article>{picture}{facts}</article>"
-
-
-def _render_section(title: str, explanation: str, content: str) -> str:
-    return (
-        f"<section><h2>{title}</h2>"
-        + (f"<p>{explanation}</p>" if explanation else "")
-        + f"{content}</section>"
-    )
+def _render_facts(node: NodeQuality) -> str:
+    outcome = "not localized without itself"
+    if node.answer is not None and node.answer.is_wrong:
+        outcome = "wrong pose without itself"
+    elif node.answer is not None and node.answer.is_localized:
+        outcome = f"{node.answer.num_inliers} inliers without itself"
+    reasons = ", ".join(REASON_TEXTS[reason] for reason in node.reasons) or "not weak"
+    return f"<b>{outcome}, {node.num_landmarks} landmarks</b><p>{reasons}</p>"

@@ -1,5 +1,4 @@
-"""What every request passes before the service sees it: who may ask, how much, how slowly; its id,
-its line in the log, its metrics."""
+"""Checks of every request before the routes: access, size and time. It also logs and counts."""
 
 from __future__ import annotations
 
@@ -16,8 +15,7 @@ from hashlib import sha256
 from typing import Any
 from urllib.parse import urlsplit
 
-from topoloc.apps.service.logs import log
-from topoloc.apps.service.metrics import Metrics
+from topoloc.apps.service.logs import Metrics, log
 from topoloc.apps.service.request_errors import RequestError
 
 Scope = MutableMapping[str, Any]
@@ -28,24 +26,25 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
 BEARER_PROTOCOL = "bearer."
-"""A browser's WebSocket cannot send headers; it names the subprotocols `topoloc` and this with the
-token behind it."""
+"""WebSockets of browsers cannot send headers. They name the subprotocols `topoloc` and this prefix
+with the token."""
 _PUBLIC_PATHS = ("/healthz", "/")
 _PUBLIC_FOLDERS = ("/static/",)
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
-_DISCARD_S, _MAX_DISCARDED_BYTES = (
-    1.0,
-    64_000_000,
-)  # of what a refused request still sends, thrown away unread
+# Limits of the rest of a refused request, which is read and dropped.
+_DISCARD_S, _MAX_DISCARDED_BYTES = 1.0, 64_000_000
 
 
 @dataclass(frozen=True)
 class RequestLimits:
-    """Who may come in, and how.
+    """Access and limits of requests.
 
-    `token` is asked of every request but those for the page itself and for /healthz; None asks
-    nobody. With `loopback_only` a request must also call us by a name of this machine, so that no
-    foreign page can reach us under a name of its own.
+    Attributes:
+        token: required by every request but those for the page and /healthz; None for no token.
+        loopback_only: the Host header must name this machine. This stops pages of other sites that
+            reach the service under their own name.
+        max_bytes: size of a request.
+        upload_s: seconds until a request must be complete.
     """
 
     token: str | None
@@ -55,13 +54,10 @@ class RequestLimits:
 
 
 class AccessMiddleware:
-    """An ASGI application around another one."""
+    """An ASGI application that wraps another one."""
 
     def __init__(self, app: App, limits: RequestLimits, metrics: Metrics) -> None:
         self._app, self._limits, self._metrics = app, limits, metrics
-        self._token_digest = (
-            None if limits.token is None else sha256(limits.token.encode()).digest()
-        )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -79,65 +75,54 @@ class AccessMiddleware:
         except Exception as error:
             log("failure", logging.ERROR, error, request_id=request.id)
             await request.reject(
-                RequestError(503, "the service failed at this request; its log says more")
+                RequestError(503, "the service failed at this request; see its log")
             )
         finally:
             self._log_request(request)
 
     def _check(self, request: _Request) -> None:
-        """Raises RequestError."""
+        """Check host, origin, token and announced size. Raises RequestError."""
         host, origin = request.header("host"), request.header("origin")
         if self._limits.loopback_only and _host_name(host) not in LOOPBACK:
             raise RequestError(
-                421,
-                "this service answers on this machine alone, by the names 127.0.0.1 and localhost",
+                421, "this service answers on this machine only, as 127.0.0.1 and localhost"
             )
         if origin and urlsplit(origin).netloc.lower() != host.lower():
-            raise RequestError(403, "requests from other sites' pages are not answered")
-        path = request.scope["path"]
-        is_public = (
-            self._token_digest is None or path in _PUBLIC_PATHS or path.startswith(_PUBLIC_FOLDERS)
-        )
-        if not is_public and not hmac.compare_digest(
-            sha256(request.token().encode()).digest(), self._token_digest or b""
-        ):
-            raise RequestError(
-                401,
-                "a bearer token is needed (Authorization: Bearer ...), and this is none or"
-                " another one",
-            )
+            raise RequestError(403, "requests from pages of other sites are not answered")
+        path, token = request.scope["path"], self._limits.token
+        is_public = path in _PUBLIC_PATHS or path.startswith(_PUBLIC_FOLDERS)
+        if token is not None and not is_public:
+            given, wanted = (sha256(text.encode()).digest() for text in (request.token(), token))
+            if not hmac.compare_digest(given, wanted):
+                raise RequestError(
+                    401, "the bearer token (Authorization: Bearer ...) is missing or wrong"
+                )
         length = request.header("content-length")
-        if length.isdigit() and int(length[:20]) > self._limits.max_bytes:
-            raise RequestError(413, f"a request has at most {self._limits.max_bytes / 1e6:g} MB")
+        if length.isdigit():
+            request.check_size(int(length[:20]))
 
     def _log_request(self, request: _Request) -> None:
-        seconds, route = (
-            time.perf_counter() - request.start,
-            getattr(request.scope.get("route"), "path", "none"),
-        )
+        seconds = time.perf_counter() - request.start
+        scope = request.scope
+        route = getattr(scope.get("route"), "path", "none")
         self._metrics.requests.labels(route, request.status).inc()
-        if request.scope["type"] == "http":
+        if scope["type"] == "http":
             self._metrics.seconds.labels(route).observe(seconds)
-        method = request.scope.get("method", "WEBSOCKET")
-        facts = {
-            "method": method,
-            "path": request.scope["path"][:200],
-            "status": request.status,
-            "ms": round(1e3 * seconds, 1),
-        }
-        client = (request.scope.get("client") or ("",))[0]
         log(
             "request",
             request_id=request.id,
-            client=client,
+            client=(scope.get("client") or ("",))[0],
             bytes=request.num_bytes,
-            **facts,
+            method=scope.get("method", "WEBSOCKET"),
+            path=scope["path"][:200],
+            status=request.status,
+            ms=round(1e3 * seconds, 1),
             **request.facts,
         )
 
 
 class _Request:
-    """One request on its way in and out."""
+    """One request and its response."""
 
     def __init__(self, scope: Scope, receive: Receive, send: Send, limits: RequestLimits) -> None:
         self.scope, self._receive, self._send, self._limits = scope, receive, send, limits
@@ -156,23 +141,21 @@ class _Request:
         return self._headers.get(name, "")
 
     def token(self) -> str:
-        """What the client shows; empty where it shows nothing."""
+        """Return the token of the client, "" if there is none."""
         kind, _, token = self.header("authorization").partition(" ")
         if kind.lower() == "bearer":
             return token.strip()
-        offered = [one.strip() for one in self.header("sec-websocket-protocol").split(",")]
-        return next(
-            (
-                one.removeprefix(BEARER_PROTOCOL)
-                for one in offered
-                if one.startswith(BEARER_PROTOCOL)
-            ),
-            "",
-        )
+        offered = (one.strip() for one in self.header("sec-websocket-protocol").split(","))
+        tokens = [one for one in offered if one.startswith(BEARER_PROTOCOL)]
+        return tokens[0].removeprefix(BEARER_PROTOCOL) if tokens else ""
+
+    def check_size(self, num_bytes: int) -> None:
+        """Raise RequestError if a request of this size is too large."""
+        if num_bytes > self._limits.max_bytes:
+            raise RequestError(413, f"a request has at most {self._limits.max_bytes / 1e6:g} MB")
 
     async def receive(self) -> Message:
-        """The next part of the request; all of it must be there in time, and be no larger than may
-        be."""
+        """Return the next part. Raises RequestError if the request is too slow or too large."""
         if self._is_complete:
             return await self._receive()
         left_s = self.start + self._limits.upload_s - time.perf_counter()
@@ -180,12 +163,11 @@ class _Request:
             message = await asyncio.wait_for(self._receive(), max(left_s, 0.001))
         except TimeoutError:
             raise RequestError(
-                408, f"the request was not there within {self._limits.upload_s:g} s"
+                408, f"the request was not complete within {self._limits.upload_s:g} s"
             ) from None
         self.num_bytes += len(message.get("body", b""))
         self._is_complete = not message.get("more_body", False)
-        if self.num_bytes > self._limits.max_bytes:
-            raise RequestError(413, f"a request has at most {self._limits.max_bytes / 1e6:g} MB")
+        self.check_size(self.num_bytes)
         return message
 
     async def send(self, message: Message) -> None:
@@ -197,51 +179,40 @@ class _Request:
         await self._send(message)
 
     async def reject(self, refusal: RequestError) -> None:
-        """The answer, where none has begun; the connection is not used again, for the rest of the
-        request may be on its way."""
+        """Send the refusal unless a response has begun, and close the connection."""
         if self.status:
             return
-        if self.scope["type"] == "websocket":
-            await self._send_error(refusal, "websocket.http.response")
-            return
-        if refusal.status < 500 and not self.header("expect"):
+        is_websocket = self.scope["type"] == "websocket"
+        if not is_websocket and refusal.status < 500 and not self.header("expect"):
             await self._discard_rest()
-        await self._send_error(refusal, "http.response")
+        kind = "websocket.http.response" if is_websocket else "http.response"
+        body = json.dumps(refusal.to_json(self.id)).encode()
+        headers = {"content-type": "application/json", "content-length": str(len(body))}
+        headers |= {"connection": "close"} | refusal.headers
+        headers |= {"www-authenticate": "Bearer"} if refusal.status == 401 else {}
+        encoded = [(name.lower().encode(), value.encode()) for name, value in headers.items()]
+        await self.send({"type": f"{kind}.start", "status": refusal.status, "headers": encoded})
+        await self.send({"type": f"{kind}.body", "body": body})
 
     async def _discard_rest(self) -> None:
-        """For a moment: a connection that is closed while its client still sends is reset, and the
-        client never reads why."""
+        """Read and drop the rest for a moment.
+
+        A connection that is closed while the client sends is reset, and the client never reads the
+        response.
+        """
         end, left = time.perf_counter() + _DISCARD_S, _MAX_DISCARDED_BYTES
         while not self._is_complete and left > 0:
+            left_s = max(end - time.perf_counter(), 0.001)
             try:
-                message = await asyncio.wait_for(
-                    self._receive(), max(end - time.perf_counter(), 0.001)
-                )
+                message = await asyncio.wait_for(self._receive(), left_s)
             except TimeoutError:
                 return
             left -= len(message.get("body", b""))
             self._is_complete = not message.get("more_body", False)
 
-    async def _send_error(self, refusal: RequestError, kind: str) -> None:
-        body = json.dumps({"error": refusal.text, "request_id": self.id}).encode()
-        headers = [
-            (b"content-type", b"application/json"),
-            (b"content-length", b"%d" % len(body)),
-            (b"connection", b"close"),
-        ]
-        headers += [
-            (name.lower().encode(), value.encode()) for name, value in refusal.headers.items()
-        ]
-        headers += [(b"www-authenticate", b"Bearer")] if refusal.status == 401 else []
-        await self.send({"type": f"{kind}.start", "status": refusal.status, "headers": headers})
-        await self.send({"type": f"{kind}.body", "body": body})
-
 
 def _host_name(host: str) -> str:
-    """The name in a Host header, without its port."""
-    name = (
-        host[: host.index("]") + 1]
-        if host.startswith("[") and "]" in host
-        else host.partition(":")[0]
-    )
-    return name.lower()
+    """Return the name in a Host header, without the port."""
+    if host.startswith("[") and "]" in host:
+        return host[: host.index("]") + 1].lower()
+    return host.partition(":")[0].lower()

@@ -1,4 +1,4 @@
-"""The service as an ASGI application, from the top."""
+"""The service as an ASGI application."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Any
 
 from fastapi import FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
@@ -14,28 +13,25 @@ from fastapi.responses import JSONResponse, Response
 
 import topoloc
 from topoloc import AtlasConfig, Localizer, MapCache, TrackerConfig
-from topoloc.apps.service import geopose_routes, map_routes, page_routes, stream_routes
+from topoloc.apps.service import geopose_routes, map_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.apps.service.logs import log
-from topoloc.apps.service.maintenance import run_maintenance
-from topoloc.apps.service.metrics import Metrics
+from topoloc.apps.service.logs import Metrics, log
 from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.served_atlases import ServedAtlases
-from topoloc.apps.service.state import Service
+from topoloc.apps.service.state import Service, Workers
 from topoloc.apps.service.streams import Streams
-from topoloc.apps.service.workers import Workers
 
-_DESCRIPTION = """Where was this picture taken? Pictures become 6-DoF poses in maps that `topoloc build` made.
+_DESCRIPTION = """6-DoF poses of images in maps that `topoloc build` made.
 
-A picture that cannot be localized is an answer (200, `"localized": false` and why); requests that make no sense are refused in one
-sentence."""  # noqa: E501
+The response for an image without a pose is 200 with `"localized": false` and the reason. Invalid
+requests are refused with one sentence."""
 
 
 @dataclass(frozen=True)
 class Access:
-    """Who may ask: with a token, or on this machine alone."""
+    """The clients that may connect: with a token, or from this machine only."""
 
     token: str | None = None
     loopback_only: bool = True
@@ -48,26 +44,29 @@ def create_application(
     tracking: TrackerConfig | None = None,
     atlas_config: AtlasConfig | None = None,
 ) -> App:
-    """The application; its maps are closed when it ends. `atlas_config` says how the tiles of its
-    atlases are asked."""
+    """Create the application. It closes the maps when it ends."""
     metrics = Metrics()
     atlases = ServedAtlases(maps, atlas_config or AtlasConfig())
     query_handler = QueryHandler(maps, config.max_pixels, 1e3 * config.answer_s, atlases)
     streams = Streams(
         maps, query_handler, tracking or TrackerConfig(), config.max_sessions, config.session_idle_s
     )
-    service = Service(
-        maps, query_handler, Workers(config.num_workers, config.max_queue), config, metrics, streams
+    workers = Workers(config.num_workers, config.max_queue)
+    service = Service(maps, query_handler, workers, config, metrics, streams)
+    metrics.gauge(
+        "topoloc_jobs", "Requests in progress or waiting.", lambda: service.workers.num_jobs
     )
-    _start_watching(service)
+    metrics.gauge("topoloc_streams", "Open streams.", lambda: len(streams))
+    metrics.gauge("topoloc_open_maps", "Open maps.", lambda: maps.num_open)
+    metrics.gauge("topoloc_open_map_bytes", "Bytes of open map files.", lambda: maps.num_bytes)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         log("ready", maps=maps.names(), workers=config.num_workers)
         atlases.watch()
-        house = asyncio.create_task(run_maintenance(streams))
+        maintenance = asyncio.create_task(streams.run_maintenance())
         yield
-        house.cancel()
+        maintenance.cancel()
         await service.close()
         log("ended")
 
@@ -80,49 +79,27 @@ def create_application(
         redoc_url=None,
     )
     app.state.service = service
-    for routes in (map_routes, geopose_routes, stream_routes, page_routes):
+    for routes in (map_routes, geopose_routes, stream_routes):
         app.include_router(routes.router)
-    for kind in (RequestError, HTTPException, RequestValidationError):
+    for kind in (RequestError, HTTPException, RequestValidationError, 404, 405):
         app.add_exception_handler(kind, _error_response)
-    app.add_exception_handler(404, _error_response)
-    app.add_exception_handler(405, _error_response)
-    return AccessMiddleware(
-        app,
-        RequestLimits(access.token, access.loopback_only, config.max_upload_bytes, config.upload_s),
-        metrics,
+    limits = RequestLimits(
+        access.token, access.loopback_only, config.max_upload_bytes, config.upload_s
     )
-
-
-def _start_watching(service: Service) -> None:
-    gauge = service.metrics.gauge
-    gauge(
-        "topoloc_jobs",
-        "Requests that are being answered or wait.",
-        lambda: service.workers.num_jobs,
-    )
-    gauge("topoloc_streams", "Streams that are followed.", lambda: len(service.streams))
-    gauge("topoloc_open_maps", "Maps that are open.", lambda: service.maps.num_open)
-    gauge(
-        "topoloc_open_map_bytes",
-        "Bytes of the files of the maps that are open.",
-        lambda: service.maps.num_bytes,
-    )
+    return AccessMiddleware(app, limits, metrics)
 
 
 async def _error_response(request: Request, error: Exception) -> Response:
-    """The one form of every refusal."""
-    status, text, headers = 500, str(error), dict[str, str]()
+    """Convert any refusal to the response of a RequestError."""
+    headers: dict[str, str] = {}
     if isinstance(error, RequestError):
-        status, text, headers = error.status, error.text, error.headers
+        refusal, headers = error, error.headers
     elif isinstance(error, RequestValidationError):
-        first: dict[str, Any] = dict(error.errors()[0])
-        status, text = 422, f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    elif isinstance(error, HTTPException) or hasattr(error, "status_code"):
-        failed: Any = error
-        status, text, headers = failed.status_code, str(failed.detail), dict(failed.headers or {})
-        text = f"nothing is at {request.url.path[:200]}" if status == 404 else text
-    return JSONResponse(
-        {"error": " ".join(text.split()), "request_id": request.scope["request_id"]},
-        status,
-        headers,
-    )
+        first = dict(error.errors()[0])
+        refusal = RequestError(422, f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
+    else:
+        status = getattr(error, "status_code", 500)
+        text = f"nothing is at {request.url.path[:200]}" if status == 404 else None
+        refusal = RequestError(status, text or str(getattr(error, "detail", error)))
+        headers = dict(getattr(error, "headers", None) or {})
+    return JSONResponse(refusal.to_json(request.scope["request_id"]), refusal.status, headers)

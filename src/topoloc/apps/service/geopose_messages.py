@@ -1,9 +1,9 @@
 """Messages of the OSCP GeoPose Protocol, versions 1 and 2
 (github.com/OpenArCloud/oscp-geopose-protocol).
 
-Clients leave out much of what the protocol asks for, so that here only what is used is wanted.
-Version 1 has one flat list of readings, and a camera's parameters in its sensor; version 2 lists by
-kind, and parameters in the reading.
+Clients omit many required fields, so only the fields in use are required here. Version 1 has one
+flat list of readings, and the camera parameters stand in the sensor. Version 2 has a list for each
+kind of reading, and the parameters stand in the reading.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from topoloc import AtlasError, GeoPositionPrior, Georeference, Image, Localization
+from topoloc import AtlasError, GeoPose, GeoPositionPrior, Georeference, Image, Localization
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.plugin import EncodedImage
 
@@ -26,42 +26,41 @@ R = TypeVar("R", bound=BaseModel)
 MEDIA_TYPE = "application/vnd.oscp+json"
 _RAW_CHANNELS = {"RGBA32": 4, "GRAY8": 1}
 _VERSION = re.compile(r"version=\"?([0-9]+(?:\.[0-9]+)?)")
+_KNOWN_VERSIONS = ("1", "1.0", "2", "2.0")
+_READING_EXAMPLE = {
+    "timestamp": 1700000000000,
+    "sensorId": "0",
+    "imageFormat": "JPG",
+    "size": [640, 400],
+    "imageBytes": "/9j/4AAQSkZJRg...",
+    "params": {"model": "PINHOLE", "modelParams": [380, 380, 320, 200]},
+}
 EXAMPLE = {
     "id": "d9fbf438-b7c6-419a-a75b-1cf79275e58d",
     "timestamp": 1700000000000,
     "type": "geopose",
     "sensors": [{"id": "0", "type": "camera"}],
-    "sensorReadings": {
-        "cameraReadings": [
-            {
-                "timestamp": 1700000000000,
-                "sensorId": "0",
-                "imageFormat": "JPG",
-                "size": [640, 400],
-                "imageBytes": "/9j/4AAQSkZJRg...",
-                "params": {"model": "PINHOLE", "modelParams": [380, 380, 320, 200]},
-            }
-        ]
-    },
+    "sensorReadings": {"cameraReadings": [_READING_EXAMPLE]},
 }
-"""What a client sends, its picture left out."""
-_KNOWN_VERSIONS = ("1", "1.0", "2", "2.0")
+"""A request, its image cut off."""
 
 
 class CameraParam(BaseModel):
-    """COLMAP's model name and parameters, in COLMAP's order and convention."""
+    """Model name and parameters in COLMAP's order and convention."""
 
     model: str | None = None
     modelParams: list[float] | None = None
 
 
 class ImageOrientation(BaseModel):
+    """Orientation of an image relative to the camera."""
+
     mirrored: bool = False
     rotation: float = 0.0
 
 
 class CameraReading(BaseModel):
-    """A picture, base64; `imageFormat` is RGBA32, GRAY8 or JPG."""
+    """An image, base64. `imageFormat` is RGBA32, GRAY8 or JPG."""
 
     imageBytes: str
     sensorId: str = ""
@@ -72,8 +71,8 @@ class CameraReading(BaseModel):
 
 
 class GeolocationReading(BaseModel):
-    """Where the device takes itself to be: degrees, and metres of which two thirds of all readings
-    are closer to the truth."""
+    """Position of the device by its own sensor: degrees. The accuracy in metres is the 68 %
+    radius."""
 
     latitude: float | None = None
     longitude: float | None = None
@@ -81,26 +80,30 @@ class GeolocationReading(BaseModel):
 
 
 class SensorReadings(BaseModel):
-    """Version 2."""
+    """Readings in version 2."""
 
     cameraReadings: list[CameraReading] | None = None
     geolocationReadings: list[GeolocationReading] | None = None
 
 
 class SensorReading(BaseModel):
-    """Version 1."""
+    """A reading in version 1."""
 
     sensorId: str = ""
     reading: dict[str, Any] | None = None
 
 
 class Sensor(BaseModel):
+    """A sensor; version 1 stores the camera parameters here."""
+
     id: str
     type: str
     params: CameraParam | None = None
 
 
 class GeoPoseRequest(BaseModel):
+    """A request of either version."""
+
     id: str
     timestamp: float | str = Field(0.0, description="milliseconds since 1970")
     type: str = "geopose"
@@ -108,16 +111,8 @@ class GeoPoseRequest(BaseModel):
     sensorReadings: SensorReadings | list[SensorReading]
 
     def camera_reading(self) -> CameraReading:
-        """The first camera's reading. Raises RequestError."""
-        readings = self.sensorReadings
-        if isinstance(readings, SensorReadings):
-            found = readings.cameraReadings or []
-        else:
-            found = [
-                _flatten_reading(one, CameraReading)
-                for one in readings
-                if "imageBytes" in (one.reading or {})
-            ]
+        """Return the reading of the first camera. Raises RequestError."""
+        found = self._readings("cameraReadings", CameraReading, "imageBytes")
         if not found:
             raise RequestError(400, "the request has no reading of a camera")
         params = {sensor.id: sensor.params for sensor in self.sensors}
@@ -126,45 +121,54 @@ class GeoPoseRequest(BaseModel):
         )
 
     def near(self, slack_m: float) -> GeoPositionPrior | None:
-        """Where the device takes itself to be, by the first reading that says how exactly, with
-        three times that and `slack_m` metres around it. None where no reading says so, or one makes
-        no sense: then nothing is known."""
+        """Return the position of the first valid reading with an accuracy.
+
+        The radius is three times the accuracy and `slack_m` (metres). Without such a reading return
+        None.
+        """
+        for one in self._readings("geolocationReadings", GeolocationReading, "latitude"):
+            # some clients send the accuracy 0 for "unknown"
+            if one.latitude is None or one.longitude is None or not one.accuracy:
+                continue
+            if one.accuracy > 0.0:
+                with suppress(AtlasError):
+                    radius_m = 3.0 * one.accuracy + slack_m
+                    return GeoPositionPrior(one.latitude, one.longitude, radius_m)
+        return None
+
+    def _readings(self, name: str, kind: type[R], key: str) -> list[R]:
+        """Return the readings of a kind: the list `name` of version 2, or those with `key`."""
         readings = self.sensorReadings
         if isinstance(readings, SensorReadings):
-            found = readings.geolocationReadings or []
-        else:
-            found = [
-                _flatten_reading(one, GeolocationReading)
-                for one in readings
-                if "latitude" in (one.reading or {})
+            return getattr(readings, name) or []
+        found = [one for one in readings if key in (one.reading or {})]
+        try:
+            return [
+                kind.model_validate({**(one.reading or {}), "sensorId": one.sensorId})
+                for one in found
             ]
-        for one in found:
-            if (
-                one.latitude is None
-                or one.longitude is None
-                or not one.accuracy
-                or one.accuracy < 0.0
-            ):  # some send 0 for "unknown"
-                continue
-            with suppress(AtlasError):
-                return GeoPositionPrior(one.latitude, one.longitude, 3.0 * one.accuracy + slack_m)
-        return None
+        except ValidationError as error:
+            raise _to_request_error("invalid reading", error) from None
 
 
 class Accuracy(BaseModel):
-    """Standard deviations, the quadratic mean of the three components."""
+    """Standard deviations: root mean square of the three components."""
 
     position: float = Field(description="metres", ge=0.0)
     orientation: float = Field(description="degrees", ge=0.0)
 
 
 class Position(BaseModel):
+    """WGS84: degrees, and metres above the ellipsoid."""
+
     lat: float
     lon: float
     h: float
 
 
 class Quaternion(BaseModel):
+    """Rotation of the camera body in east-north-up."""
+
     x: float
     y: float
     z: float
@@ -179,6 +183,8 @@ class GeoPoseOgc(BaseModel):
 
 
 class GeoPoseReply(BaseModel):
+    """The response with a pose."""
+
     id: str
     timestamp: float
     type: str = "geopose"
@@ -187,7 +193,7 @@ class GeoPoseReply(BaseModel):
 
 
 class GeoPoseError(BaseModel):
-    """Why there is no pose."""
+    """The response without a pose."""
 
     ERROR: str
     request_id: str
@@ -195,42 +201,38 @@ class GeoPoseError(BaseModel):
 
 
 def check_version(accept: str) -> None:
-    """Raises RequestError where an Accept header names a version of the protocol that is neither
-    1.0 nor 2.0."""
+    """Raise RequestError if an Accept header names a version other than 1.0 and 2.0."""
     named = _VERSION.search(accept)
     if named and named.group(1) not in _KNOWN_VERSIONS:
         raise RequestError(
             400,
-            f"version {named.group(1)} of the GeoPose Protocol is not spoken here; 1.0 and 2.0 are",
+            f"version {named.group(1)} of the GeoPose Protocol is not supported; use 1.0 or 2.0",
         )
 
 
 def read_request(body: bytes) -> GeoPoseRequest:
-    """Raises RequestError where it is none."""
+    """Parse a request. Raises RequestError if it is invalid."""
     try:
         return GeoPoseRequest.model_validate_json(body)
     except ValidationError as error:
-        first = error.errors(include_input=False, include_url=False)[0]
-        raise RequestError(
-            400, f"no GeoPose request: {'.'.join(map(str, first['loc']))}: {first['msg']}"
-        ) from None
+        raise _to_request_error("no GeoPose request", error) from None
 
 
 def read_image_bytes(reading: CameraReading) -> EncodedImage | Image:
-    """The picture: a file's bytes, whatever the format is called (clients call JPEG files RGBA32),
-    else bare pixels.
+    """Return the image: raw pixels if the size fits, else the bytes of an image file.
+
+    Clients name JPEG files RGBA32 too, so the format is not trusted.
 
     Raises:
-        RequestError: neither.
+        RequestError: the bytes are missing or not base64, or the image is mirrored or depth.
     """
     if reading.imageOrientation is not None and reading.imageOrientation.mirrored:
-        raise RequestError(400, "a mirrored picture; it must be sent as the camera saw the world")
+        raise RequestError(400, "the image is mirrored; send it as the camera captured it")
     if reading.imageFormat.upper() == "DEPTH":
-        raise RequestError(400, "a picture of depth cannot be localized")
+        raise RequestError(400, "a depth image cannot be localized")
+    text = reading.imageBytes.rpartition(",")[2]  # some clients send a data: URL
     try:
-        data = base64.b64decode(
-            reading.imageBytes.rpartition(",")[2], validate=True
-        )  # some send a data: address
+        data = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
         raise RequestError(400, "imageBytes: not base64") from None
     if not data:
@@ -244,7 +246,7 @@ def read_image_bytes(reading: CameraReading) -> EncodedImage | Image:
 
 
 def read_image_size(reading: CameraReading) -> tuple[int, int] | None:
-    """Width and height (pixels) as the reading tells them; None where it tells none."""
+    """Return width and height (pixels) of a reading, None if they are missing or invalid."""
     size = reading.size or []
     if len(size) != 2 or not all(1.0 <= length <= 1e5 for length in size):
         return None
@@ -252,23 +254,22 @@ def read_image_size(reading: CameraReading) -> tuple[int, int] | None:
 
 
 def camera_to_json(reading: CameraReading) -> dict[str, Any] | None:
-    """The camera as `query_cameras.camera_from_json` takes it; None where the reading tells
-    none."""
-    params = reading.params
-    if (
-        params is None
-        or not params.modelParams
-        or (params.model or "UNKNOWN").upper().startswith("UNKNOWN")
-    ):
+    """Return the camera for `query_request.camera_from_json`, None if the reading has none."""
+    params = reading.params or CameraParam()
+    model = (params.model or "UNKNOWN").upper()
+    if not params.modelParams or model.startswith("UNKNOWN"):
         return None
-    return {"model": (params.model or "").upper(), "params": params.modelParams}
+    return {"model": model, "params": params.modelParams}
 
 
 def create_reply(
-    request: GeoPoseRequest, result: Localization, georeference: Georeference, now_ms: float
+    request: GeoPoseRequest,
+    result: Localization,
+    geopose: GeoPose,
+    georeference: Georeference,
+    now_ms: float,
 ) -> GeoPoseReply:
-    """The reply; where the map's place on earth was fitted, what that fit left over counts, too."""
-    assert result.geopose is not None, "a map that knows its place"
+    """Create the reply. Its accuracy includes the residuals of the map's georeference."""
     position_sigma = math.hypot(result.position_sigma_m, georeference.rms_m or 0.0)
     mean = 1.0 / math.sqrt(3.0)
     return GeoPoseReply(
@@ -277,15 +278,10 @@ def create_reply(
         accuracy=Accuracy(
             position=mean * position_sigma, orientation=mean * result.rotation_sigma_deg
         ),
-        geopose=GeoPoseOgc.model_validate(result.geopose.to_json()),
+        geopose=GeoPoseOgc.model_validate(geopose.to_json()),
     )
 
 
-def _flatten_reading(one: SensorReading, kind: type[R]) -> R:
-    try:
-        return kind.model_validate({**(one.reading or {}), "sensorId": one.sensorId})
-    except ValidationError as error:
-        first = error.errors(include_input=False, include_url=False)[0]
-        raise RequestError(
-            400, f"no reading of this kind: {'.'.join(map(str, first['loc']))}: {first['msg']}"
-        ) from None
+def _to_request_error(problem: str, error: ValidationError) -> RequestError:
+    first = error.errors(include_input=False, include_url=False)[0]
+    return RequestError(400, f"{problem}: {'.'.join(map(str, first['loc']))}: {first['msg']}")

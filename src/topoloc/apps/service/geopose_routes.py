@@ -1,11 +1,10 @@
-"""POST /localize/geopose: the OSCP GeoPose Protocol, by all maps and atlases that know their place
-on earth."""
+"""POST /localize/geopose: the OSCP GeoPose Protocol for all georeferenced maps and atlases."""
 
 from __future__ import annotations
 
 import math
 import time
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Query, Request
@@ -13,6 +12,7 @@ from fastapi.responses import JSONResponse, Response
 
 from topoloc import (
     Camera,
+    GeoPose,
     Georeference,
     Image,
     Localization,
@@ -35,46 +35,38 @@ from topoloc.apps.service.geopose_messages import (
     read_request,
 )
 from topoloc.apps.service.openapi_schemas import resolve_references
-from topoloc.apps.service.query_cameras import camera_from_json, parse_camera_field
 from topoloc.apps.service.query_handler import decode_image
-from topoloc.apps.service.query_request import read_body
+from topoloc.apps.service.query_request import camera_from_json, parse_camera_field, read_body
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
 from topoloc.plugin import EncodedImage
 
 router = APIRouter()
+Results = dict[str, Localization | NotLocalized]
 _MAX_DISAGREEMENT_M = 10.0
 _ERRORS = {
-    400: "no such request, or of another version",
-    404: "not localized: why",
-    409: "no map knows its place on earth",
-}
-_ERRORS |= {
-    401: "no token",
-    408: "too slow",
-    413: "too large",
-    429: "too many wait",
+    400: "invalid request, or an unknown version",
+    401: "the token is missing or wrong",
+    404: "not localized: reason",
+    408: "the request came too slowly",
+    409: "no map is georeferenced",
+    413: "the request is too large",
+    429: "too many requests wait",
     503: "the service failed",
 }
-_BODY = {
+_SCHEMA = resolve_references(GeoPoseRequest.model_json_schema())
+_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "content": {
-            "application/json": {
-                "schema": resolve_references(GeoPoseRequest.model_json_schema()),
-                "example": EXAMPLE,
-            }
-        },
+        "content": {"application/json": {"schema": _SCHEMA, "example": EXAMPLE}},
     }
 }
-MapOnly = Annotated[
-    str | None, Query(alias="map", description="ask this map alone", max_length=200)
-]
+MapOnly = Annotated[str | None, Query(alias="map", description="use this map only", max_length=200)]
 
 
 @router.get("/localize/geopose")
 async def geopose_lives() -> dict[str, str]:
-    """As the protocol's reference server answers."""
+    """Return the state, as the protocol's reference server does."""
     return {"status": "running"}
 
 
@@ -87,76 +79,66 @@ async def geopose_lives() -> dict[str, str]:
     openapi_extra=_BODY,
 )
 async def localize_geopose(request: Request, only: MapOnly = None) -> Response:
-    """Where on earth was this picture taken? The camera as a body, x forward, y left, z up, in
-    east-north-up."""
+    """Localize an image on earth. The body frame of the camera is x forward, y left, z up; the pose
+    is in east-north-up."""
     service = get_service(request)
+    accept = request.headers.get("accept", "")
     try:
-        check_version(request.headers.get("accept", ""))
+        check_version(accept)
         body = await read_body(request)
         reply, results = await service.run_job(
             request, lambda: _localize_and_reply(service, body, only)
         )
-    except RequestError as refusal:
-        return _error_response(request, refusal)
+    except RequestError as refusal:  # the protocol has 400 for all faults of a request
+        status = 400 if refusal.status in (415, 422) else refusal.status
+        return _error_response(request, status, {"ERROR": refusal.text}, refusal.headers)
     for name, result in results.items():
         service.count(request, name, result)
     if reply is None:
-        return _not_localized(request, results)
-    return JSONResponse(
-        reply.model_dump(), media_type=f"{MEDIA_TYPE};version={_parse_version(request)}"
-    )
+        return _error_response(request, 404, _describe_refusal(results))
+    version = "1.0" if "version=1" in accept else "2.0"
+    return JSONResponse(reply.model_dump(), media_type=f"{MEDIA_TYPE};version={version}")
 
 
 def _localize_and_reply(
     service: Service, body: bytes, only: str | None
-) -> tuple[GeoPoseReply | None, dict[str, Localization | NotLocalized]]:
-    """The work of a request: the answer of each map, and of each atlas; and the reply where they
-    agree on one place."""
-    asked = read_request(body)
-    reading = asked.camera_reading()
+) -> tuple[GeoPoseReply | None, Results]:
+    """Return the results of all maps and atlases, and the reply if their poses agree."""
+    query = read_request(body)
+    reading = query.camera_reading()
     picture = read_image_bytes(reading)
-    image = (
-        decode_image(picture, service.query_handler.max_pixels)
-        if isinstance(picture, EncodedImage)
-        else picture
-    )
-    atlases = [] if only is not None else service.query_handler.atlases.opened()
+    handler = service.query_handler
+    is_encoded = isinstance(picture, EncodedImage)
+    image = decode_image(picture, handler.max_pixels) if is_encoded else picture
+    atlases = [] if only is not None else handler.atlases.opened()
     tiles = {tile_id for _, localizer in atlases for tile_id in localizer.tile_ids}
-    results, georeferences = dict[str, Localization | NotLocalized](), dict[str, Georeference]()
-    for name in (
-        [only] if only is not None else [name for name in service.maps.names() if name not in tiles]
-    ):
+    maps = [name for name in service.maps.names() if name not in tiles] if only is None else [only]
+    results: Results = {}
+    georeferences = dict[str, Georeference]()
+    for name in maps:
         with service.maps.use_map(name) as opened:
             topomap = opened.content.topomap
             if topomap.georeference is not None:
                 camera = _select_camera(reading, picture, image, topomap)
-                results[name] = opened.content.localize(
-                    image, camera, max_ms=service.query_handler.max_ms
-                )
+                results[name] = opened.content.localize(image, camera, max_ms=handler.max_ms)
                 georeferences[name] = topomap.georeference
-    near = asked.near(service.config.geolocation_m)
+    near = query.near(service.config.geolocation_m)
     for atlas, localizer in atlases:
-        known = {
-            tile.tile_id: place
-            for tile in atlas.manifest.tiles
-            if (place := atlas.manifest.georeference_of(tile)) is not None
-        }
+        manifest = atlas.manifest
+        places = {tile.tile_id: manifest.georeference_of(tile) for tile in manifest.tiles}
+        known = {tile_id: place for tile_id, place in places.items() if place is not None}
         if known:
             camera = _select_camera(reading, picture, image, None)
-            result = localizer.near(near, georeferenced_only=True).localize(
-                image, camera, max_ms=service.query_handler.max_ms
-            )
+            nearby = localizer.near(near, georeferenced_only=True)
+            result = nearby.localize(image, camera, max_ms=handler.max_ms)
             results[result.provenance.tile or ""] = result
             georeferences |= known
     if not results:
-        raise RequestError(
-            409, "no map here knows where on earth it lies; `topoloc georeference` tells it"
-        )
-    found = {name: result for name, result in results.items() if isinstance(result, Localization)}
-    best = _select_agreeing_map(found)
-    if best is None:
+        raise RequestError(409, "no map is georeferenced; use `topoloc georeference`")
+    if (best := _select_agreeing_map(results)) is None:
         return None, results
-    return create_reply(asked, found[best], georeferences[best], 1e3 * time.time()), results
+    name, result, geopose = best
+    return create_reply(query, result, geopose, georeferences[name], 1e3 * time.time()), results
 
 
 def _select_camera(
@@ -165,70 +147,52 @@ def _select_camera(
     image: Image,
     topomap: TopoMetricMap | None,
 ) -> Camera | UncalibratedCamera:
-    """What the request says of the camera, else the picture's file, else any usual lens."""
+    """Return the camera of the request, else that of the EXIF data, else an unknown one."""
     height, width = image.shape[:2]
-    told = camera_to_json(reading)
-    if told is None and isinstance(picture, EncodedImage):
+    given = camera_to_json(reading)
+    if given is None and isinstance(picture, EncodedImage):
         return parse_camera_field(None, picture, (width, height), topomap)
-    if told is None:
+    if given is None:
         return UncalibratedCamera.unknown(width, height)
-    told_width, told_height = read_image_size(reading) or (width, height)
-    camera = camera_from_json(told, told_width, told_height)
-    if abs(told_width * height - told_height * width) > max(told_width, told_height):
+    given_width, given_height = read_image_size(reading) or (width, height)
+    camera = camera_from_json(given, given_width, given_height)
+    if abs(given_width * height - given_height * width) > max(given_width, given_height):
         raise RequestError(
-            400, f"the picture is {width}x{height}, its reading says {told_width}x{told_height}"
+            400, f"the image is {width}x{height}, but its reading is {given_width}x{given_height}"
         )
-    return (
-        camera if (told_width, told_height) == (width, height) else camera.rescaled(width, height)
-    )
+    same_size = (given_width, given_height) == (width, height)
+    return camera if same_size else camera.rescaled(width, height)
 
 
-def _select_agreeing_map(found: dict[str, Localization]) -> str | None:
-    """The map whose pose has most for it; None where another one says that it was far from
-    there."""
+def _select_agreeing_map(results: Results) -> tuple[str, Localization, GeoPose] | None:
+    """Return the most probable pose with its map; None if another pose is far from it."""
+    found = [
+        (name, result, result.geopose)
+        for name, result in results.items()
+        if isinstance(result, Localization) and result.geopose is not None
+    ]
     if not found:
         return None
-    best = max(found, key=lambda name: found[name].probability)
-    ecef = {
-        name: result.geopose.position.ecef()
-        for name, result in found.items()
-        if result.geopose is not None
-    }
-    for name, place in ecef.items():
-        sigmas = math.hypot(found[name].position_sigma_m, found[best].position_sigma_m)
-        if np.linalg.norm(place - ecef[best]) > _MAX_DISAGREEMENT_M + 3.0 * sigmas:
+    best = max(found, key=lambda one: one[1].probability)
+    for _, result, geopose in found:
+        sigmas = math.hypot(result.position_sigma_m, best[1].position_sigma_m)
+        distance = np.linalg.norm(geopose.position.ecef() - best[2].position.ecef())
+        if distance > _MAX_DISAGREEMENT_M + 3.0 * sigmas:
             return None
     return best
 
 
-def _not_localized(
-    request: Request, results: dict[str, Localization | NotLocalized]
-) -> JSONResponse:
+def _describe_refusal(results: Results) -> dict[str, str]:
     refused = [result for result in results.values() if isinstance(result, NotLocalized)]
-    several = len(refused) < len(results)
-    reason = "ambiguous" if several else refused[0].reason
-    text = (
-        "maps place it far apart"
-        if several
-        else refused[0].detail or refused[0].reason.replace("_", " ")
-    )
-    return JSONResponse(
-        {
-            "ERROR": f"not localized: {text}",
-            "reason": reason,
-            "request_id": request.scope["request_id"],
-        },
-        404,
-    )
+    if len(refused) < len(results):
+        return {"ERROR": "not localized: the poses of maps are far apart", "reason": "ambiguous"}
+    reason = refused[0].reason
+    text = refused[0].detail or reason.replace("_", " ")
+    return {"ERROR": f"not localized: {text}", "reason": reason}
 
 
-def _error_response(request: Request, refusal: RequestError) -> JSONResponse:
-    """The protocol knows 400 for all that a request can have wrong."""
-    status = 400 if refusal.status in (415, 422) else refusal.status
-    return JSONResponse(
-        {"ERROR": refusal.text, "request_id": request.scope["request_id"]}, status, refusal.headers
-    )
-
-
-def _parse_version(request: Request) -> str:
-    return "1.0" if "version=1" in request.headers.get("accept", "") else "2.0"
+def _error_response(
+    request: Request, status: int, content: dict[str, str], headers: dict[str, str] | None = None
+) -> JSONResponse:
+    content = content | {"request_id": request.scope["request_id"]}
+    return JSONResponse(content, status, headers)

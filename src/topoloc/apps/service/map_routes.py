@@ -1,8 +1,12 @@
-"""The native routes: maps, and pictures localized in them."""
+"""Routes of the page, the maps and single images."""
 
 from __future__ import annotations
 
-from functools import partial
+import base64
+import json
+from functools import cache, partial
+from hashlib import sha256
+from importlib import resources
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request
@@ -12,27 +16,39 @@ import topoloc
 from topoloc import Camera
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
+    QUERY_ERRORS,
+    QueryParameters,
     error_responses,
-    result_schema,
-    success_response,
+    result_response,
 )
 from topoloc.apps.service.query_handler import combine_results, result_to_line
-from topoloc.apps.service.query_request import QueryParameters, read_query_request
-from topoloc.apps.service.state import get_service
+from topoloc.apps.service.query_request import read_query_request
+from topoloc.apps.service.request_errors import RequestError
+from topoloc.apps.service.state import Service, get_service
+from topoloc.apps.viewer.document import SceneBudget, create_document
+from topoloc.apps.viewer.page import MODULES, import_map, static_text
 
 router = APIRouter()
 MapName = Annotated[
-    str, Path(description="a map's name: its file's, without .topo", max_length=200)
+    str, Path(description="name of a map: its file name without .topo", max_length=200)
 ]
-
-
 UrlParameters = Annotated[QueryParameters, Query()]
-_QUERY_ERRORS = error_responses(400, 401, 403, 404, 408, 413, 415, 422, 429, 503)
+_PAGE_MODULES = MODULES | {
+    f"topoloc/page/{name}": f"page/{name}.js" for name in ("page", "asking", "live", "matches")
+}
+_TYPES = {
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".html": "text/html",
+    ".LICENSE": "text/plain",
+    ".md": "text/plain",
+}
+_NUM_CACHED_SCENES = 4
 
 
 @router.get("/healthz", responses=error_responses(503))
 async def health(request: Request) -> dict[str, Any]:
-    """Whether the service lives."""
+    """Return the state of the service."""
     service = get_service(request)
     return {"status": "ok", "jobs": service.workers.num_jobs, "open_maps": service.maps.num_open}
 
@@ -44,13 +60,13 @@ async def health(request: Request) -> dict[str, Any]:
     | error_responses(401),
 )
 async def metrics(request: Request) -> Response:
-    """Counters and times, as Prometheus reads them."""
+    """Return counters and times for Prometheus."""
     return Response(get_service(request).metrics.text(), media_type="text/plain; version=0.0.4")
 
 
 @router.get("/capabilities", responses=error_responses(401, 503))
 async def capabilities(request: Request) -> dict[str, Any]:
-    """What the service can do, for programs that look for one."""
+    """Return the services, maps, camera models and limits."""
     service = get_service(request)
     config = service.config
     return {
@@ -70,51 +86,58 @@ async def capabilities(request: Request) -> dict[str, Any]:
 
 @router.get("/v1/maps", responses=error_responses(401, 503))
 async def maps(request: Request) -> dict[str, list[str]]:
-    """The names of all maps."""
+    """Return the names of all maps."""
     return {"maps": get_service(request).maps.names()}
 
 
 @router.get("/v1/maps/{map}", responses=error_responses(401, 404, 422, 429, 503))
 async def one_map(request: Request, map: MapName) -> JSONResponse:
-    """What a map holds: what `topoloc info --json` prints, and each node with its pose."""
+    """Return the facts of a map, as `topoloc info --json`, and its nodes with their poses."""
     service = get_service(request)
 
     def describe() -> dict[str, Any]:
         with service.maps.use_map(map) as opened:
             topomap = opened.content.topomap
+            nodes = [
+                {
+                    "node": summary.node_id,
+                    "session": summary.session_id,
+                    "world_from_cam": summary.world_from_cam.to_json(),
+                    "num_points": summary.num_points,
+                }
+                for summary in topomap.summaries
+            ]
             facts = topomap.describe(opened.path) | {"path": opened.path.name, "name": map}
-            return facts | {"nodes": [_node_to_json(summary) for summary in topomap.summaries]}
+            return facts | {"nodes": nodes}
 
     return JSONResponse(await service.run_job(request, describe))
 
 
 @router.post(
     "/v1/maps/{map}/localize",
-    responses=success_response(
-        result_schema(), "a pose, or why there is none: the JSON line of `topoloc localize --json`"
-    )
-    | _QUERY_ERRORS,
+    responses=result_response("pose or refusal, as a line of `topoloc localize --json`")
+    | QUERY_ERRORS,
     openapi_extra=IMAGE_BODY,
 )
 async def localize(request: Request, map: MapName, parameters: UrlParameters) -> Response:
-    """Where was this picture taken?"""
-    service, asked = get_service(request), await read_query_request(request, parameters)
-    result = await service.run_job(request, partial(service.query_handler.localize, map, asked))
+    """Localize an image in one map."""
+    service, query = get_service(request), await read_query_request(request, parameters)
+    result = await service.run_job(request, partial(service.query_handler.localize, map, query))
     service.count(request, map, result)
-    return Response(result_to_line(result, asked.picture.name), media_type="application/json")
+    return Response(result_to_line(result, query.picture.name), media_type="application/json")
 
 
-@router.post("/v1/localize", responses=_QUERY_ERRORS, openapi_extra=IMAGE_BODY)
+@router.post("/v1/localize", responses=QUERY_ERRORS, openapi_extra=IMAGE_BODY)
 async def localize_everywhere(request: Request, parameters: UrlParameters) -> JSONResponse:
-    """Where, and in which of the maps? `map` is the only one that vouches for a pose; null where
-    none does, or several."""
-    service, asked = get_service(request), await read_query_request(request, parameters)
+    """Localize an image in all maps. `map` names the map of the only pose; it is null if there are
+    no poses or several."""
+    service, query = get_service(request), await read_query_request(request, parameters)
     results = await service.run_job(
-        request, partial(service.query_handler.localize_everywhere, asked)
+        request, partial(service.query_handler.localize_everywhere, query)
     )
     for map_name, result in results.items():
         service.count(request, map_name, result)
-    return JSONResponse(combine_results(results, asked.picture.name))
+    return JSONResponse(combine_results(results, query.picture.name))
 
 
 @router.post(
@@ -128,28 +151,84 @@ async def localize_everywhere(request: Request, parameters: UrlParameters) -> JS
             }
         }
     }
-    | _QUERY_ERRORS,
+    | QUERY_ERRORS,
     openapi_extra=IMAGE_BODY,
 )
 async def explain(request: Request, map: MapName, parameters: UrlParameters) -> Response:
-    """Why this answer, or none: JSON, or the page of `topoloc explain` for those who accept
-    text/html."""
-    service, asked = get_service(request), await read_query_request(request, parameters)
+    """Localize an image and return all tried poses: JSON, or a page if text/html is accepted."""
+    service, query = get_service(request), await read_query_request(request, parameters)
     as_page = "text/html" in request.headers.get("accept", "")
     text = await service.run_job(
-        request, partial(service.query_handler.explain, map, asked, as_page)
+        request, partial(service.query_handler.explain, map, query, as_page)
     )
     return HTMLResponse(text) if as_page else Response(text, media_type="application/json")
 
 
-def _node_to_json(summary: Any) -> dict[str, Any]:
-    pose = summary.world_from_cam
-    return {
-        "node": summary.node_id,
-        "session": summary.session_id,
-        "world_from_cam": {
-            "translation": pose.translation.tolist(),
-            "quat_wxyz": pose.quat_wxyz().tolist(),
-        },
-        "num_points": summary.num_points,
-    }
+@router.get("/v1/maps/{map}/scene", responses=error_responses(401, 404, 422, 429, 503))
+async def scene(request: Request, map: MapName) -> Response:
+    """Return a map for display: points, nodes with their images, and paths. See docs/viewer.md."""
+    service = get_service(request)
+    body = await service.run_job(request, lambda: _build_scene(service, map))
+    return Response(body, media_type="application/json")
+
+
+def _build_scene(service: Service, name: str) -> bytes:
+    """Return the document of a map, cached while its file is unchanged."""
+    cached = service.scenes
+    with service.maps.use_map(name) as opened:
+        if name in cached and cached[name][0] == opened.stamp:
+            return cached[name][1]
+        document = create_document(opened.content.topomap, name, budget=SceneBudget())
+        body = json.dumps(document, separators=(",", ":")).encode()
+        cached.pop(name, None)
+        while len(cached) >= _NUM_CACHED_SCENES:
+            cached.pop(next(iter(cached)), None)
+        cached[name] = opened.stamp, body
+        return body
+
+
+@router.get("/", response_class=HTMLResponse, include_in_schema=False)
+async def page() -> Response:
+    """Return the page of the service."""
+    text, policy = _render_page()
+    return HTMLResponse(
+        text, headers={"content-security-policy": policy, "referrer-policy": "no-referrer"}
+    )
+
+
+@router.get("/static/{name:path}", include_in_schema=False)
+async def static(name: str) -> Response:
+    """Return a file of the page."""
+    if name not in _list_static_files():
+        raise RequestError(404, f"nothing is at /static/{name[:80]}")
+    return Response(
+        static_text(name),
+        media_type=_TYPES[name[name.rindex(".") :]],
+        headers={"cache-control": "no-cache", "x-content-type-options": "nosniff"},
+    )
+
+
+@cache
+def _render_page() -> tuple[str, str]:
+    """Return the page and its content security policy, which allows this service only."""
+    element = import_map(lambda file: f"/static/{file}", _PAGE_MODULES)
+    inside = element[element.index(">") + 1 : element.rindex("<")]
+    digest = base64.b64encode(sha256(inside.encode()).digest()).decode("ascii")
+    policy = (
+        f"default-src 'none'; script-src 'self' 'sha256-{digest}'; style-src 'self'"
+        " 'unsafe-inline'; img-src 'self' data: blob:; media-src 'self' blob:; connect-src 'self';"
+        " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return static_text("page/page.html").replace("<!--import map-->", element), policy
+
+
+@cache
+def _list_static_files() -> frozenset[str]:
+    root = resources.files("topoloc.apps.viewer").joinpath("static")
+    folders = (("", root), ("page/", root.joinpath("page")))
+    return frozenset(
+        prefix + file.name
+        for prefix, folder in folders
+        for file in folder.iterdir()
+        if file.is_file()
+    )

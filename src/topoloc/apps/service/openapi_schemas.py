@@ -1,4 +1,4 @@
-"""What OpenAPI says beyond what FastAPI finds out by itself: bodies, answers, examples."""
+"""OpenAPI schemas that FastAPI does not derive: query images, results and errors."""
 
 from __future__ import annotations
 
@@ -6,41 +6,51 @@ import json
 from importlib import resources
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 
 class Error(BaseModel):
-    """Why a request was refused, in one sentence; `request_id` is that of its line in the log."""
+    """A refused request: the reason in one sentence, and the id of its line in the log."""
 
     error: str
     request_id: str
 
 
-_CAMERA = {
-    "type": "string",
-    "description": (
-        "`exif` (what the picture's file says, else any usual lens), `unknown`, `map`,"
-        ' `fx,fy,cx,cy` in pixels, a JSON object as camera.json, or COLMAP\'s `{"model": "OPENCV",'
-        ' "params": [...]}` (centre of the top-left pixel at 0.5, 0.5)'
-    ),
-}
-_PRIOR = {
-    "type": "string",
-    "description": "about where the camera is, world_from_cam as results write it (JSON)",
-}
-_NEAR = {
-    "type": "string",
-    "description": (
-        "`LAT,LON,METRES`: tiles of atlases that are known to lie further from this place on earth"
-        " are not asked; maps are"
-    ),
-}
-CAMERA_EXAMPLES = [
-    "unknown",
-    "380,380,319.5,199.5",
-    '{"model": "OPENCV", "params": [380, 380, 320, 200, 0.01, 0, 0, 0]}',
-]
-PRIOR_EXAMPLE = '{"translation": [0.2, 0.0, 1.4], "quat_wxyz": [1, 0, 0, 0]}'
+class QueryParameters(BaseModel):
+    """Optional parameters of a query image. Form fields take precedence over the URL."""
+
+    camera: str | None = Field(
+        None,
+        description=(
+            "`exif` (focal length of the file, else any common one), `unknown`, `map`,"
+            ' `fx,fy,cx,cy` in pixels, a JSON object as camera.json, or COLMAP\'s `{"model":'
+            ' "OPENCV", "params": [...]}` (centre of the top-left pixel at 0.5, 0.5)'
+        ),
+        max_length=20_000,
+        examples=[
+            "unknown",
+            "380,380,319.5,199.5",
+            '{"model": "OPENCV", "params": [380, 380, 320, 200, 0.01, 0, 0, 0]}',
+        ],
+    )
+    prior: str | None = Field(
+        None,
+        description="approximate pose world_from_cam, as in results (JSON)",
+        max_length=2_000,
+        examples=['{"translation": [0.2, 0.0, 1.4], "quat_wxyz": [1, 0, 0, 0]}'],
+    )
+    near: str | None = Field(
+        None,
+        description="`LAT,LON,METRES`: skip tiles of atlases that lie further from this position",
+        max_length=200,
+        examples=["50.8775,4.7043,200"],
+    )
+    max_ms: float | None = Field(
+        None, description="milliseconds after which no further pose is tried", gt=0, le=600_000
+    )
+    name: str | None = Field(None, description="name of the image in the result", max_length=200)
+
+
 _REFUSED_EXAMPLE = {
     "query": "view.jpg",
     "localized": False,
@@ -54,81 +64,61 @@ _REFUSED_EXAMPLE = {
     "map": "47f0700ed2db59ce",
     "version": 1,
     "t_ns": 1700000000000000000,
-    "camera": {
-        "model": "PINHOLE",
-        "width": 640,
-        "height": 400,
-        "fx": 380.0,
-        "fy": 380.0,
-        "cx": 319.5,
-        "cy": 199.5,
-    },
+    "camera": {"model": "PINHOLE", "width": 640, "height": 400}
+    | {"fx": 380.0, "fy": 380.0, "cx": 319.5, "cy": 199.5},
     "features": "surf",
 }
+_FILE = {"type": "string", "format": "binary"}
+_IMAGE = _FILE | {"description": "PNG, JPEG, BMP, PNM, TIFF or WebP; HEIC with the extra heic"}
 _FORM = {
     "type": "object",
     "required": ["image"],
-    "properties": {
-        "image": {
-            "type": "string",
-            "format": "binary",
-            "description": "PNG, JPEG, BMP, PNM, TIFF or WebP; HEIC with the extra heic",
-        },
-        "camera": _CAMERA,
-        "prior": _PRIOR,
-        "near": _NEAR,
-        "max_ms": {"type": "number", "exclusiveMinimum": 0, "maximum": 600000},
-        "name": {"type": "string", "maxLength": 200},
-    },
+    "properties": {"image": _IMAGE} | QueryParameters.model_json_schema()["properties"],
 }
 IMAGE_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "content": {
-            "multipart/form-data": {"schema": _FORM},
-            "image/jpeg": {"schema": {"type": "string", "format": "binary"}},
-            "image/png": {"schema": {"type": "string", "format": "binary"}},
-        },
+        "content": {"multipart/form-data": {"schema": _FORM}}
+        | {kind: {"schema": _FILE} for kind in ("image/jpeg", "image/png")},
     }
 }
 _ERROR_DESCRIPTIONS = {
-    400: "no picture, or a damaged one; a form that cannot be read",
-    401: "no token, or another one",
-    403: "a page of another site asks",
+    400: "no image, a damaged image, or an unreadable form",
+    401: "the token is missing or wrong",
+    403: "the request comes from a page of another site",
     404: "no such map or session",
     408: "the request came too slowly",
-    409: "not in this state of things",
-    413: "too many bytes, or too many pixels",
-    415: "a body of another kind is expected",
-    422: "a camera, a prior or a number that makes no sense",
-    429: "too many wait; Retry-After says when to come again",
-    503: "the map or the worker failed, or it took too long",
+    409: "the previous image of the stream is still in progress",
+    413: "too many bytes or pixels",
+    415: "wrong content type of the body",
+    422: "invalid camera, prior or number",
+    429: "too many requests wait; see Retry-After",
+    503: "the map or the worker failed, or the time limit is exceeded",
 }
 
 
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """These answers, for OpenAPI."""
+    """Return the OpenAPI responses of error statuses."""
     return {
         status: {"model": Error, "description": _ERROR_DESCRIPTIONS[status]} for status in statuses
     }
 
 
-def result_schema() -> dict[str, Any]:
-    """That of one result, with what it refers to written out."""
-    text = (
-        resources.files("topoloc.localization")
-        .joinpath("result.schema.json")
-        .read_text(encoding="utf-8")
-    )
-    return {
-        name: value
-        for name, value in resolve_references(json.loads(text)).items()
-        if not name.startswith("$")
-    } | {"examples": [_REFUSED_EXAMPLE]}
+QUERY_ERRORS = error_responses(400, 401, 403, 404, 408, 413, 415, 422, 429, 503)
+"""Errors of every route that takes an image."""
+
+
+def result_response(description: str) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI response 200 with the schema of one localization result."""
+    file = resources.files("topoloc.localization").joinpath("result.schema.json")
+    schema = resolve_references(json.loads(file.read_text(encoding="utf-8")))
+    shown = {name: value for name, value in schema.items() if not name.startswith("$")}
+    shown["examples"] = [_REFUSED_EXAMPLE]
+    return {200: {"description": description, "content": {"application/json": {"schema": shown}}}}
 
 
 def resolve_references(schema: dict[str, Any]) -> dict[str, Any]:
-    """A schema with what it refers to in its own `$defs` written out."""
+    """Return a schema with the references to its own `$defs` replaced by their content."""
     named = schema.get("$defs", {})
 
     def resolve_value(value: Any) -> Any:
@@ -141,8 +131,3 @@ def resolve_references(schema: dict[str, Any]) -> dict[str, Any]:
         return {name: resolve_value(one) for name, one in value.items() if name != "$defs"}
 
     return resolve_value(schema)
-
-
-def success_response(schema: dict[str, Any], description: str) -> dict[int | str, dict[str, Any]]:
-    """The answer 200 of this schema, for OpenAPI."""
-    return {200: {"description": description, "content": {"application/json": {"schema": schema}}}}

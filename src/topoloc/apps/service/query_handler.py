@@ -23,8 +23,7 @@ from topoloc import (
 )
 from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.apps.report.explanation_page import compared_to_json, explanation_page
-from topoloc.apps.service.query_cameras import parse_camera_field
-from topoloc.apps.service.query_request import QueryRequest
+from topoloc.apps.service.query_request import QueryRequest, parse_camera_field
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.served_atlases import ServedAtlases
 from topoloc.plugin import EncodedImage, image_size

@@ -1,59 +1,45 @@
-"""What a request asks: the picture's bytes and what goes with them, read out of a body that may be
-anything."""
+"""Parse a query from an HTTP request: the image, its camera and the other parameters."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
+from typing import Annotated, Any
 
-from pydantic import BaseModel, Field
+from msgspec import Meta, Struct
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect, Request
 
-from topoloc import AtlasError, GeoPositionPrior, Rigid3, TrajectoryError
-from topoloc.apps.service.openapi_schemas import CAMERA_EXAMPLES, PRIOR_EXAMPLE
+from topoloc import (
+    AtlasError,
+    CalibrationError,
+    Camera,
+    GeoPositionPrior,
+    Rigid3,
+    TopoMetricMap,
+    TrajectoryError,
+    UncalibratedCamera,
+)
+from topoloc.apps.query_camera import parse_camera_option
+from topoloc.apps.service.openapi_schemas import QueryParameters
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.plugin import EncodedImage
+from topoloc.plugin import EncodedImage, decode_json, exif_focal_length
 
-_MAX_FIELDS, _MAX_FIELD_BYTES = 8, 20_000
+_MAX_FIELD_BYTES = 20_000
 _MAX_MS = 600_000.0
-
-
-class QueryParameters(BaseModel):
-    """What may be said of a picture in the address instead of in the form, whose fields count
-    first."""
-
-    camera: str | None = Field(
-        None,
-        description="as the form's field `camera`",
-        max_length=20_000,
-        examples=CAMERA_EXAMPLES,
-    )
-    prior: str | None = Field(
-        None, description="as the form's field `prior`", max_length=2_000, examples=[PRIOR_EXAMPLE]
-    )
-    near: str | None = Field(
-        None,
-        description="as the form's field `near`",
-        max_length=200,
-        examples=["50.8775,4.7043,200"],
-    )
-    max_ms: float | None = Field(
-        None, description="milliseconds after which no further pose is tried", gt=0, le=600_000
-    )
-    name: str | None = Field(None, description="what the answer calls the picture", max_length=200)
 
 
 @dataclass(frozen=True, eq=False)
 class QueryRequest:
-    """A picture and what is said of it.
+    """An image and its parameters.
 
-    `camera` is as `query_cameras.parse_camera_field` reads it, None where nothing is said; `prior`
-    is world_from_cam; `max_ms` is that of `Localizer.localize`; tiles of atlases that are known to
-    lie elsewhere than `near` are not asked.
+    Attributes:
+        camera: text for `parse_camera_field`; None if the request names no camera.
+        prior: world_from_cam.
+        max_ms: time limit of `Localizer.localize`.
+        near: tiles of atlases that lie further away are skipped.
     """
 
     picture: EncodedImage
@@ -64,11 +50,10 @@ class QueryRequest:
 
 
 async def read_query_request(request: Request, parameters: QueryParameters) -> QueryRequest:
-    """The body, which is a form with the field `image` or the picture itself; what goes with it is
-    in the form, or in the address.
+    """Read a query. The body is an image, or a form with the field `image`.
 
     Raises:
-        RequestError: neither, or a field that makes no sense.
+        RequestError: the body is neither, or a parameter is invalid.
     """
     fields = {name: str(value) for name, value in parameters.model_dump(exclude_none=True).items()}
     content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -78,26 +63,25 @@ async def read_query_request(request: Request, parameters: QueryParameters) -> Q
     elif content_type == "application/x-www-form-urlencoded":
         raise RequestError(
             415,
-            "the body must be a picture (Content-Type: image/...), or a form with the file `image`"
+            "the body must be an image (Content-Type: image/...), or a form with the file `image`"
             " (multipart/form-data)",
         )
     else:
         data, name = await read_body(request), f"image.{content_type.partition('/')[2]}"
     name = fields.get("name", name)[:200]
     if not data:
-        raise RequestError(400, f"{name}: the picture is empty")
-    picture = EncodedImage(name, data, PurePath(name).suffix)
+        raise RequestError(400, f"{name}: the image is empty")
     return QueryRequest(
-        picture,
+        EncodedImage(name, data, PurePath(name).suffix),
         fields.get("camera"),
-        _parse_prior(fields),
-        _parse_max_ms(fields),
-        _parse_near(fields),
+        _parse_prior(fields["prior"]) if "prior" in fields else None,
+        _parse_max_ms(fields["max_ms"]) if "max_ms" in fields else None,
+        _parse_near(fields["near"]) if "near" in fields else None,
     )
 
 
 async def read_body(request: Request) -> bytes:
-    """All of it. Raises RequestError where the client goes away."""
+    """Return the whole body. Raises RequestError if the client disconnects."""
     try:
         return await request.body()
     except ClientDisconnect:
@@ -105,7 +89,7 @@ async def read_body(request: Request) -> bytes:
 
 
 async def _read_form(request: Request) -> tuple[bytes, str, dict[str, str]]:
-    """The picture, its name and the other fields."""
+    """Return the image, its name and the other fields."""
     parser = MultiPartParser(
         request.headers,
         request.stream(),
@@ -113,15 +97,12 @@ async def _read_form(request: Request) -> tuple[bytes, str, dict[str, str]]:
         max_fields=len(QueryParameters.model_fields) + 4,
         max_part_size=_MAX_FIELD_BYTES,
     )
-    parser.spool_max_size = (
-        2**40
-    )  # nothing is written to disk: the whole request is of bounded size
+    parser.spool_max_size = 2**40  # never to disk: the middleware limits the request's size
     try:
         form = await parser.parse()
     except (MultiPartException, KeyError, UnicodeDecodeError) as error:
-        raise RequestError(
-            400, f"the form cannot be read: {getattr(error, 'message', None) or 'it is malformed'}"
-        ) from None
+        reason = getattr(error, "message", None) or "it is malformed"
+        raise RequestError(400, f"the form cannot be read: {reason}") from None
     except ClientDisconnect:
         raise RequestError(400, "the request ended early") from None
     fields = {
@@ -135,29 +116,78 @@ async def _read_form(request: Request) -> tuple[bytes, str, dict[str, str]]:
     raise RequestError(400, "the form has no file called `image`, or ends before it is complete")
 
 
-def _parse_prior(fields: Mapping[str, str]) -> Rigid3 | None:
-    if "prior" not in fields:
-        return None
+def _parse_prior(text: str) -> Rigid3:
     try:
-        return Rigid3.from_json(fields["prior"], "prior")
+        return Rigid3.from_json(text, "prior")
     except TrajectoryError as error:
         raise RequestError(422, str(error)) from None
 
 
-def _parse_near(fields: Mapping[str, str]) -> GeoPositionPrior | None:
+def _parse_near(text: str) -> GeoPositionPrior:
     try:
-        return GeoPositionPrior.parse(fields["near"]) if "near" in fields else None
+        return GeoPositionPrior.parse(text)
     except AtlasError as error:
         raise RequestError(422, f"near: {error}") from None
 
 
-def _parse_max_ms(fields: Mapping[str, str]) -> float | None:
-    if "max_ms" not in fields:
-        return None
+def _parse_max_ms(text: str) -> float:
     try:
-        max_ms = float(fields["max_ms"])
+        max_ms = float(text)
     except ValueError:
         max_ms = math.nan
     if not 0.0 < max_ms <= _MAX_MS:
         raise RequestError(422, f"max_ms: above 0 and at most {_MAX_MS:g} milliseconds")
     return max_ms
+
+
+def parse_camera_field(
+    text: str | None, picture: EncodedImage, size: tuple[int, int], topomap: TopoMetricMap | None
+) -> Camera | UncalibratedCamera:
+    """Return the camera of an image of this width and height (pixels). Server files are not read.
+
+    Args:
+        text: ``exif`` (the default), ``unknown``, ``map``, ``fx,fy,cx,cy``, or a JSON object.
+        topomap: the queried map, for ``map``; None if several maps are queried.
+
+    Raises:
+        CalibrationError, QueryError: the camera is invalid or does not fit the image.
+    """
+    width, height = size
+    text = (text or "exif").strip()
+    if text == "exif":
+        focal = exif_focal_length(picture, width, height)
+        return UncalibratedCamera.from_focal_guess(width, height, focal)
+    if text.startswith("{"):
+        return camera_from_json(text, width, height)
+    if text == "unknown" or "," in text or (text == "map" and topomap is not None):
+        return parse_camera_option(text, topomap, allow_files=False)(width, height)
+    raise CalibrationError(
+        f"camera {text[:40]!r}: exif, unknown, map, fx,fy,cx,cy or a JSON object is expected"
+    )
+
+
+def camera_from_json(data: Any, width: int, height: int) -> Camera:
+    """Convert a JSON camera: parameters as in camera.json, or `model` and `params` of COLMAP.
+
+    COLMAP's centre of the top-left pixel is (0.5, 0.5). The default size is that of the image.
+
+    Raises:
+        CalibrationError: the camera is invalid.
+    """
+    named = decode_json(data, dict[str, Any], CalibrationError, "camera")
+    sized = {"width": width, "height": height, **named}
+    if "params" not in sized:
+        return Camera.from_json(sized)
+    camera = decode_json(sized, _ColmapCamera, CalibrationError, "camera")
+    size = int(camera.width), int(camera.height)
+    return Camera.from_colmap(camera.model, *size, tuple(camera.params))
+
+
+_Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
+
+
+class _ColmapCamera(Struct, frozen=True):
+    width: _Number
+    height: _Number
+    params: Annotated[list[_Number], Meta(max_length=20)]
+    model: str = "PINHOLE"

@@ -1,5 +1,4 @@
-"""The service as a deployment of Ray Serve: replicas of the one application, on as many machines,
-behind Serve's own proxies."""
+"""Run the service on Ray Serve: replicas of one application behind Serve's own proxies."""
 
 from __future__ import annotations
 
@@ -21,17 +20,16 @@ NAME = "topoloc"
 
 @runtime_checkable
 class ApplicationFactory(Protocol):
-    """Makes the application, in each replica; it may be pickled."""
+    """Creates the application in each replica. It may be pickled."""
 
     def application(self) -> App:
-        """Raises TopolocError."""
+        """Create the application. Raises TopolocError."""
         ...
 
 
 @dataclass(frozen=True)
 class ProxyOptions:
-    """Where Serve's proxies listen, and how many requests a replica takes at once: those that it
-    answers, and those that wait in it."""
+    """Address of Serve's proxies, and the requests that a replica runs and queues."""
 
     host: str
     port: int
@@ -40,9 +38,14 @@ class ProxyOptions:
     tls_cert: str | None = None
     tls_key: str | None = None
 
+    def http_options(self) -> dict[str, Any]:
+        """Return the options of Serve's proxies."""
+        tls = {"ssl_certfile": self.tls_cert, "ssl_keyfile": self.tls_key} if self.tls_cert else {}
+        return {"host": self.host, "port": self.port} | tls
+
 
 class Replica:
-    """One of those who answer."""
+    """One process that serves the application."""
 
     def __init__(self, maker: ApplicationFactory) -> None:
         self._maker = maker
@@ -58,12 +61,15 @@ def serve_on_ray(
     replicas: ReplicasConfig,
     wait: Callable[[], None],
 ) -> None:
-    """Serve on the cluster at `address` (as `connect_to_cluster` takes it) until `wait`, which is
-    called then, returns; requests in progress are answered.
+    """Serve on a cluster until `wait` returns, then finish the requests in progress.
+
+    Args:
+        address: cluster, as for `connect_to_cluster`.
+        wait: called when the service runs.
 
     Raises:
         MissingExtraError: Ray Serve is not installed.
-        ClusterError: no cluster answers, or no replica can begin; its reason is told.
+        ClusterError: no cluster answers, or no replica can start. The text gives the reason.
     """
     with connect_to_cluster(address):
         try:
@@ -73,42 +79,23 @@ def serve_on_ray(
                 f"replicas need Ray Serve ({error}): pip install 'topoloc[cluster,serve]'"
             ) from error
         logging.getLogger("ray.serve").setLevel(logging.ERROR)
-        was_there = bool(serve.status().proxies)
-        options = {
-            "host": proxy.host,
-            "port": proxy.port,
-            "ssl_certfile": proxy.tls_cert,
-            "ssl_keyfile": proxy.tls_key,
-        }
+        is_running = bool(serve.status().proxies)
         try:
             try:
-                if not was_there:
-                    serve.start(
-                        proxy_location="EveryNode",
-                        http_options={
-                            key: value for key, value in options.items() if value is not None
-                        },
-                    )
-                serve.run(
-                    _create_deployment(serve, proxy, replicas).bind(maker),
-                    name=NAME,
-                    route_prefix="/",
-                )
-            # of many classes; what a replica raised is a text in the deployment's state
-            except Exception as error:
+                if not is_running:
+                    serve.start(proxy_location="EveryNode", http_options=proxy.http_options())
+                deployment = _create_deployment(serve, proxy, replicas).bind(maker)
+                serve.run(deployment, name=NAME, route_prefix="/")
+            except Exception as error:  # of many classes; the deployment's state holds the text
                 raise ClusterError(
                     f"no replica of the service began: {_failure_reason(serve, error)}"
                 ) from error
-            where = f"{'https' if proxy.tls_cert else 'http'}://{proxy.host}:{proxy.port}"
-            print(
-                "topoloc serves on"
-                f" {'the proxies of Ray Serve that run already' if was_there else where} by Ray",
-                file=sys.stderr,
-                flush=True,
-            )
+            shown = f"{'https' if proxy.tls_cert else 'http'}://{proxy.host}:{proxy.port}"
+            shown = "the proxies of Ray Serve that run already" if is_running else shown
+            print(f"topoloc serves on {shown} by Ray", file=sys.stderr, flush=True)
             wait()
         finally:
-            _shut_down(serve, is_ours=not was_there and address != LOCAL)
+            _shut_down(serve, is_ours=not is_running and address != LOCAL)
 
 
 def _create_deployment(serve: Any, proxy: ProxyOptions, replicas: ReplicasConfig) -> Any:
@@ -132,7 +119,7 @@ def _create_deployment(serve: Any, proxy: ProxyOptions, replicas: ReplicasConfig
 
 
 def _shut_down(serve: Any, is_ours: bool) -> None:
-    """Our application goes, and Serve with it where it is ours alone."""
+    """Delete the application, and end Serve if this process started it and nothing else runs."""
     try:
         serve.delete(NAME)
         if is_ours and not serve.status().applications:
@@ -142,15 +129,11 @@ def _shut_down(serve: Any, is_ours: bool) -> None:
 
 
 def _failure_reason(serve: Any, error: Exception) -> str:
-    """What Serve says of our deployment: of a traceback the line that names a known failure, else
-    the last one."""
+    """Return the line of the deployment's message with a topoloc error, else the last line."""
     text = str(error)
-    with suppress(Exception):  # the error itself says enough then
+    with suppress(Exception):  # without a status the error itself is used
         deployments = serve.status().applications[NAME].deployments.values()
-        text = (
-            "\n".join(deployment.message for deployment in deployments if deployment.message)
-            or text
-        )
+        text = "\n".join(one.message for one in deployments if one.message) or text
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     known = [line.partition(": ")[2] for line in lines if line.startswith("topoloc.errors.")]
     return (known or lines[-1:] or [type(error).__name__])[-1][:400]

@@ -1,4 +1,4 @@
-"""What a request is refused with: a status of HTTP, and one sentence."""
+"""Errors of HTTP requests: a status and one sentence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from topoloc import (
 
 
 class RequestError(Exception):
-    """Ends a request with this status and sentence; `retry_after_s` says when to come again."""
+    """End a request with this status and sentence. `retry_after_s` becomes Retry-After."""
 
     def __init__(self, status: int, text: str, retry_after_s: int | None = None) -> None:
         super().__init__(text)
@@ -22,33 +22,26 @@ class RequestError(Exception):
 
     @property
     def headers(self) -> dict[str, str]:
+        """HTTP headers of the response."""
         return {} if self.retry_after_s is None else {"Retry-After": str(self.retry_after_s)}
 
-
-# Failures of what lies here and not of the request; every other known failure is the request's.
-_SERVER_ERRORS = (MapError, WeightsError, MissingExtraError)
+    def to_json(self, request_id: str) -> dict[str, str]:
+        """Return the body of the response."""
+        return {"error": " ".join(self.text.split()), "request_id": request_id}
 
 
 def to_request_error(error: Exception) -> RequestError:
-    """How a failure while a request was answered is told."""
+    """Convert any error raised during a request."""
     if isinstance(error, RequestError):
         return error
     if isinstance(error, MapNotFoundError):
         return RequestError(404, str(error))
     if isinstance(error, ObjectStoreError):
-        return RequestError(503, str(error), retry_after_s=5)
-    if isinstance(error, _SERVER_ERRORS):
-        return RequestError(503, str(error), retry_after_s=30)
-    if isinstance(error, UnreadableImageError):
-        return RequestError(400, str(error))
+        return RequestError(503, str(error), 5)
+    if isinstance(error, MapError | WeightsError | MissingExtraError):
+        return RequestError(503, str(error), 30)
     if isinstance(error, TopolocError):
-        return RequestError(422, str(error))
+        return RequestError(400 if isinstance(error, UnreadableImageError) else 422, str(error))
     if isinstance(error, MemoryError):
-        return RequestError(
-            503, "out of memory; a smaller picture, or this one later, may do", retry_after_s=5
-        )
-    return RequestError(
-        503,
-        "the worker failed while it answered this request; the log of the service says more",
-        retry_after_s=1,
-    )
+        return RequestError(503, "out of memory; send a smaller image, or try again later", 5)
+    return RequestError(503, "the worker failed at this request; see the log of the service", 1)

@@ -1,4 +1,4 @@
-"""The service run by uvicorn until it is told to end."""
+"""Run the service with uvicorn."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from topoloc.apps.service.logs import log_json
 
 _MAX_CONNECTIONS = 1000
 _KEEP_ALIVE_S = 75
-"""Longer than clients and load balancers keep a connection (5 to 60 s): else a request now and then
-meets one that is being closed."""
+"""Longer than clients and load balancers keep a connection (5 to 60 s). Otherwise a request may
+meet a connection that is being closed."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where the service listens; with TLS where there are files for it."""
+    """Address of the service. It uses TLS if the files are given."""
 
     host: str
     port: int
@@ -38,10 +38,10 @@ class Address:
 
 
 def serve(app: App, address: Address, limits: ServiceConfig) -> None:
-    """Listen until SIGTERM or SIGINT; requests in progress are then given so many seconds.
+    """Listen until SIGTERM or SIGINT. Requests in progress then have `limits.drain_s` seconds.
 
     Raises:
-        TopolocError: nothing can listen there.
+        TopolocError: the address cannot be used.
     """
     config = uvicorn.Config(
         app,
@@ -63,11 +63,8 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
     log_json()
     scheme = "https" if address.tls_cert else "http"
     host, port = listener.getsockname()[:2]
-    print(
-        f"topoloc serves on {scheme}://{f'[{host}]' if ':' in host else host}:{port}",
-        file=sys.stderr,
-        flush=True,
-    )
+    shown = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
+    print(f"topoloc serves on {shown}", file=sys.stderr, flush=True)
     asyncio.run(_Server(config).serve([listener]))
 
 
@@ -82,7 +79,7 @@ def _create_socket(address: Address) -> socket.socket:
 
 
 class _Server(uvicorn.Server):
-    """Ends with status 0 when it is told to: uvicorn's own would die of the signal."""
+    """A server that ends with status 0 at a signal. uvicorn's own re-raises the signal."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -98,7 +95,7 @@ class _Server(uvicorn.Server):
 
 
 class _HeadTimeoutProtocol(H11Protocol):
-    """HTTP/1.1; a connection on which no request's head arrives in time is closed."""
+    """HTTP/1.1 that closes a connection if no request head arrives in time."""
 
     head_s = 10.0
     _timer: asyncio.TimerHandle | None = None
@@ -122,9 +119,6 @@ class _HeadTimeoutProtocol(H11Protocol):
         self._timer = self.loop.call_later(seconds, self._close_if_idle, self.cycle)
 
     def _close_if_idle(self, before: Any) -> None:
-        if (
-            self.cycle is before
-            and self.transport.get_protocol() is self
-            and not self.transport.is_closing()
-        ):
+        is_ours = self.transport.get_protocol() is self and not self.transport.is_closing()
+        if self.cycle is before and is_ours:
             self.transport.close()

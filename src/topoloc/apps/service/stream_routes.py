@@ -1,4 +1,4 @@
-"""Streams over plain HTTP, a request a picture, and over a WebSocket."""
+"""Routes of streams: one HTTP request for each image, or a WebSocket."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from pydantic import BaseModel
 from topoloc.apps.service.map_routes import MapName, UrlParameters
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
+    QUERY_ERRORS,
     error_responses,
-    result_schema,
-    success_response,
+    result_response,
 )
 from topoloc.apps.service.query_request import QueryRequest, read_query_request
 from topoloc.apps.service.request_errors import RequestError
@@ -29,19 +29,18 @@ from topoloc.plugin import EncodedImage, decode_json
 
 router = APIRouter()
 PROTOCOL = "topoloc"
-"""The subprotocol that a browser asks for beside the one with its token."""
+"""The subprotocol that a browser names beside the one with its token."""
 TimeNs = Annotated[
-    int | None,
-    Query(description="when it was taken, nanoseconds; now where nothing is said", ge=0, lt=2**63),
+    int | None, Query(description="time of the image, nanoseconds; default now", ge=0, lt=2**63)
 ]
 StreamCamera = Annotated[
     str | None,
-    Query(description="of all its pictures, as the form's field `camera`", max_length=20_000),
+    Query(description="default of the parameter `camera` of its images", max_length=20_000),
 ]
 
 
 class StreamFacts(BaseModel):
-    """A stream by its id; it is forgotten where no picture comes for `idle_s` seconds."""
+    """A stream and its id. It ends after `idle_s` seconds without an image."""
 
     session: str
     map: str
@@ -54,7 +53,7 @@ class StreamFacts(BaseModel):
     responses=error_responses(401, 403, 404, 422, 429, 503),
 )
 async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> StreamFacts:
-    """Begin a stream: pictures that follow each other, so that each helps with the next."""
+    """Begin a stream of successive images. Each result supports the next one."""
     service = get_service(request)
     stream = await service.run_job(request, lambda: service.streams.begin(map, camera))
     return StreamFacts(session=stream.id, map=map, idle_s=service.config.session_idle_s)
@@ -62,27 +61,20 @@ async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> 
 
 @router.post(
     "/v1/maps/{map}/sessions/{session}/pictures",
-    responses=success_response(
-        result_schema(), "as of a single picture, with `state` and the smoothed pose"
-    )
-    | error_responses(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503),
+    responses=result_response("result of a single image, with `state` and the smoothed pose")
+    | QUERY_ERRORS
+    | error_responses(409),
     openapi_extra=IMAGE_BODY,
 )
 async def next_picture(
     request: Request, map: MapName, session: str, parameters: UrlParameters, t_ns: TimeNs = None
 ) -> Response:
-    """The next picture of a stream."""
+    """Localize the next image of a stream."""
     service = get_service(request)
-    stream, query_request = (
-        service.streams.find(map, session),
-        await read_query_request(request, parameters),
-    )
-    answer = await service.run_job(
-        request,
-        lambda: service.streams.next(
-            stream, query_request, time.time_ns() if t_ns is None else t_ns
-        ),
-    )
+    stream = service.streams.find(map, session)
+    query = await read_query_request(request, parameters)
+    t_ns = time.time_ns() if t_ns is None else t_ns
+    answer = await service.run_job(request, lambda: service.streams.next(stream, query, t_ns))
     request.scope["facts"].update({"map": map, "outcome": answer["state"]})
     return Response(json.dumps(answer), media_type="application/json")
 
@@ -102,22 +94,25 @@ async def end(request: Request, map: MapName, session: str) -> Response:
 
 @router.websocket("/v1/maps/{map}/sessions")
 async def stream_over_websocket(socket: WebSocket, map: str) -> None:
-    """A stream as long as the connection: a binary message is a picture, its answer a text. A text
-    message says what holds for the pictures after it: `{"camera": ..., "t_ns": ...}` (the time for
-    the next one alone)."""
+    """Run a stream that ends with the connection.
+
+    A binary message is an image, and its result is a text. A text message sets parameters of the
+    next images: `{"camera": ..., "t_ns": ...}`. The time is that of the next image only.
+    """
     service = get_service(socket)
+    camera = socket.query_params.get("camera")
     try:
-        stream = await service.run_job(
-            socket, lambda: service.streams.begin(map, socket.query_params.get("camera"))
-        )
+        stream = await service.run_job(socket, lambda: service.streams.begin(map, camera))
     except RequestError as refusal:
-        await socket.send_denial_response(_reject_connection(socket, refusal))
+        body = refusal.to_json(socket.scope["request_id"])
+        await socket.send_denial_response(JSONResponse(body, refusal.status, refusal.headers))
         return
     try:
         await socket.accept(PROTOCOL if PROTOCOL in socket.scope.get("subprotocols", ()) else None)
         await _serve_websocket(socket, service, stream)
     except RequestError as refusal:
-        await _close_socket(socket, refusal)
+        with contextlib.suppress(TimeoutError, RuntimeError):  # the client is slow or gone
+            await asyncio.wait_for(socket.close(1008, refusal.text[:120]), 1.0)
     except WebSocketDisconnect:
         pass
     finally:
@@ -126,48 +121,38 @@ async def stream_over_websocket(socket: WebSocket, map: str) -> None:
 
 
 async def _serve_websocket(socket: WebSocket, service: Service, stream: Stream) -> None:
-    """Until the client goes away. Raises RequestError where it does not listen, or says nothing."""
+    """Serve until the client disconnects. Raises RequestError if it does not read or send."""
     parameters: dict[str, Any] = {}
     number = 0
     while True:
         try:
             message = await asyncio.wait_for(socket.receive(), service.config.session_idle_s)
         except TimeoutError:
-            raise RequestError(408, f"no picture for {service.config.session_idle_s:g} s") from None
+            raise RequestError(408, f"no image for {service.config.session_idle_s:g} s") from None
         if message["type"] == "websocket.disconnect":
             return
         if message.get("text") is not None:
             parameters |= _parse_message(message["text"])
             continue
         t_ns = parameters.pop("t_ns", None) or time.time_ns()
-        query_request = QueryRequest(
-            EncodedImage(str(number), message["bytes"]), parameters.get("camera")
-        )
+        query = QueryRequest(EncodedImage(str(number), message["bytes"]), parameters.get("camera"))
         number += 1
-        await _send_text(
-            socket,
-            await _localize_image(socket, service, stream, query_request, t_ns),
-            service.config.upload_s,
-        )
+        text = await _localize_image(socket, service, stream, query, t_ns)
+        try:
+            await asyncio.wait_for(socket.send_text(text), service.config.upload_s)
+        except TimeoutError:
+            raise RequestError(408, "the client does not read the results") from None
 
 
 async def _localize_image(
-    socket: WebSocket, service: Service, stream: Stream, query_request: QueryRequest, t_ns: int
+    socket: WebSocket, service: Service, stream: Stream, query: QueryRequest, t_ns: int
 ) -> str:
-    """The answer, or why this picture has none; the stream goes on."""
+    """Return the result, or the error of this image as JSON. The stream continues."""
     try:
-        return json.dumps(
-            await service.run_job(socket, lambda: service.streams.next(stream, query_request, t_ns))
-        )
+        answer = await service.run_job(socket, lambda: service.streams.next(stream, query, t_ns))
     except RequestError as refusal:
-        return json.dumps({"query": query_request.picture.name, "error": refusal.text})
-
-
-async def _send_text(socket: WebSocket, text: str, timeout_s: float) -> None:
-    try:
-        await asyncio.wait_for(socket.send_text(text), timeout_s)
-    except TimeoutError:
-        raise RequestError(408, "the answers are not read") from None
+        answer = {"query": query.picture.name, "error": refusal.text}
+    return json.dumps(answer)
 
 
 class _Message(Struct, frozen=True, forbid_unknown_fields=True):
@@ -181,13 +166,3 @@ def _parse_message(text: str) -> dict[str, Any]:
     data = to_builtins(message)
     camera = data.get("camera")
     return data | {"camera": json.dumps(camera)} if isinstance(camera, dict) else data
-
-
-async def _close_socket(socket: WebSocket, refusal: RequestError) -> None:
-    with contextlib.suppress(TimeoutError, RuntimeError):  # it does not listen, or is gone
-        await asyncio.wait_for(socket.close(1008, refusal.text[:120]), 1.0)
-
-
-def _reject_connection(socket: WebSocket, refusal: RequestError) -> JSONResponse:
-    body = {"error": refusal.text, "request_id": socket.scope["request_id"]}
-    return JSONResponse(body, refusal.status, refusal.headers)

@@ -1,12 +1,16 @@
-"""Streams: each has a tracker of its own, and keeps its map open until it ends or is forgotten."""
+"""Streams of images: each has its own tracker and keeps its map open until it ends."""
 
 from __future__ import annotations
 
+import asyncio
+import ctypes
 import threading
 import time
 import uuid
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 from topoloc import (
@@ -21,11 +25,12 @@ from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.query_request import QueryRequest
 from topoloc.apps.service.request_errors import RequestError
 
+_MAINTENANCE_PERIOD_S = 5.0
+
 
 @dataclass(eq=False)
 class Stream:
-    """One stream; its lock is held while a picture of it is looked at, and `resources` keeps its
-    map open."""
+    """One stream. Its lock is held during a query. `resources` keep its map open."""
 
     map_name: str
     resources: ExitStack
@@ -41,7 +46,7 @@ class Streams:
     """All streams of a service, at most `max_streams`.
 
     Args:
-        idle_s: a stream without a picture for so long is forgotten.
+        idle_s: seconds without an image after which a stream ends.
     """
 
     def __init__(
@@ -52,7 +57,7 @@ class Streams:
         max_streams: int,
         idle_s: float,
     ) -> None:
-        self._maps, self._answerer, self._config = maps, query_handler, config
+        self._maps, self._query_handler, self._config = maps, query_handler, config
         self._max_streams, self._idle_s = max_streams, idle_s
         self._lock = threading.Lock()
         self._streams: dict[str, Stream] = {}
@@ -61,11 +66,10 @@ class Streams:
         return len(self._streams)
 
     def begin(self, map_name: str, camera: str | None) -> Stream:
-        """A stream in this map; `camera` is what its pictures' camera is called where they do not
-        say it themselves.
+        """Begin a stream in a map. `camera` is the default for its images.
 
         Raises:
-            RequestError: there are too many, or there is no such map.
+            RequestError: there are too many streams, or no such map.
             MapError: the map is damaged.
         """
         self.forget_idle()
@@ -78,39 +82,33 @@ class Streams:
                 self._streams[stream.id] = stream
         if is_full:
             resources.close()
-            raise RequestError(
-                429, f"{self._max_streams} streams are followed already", retry_after_s=10
-            )
+            raise RequestError(429, f"{self._max_streams} streams are open already", 10)
         return stream
 
     def find(self, map_name: str, stream_id: str) -> Stream:
-        """Raises RequestError."""
+        """Return a stream by its id. Raises RequestError."""
         stream = self._streams.get(stream_id)
         if stream is None or stream.map_name != map_name:
-            raise RequestError(
-                404, "there is no such stream here; one without a picture for a while is forgotten"
-            )
+            raise RequestError(404, "there is no such stream; a stream without images ends")
         return stream
 
     def next(self, stream: Stream, query_request: QueryRequest, t_ns: int) -> dict[str, Any]:
-        """The answer to the stream's next picture, as JSON.
+        """Return the result for the next image of a stream, as JSON.
 
         Raises:
-            RequestError: the stream has ended, or looks at another picture still.
-            TopolocError: the picture, its camera or its time is none.
+            RequestError: the stream has ended, or its previous image is still in progress.
+            TopolocError: the image, its camera or its time is invalid.
         """
         if not stream.lock.acquire(blocking=False):
-            raise RequestError(
-                409,
-                "the picture before is looked at still; the next one may come when that is"
-                " answered",
-            )
+            raise RequestError(409, "the previous image is in progress; send the next one after it")
         try:
             if stream.is_ended:
                 raise RequestError(404, "the stream has ended")
             stream.last_used = time.monotonic()
             named = QueryRequest(query_request.picture, query_request.camera or stream.camera)
-            image, camera = self._answerer.decode_query(named, stream.tracker.localizer.topomap)
+            image, camera = self._query_handler.decode_query(
+                named, stream.tracker.localizer.topomap
+            )
             if isinstance(camera, UncalibratedCamera):
                 raise CalibrationError(
                     "a stream needs a calibrated camera: `map`, fx,fy,cx,cy or a JSON object"
@@ -121,7 +119,7 @@ class Streams:
             stream.lock.release()
 
     def end(self, stream: Stream) -> None:
-        """Forget it, when the picture that is being looked at is done."""
+        """End a stream after its image in progress."""
         with stream.lock:
             with self._lock:
                 self._streams.pop(stream.id, None)
@@ -130,15 +128,34 @@ class Streams:
                 stream.resources.close()
 
     def forget_idle(self) -> None:
-        """End those that nobody has used for long."""
+        """End the streams without a recent image."""
         oldest = time.monotonic() - self._idle_s
-        for stream in [
-            one
-            for one in list(self._streams.values())
-            if one.last_used < oldest and not one.lock.locked()
-        ]:
-            self.end(stream)
+        for stream in list(self._streams.values()):
+            if stream.last_used < oldest and not stream.lock.locked():
+                self.end(stream)
 
     def close(self) -> None:
+        """End all streams."""
         for stream in list(self._streams.values()):
             self.end(stream)
+
+    async def run_maintenance(self) -> None:
+        """End idle streams and return free memory to the system, every few seconds.
+
+        Without `malloc_trim` glibc keeps memory that threads freed: tens of megabytes after a
+        thousand images.
+        """
+        while True:
+            await asyncio.sleep(_MAINTENANCE_PERIOD_S)
+            await asyncio.to_thread(self.forget_idle)
+            if (trim := _find_malloc_trim()) is not None:
+                await asyncio.to_thread(trim, 0)
+
+
+@cache
+def _find_malloc_trim() -> Callable[[int], int] | None:
+    """Return the function of glibc; None with another C library."""
+    try:
+        return ctypes.CDLL(None).malloc_trim
+    except (AttributeError, OSError, TypeError):
+        return None

@@ -1,9 +1,8 @@
-"""What is shown or exported, whatever the form: pictures with known poses, and the points that they
-show. Data only."""
+"""Data of a scene to show or export: images with known poses, and the points that they show."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,15 +10,17 @@ from jaxtyping import Float, Int, UInt8
 
 from topoloc import Camera, GeoPose, Georeference, Rigid3
 
+Progress = Callable[[str, int, int], None]
+"""Called with a stage's name, steps done and steps in all."""
+
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture and where it was taken. `name` is that of its file; `t_ns` is None where it has no
-    time.
+    """An image with its pose. `name` is its file name. `t_ns` is None without a time.
 
     Pixel `points_img[k]` of `camera` shows point `point_rows[k]` of the scene, -1 for none. `jpeg`
-    is the picture, encoded, possibly smaller than `camera`, and seen by `jpeg_camera`; empty where
-    it is not at hand.
+    is the encoded image of `jpeg_camera`, which may be smaller than `camera`. It is empty without
+    an image.
     """
 
     name: str
@@ -36,8 +37,8 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points in the world (metres), their colours where pictures show them (else black), and the
-    mean reprojection error (pixels)."""
+    """Points in the world (metres), their colours (black without an image), and their mean
+    reprojection errors (pixels)."""
 
     world: Float[np.ndarray, "n 3"]
     rgb: UInt8[np.ndarray, "n 3"]
@@ -45,13 +46,14 @@ class Points:
 
     @staticmethod
     def none() -> Points:
+        """Return an empty set of points."""
         return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """`views` in the order in which they were taken; `trajectory` are all poses that are known,
-    with or without a picture or a time."""
+    """`views` are in the order of recording. `trajectory` holds all known poses, with or without an
+    image or a time."""
 
     name: str
     views: Sequence[View]

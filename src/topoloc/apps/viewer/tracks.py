@@ -1,35 +1,35 @@
-"""Tracks: which points of a map's nodes are one and the same point, and which nodes therefore see
-it.
+"""Tracks: points of several nodes that are the same point.
 
-Every node keeps points of its own. Those of one node are sought in its neighbours' pictures where
-they must be seen (`localization/guided.py`), and what is found to be one is joined, the most alike
-first; no track has two key points of one picture.
+Every node has its own points. Guided matching (`localization/guided.py`) finds those of a node in
+the images of its neighbours. Matched points are merged, the most similar first. A track has at most
+one key point in each image.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc import TopoMetricMap, TopoNode
+from topoloc.apps.viewer.scene import Progress
 from topoloc.plugin import NodeMatcher
 
 NUM_NEIGHBOURS = 8
 MAX_ERROR_PX = 3.0
-"""Of a picture whose longer side is 640 pixels: key points further from where a point must be seen
-do not show it."""
+"""Maximum distance of a key point from the projection, for an image with a longer side of 640."""
 _NUM_STEPS = 5
-_MIN_SIGMA = 1e-4  # metres; no map knows its points better
+_MIN_SIGMA = 1e-4  # metres; no map is more precise
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Point k lies at `points_world[k]` (metres). Key point i, all nodes' in their order, shows the
-    point `point_rows[i]`, or -1 where it agrees with none. `errors_px[i]` is how far it is from the
-    point's projection (NaN: behind the camera)."""
+    """Point k lies at `points_world[k]` (metres).
+
+    Key point i of all nodes, in their order, shows the point `point_rows[i]`, -1 if it agrees with
+    none. `errors_px[i]` is its distance from the projection (NaN behind the camera).
+    """
 
     points_world: Float[np.ndarray, "n 3"]
     point_rows: Int[np.ndarray, " m"]
@@ -37,13 +37,12 @@ class Tracks:
 
 
 def find_tracks(
-    topomap: TopoMetricMap, rows: list[int], progress: Callable[[str, int, int], None] | None = None
+    topomap: TopoMetricMap, rows: list[int], progress: Progress | None = None
 ) -> Tracks:
-    """Tracks through these nodes. Raises MapError from reading them."""
+    """Find the tracks through these nodes. Raises MapError if a node cannot be read."""
     nodes = [topomap.nodes[row] for row in rows]
-    starts = np.concatenate([[0], np.cumsum([len(node.points_cam) for node in nodes])]).astype(
-        np.int64
-    )
+    counts = [len(node.points_cam) for node in nodes]
+    starts = np.cumsum([0, *counts])
     matchers = [NodeMatcher(node, topomap.config.features) for node in nodes]
     pairs = [np.zeros((0, 3))]
     neighbours = topomap.find_neighbours(
@@ -51,12 +50,9 @@ def find_tracks(
     )
     for a, matcher in enumerate(matchers):
         for b in neighbours[a]:
-            other = nodes[b]
+            cam_from_world = nodes[b].summary.world_from_cam.inverse()
             found = matcher.match_at_pose(
-                other.features,
-                other.summary.world_from_cam.inverse(),
-                other.camera,
-                MAX_ERROR_PX,
+                nodes[b].features, cam_from_world, nodes[b].camera, MAX_ERROR_PX
             )
             pairs.append(
                 np.column_stack(
@@ -65,15 +61,15 @@ def find_tracks(
             )
         if progress:
             progress("tracks", a + 1, len(nodes))
-    labels = _merge_points(np.concatenate(pairs), np.repeat(np.arange(len(nodes)), np.diff(starts)))
+    labels = _merge_points(np.concatenate(pairs), np.repeat(np.arange(len(nodes)), counts))
     return _triangulate_tracks(labels, matchers)
 
 
 def _merge_points(
     pairs: Float[np.ndarray, "p 3"], of_node: Int[np.ndarray, " m"]
 ) -> Int[np.ndarray, " m"]:
-    """A label for each point: that of the points that it is one with. Rows of `pairs`: two points,
-    and how unlike they are."""
+    """Return a label for each point; merged points have the same one. A row of `pairs` holds two
+    points and their distance in appearance."""
     parents, seen_by = list(range(len(of_node))), [{int(node)} for node in of_node]
 
     def root(i: int) -> int:
@@ -87,14 +83,13 @@ def _merge_points(
         if low != high and seen_by[low].isdisjoint(seen_by[high]):
             parents[high] = low
             seen_by[low] |= seen_by[high]
-    return np.unique([root(i) for i in range(len(parents))], return_inverse=True)[1].astype(
-        np.int64
-    )
+    roots = [root(i) for i in range(len(parents))]
+    return np.unique(roots, return_inverse=True)[1].astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class _KeyPoints:
-    """All key points of the nodes: key point i shows the point `labels[i]`, at `normalized[i]` on
+    """All key points of the nodes. Key point i shows the point `labels[i]`, at `normalized[i]` on
     the plane z = 1 of its camera."""
 
     labels: Int[np.ndarray, " m"]
@@ -125,7 +120,7 @@ class _KeyPoints:
     def residuals(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 3"]]:
-        """How far each is from its point's projection, pixels of an undistorted picture; and the
+        """Return the distances from the projections, in pixels of an undistorted image, and the
         points in the cameras."""
         points_cam = (
             np.einsum("mij,mj->mi", self.rotations, points[self.labels]) + self.translations
@@ -135,27 +130,21 @@ class _KeyPoints:
 
 
 def _triangulate_tracks(labels: Int[np.ndarray, " m"], matchers: list[NodeMatcher]) -> Tracks:
-    """Each track's point by least squares: where its nodes have it, by their covariances, and where
-    their key points are."""
+    """Fit the point of each track to its nodes' points, by their covariances, and to its key
+    points."""
     nodes = [matcher.node for matcher in matchers]
     num_points, key_points = int(labels.max(initial=-1)) + 1, _KeyPoints.of(nodes, labels)
     prior, pull = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))
-    information = np.linalg.inv(
-        np.concatenate([part.covariances for part in matchers]) + _MIN_SIGMA**2 * np.eye(3)
-    )
+    covariances = np.concatenate([part.covariances for part in matchers])
+    points_world = np.concatenate([part.points_world for part in matchers])
+    information = np.linalg.inv(covariances + _MIN_SIGMA**2 * np.eye(3))
     np.add.at(prior, labels, information)
-    np.add.at(
-        pull,
-        labels,
-        np.einsum(
-            "mij,mj->mi", information, np.concatenate([part.points_world for part in matchers])
-        ),
-    )
+    np.add.at(pull, labels, np.einsum("mij,mj->mi", information, points_world))
     points = first = np.linalg.solve(prior, pull[:, :, None])[:, :, 0]
     for _ in range(_NUM_STEPS):
         points = points + _gauss_newton_step(points, first, prior, key_points)
     errors = np.linalg.norm(key_points.residuals(points)[0], axis=1)
-    kept = errors <= key_points.max_errors_px  # NaN is not
+    kept = errors <= key_points.max_errors_px  # False for NaN
     of_kept, places = np.unique(labels[kept], return_inverse=True)
     point_rows = np.full(len(labels), -1, np.int64)
     point_rows[kept] = places
@@ -168,8 +157,7 @@ def _gauss_newton_step(
     prior: Float[np.ndarray, "n 3 3"],
     key_points: _KeyPoints,
 ) -> Float[np.ndarray, "n 3"]:
-    """One step of Gauss-Newton, every point on its own; key points off by more than a pixel count
-    less (Huber)."""
+    """Return one Gauss-Newton step of each point, with a Huber loss of one pixel."""
     residuals, points_cam = key_points.residuals(points)
     used = np.isfinite(residuals[:, 0])
     labels, residuals, points_cam = key_points.labels[used], residuals[used], points_cam[used]

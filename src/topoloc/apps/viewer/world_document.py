@@ -1,5 +1,4 @@
-"""Tiles of an atlas that share a world as one document of the viewer: each tile's own
-(`document.py`), moved to where it lies."""
+"""Tiles of an atlas that share a world as one document: those of the tiles, transformed."""
 
 from __future__ import annotations
 
@@ -15,8 +14,9 @@ from topoloc.apps.viewer.document import (
     ResultSet,
     SceneBudget,
     create_document,
-    path_to_json,
+    result_paths,
     results_to_json,
+    to_base64,
 )
 
 _POSE_KEYS = ("world_from_cam", "true_world_from_cam", "smoothed")
@@ -31,9 +31,10 @@ def create_world_document(
     budget: SceneBudget | None = None,
     warn: Callable[[str], None] = lambda text: None,
 ) -> Document:
-    """As `create_document`, of all tiles of a world together. Nodes name their tile, sessions are
-    numbered anew, points and pictures are shared out by nodes. Answers stand where their tile lies;
-    those of tiles of other worlds are left out.
+    """Return the document of all tiles of a world, as `create_document` for one map.
+
+    Nodes name their tile, and sessions are numbered again. Each tile has a share of the budget by
+    its number of nodes. Results are transformed; those of other worlds are left out.
 
     Raises:
         AtlasError: none of the tiles can be read.
@@ -45,64 +46,50 @@ def create_world_document(
         its_budget = SceneBudget(
             int(share * budget.max_points), int(share * budget.max_image_bytes)
         )
-        part = _transform_document(
-            create_document(topomap, placed.tile.tile_id, budget=its_budget),
-            placed.world_from_map,
-            first_session,
-        )
-        first_session = (
-            max((session["id"] for session in part["map"]["sessions"]), default=first_session - 1)
-            + 1
-        )
-        parts.append(part)
-    paths = [
-        path_to_json(one.name, [pose.translation for pose in one.path])
-        for one in results
-        if one.path
-    ]
+        part = create_document(topomap, placed.tile.tile_id, budget=its_budget)
+        parts.append(_transform_document(part, placed.world_from_map, first_session))
+        first_session += len(part["map"]["sessions"])
     shown = [
         replace(one, answers=transform_answers(world, one.answers))
         for one in results
         if one.answers
     ]
-    joined = _merge_documents(parts, name)
-    return joined | {
-        "paths": joined["paths"] + paths,
-        "results": [results_to_json(one) for one in shown],
-    }
+    document = _merge_documents(parts, name)
+    document["paths"] += result_paths(results)
+    return document | {"results": [results_to_json(one) for one in shown]}
 
 
 def transform_answers(
     world: SharedWorld, answers: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Answers of an atlas, as JSON, in the coordinates of a world that tiles share; those of other
-    tiles are left out."""
-    moved = list[dict[str, Any]]()
+    """Return JSON results of tiles in the coordinates of a shared world, without those of other
+    tiles."""
+    transformed = list[dict[str, Any]]()
     for answer in answers:
         alternatives = list(answer.get("alternatives", []))
-        named = answer.get("tile") or next((one.get("tile") for one in alternatives), None)
-        pose = world.world_from_map_of(named)
+        tile_id = answer.get("tile") or next((one.get("tile") for one in alternatives), None)
+        pose = world.world_from_map_of(tile_id)
         if pose is None:
             continue
-        its = dict(answer) | {
+        moved = dict(answer) | {
             key: _transform_pose(pose, answer[key])
             for key in _POSE_KEYS
             if answer.get(key) is not None
         }
-        if "covariance" in its:
-            covariance = np.array(its["covariance"], np.float64)
-            its["covariance"] = (pose.adjoint() @ covariance @ pose.adjoint().T).tolist()
+        if "covariance" in moved:
+            covariance = np.array(moved["covariance"], np.float64)
+            moved["covariance"] = (pose.adjoint() @ covariance @ pose.adjoint().T).tolist()
         if alternatives:
             placed = [
-                (one, world.world_from_map_of(one.get("tile") or named)) for one in alternatives
+                (one, world.world_from_map_of(one.get("tile") or tile_id)) for one in alternatives
             ]
-            its["alternatives"] = [
+            moved["alternatives"] = [
                 one | {"world_from_cam": _transform_pose(there, one["world_from_cam"])}
                 for one, there in placed
                 if there is not None
             ]
-        moved.append(its)
-    return moved
+        transformed.append(moved)
+    return transformed
 
 
 def _transform_pose(world_from_map: Rigid3, pose: Any) -> dict[str, Any]:
@@ -110,76 +97,67 @@ def _transform_pose(world_from_map: Rigid3, pose: Any) -> dict[str, Any]:
 
 
 def _transform_document(document: Document, world_from_map: Rigid3, first_session: int) -> Document:
-    """The document of one tile where that lies, its sessions counted on from others'."""
-    tile_id = document["name"]
+    """Transform the document of a tile. Points, focus and up become arrays."""
+    tile_id, sessions = document["name"], document["map"]["sessions"]
     points = np.frombuffer(base64.b64decode(document["points"]["world"]), "<f4").reshape(-1, 3)
-    moved = world_from_map.apply(points.astype(np.float64)).astype("<f4")
     corners = np.array(np.meshgrid(*np.array(document["focus"]).T)).reshape(3, -1).T
-    numbers = {
-        session["id"]: first_session + k for k, session in enumerate(document["map"]["sessions"])
-    }
-    sessions = [
-        one | {"id": numbers[one["id"]], "name": f"{tile_id}: {one['name']}"}
-        for one in document["map"]["sessions"]
-    ]
-    nodes = [
-        node
-        | {"tile": tile_id, "session": numbers.get(node["session"], first_session)}
-        | {"world_from_cam": _transform_pose(world_from_map, node["world_from_cam"])}
-        for node in document["nodes"]
-    ]
+    numbers = {session["id"]: first_session + k for k, session in enumerate(sessions)}
+
+    def transform_path(path: Document) -> Document:
+        lines = [np.array(line, np.float64).reshape(-1, 3) for line in path["lines"]]
+        return {
+            "name": f"{tile_id}: {path['name']}",
+            "lines": [world_from_map.apply(line).round(4).tolist() for line in lines],
+            "session": numbers[path["session"]],
+        }
+
     return document | {
         "up": world_from_map.rotation @ np.array(document["up"]),
         "focus": world_from_map.apply(corners),
-        "map": document["map"] | {"sessions": sessions},
-        "points": {"world": moved, "rgb": base64.b64decode(document["points"]["rgb"])},
-        "nodes": nodes,
-        "paths": [
-            _transform_path(path, world_from_map, tile_id, numbers) for path in document["paths"]
+        "map": document["map"]
+        | {
+            "sessions": [
+                one | {"id": numbers[one["id"]], "name": f"{tile_id}: {one['name']}"}
+                for one in sessions
+            ]
+        },
+        "points": {
+            "world": world_from_map.apply(points.astype(np.float64)).astype("<f4"),
+            "rgb": base64.b64decode(document["points"]["rgb"]),
+        },
+        "nodes": [
+            node
+            | {
+                "tile": tile_id,
+                "session": numbers.get(node["session"], first_session),
+                "world_from_cam": _transform_pose(world_from_map, node["world_from_cam"]),
+            }
+            for node in document["nodes"]
         ],
-    }
-
-
-def _transform_path(
-    path: Document, world_from_map: Rigid3, tile_id: str, numbers: Mapping[int, int]
-) -> Document:
-    lines = [
-        world_from_map.apply(np.array(line, np.float64).reshape(-1, 3)).round(4).tolist()
-        for line in path["lines"]
-    ]
-    return {
-        "name": f"{tile_id}: {path['name']}",
-        "lines": lines,
-        "session": numbers[path["session"]],
+        "paths": [transform_path(path) for path in document["paths"]],
     }
 
 
 def _merge_documents(parts: Sequence[Document], name: str) -> Document:
-    """One document of several that lie in one world."""
+    """Merge documents in the same world."""
     facts = [part["map"] for part in parts]
-    sums = {
-        key: sum(one[key] for one in facts)
-        for key in ("num_nodes", "num_points", "num_points_shown", "length_m")
-    }
+    keys = ("num_nodes", "num_points", "num_points_shown", "length_m")
     focus = np.concatenate([part["focus"] for part in parts])
     up = np.sum([part["map"]["num_nodes"] * part["up"] for part in parts], axis=0)
-    world, rgb = (
-        b"".join(bytes(part["points"][key]) for part in parts) for key in ("world", "rgb")
-    )
     return parts[0] | {
         "name": name,
         "up": (up / max(float(np.linalg.norm(up)), 1e-9)).round(6).tolist(),
         "focus": [focus.min(axis=0).round(3).tolist(), focus.max(axis=0).round(3).tolist()],
-        "map": sums
+        "map": {key: sum(one[key] for one in facts) for key in keys}
         | {
             "id": None,
             "version": None,
             "tiles": [part["name"] for part in parts],
-            "sessions": [one for f in facts for one in f["sessions"]],
+            "sessions": [session for one in facts for session in one["sessions"]],
         },
         "points": {
-            "world": base64.b64encode(world).decode("ascii"),
-            "rgb": base64.b64encode(rgb).decode("ascii"),
+            key: to_base64(b"".join(bytes(part["points"][key]) for part in parts))
+            for key in ("world", "rgb")
         },
         "nodes": [node for part in parts for node in part["nodes"]],
         "paths": [path for part in parts for path in part["paths"]],

@@ -36,11 +36,11 @@ def test_whatever_decides_changes_it(
         replace(making, recordings=(f"{recording}@0:5",)).digest(),
         replace(making, build=BuildConfig(max_node_points=500)).digest(),
         replace(making, camera="500,500,160,120").digest(),
-        replace(making, asked=PoseOptions(("slam",))).digest(),
-        replace(making, asked=PoseOptions((str(poses),))).digest(),
+        replace(making, pose_options=PoseOptions(("slam",))).digest(),
+        replace(making, pose_options=PoseOptions((str(poses),))).digest(),
     ]
     poses.write_text("0 1 1 1 0 0 0 1\n0 0 0 0 0 0 0 1\n")
-    digests.append(replace(making, asked=PoseOptions((str(poses),))).digest())
+    digests.append(replace(making, pose_options=PoseOptions((str(poses),))).digest())
     picture = next((recording / "image_0").iterdir())
     os.utime(picture, ns=(1, 1))
     digests.append(making.digest())
@@ -60,13 +60,13 @@ def test_one_each(making: MapJob):
     three = replace(making, recordings=("a", "b", "c"))
     assert [one.recordings for one in three.split_by_recording()] == [("a",), ("b",), ("c",)]
     given = [
-        one.asked.trajectory
-        for one in replace(three, asked=PoseOptions(("x", "y", "z"))).split_by_recording()
+        one.pose_options.trajectory
+        for one in replace(three, pose_options=PoseOptions(("x", "y", "z"))).split_by_recording()
     ]
     assert given == [("x",), ("y",), ("z",)]
     assert [
-        one.asked.trajectory
-        for one in replace(three, asked=PoseOptions(("slam",))).split_by_recording()
+        one.pose_options.trajectory
+        for one in replace(three, pose_options=PoseOptions(("slam",))).split_by_recording()
     ] == [("slam",)] * 3
     with pytest.raises(UsageError, match="3 recordings but 2 trajectories"):
-        replace(three, asked=PoseOptions(("x", "y"))).split_by_recording()
+        replace(three, pose_options=PoseOptions(("x", "y"))).split_by_recording()

@@ -89,7 +89,7 @@ def test_few_frames_a_second(film: Path, tmp_path: Path):
 def test_the_recording_before_stays(film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert record("webcam", tmp_path / "out", "--source", film, "--frames", 1) == 0
     assert record("webcam", tmp_path / "out", "--source", film) == 1
-    assert "holds other things" in capsys.readouterr().err
+    assert "is not empty" in capsys.readouterr().err
     assert len(open_sequence(tmp_path / "out")) == 1
 
 
@@ -140,7 +140,7 @@ def test_signals_end_it_in_good_order(film: Path, tmp_path: Path, number: signal
         (("zed",), 1, "--camera SN12345.conf records it as a USB camera"),
         (("carla", "--server", "127.0.0.1"), 2, "no HOST:PORT"),
         (("carla", "--source", "0"), 2, "not for CARLA"),
-        (("webcam", "--lane-offset", "1"), 2, "not for a webcam"),
+        (("webcam", "--lane-offset", "1"), 2, "do not apply to webcam"),
         (("webcam", "--size", "big"), 2, "no WIDTHxHEIGHT"),
         (("webcam", "--fps", "0"), 2, "above 0"),
         (("webcam", "--frames", "0"), 2, "at least 1"),
@@ -170,7 +170,7 @@ def test_no_carla_server_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     pytest.importorskip("carla", reason="CARLA's client (extra carla) is not installed")
-    monkeypatch.setattr("topoloc.apps.formats.capture.carla_capture._CONNECT_S", 0.5)
+    monkeypatch.setattr("topoloc.apps.formats.carla._CONNECT_S", 0.5)
     assert record("carla", tmp_path / "out", "--server", "127.0.0.1:9") == 1
     assert capsys.readouterr().err.splitlines() == [
         "error: no CARLA server answers at 127.0.0.1:9; start CarlaUE4.sh (or its container) first"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from topoloc.apps.cli import main
-from topoloc.recordings.trajectory import read_trajectory
+from topoloc.recordings.trajectory import Trajectory
 
 
 def test_slam_writes_a_trajectory_and_says_how_good_it_is(
@@ -19,7 +19,7 @@ def test_slam_writes_a_trajectory_and_says_how_good_it_is(
     assert main(["slam", str(tiny_recording), str(out), "--json", str(told)]) == 0
     printed = capsys.readouterr().out
     facts = json.loads(told.read_text())
-    assert facts["num_frames"] == facts["num_tracked"] == len(read_trajectory(out)) == 14
+    assert facts["num_frames"] == facts["num_tracked"] == len(Trajectory.read(out)) == 14
     assert facts["ate_m"] < 0.01
     assert facts["num_submaps"] == facts["num_joined"] == 1
     for word in ("key frames", "loops", "sub-maps", "frames a second", "error (ATE)"):
@@ -42,7 +42,7 @@ def test_slam_poses_and_others_do_not_mix(
     tiny_recording: Path, tmp_path: Path, complaint: Callable[..., str]
 ):
     mixed = ["--trajectory", "slam", "--trajectory", "truth"]
-    assert "for all recordings or for none" in complaint(
+    assert "to all recordings or to none" in complaint(
         "build", *mixed, tiny_recording, tiny_recording, tmp_path / "x.topo", status=2
     )
 

@@ -27,7 +27,7 @@ def test_what_no_name_says_needs_a_format(room_map: Path, tmp_path: Path, compla
     assert "--format takes colmap, nerfstudio" in complaint(
         "export", room_map, tmp_path / "room.zip"
     )
-    assert "no format of ours" in complaint(
+    assert "unknown format" in complaint(
         "export", room_map, tmp_path / "room.tum", "--format", "fbx"
     )
 
@@ -45,11 +45,11 @@ def test_results_that_are_none(tmp_path: Path, refusals: Path, complaint: Compla
     assert "line 1: no result" in complaint("export", broken, tmp_path / "a.tum")
     broken.write_bytes(b"\x00\xff")
     assert "not a text file" in complaint("export", broken, tmp_path / "a.tum")
-    assert "no such file" in complaint("export", tmp_path / "gone.jsonl", tmp_path / "a.tum")
     os.mkfifo(tmp_path / "pipe")
-    assert "is no file" in complaint("export", tmp_path / "pipe", tmp_path / "a.tum")
-    assert "is no file" in complaint("export", tmp_path, tmp_path / "a.tum")
-    assert "cannot open map" in complaint("export", tmp_path / "gone.topo", tmp_path / "a.tum")
+    assert "is no map" in complaint("export", tmp_path / "pipe", tmp_path / "a.tum")
+    assert "is no map but a folder" in complaint("export", tmp_path, tmp_path / "a.tum")
+    for name in ("gone.topo", "gone.jsonl"):
+        assert "cannot open map" in complaint("export", tmp_path / name, tmp_path / "a.tum")
 
 
 def test_wrong_outputs(room_map: Path, tmp_path: Path, complaint: Complaint):

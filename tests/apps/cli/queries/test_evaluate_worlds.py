@@ -11,7 +11,7 @@ import pytest
 
 from topoloc.apps.cli import main
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.trajectory import Trajectory, write_tum
+from topoloc.recordings.trajectory import Trajectory
 
 Complaint = Callable[..., str]
 
@@ -103,7 +103,7 @@ def test_truth_of_another_convention_is_read_as_told(
     shutil.copytree(queries, inverse)
     sequence = open_sequence(queries)
     poses = [pose.inverse() for pose in sequence.poses if pose is not None]
-    write_tum(inverse / "truth.tum", Trajectory(poses, sequence.t_ns))
+    Trajectory(poses, sequence.t_ns).write_tum(inverse / "truth.tum")
     assert (
         main(
             ["evaluate", str(room_map), f"{inverse}@0:3", "--poses", "inverse", "--json", str(out)]

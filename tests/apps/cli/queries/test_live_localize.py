@@ -12,7 +12,7 @@ from mjpeg_camera import mjpeg_camera
 from room_stream import room_stream
 from tiny_world import CAMERA
 from topoloc.apps.cli import main
-from topoloc.recordings.trajectory import read_trajectory
+from topoloc.recordings.trajectory import Trajectory
 
 NUMBERS = f"{CAMERA.fx},{CAMERA.fy},{CAMERA.cx},{CAMERA.cy}"
 
@@ -44,7 +44,7 @@ def test_the_newest_pictures_are_localized(
     assert lines[-1]["query"] == "000011"  # the last picture is never left out
     assert all(line["localized"] for line in lines)
     assert ("state" in lines[0]) is not bool(options)
-    for line, pose in zip(lines, read_trajectory(found).world_from_cam, strict=True):
+    for line, pose in zip(lines, Trajectory.read(found).world_from_cam, strict=True):
         assert np.linalg.norm(pose.translation - stream[int(line["query"])][2].translation) < 0.05
 
 

@@ -16,7 +16,7 @@ from room_stream import room_stream
 from tiny_world import CAMERA
 from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
-from topoloc.recordings.trajectory import read_trajectory
+from topoloc.recordings.trajectory import Trajectory
 
 NUM_FRAMES = 15
 STATES = {"t_ns", "state", "smoothed", "smoothed_covariance"}
@@ -75,7 +75,7 @@ def test_recordings_and_videos_are_streams(
     assert all(line.keys() >= STATES for line in lines)
     assert main(["localize", str(room_map), str(source), "--tum", str(smoothed), "--smoothed"]) == 0
     for path, key in ((raw, "world_from_cam"), (smoothed, "smoothed")):
-        found = read_trajectory(path)
+        found = Trajectory.read(path)
         assert len(found) == NUM_FRAMES
         for pose, line, (_, _, truth) in zip(
             found.world_from_cam, lines, room_stream(), strict=False

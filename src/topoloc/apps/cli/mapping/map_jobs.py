@@ -1,7 +1,6 @@
-"""What becomes of recordings as a map: where their poses come from, how these are written, all
-settings; and that map, made.
+"""Build a map from recordings: the source of their poses, their conventions and all settings.
 
-`topoloc build` makes one of its own recordings, or sends one for each to other machines.
+`topoloc build` builds one map here, or sends one `MapJob` for each recording to other machines.
 """
 
 from __future__ import annotations
@@ -28,14 +27,18 @@ from topoloc import (
     with_trajectory,
 )
 from topoloc.apps.cli.output import UsageError, open_recording
+from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.formats.metric_scale import estimate_metric_scale
-from topoloc.plugin import Progress, has_scale, scale_poses, split_selection
+from topoloc.plugin import has_scale, scale_poses, split_selection
 
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """Where the poses of recordings come from, one name or one each (none: truth, where all have
-    one, else slam), and how they are written: as the options of `topoloc build` say it."""
+    """Source and conventions of poses, as the options of `topoloc build`.
+
+    `trajectory` has one entry for all recordings or one for each. If it is empty, the truth is used
+    if all recordings have one, else SLAM.
+    """
 
     trajectory: tuple[str, ...] = ()
     poses: str | None = None
@@ -44,16 +47,16 @@ class PoseOptions:
 
     @property
     def conventions(self) -> list[str]:
+        """The names in `poses`."""
         return (self.poses or "").split(",")
 
 
 @dataclass(frozen=True)
 class MapJob:
-    """One map of one or several recordings. Nothing in it is open: it may be sent to another
-    machine."""
+    """One map of one or several recordings. It can be pickled."""
 
     recordings: tuple[str, ...]
-    asked: PoseOptions
+    pose_options: PoseOptions
     build: BuildConfig
     format: str | None = None
     camera: str | None = None
@@ -61,57 +64,51 @@ class MapJob:
     topics: str | None = None
 
     def make(self, progress: Progress) -> tuple[TopoMetricMap, list[str]]:
-        """The map, and where the poses of each recording came from; what is to be known of the
-        recordings is said on standard error.
+        """Return the map and the source of each recording's poses. Warnings go to standard error.
 
         Raises:
-            UsageError: the options contradict each other, or the recordings.
-            TopolocError: as of `open_sequence`, `run_slam` and `build_map`.
+            UsageError: the options contradict each other or the recordings.
+            TopolocError: see `open_sequence`, `run_slam` and `build_map`.
         """
         sequences, poses_from = self._open()
-        if poses_from[0] == "slam":
+        is_slam = poses_from[0] == "slam"
+        if is_slam:
             result = run_slam(sequences, progress)
             sequences = result.apply(sequences)
-            apart = result.num_submaps - result.num_joined
-            if apart:
-                print(
-                    f"{apart} of {result.num_submaps} sub-maps see nothing in common with the"
-                    " others",
-                    file=sys.stderr,
-                )
-        _report_gaps(sequences)
+            if apart := result.num_submaps - result.num_joined:
+                _warn(f"{apart} of {result.num_submaps} sub-maps share no view with the others")
+        for sequence in sequences:
+            if num_without := sum(pose is None for pose in sequence.poses):
+                count = f"{num_without} of {len(sequence)}"
+                _warn(f"{sequence.name}: {count} frames have no pose and are left out")
         skipped_checks = SkippedChecks(
-            poses="unchecked" in self.asked.conventions,
-            gaps=self.asked.allow_gaps or poses_from[0] == "slam",
+            poses="unchecked" in self.pose_options.conventions,
+            gaps=self.pose_options.allow_gaps or is_slam,
         )
         return build_map(sequences, self.build, progress, poses_from, skipped_checks), poses_from
 
     def split_by_recording(self) -> list[MapJob]:
-        """For each recording the map of that one alone. Raises UsageError where there are neither
-        one nor as many trajectories."""
-        given = self.asked.trajectory
-        if len(given) not in (0, 1, len(self.recordings)):
-            raise UsageError(f"{len(self.recordings)} recordings but {len(given)} trajectories")
-        each = [given] * len(self.recordings) if len(given) < 2 else [(one,) for one in given]
+        """Return one job for each recording. Raises UsageError if the number of trajectories is
+        wrong."""
+        given = self.pose_options.trajectory
         return [
-            replace(self, recordings=(recording,), asked=replace(self.asked, trajectory=trajectory))
-            for recording, trajectory in zip(self.recordings, each, strict=True)
+            replace(
+                self,
+                recordings=(recording,),
+                pose_options=replace(self.pose_options, trajectory=(name,) if given else ()),
+            )
+            for recording, name in zip(self.recordings, self._for_each(given), strict=True)
         ]
 
     def digest(self) -> str:
-        """Of all that decides what the map looks like, 64 hexadecimal digits: settings, versions,
-        and the recordings' files by their names, sizes and times. Raises RecordingError where there
-        is no such recording."""
+        """Return the digest of settings, versions, and names, sizes and times of all files, 64
+        hexadecimal digits. Raises RecordingError if a recording is missing."""
         from topoloc import __version__
 
         files = [path for text in self.recordings for path in _list_files(split_selection(text)[0])]
-        named = (*self.asked.trajectory, self.camera or "", self.images or "")
-        files += [
-            path
-            for text in named
-            if text and os.path.exists(text)
-            for path in _list_files(Path(text))
-        ]
+        for text in (*self.pose_options.trajectory, self.camera, self.images):
+            if text and os.path.exists(text):
+                files += _list_files(Path(text))
         facts = {
             "settings": asdict(self),
             "versions": [__version__, TopoMetricMap.schema_version],
@@ -120,79 +117,63 @@ class MapJob:
                 for path in files
             ),
         }
-        return sha256(
-            json.dumps(facts, sort_keys=True).encode("utf-8", "surrogateescape")
-        ).hexdigest()
+        text = json.dumps(facts, sort_keys=True)
+        return sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
-    def _open(self) -> tuple[list[StereoSequence], list[str]]:
-        """The recordings with their poses, and where those of each come from; with `slam` they are
-        still to be found."""
-        sequences = [
-            open_recording(path, self.format, self.camera, self.topics, self.images)
-            for path in self.recordings
-        ]
-        trajectories = self.asked.trajectory or (
-            "truth" if all(any(sequence.poses) for sequence in sequences) else "slam",
-        )
-        if len(trajectories) == 1:
-            trajectories *= len(self.recordings)
+    def _for_each(self, trajectories: tuple[str, ...]) -> tuple[str, ...]:
+        """Return one trajectory for each recording. Raises UsageError."""
+        if len(trajectories) < 2:
+            return (trajectories or ("",)) * len(self.recordings)
         if len(trajectories) != len(self.recordings):
             raise UsageError(
                 f"{len(self.recordings)} recordings but {len(trajectories)} trajectories"
             )
+        return trajectories
+
+    def _open(self) -> tuple[list[StereoSequence], list[str]]:
+        """Return the recordings with their poses and the sources of these. With `slam` the poses
+        are computed later."""
+        sequences = [
+            open_recording(path, self.format, self.camera, self.topics, self.images)
+            for path in self.recordings
+        ]
+        has_truth = all(any(sequence.poses) for sequence in sequences)
+        default = ("truth" if has_truth else "slam",)
+        trajectories = self._for_each(self.pose_options.trajectory or default)
         if "slam" in trajectories:
-            if self.asked.poses is not None:
-                raise UsageError("--poses says how given poses are written; those of SLAM are ours")
+            if self.pose_options.poses is not None:
+                raise UsageError("--poses needs given poses; slam computes its own")
             if set(trajectories) != {"slam"}:
-                raise UsageError(
-                    "--trajectory slam goes for all recordings or for none: its world is no other's"
-                )
-            if self.asked.scale:
-                raise UsageError(
-                    "--scale is that of the recordings' own poses, and slam finds others"
-                )
+                raise UsageError("--trajectory slam applies to all recordings or to none")
+            if self.pose_options.scale:
+                raise UsageError("--scale needs the recordings' own poses; slam computes its own")
             return sequences, list(trajectories)
         pairs = zip(sequences, trajectories, strict=True)
-        return [self._with_poses(sequence, trajectory) for sequence, trajectory in pairs], list(
-            trajectories
-        )
+        return [self._with_poses(sequence, name) for sequence, name in pairs], list(trajectories)
 
     def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:
-        reading = PoseConventions.of(
-            ",".join(name for name in self.asked.conventions if name != "unchecked")
-        )
-        scale = self.asked.scale
-        if trajectory != "truth" and scale:
+        names = [name for name in self.pose_options.conventions if name != "unchecked"]
+        conventions, scale = PoseConventions.of(",".join(names)), self.pose_options.scale
+        if trajectory == "truth":
+            if scale:
+                sequence = scale_poses(sequence, estimate_metric_scale(scale, sequence))
+            return with_pose_conventions(sequence, conventions)
+        if scale:
             raise UsageError(
-                "--scale is that of the recordings' own poses, and --trajectory takes others"
+                "--scale needs the recordings' own poses, but --trajectory gives others"
             )
-        if trajectory != "truth":
-            has_metres = has_scale(sequence)
-            return (
-                with_trajectory(sequence, Path(trajectory), reading)
-                if has_metres
-                else align_to_trajectory(sequence, Path(trajectory))
-            )
-        return with_pose_conventions(
-            scale_poses(sequence, estimate_metric_scale(scale, sequence)) if scale else sequence,
-            reading,
-        )
+        if has_scale(sequence):
+            return with_trajectory(sequence, Path(trajectory), conventions)
+        return align_to_trajectory(sequence, Path(trajectory))
 
 
-def _report_gaps(sequences: list[StereoSequence]) -> None:
-    for sequence in sequences:
-        num_without = sum(pose is None for pose in sequence.poses)
-        if num_without:
-            print(
-                f"{sequence.name}: {num_without} of {len(sequence)} frames have no pose and are"
-                " left out",
-                file=sys.stderr,
-            )
+def _warn(text: str) -> None:
+    print(text, file=sys.stderr)
 
 
 def _list_files(path: Path) -> Iterator[Path]:
-    """The file, or all files below the folder. Raises RecordingError."""
-    if not os.path.exists(path):  # no error of a name that is too long
+    """Yield the file, or all files below the folder. Raises RecordingError."""
+    if not os.path.exists(path):  # no error for a name that is too long
         raise RecordingError(f"{path}: no such file or folder")
     if path.is_file():
         yield path

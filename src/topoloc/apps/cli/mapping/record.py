@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, closing
@@ -11,7 +12,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from topoloc import CalibrationError, MissingExtraError, StereoFrame, TopolocError
+from topoloc import CalibrationError, ConfigError, MissingExtraError, StereoFrame, TopolocError
 from topoloc.apps.cli.output import (
     File,
     UsageError,
@@ -20,96 +21,62 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.formats.capture.carla_capture import (
-    CarlaConfig,
-    Weather,
-    carla_client,
-    carla_frames,
-)
-from topoloc.apps.formats.capture.recording_writer import RecordingWriter
-from topoloc.apps.formats.capture.zed_capture import sdk_frames, side_by_side_frames
+from topoloc.apps.formats.carla import CarlaConfig, carla_client, carla_frames
 from topoloc.apps.formats.live import LiveSource
+from topoloc.apps.formats.recording_writer import RecordingWriter
+from topoloc.apps.formats.svo import sdk_frames
+from topoloc.apps.formats.zed import side_by_side_frames
 from topoloc.plugin import parse_calibration
 
 _ZED_SIZE = (2560, 720)
 
 
 @dataclass(frozen=True)
-class CarlaOptions:
-    """Where CARLA is recorded, and how (metres, degrees)."""
-
-    server: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = "localhost:2000"
-    """The running server."""
-    town: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: as it is)")
-    ] = None
-    """The town that is loaded, such as Town10HD."""
-    weather: Weather = "clear"
-    """The paper's: clear noon, cloudy noon, hard rain at noon."""
-    start: int = 0
-    """The spawn point at which the way begins; it follows the lane, and at junctions goes straight
-    on."""
-    length: float = 300.0
-    """Length of the way."""
-    spacing: float = 0.5
-    """From frame to frame."""
-    lane_offset: float = 0.0
-    """To the right of the lane's middle; negative to the left."""
-    height: float = 1.6
-    """Of the cameras above the lane."""
-    baseline: float = 0.5
-    """From the left to the right camera."""
-    fov: float = 90.0
-    """Horizontal field of view."""
-
-
-@dataclass(frozen=True)
 class Command:
-    """What `topoloc record` takes."""
+    """Arguments of `topoloc record`."""
 
     kind: Annotated[
         tyro.conf.Positional[Literal["zed", "carla", "webcam"]],
         tyro.conf.arg(metavar="zed|carla|webcam"),
     ]
-    """What is recorded: a ZED that is plugged in, the simulator CARLA, or any camera or stream that
-    OpenCV opens."""
+    """Source: a connected ZED, the simulator CARLA, or any camera or stream that OpenCV opens."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
-    """The recording's folder: a new one, or an empty one."""
+    """Folder of the recording, new or empty."""
     source: Annotated[
         str | None,
         tyro.conf.arg(
             metavar="SOURCE",
-            help_behavior_hint="(default: 0; of a ZED its SDK where that is installed)",
+            help_behavior_hint="(default: 0; for a ZED its SDK if installed)",
         ),
     ] = None
     """Device number or /dev/video0, rtsp:// or http:// URL, GStreamer pipeline, or a video file."""
     camera: Annotated[
         str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="")
     ] = None
-    """Calibration: of a ZED without its SDK the SN*.conf; of a webcam a camera.json, OpenCV's or
-    Kalibr's YAML, or four numbers."""
+    """Calibration: SN*.conf of a ZED without its SDK; camera.json, OpenCV's or Kalibr's YAML, or
+    four numbers of a webcam."""
     size: Annotated[
         str | None,
         tyro.conf.arg(
             metavar="WxH", help_behavior_hint="(default: the device's; ZED 2560x720, CARLA 800x600)"
         ),
     ] = None
-    """Pixels that the device is asked for; of a ZED of both pictures side by side."""
+    """Requested image size; for a ZED that of both images side by side."""
     fps: Annotated[
         float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: all)")
     ] = None
-    """Frames a second at most."""
+    """Maximum number of frames a second."""
     frames: Annotated[
         int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: until Ctrl-C)")
     ] = None
-    """Ends after so many frames."""
+    """Number of frames after which the recording ends."""
     jpeg: Annotated[
         int | None, tyro.conf.arg(metavar="1-100", help_behavior_hint="(default: PNG)")
     ] = None
-    """Store pictures as JPEG of this quality."""
-    carla: tyro.conf.OmitArgPrefixes[CarlaOptions] = field(default_factory=CarlaOptions)
+    """JPEG quality of the images."""
+    carla: tyro.conf.OmitArgPrefixes[CarlaConfig] = field(default_factory=CarlaConfig)
     json: File = None
-    """Write what is printed as JSON to this file (- for standard output)."""
+    """Write the printed facts as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
         self._check_usage()
@@ -119,7 +86,7 @@ class Command:
             frames = stack.enter_context(closing(self._frames(stop, stack)))
             last = self._write(writer, frames, stop)
         if last is None:
-            raise TopolocError(f"nothing recorded: {self.source or self.kind} gave no picture")
+            raise TopolocError(f"nothing recorded: {self.source or self.kind} gave no image")
         facts = {
             "out": self.out,
             "num_frames": writer.num_frames,
@@ -128,25 +95,23 @@ class Command:
             "poses": last.world_from_cam is not None,
         }
         if self.json != "-":
-            what = ", ".join(name for name in ("stereo", "depth", "poses") if facts[name])
-            print(f"{self.out}: {writer.num_frames} frames{f' ({what})' if what else ''}")
+            content = ", ".join(name for name in ("stereo", "depth", "poses") if facts[name])
+            print(f"{self.out}: {writer.num_frames} frames{f' ({content})' if content else ''}")
         write_json(self.json, facts)
         return 0
 
     def _write(
         self, writer: RecordingWriter, frames: Iterator[StereoFrame], stop: threading.Event
     ) -> StereoFrame | None:
-        """Writes all frames that come, no more of them than are wanted a second; gives the last."""
+        """Write the frames, at most `fps` a second, and return the last one."""
         last, next_ns = None, None
+        step_ns = 0 if self.fps is None else round(1e9 / self.fps)
         with progress_bar() as progress:
             try:
                 for frame in frames:
                     if next_ns is None or frame.t_ns >= next_ns:
                         writer.write(frame)
-                        last, next_ns = (
-                            frame,
-                            frame.t_ns + (0 if self.fps is None else round(1e9 / self.fps)),
-                        )
+                        last, next_ns = frame, frame.t_ns + step_ns
                         progress("frames", writer.num_frames, self.frames or writer.num_frames)
                     if stop.is_set() or writer.num_frames == self.frames:
                         break
@@ -154,17 +119,20 @@ class Command:
                 if last is None:
                     raise
                 raise TopolocError(
-                    f"{error} ({writer.num_frames} frames before are in {self.out})"
+                    f"{error} ({self.out} has the {writer.num_frames} frames before)"
                 ) from error
         return last
 
     def _frames(
         self, stop: threading.Event, stack: ExitStack
     ) -> Generator[StereoFrame, None, None]:
-        """Raises what opening the camera, or connecting to the server, does."""
+        """Open the source and yield its frames."""
         if self.kind == "carla":
-            config = self._carla_config()
-            yield from carla_frames(*carla_client(config), config)
+            try:
+                carla, client = carla_client(self.carla.server)
+            except ConfigError as error:
+                raise UsageError(str(error)) from None
+            yield from carla_frames(carla, client, self.carla, self._size() or (800, 600))
         elif self.kind == "zed" and self.source is None and self.camera is None:
             try:
                 yield from sdk_frames(stop)
@@ -194,47 +162,20 @@ class Command:
             raise UsageError("--jpeg is a quality from 1 to 100")
         if self.kind == "carla" and (self.source is not None or self.camera is not None):
             raise UsageError(
-                "--source and --camera are not for CARLA, whose cameras are made: --server, --size"
-                " and --fov say which"
+                "--source and --camera are not for CARLA; use --server, --size and --fov"
             )
-        if self.kind != "carla" and self.carla != CarlaOptions():
-            raise UsageError(f"options of CARLA's are not for a {self.kind}")
+        if self.kind != "carla" and self.carla != CarlaConfig():
+            raise UsageError(f"options of CARLA do not apply to {self.kind}")
         self._size()
 
     def _size(self) -> tuple[int, int] | None:
         if self.size is None:
             return None
-        width, _, height = self.size.lower().partition("x")
-        if not (
-            width.isdigit()
-            and height.isdigit()
-            and 0 < int(width[:6]) <= 16384
-            and 0 < int(height[:6]) <= 16384
-        ):
+        match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", self.size)
+        width, height = (int(match[1]), int(match[2])) if match else (0, 0)
+        if not (0 < width <= 16384 and 0 < height <= 16384):
             raise UsageError(f"--size {self.size[:40]} is no WIDTHxHEIGHT")
-        return int(width), int(height)
-
-    def _carla_config(self) -> CarlaConfig:
-        its = self.carla
-        host, _, port = its.server.rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port[:6]) < 65536:
-            raise UsageError(f"--server {its.server[:80]} is no HOST:PORT")
-        width, height = self._size() or (CarlaConfig.width, CarlaConfig.height)
-        return CarlaConfig(
-            host=host,
-            port=int(port),
-            town=its.town,
-            weather=its.weather,
-            start=its.start,
-            length_m=its.length,
-            spacing_m=its.spacing,
-            lane_offset_m=its.lane_offset,
-            height_m=its.height,
-            baseline_m=its.baseline,
-            width=width,
-            height=height,
-            fov_deg=its.fov,
-        )
+        return width, height
 
 
 def _single_frames(source: LiveSource, calibration_option: str | None) -> Iterator[StereoFrame]:
@@ -246,7 +187,7 @@ def _single_frames(source: LiveSource, calibration_option: str | None) -> Iterat
             camera = calibration(width, height).camera
         if camera is not None and (camera.width, camera.height) != (width, height):
             raise CalibrationError(
-                f"the pictures are {width}x{height}, their calibration is of"
+                f"the images are {width}x{height}, but the calibration is for"
                 f" {camera.width}x{camera.height}"
             )
         yield StereoFrame(f"{picture.number:06d}", picture.t_ns, picture.image, camera)

@@ -1,10 +1,9 @@
-"""Long recordings in pieces that overlap, each mapped by itself: `topoloc build --ray ...
---split`."""
+"""Split long recordings into overlapping pieces: `topoloc build --ray ... --split`."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
 from dataclasses import dataclass, replace
 from hashlib import sha256
 
@@ -18,11 +17,10 @@ MIN_OVERLAP = 3
 
 @dataclass(frozen=True)
 class SplitOptions:
-    """Pieces of at most so many frames, and how many of these a piece shares with the next one at
-    least.
+    """Maximum number of frames of a piece, and minimum number shared with the next one.
 
     Raises:
-        UsageError: they cannot be so.
+        UsageError: the numbers do not fit together.
     """
 
     num_frames: int
@@ -31,30 +29,25 @@ class SplitOptions:
     def __post_init__(self) -> None:
         if not MIN_OVERLAP <= self.num_shared <= self.num_frames // 2:
             raise UsageError(
-                "--split takes the frames of a piece and, behind a comma, how many of these the"
-                f" next one shares: {MIN_OVERLAP} at least and at most half, not"
-                f" {self.num_shared} of {self.num_frames}"
+                "--split FRAMES,SHARED: successive pieces must share at least"
+                f" {MIN_OVERLAP} frames and at most half, not {self.num_shared} of"
+                f" {self.num_frames}"
             )
 
     @staticmethod
     def of(text: str | None) -> SplitOptions | None:
-        """As the option says it, `500` or `500,50`: a tenth is shared where that is not said.
-        Raises UsageError."""
+        """Parse the option, `500` or `500,50`. By default a tenth is shared. Raises UsageError."""
         if text is None:
             return None
-        parts = text.split(",")
-        if len(parts) > 2 or not all(
-            part.isascii() and part.isdigit() and len(part) < 10 for part in parts
-        ):
+        parts = re.fullmatch(r"([0-9]{1,9})(?:,([0-9]{1,9}))?", text)
+        if parts is None:
             raise UsageError(f"--split takes frames, such as 500 or 500,50, not {text[:40]!r}")
-        num_frames = int(parts[0])
-        return SplitOptions(
-            num_frames, int(parts[1]) if len(parts) == 2 else max(num_frames // 10, MIN_OVERLAP)
-        )
+        num_frames = int(parts[1])
+        return SplitOptions(num_frames, int(parts[2] or max(num_frames // 10, MIN_OVERLAP)))
 
     def ranges(self, total: int) -> list[tuple[int, int]]:
-        """First frame and the one after the last of each piece of so many frames in all; all are of
-        one length."""
+        """Return the first frame, and the one after the last, of each piece of `total` frames. All
+        pieces have the same length."""
         if total <= self.num_frames:
             return [(0, total)]
         step = self.num_frames - self.num_shared
@@ -65,22 +58,23 @@ class SplitOptions:
 
 @dataclass(frozen=True)
 class Pieces:
-    """The maps to make of one recording, one after the other along it, and the world that they
-    share by its own poses; None where it has none, or there is but one map."""
+    """The maps of successive pieces of a recording, and the world of its own poses. The world is
+    None without such poses, and for a single map."""
 
     piece_jobs: list[MapJob]
     world: str | None = None
 
 
 def split_recording(map_job: MapJob, tile_id: str, split: SplitOptions) -> Pieces:
-    """The pieces of a recording, that of `map_job`; as it is where it is short, or cannot be
-    opened, of which its own task tells.
+    """Split the recording of `map_job`.
+
+    A short recording stays whole, and one that cannot be opened, so that its own task fails.
 
     Args:
-        tile_id: what the tile of the whole recording would be called.
+        tile_id: tile id of the whole recording.
 
     Raises:
-        UsageError: it is long, and frames of it are chosen.
+        UsageError: the recording is long, and frames of it are selected.
     """
     (recording,) = map_job.recordings
     try:
@@ -92,27 +86,19 @@ def split_recording(map_job: MapJob, tile_id: str, split: SplitOptions) -> Piece
     ranges = split.ranges(len(sequence))
     if len(ranges) == 1:
         return Pieces([map_job])
-    asked = map_job.asked
-    if not asked.trajectory and any(sequence.poses):
-        asked = replace(
-            asked, trajectory=("truth",)
-        )  # of every piece, also where one happens to have no pose
-    has_poses = asked.trajectory not in ((), ("slam",))
-    named = _select_frames(recording, ranges)
-    made = [replace(map_job, recordings=(name,), asked=asked) for name in named]
-    return Pieces(made, _world_name(recording, tile_id) if has_poses else None)
-
-
-def _select_frames(recording: str, ranges: Sequence[tuple[int, int]]) -> list[str]:
-    """The recording with these of its frames chosen. Raises UsageError."""
+    options = map_job.pose_options
+    if not options.trajectory and any(sequence.poses):  # also for pieces without a pose
+        options = replace(options, trajectory=("truth",))
     path, selection = split_selection(recording)
     if selection is not None:
         raise UsageError(
-            f"--split takes whole recordings, but frames are chosen of {path} ({selection[:40]})"
+            f"--split takes whole recordings, but frames of {path} are selected ({selection[:40]})"
         )
-    return [f"{path}@{start}:{stop}" for start, stop in ranges]
-
-
-def _world_name(recording: str, tile_id: str) -> str:
-    """A name for the world of a recording's own poses that no other recording's has."""
-    return f"{tile_id[:80]}-{sha256(os.fsencode(os.path.abspath(recording))).hexdigest()[:8]}"
+    pieces = [
+        replace(map_job, recordings=(f"{path}@{start}:{stop}",), pose_options=options)
+        for start, stop in ranges
+    ]
+    if options.trajectory in ((), ("slam",)):
+        return Pieces(pieces)
+    digest = sha256(os.fsencode(os.path.abspath(recording))).hexdigest()  # unique by recording
+    return Pieces(pieces, f"{tile_id[:80]}-{digest[:8]}")

@@ -1,4 +1,4 @@
-"""Recordings that become tiles, or join them: one table on a terminal, one line each elsewhere."""
+"""Show the progress of recordings: a table on a terminal, else one line for each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _STATES = {
 
 
 def format_state(state: Outcome | JobProgress | None) -> str:
-    """Where a recording is, in a few words."""
+    """Return the state of a recording in a few words."""
     if state is None:
         return "waits"
     if isinstance(state, JobProgress):
@@ -29,23 +29,18 @@ def format_state(state: Outcome | JobProgress | None) -> str:
 
 
 def format_outcome(outcome: Outcome) -> str:
-    """One line of a recording that is finished."""
+    """Return one line for a finished recording."""
+    prefix = f"{outcome.recording}: "
     if outcome.reason is not None:
-        return (
-            f"error: {outcome.recording}: {outcome.reason.removeprefix(f'{outcome.recording}: ')}"
-        )
+        return f"error: {prefix}{outcome.reason.removeprefix(prefix)}"
     size = f"{outcome.num_nodes} nodes, {outcome.num_bytes / 1e6:.2f} MB"
-    took = (
-        "there already"
-        if outcome.state == "there"
-        else f"{outcome.seconds:.1f} s on {outcome.host}"
-    )
-    return f"{outcome.recording}: tile {outcome.tile_id}, {size}, {took}"
+    work = f"{outcome.seconds:.1f} s on {outcome.host}"
+    work = _STATES["there"] if outcome.state == "there" else work
+    return f"{prefix}tile {outcome.tile_id}, {size}, {work}"
 
 
 def print_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
-    """What is to be known of recordings beside; below a table (`was_live`) also what failed once
-    more, where it can be copied."""
+    """Print the notes of recordings, and after a table (`was_live`) the failures again."""
     for outcome in outcomes:
         for note in outcome.notes:
             print(f"{outcome.recording}: {note}", file=sys.stderr)
@@ -57,17 +52,15 @@ def print_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
 def recordings_table(
     recordings: Sequence[str],
 ) -> Iterator[tuple[Callable[[int, Outcome | JobProgress], None], bool]]:
-    """A callable (recording's number, its state) that shows it; and whether it wants to know of
-    those that are being worked on, too."""
+    """Yield a callable (recording's number, its state) that shows it, and whether it also shows
+    recordings in progress."""
+
+    def print_line(number: int, state: Outcome | JobProgress) -> None:
+        if isinstance(state, Outcome):
+            print(format_outcome(state), file=sys.stderr)
+
     if not sys.stderr.isatty():
-        yield (
-            lambda number, state: (
-                print(format_outcome(state), file=sys.stderr)
-                if isinstance(state, Outcome)
-                else None
-            ),
-            False,
-        )
+        yield print_line, False
         return
     from rich.console import Console
     from rich.live import Live

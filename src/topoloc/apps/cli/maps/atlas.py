@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc.apps.cli.maps.tile_joining import join_overlapping_tiles
+from topoloc import Atlas, PairResult, join_tiles
 from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, print_fields, write_json
-from topoloc.apps.cli.settings_file import read_settings
+from topoloc.apps.cli.settings_file import Settings, read_settings
 
 Names = Annotated[
     tyro.conf.Positional[tuple[str, ...]],
@@ -22,83 +23,61 @@ Names = Annotated[
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc atlas` takes."""
+    """Options of `topoloc atlas`."""
 
     action: Annotated[
         tyro.conf.Positional[Literal["create", "add", "remove", "join", "info"]],
         tyro.conf.arg(metavar="ACTION"),
     ]
-    """`create`: a new atlas of maps. `add`: more maps. `remove`: tiles by their ids. `join`: tiles
-    that overlap get one world, as far as what they see is beyond doubt the same. `info`: what it
-    holds."""
+    """`create` makes a new atlas of maps, `add` adds maps, and `remove` removes tiles. `join` gives
+    tiles that certainly overlap one world. `info` prints the content."""
     atlas: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ATLAS")]
-    """The atlas: a folder; or, with the extra `cluster`, a prefix of an object store, such as
+    """The atlas: a folder. With the extra `cluster` also a prefix of an object store, such as
     s3://bucket/campus."""
     names: Names = ()
-    """Of `create` and `add`: map files, which are copied. Of `remove`: ids of tiles. Of `join`: ids
-    of tiles that others are compared with (none: all with each other)."""
+    """`create` and `add` copy these map files. `remove` removes these tiles. `join` compares these
+    tiles with the others (default: all with each other)."""
     id: Annotated[
         str | None,
         tyro.conf.arg(
             metavar="NAME", help_behavior_hint="(default: the file's name without .topo)"
         ),
     ] = None
-    """Of `create` and `add`, for one map: what the tile is called."""
+    """`create`, `add`: the id of the tile, for one map."""
     world: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")
     ] = None
-    """Of `create` and `add`: maps of one world, so that poses in one are poses in the other, too
-    (maps of one recording split, or of recordings whose poses are in one world)."""
+    """`create`, `add`: the world that all these maps share, for example the parts of one
+    recording."""
     replace: Flag = False
-    """Of `add`: a tile of the same id is replaced by the new map."""
+    """`add`: replace tiles of the same ids."""
     join: Flag = False
-    """Of `create` and `add`: then the new tiles are joined with those that they overlap with."""
+    """`create`, `add`: then join the new tiles with overlapping ones."""
     ray: RayOption = None
-    """Of `join` and `--join`: a Ray cluster on which each pair of tiles is compared, as in `topoloc
+    """`join`, `--join`: the Ray cluster that compares the pairs of tiles, as in `topoloc
     build`."""
     check: Flag = False
-    """Of `info`: also compare every file with its checksum; exit status 1 where one is missing or
-    another."""
+    """`info`: also compare every file with its checksum. The exit status is 1 if a file is missing
+    or differs."""
     json: File = None
-    """Write what the atlas holds afterwards as JSON to this file (- for standard output)."""
+    """Write the content of the atlas as JSON to this file (- for standard output)."""
     config: File = None
-    """Settings of the cluster of `join`: a TOML file, as `topoloc config atlas` prints it."""
+    """TOML file with the settings of a cluster, as printed by `topoloc config atlas`."""
 
     def run(self) -> int:
         self._check_usage()
-        found, joined = [], None
         if self.action == "info":
-            from topoloc import Atlas
-
-            atlas = Atlas.open(self.atlas)
-            manifest = atlas.manifest
-            if self.check:
-                found = [
-                    f"tile {tile.tile_id}: {problem}"
-                    for tile in manifest.tiles
-                    if (problem := atlas.find_problem(tile.tile_id))
-                ]
-        else:
-            settings = read_settings(self.config)
-            manifest = None if self.action == "join" else self._write()
-            if manifest is None or self.join:
-                ids = self._new_ids() if self.join else self.names
-                joined = join_overlapping_tiles(
-                    self.atlas, ids, settings, self.json != "-", ray=self.ray
-                )
-                manifest, found = joined.manifest, joined.not_compared
-        facts = describe(self.atlas, manifest) | ({"check": found or "ok"} if self.check else {})
-        facts |= {} if joined is None else {"tried": joined.rows}
-        if self.json != "-":
-            print_atlas(facts)
-        write_json(self.json, facts)
-        for problem in found:
-            print(f"error: {problem}", file=sys.stderr)
-        return 1 if found else 0
+            return show_atlas(Atlas.open(self.atlas), self.check, self.json)
+        settings = read_settings(self.config)
+        if self.action != "join":
+            manifest = self._write()
+            if not self.join:
+                return report_atlas(describe(self.atlas, manifest), self.json)
+        ids = self._new_ids() if self.join else self.names
+        joined = join_overlapping_tiles(self.atlas, ids, settings, self.json != "-", ray=self.ray)
+        return report_joined(self.atlas, joined, self.json)
 
     def _write(self) -> Any:
-        from topoloc import Atlas
-
         if self.action == "remove":
             return Atlas.remove(self.atlas, self.names).manifest
         if self.action == "create":
@@ -106,7 +85,7 @@ class Command:
         return Atlas.add(self.atlas, self.names, self.id, self.world, self.replace).manifest
 
     def _new_ids(self) -> list[str]:
-        """The ids of the tiles that `create` and `add` write."""
+        """Return the ids of the tiles that `create` and `add` write."""
         return [self.id or Path(name).name.removesuffix(".topo") for name in self.names]
 
     def _check_usage(self) -> None:
@@ -117,28 +96,57 @@ class Command:
                 f"{self.action} takes an atlas and at least one"
                 f" {'map' if self.action == 'add' else 'tile'}"
             )
-        if self.id is not None and (self.action not in ("create", "add") or len(self.names) != 1):
-            raise UsageError("--id is of one map that is added")
-        if self.world is not None and self.action not in ("create", "add"):
-            raise UsageError("--world is of maps that are added")
-        if self.replace and self.action != "add":
-            raise UsageError("--replace belongs to add")
-        if self.join and self.action not in ("create", "add"):
-            raise UsageError(
-                "--join belongs to create and add; `topoloc atlas join` joins what is there"
-            )
-        if self.config is not None and self.action != "join" and not self.join:
-            raise UsageError("--config sets the cluster on which tiles are joined")
-        if self.ray is not None and self.action != "join" and not self.join:
-            raise UsageError("--ray is of tiles that are joined")
-        if self.check and self.action != "info":
-            raise UsageError("--check belongs to info")
+        if self.id is not None and len(self.names) != 1:
+            raise UsageError("--id names the tile of one map")
+        joining = ("join", "create --join", "add --join")
+        action = f"{self.action}{' --join' if self.join else ''}"
+        for option, actions in {
+            "id": ("create", "add"),
+            "world": ("create", "add"),
+            "replace": ("add",),
+            "join": ("create", "add"),
+            "check": ("info",),
+            "config": joining,
+            "ray": joining,
+        }.items():
+            is_given = getattr(self, option) not in (None, False)
+            if is_given and self.action not in actions and action not in actions:
+                raise UsageError(f"--{option} belongs to {' and '.join(actions)}")
+
+
+def show_atlas(atlas: Atlas, check: bool, json: str | None) -> int:
+    """Print the facts of an atlas and, if `check` is set, each tile that differs from its
+    checksums. Return the exit status."""
+    problems = [(name, atlas.find_problem(name)) for name in atlas.select_tiles() if check]
+    found = [f"tile {name}: {problem}" for name, problem in problems if problem]
+    facts = describe(atlas.store.where, atlas.manifest)
+    return report_atlas(facts | ({"check": found or "ok"} if check else {}), json, found)
+
+
+def report_joined(where: str, joined: JoinedTiles, json: str | None) -> int:
+    """Print the facts of an atlas and the pairs that could not be compared. Return the exit
+    status."""
+    facts = describe(where, joined.manifest) | {"tried": joined.rows}
+    return report_atlas(facts, json, joined.not_compared)
+
+
+def report_atlas(facts: dict[str, Any], json: str | None, problems: Sequence[str] = ()) -> int:
+    """Print the facts of an atlas or write them to the file `json`, then print the problems. Return
+    the exit status."""
+    if json != "-":
+        _print_atlas(facts)
+    write_json(json, facts)
+    for problem in problems:
+        print(f"error: {problem}", file=sys.stderr)
+    return 1 if problems else 0
 
 
 def describe(where: str, manifest: Any) -> dict[str, Any]:
-    """The facts of an atlas: those of its tiles, and their sums."""
-    tiles = [tile.to_json() for tile in manifest.tiles]
-    origin = manifest.origin
+    """Return the facts of an atlas: those of its tiles, and their sums."""
+    tiles, origin, worlds = list[dict[str, Any]](), manifest.origin, dict[str, list[str]]()
+    for tile in manifest.tiles:
+        tiles.append(tile.to_json())
+        worlds.setdefault(tile.in_joint_world.joint, []).append(tile.tile_id)
     return {
         "path": where,
         "serial": manifest.serial,
@@ -146,31 +154,25 @@ def describe(where: str, manifest: Any) -> dict[str, Any]:
         "num_nodes": sum(tile.num_nodes for tile in manifest.tiles),
         "bytes": sum(stored.num_bytes for tile in manifest.tiles for stored in tile.files),
         "origin": None if origin is None else {"lat": origin.lat, "lon": origin.lon, "h": origin.h},
-        "worlds": group_tiles_by_world(manifest),
+        "worlds": worlds,
         "joins": [_describe_join(join, manifest) for join in manifest.joins],
         "tiles": tiles,
     }
 
 
-def group_tiles_by_world(manifest: Any) -> dict[str, list[str]]:
-    """The ids of the tiles of each world, those that joins make one together."""
-    worlds: dict[str, list[str]] = {}
-    for tile in manifest.tiles:
-        worlds.setdefault(tile.in_joint_world.joint, []).append(tile.tile_id)
-    return worlds
-
-
 def _describe_join(join: Any, manifest: Any) -> dict[str, Any]:
-    """What the manifest says of it, and one sigma of where the second tile's middle lies in the
-    first's world."""
+    """Return a join as JSON, with the standard deviation of its pose at the middle of the second
+    tile (metres, degrees)."""
     middle = manifest.by_id[join.second].box_world.mean(axis=0)
     metres, radians = join.sigmas_at(middle)
     return join.to_json() | {"sigma_m": metres, "sigma_deg": math.degrees(radians)}
 
 
-def print_atlas(facts: dict[str, Any]) -> None:
-    """For people: a line each tile."""
-    width = max((len(tile["id"]) for tile in facts["tiles"]), default=0)
+def _print_atlas(facts: dict[str, Any]) -> None:
+    """Print the facts of an atlas, with one line for each tile."""
+    width, check = max((len(tile["id"]) for tile in facts["tiles"]), default=0), facts.get("check")
+    if isinstance(check, list):
+        check = f"{len(check)} tiles are damaged"
     print_fields(
         [
             ("atlas", f"{facts['path']}, serial {facts['serial']}"),
@@ -185,29 +187,16 @@ def print_atlas(facts: dict[str, Any]) -> None:
                 if len(ids) > 1
             ),
             *(("join", _format_join(join)) for join in facts["joins"]),
-            *(
-                [
-                    (
-                        "check",
-                        (
-                            "ok"
-                            if facts["check"] == "ok"
-                            else f"{len(facts['check'])} tiles are damaged"
-                        ),
-                    )
-                ]
-                if "check" in facts
-                else []
-            ),
+            *([("check", check)] if check else []),
         ]
     )
 
 
 def _format_join(join: dict[str, Any]) -> str:
-    said = f"{join['first']} and {join['second']}: {join['num_agreeing']} pictures agree"
+    text = f"{join['first']} and {join['second']}: {join['num_agreeing']} pictures agree"
     if join["residual"] is None:
-        return f"{said}, but other joins contradict them; not used"
-    return f"{said}, {100 * join['sigma_m']:.1f} cm, {join['sigma_deg']:.2f} deg"
+        return f"{text}, but other joins contradict them; not used"
+    return f"{text}, {100 * join['sigma_m']:.1f} cm, {join['sigma_deg']:.2f} deg"
 
 
 def _format_tile(tile: dict[str, Any]) -> str:
@@ -219,3 +208,56 @@ def _format_tile(tile: dict[str, Any]) -> str:
         f"{tile['num_nodes']} nodes  {extent} m  {tile['map']['bytes'] / 1e6:.1f} MB "
         f" {', '.join(tile['kinds'])}{place}"
     )
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedTiles:
+    """The new manifest of the atlas, the result of each pair as JSON, and one line for each pair
+    that could not be compared."""
+
+    manifest: Any
+    rows: list[dict[str, Any]]
+    not_compared: list[str]
+
+
+def join_overlapping_tiles(
+    where: str,
+    tile_ids: Sequence[str],
+    settings: Settings,
+    is_verbose: bool,
+    pairs: Sequence[tuple[str, str]] | None = None,
+    ray: str | None = None,
+) -> JoinedTiles:
+    """Join these tiles with overlapping ones, or only these `pairs`, on the cluster `ray` if it is
+    given.
+
+    Raises:
+        TopolocError: from `join_tiles` and `run_on_ray`.
+    """
+
+    def report_pair(one: PairResult) -> None:
+        if is_verbose and one.problem is None:
+            print(f"{one.first} and {one.second}: {one}", file=sys.stderr)
+
+    run_jobs = None if ray is None else _run_jobs_on(ray, settings, report_pair)
+    done = join_tiles(where, tile_ids, report_pair, pairs, run_jobs)
+    lost = [
+        f"{one.first} and {one.second}: {one.problem}"
+        for one in done.pair_results
+        if one.problem is not None
+    ]
+    return JoinedTiles(done.manifest, [one.to_json() for one in done.pair_results], lost)
+
+
+def _run_jobs_on(
+    ray: str, settings: Settings, report_pair: Callable[[PairResult], None]
+) -> Callable[[Sequence[Any]], list[PairResult]]:
+    """Return a function that runs one task for each pair and reports pairs as they finish."""
+    from topoloc.apps.cluster.config import ClusterConfig
+    from topoloc.apps.cluster.tasks import JobProgress, run_on_ray
+
+    def show(number: int, state: PairResult | JobProgress) -> None:
+        if not isinstance(state, JobProgress):
+            report_pair(state)
+
+    return lambda jobs: run_on_ray(jobs, ray, settings.of(ClusterConfig), show)

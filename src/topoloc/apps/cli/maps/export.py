@@ -8,32 +8,32 @@ from typing import Annotated
 
 import tyro
 
-from topoloc import Atlas, TopolocError, TopoMetricMap, is_atlas
-from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
-from topoloc.apps.cli.tile_option import (
-    TileOption,
-    atlas_name,
-    check_tile_option,
+from topoloc import Atlas, TopolocError, TopoMetricMap, open_place
+from topoloc.apps.cli.output import (
+    File,
+    UsageError,
+    check_outputs,
     print_warning,
-    select_world,
+    progress_bar,
+    write_json,
 )
+from topoloc.apps.cli.tile_option import TileOption, select_world
 from topoloc.apps.export.formats import ExportFormat, find_export_format, write_scene
-from topoloc.apps.viewer.map_scene import create_map_scene
-from topoloc.apps.viewer.results_scene import create_results_scene
+from topoloc.apps.viewer.map_scene import create_map_scene, create_world_scene
+from topoloc.apps.viewer.result_files import create_results_scene
 from topoloc.apps.viewer.scene import Scene
-from topoloc.apps.viewer.world_scene import create_world_scene
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc export` takes."""
+    """Options of `topoloc export`."""
 
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS|RESULTS")]
-    """A map file; an atlas, of which the tiles are exported that share a world, those with most
-    nodes; or results: the JSON lines of `topoloc localize --json`."""
+    """A map file, an atlas, or results: the JSON lines of `topoloc localize --json`. Of an atlas,
+    the tiles of the shared world with most nodes are exported."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
-    """What is written: a file such as points.ply, map.geojson, map.mcap, walk.tum, walk.kitti, or
-    for COLMAP and nerfstudio a folder."""
+    """The file to write, such as points.ply, map.geojson, map.mcap, walk.tum or walk.kitti. COLMAP
+    and nerfstudio need a folder."""
     format: Annotated[
         str | None,
         tyro.conf.arg(
@@ -41,31 +41,22 @@ class Command:
             help_behavior_hint="(default: by OUT's suffix)",
         ),
     ] = None
-    """The format; a folder is COLMAP's unless this says nerfstudio."""
+    """The format. A folder is written for COLMAP unless this is nerfstudio."""
     session: Annotated[
         int | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: all)")
     ] = None
-    """Of a map, only the nodes of this session (`topoloc info --json` names them)."""
+    """Export only the nodes of this session of a map (`topoloc info --json` lists the sessions)."""
     tile: TileOption = None
-    """Of an atlas: only this tile, in its own world."""
+    """Export only this tile of an atlas, in its own world."""
     json: File = None
-    """Write what is printed as JSON to this file (- for standard output)."""
+    """Write the counts as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
         form = find_export_format(Path(self.out), self.format)
         outputs = [self.json] if form.folder is not None else [self.out, self.json]
         check_outputs(outputs, inputs=[self.source])
-        check_tile_option(self.source, self.tile)
-        if (
-            Path(self.source).exists()
-            and not Path(self.source).is_file()
-            and not is_atlas(self.source)
-        ):
-            raise TopolocError(
-                f"{self.source} is no file and no atlas: a map, an atlas or results are exported"
-            )
         if Path(self.out).resolve() == Path(self.source).resolve():
-            raise UsageError("OUT is what is to be exported")
+            raise UsageError("OUT is the exported path; choose another one")
         if not Path(self.out).absolute().parent.is_dir():
             raise TopolocError(f"cannot write {self.out}: its folder does not exist")
         scene = self._load_scene(form)
@@ -83,33 +74,37 @@ class Command:
         return 0
 
     def _load_scene(self, form: ExportFormat) -> Scene:
-        if is_atlas(self.source):
-            return self._load_tiles_scene(form)
-        if not _is_map(Path(self.source)):
-            if self.session is not None:
-                raise UsageError("--session is of maps, and this is none")
+        if _is_results(Path(self.source)):
+            if self.session is not None or self.tile is not None:
+                raise UsageError(f"--session and --tile select parts of maps, not of {self.source}")
             return create_results_scene(Path(self.source))
-        with TopoMetricMap.load(self.source) as topomap, progress_bar() as progress:
-            return create_map_scene(
-                topomap, Path(self.source).stem, self.session, form.with_points, progress
-            )
+        place = open_place(self.source)
+        place.select_tiles(self.tile)  # refuses a tile that does not exist
 
-    def _load_tiles_scene(self, form: ExportFormat) -> Scene:
-        if self.session is not None:
-            raise UsageError(
-                "--session is of maps: the tiles of an atlas have sessions of their own"
-            )
-        atlas = Atlas.open(self.source)
-        world, name = select_world(atlas, self.tile), self.tile or atlas_name(self.source)
-        with progress_bar() as progress:
-            return create_world_scene(atlas, world, name, form.with_points, progress, print_warning)
+        def load_map(path: str) -> Scene:
+            with TopoMetricMap.load(path) as topomap, progress_bar() as progress:
+                return create_map_scene(
+                    topomap, place.name, self.session, form.with_points, progress
+                )
+
+        def load_tiles(atlas: Atlas) -> Scene:
+            if self.session is not None:
+                raise UsageError("--session selects a session of one map file, not of an atlas")
+            world, name = select_world(atlas, self.tile), self.tile or place.name
+            with progress_bar() as progress:
+                return create_world_scene(
+                    atlas, world, name, form.with_points, progress, print_warning
+                )
+
+        return place.visit(load_map, load_tiles)
 
 
-def _is_map(path: Path) -> bool:
-    """By the first bytes, or where these cannot be read, by the name: opening it then says what is
-    wrong."""
+def _is_results(path: Path) -> bool:
+    """Return whether a path is a readable file that is no map, by its first bytes."""
     try:
+        if not path.is_file():
+            return False
         with path.open("rb") as file:
-            return file.read(16) == b"SQLite format 3\0"
+            return file.read(16) != b"SQLite format 3\0"
     except (OSError, ValueError):
-        return path.suffix == ".topo"
+        return False

@@ -14,6 +14,7 @@ from topoloc import (
     GeoreferenceError,
     GeoreferenceResult,
     georeference,
+    open_place,
 )
 from topoloc.apps.cli.output import (
     File,
@@ -23,26 +24,26 @@ from topoloc.apps.cli.output import (
     print_waiting,
     write_json,
 )
-from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
+from topoloc.apps.cli.tile_option import TileOption, select_tile
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc georeference` takes."""
+    """Options of `topoloc georeference`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; it is replaced by one that knows where on earth it lies. Or an atlas, with
-    `--tile`."""
+    """The map file, which is replaced by a georeferenced one. Or an atlas, with `--tile`."""
     origin: Annotated[
         str | None, tyro.conf.arg(metavar="LAT,LON,H,HEADING", help_behavior_hint="")
     ] = None
-    """Where the first mapping picture was taken (degrees, metres above the ellipsoid), and which
-    way it looks: degrees clockwise from true north."""
+    """Position of the first mapping image (degrees, metres above the ellipsoid) and its heading in
+    degrees clockwise from true north."""
     gnss: File = None
-    """Where the camera was: lines of `time,lat,lon,h` or `name of a mapping picture,lat,lon,h`;
-    fitted robustly."""
+    """Positions of the camera, fitted robustly: lines of `time,lat,lon,h` or
+    `name of a mapping image,lat,lon,h`."""
     points: File = None
-    """Three or more known points: lines of `x,y,z,lat,lon,h`, x, y, z metres in the map's world."""
+    """Three or more known points: lines of `x,y,z,lat,lon,h`, with x, y, z in metres in the map's
+    world."""
     up: Annotated[
         str | None,
         tyro.conf.arg(
@@ -50,12 +51,12 @@ class Command:
             help_behavior_hint="(default: the axis nearest to the cameras' up)",
         ),
     ] = None
-    """The axis of the map's world that is up; --points do not need it."""
+    """The axis of the map's world that points up. --points does not need it."""
     tile: TileOption = None
-    """Of an atlas: the tile; those that share its world, or are joined with it, then know where
-    they lie, too."""
+    """The tile of an atlas. Tiles that share its world or are joined with it are then georeferenced
+    too."""
     json: File = None
-    """Write what is printed as JSON to this file (- for standard output)."""
+    """Write the result as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
         given = [option for option in (self.origin, self.gnss, self.points) if option is not None]
@@ -65,9 +66,9 @@ class Command:
             [self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path]
         )
         origin = None if self.origin is None else _parse_origin(self.origin)
-        result = edit_map_or_tile(
-            self.map,
-            self.tile,
+        place = open_place(self.map)
+        result = place.edit(
+            select_tile(place, self.tile),
             lambda path: georeference(path, origin, self.gnss, self.points, self.up, print_waiting),
         )
         facts = _describe_result(result)
@@ -103,7 +104,7 @@ def _parse_origin(text: str) -> tuple[GeoPoint, float]:
 
 
 def format_georeference(georeference: Georeference) -> str:
-    """Where a map lies, and how well that is known, in one line."""
+    """Return the position of a map on earth and its accuracy as one line."""
     o, rms = georeference.origin, georeference.rms_m
     fitted = "" if rms is None else f", rms {rms:.2f} m"
     return f"{o.lat:.7f}, {o.lon:.7f}, {o.h:.2f} m (from {georeference.source}{fitted})"
@@ -125,10 +126,8 @@ def _print(result: GeoreferenceResult, facts: dict[str, Any]) -> None:
         lines.append(
             (
                 "residuals",
-                (
-                    f"rms {result.georeference.rms_m:.3f} m, largest"
-                    f" {result.residuals_m[worst]:.3f} m ({result.names[worst]})"
-                ),
+                f"rms {result.georeference.rms_m:.3f} m, largest"
+                f" {result.residuals_m[worst]:.3f} m ({result.names[worst]})",
             )
         )
         if not result.is_inlier.all():

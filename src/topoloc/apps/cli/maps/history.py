@@ -7,14 +7,14 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc import Atlas, is_atlas, read_history
-from topoloc.apps.cli.output import File, print_fields, write_json
+from topoloc import open_place
+from topoloc.apps.cli.output import File, print_fields
 from topoloc.apps.cli.tile_option import run_for_each_tile
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc history` takes."""
+    """Options of `topoloc history`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file, or an atlas."""
@@ -22,31 +22,18 @@ class Command:
     """Write the history to this file (- for standard output)."""
 
     def run(self) -> int:
-        if is_atlas(self.map):
-            return self._show_tiles()
-        facts = read_history(self.map)
-        if self.json != "-":
-            _print_edits(facts, "nothing is known of how this map was made")
-            _print_undo(self.map, facts)
-        write_json(self.json, {"map": self.map, "edits": facts})
-        return 0
+        place = open_place(self.map)
 
-    def _show_tiles(self) -> int:
-        atlas = Atlas.open(self.map)
-
-        def print_tile_history(tile_id: str) -> dict[str, Any]:
-            edits = atlas.history(tile_id)
+        def show_history(tile_id: str) -> dict[str, Any]:
+            edits = place.history(tile_id)
             if self.json != "-":
-                print(f"tile {tile_id}")
-                _print_edits(edits, "nothing is known of how this tile was made")
-                _print_undo(f"{self.map} --tile {tile_id}", edits)
+                if tile_id:
+                    print(f"tile {tile_id}")
+                _print_edits(edits)
+                _print_undo(f"{self.map} --tile {tile_id}" if tile_id else self.map, edits)
             return {"edits": edits}
 
-        tiles, are_all_told = run_for_each_tile(
-            atlas, list(atlas.manifest.by_id), print_tile_history
-        )
-        write_json(self.json, {"atlas": self.map, "tiles": tiles})
-        return 0 if are_all_told else 1
+        return run_for_each_tile(place, None, show_history, self.json)
 
 
 def _print_undo(where: str, edits: list[dict[str, Any]]) -> None:
@@ -58,7 +45,7 @@ def _print_undo(where: str, edits: list[dict[str, Any]]) -> None:
         )
 
 
-def _print_edits(edits: list[dict[str, Any]], without: str) -> None:
+def _print_edits(edits: list[dict[str, Any]]) -> None:
     print_fields(
         [
             (
@@ -67,24 +54,24 @@ def _print_edits(edits: list[dict[str, Any]], without: str) -> None:
             )
             for edit in edits
         ]
-        or [("", without)]
+        or [("", "the edits of this map are unknown")]
     )
 
 
 def _format_changes(changes) -> str:
-    """What an edit changed, in the words of its numbers."""
+    """Return the changes of an edit as text: each number with its name."""
     recall, numbers = _describe_recall_change(changes or {}), (changes or {}).items()
     shown = {
         name.replace("_", " "): value
         for name, value in numbers
         if value not in ([], None, "") and not name.startswith("earlier_")
     }
-    said = [f"{name} {value}" for name, value in shown.items()] + ([recall] if recall else [])
-    return "" if not said else ": " + ", ".join(said)
+    texts = [f"{name} {value}" for name, value in shown.items()] + ([recall] if recall else [])
+    return ": " + ", ".join(texts) if texts else ""
 
 
 def _describe_recall_change(changes) -> str | None:
-    """How many earlier nodes were localized before and after an edit; None if it was not
+    """Return how many earlier nodes were localized before and after an edit, None if it was not
     measured."""
     if not changes.get("earlier_asked"):
         return None

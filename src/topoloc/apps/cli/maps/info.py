@@ -1,4 +1,4 @@
-"""topoloc info MAP."""
+"""topoloc info MAP|ATLAS."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc import MapError, check_map, is_atlas
-from topoloc.apps.cli.maps import atlas
+from topoloc import Atlas, MapError, TopoMetricMap, check_map, open_place
+from topoloc.apps.cli.maps.atlas import show_atlas
 from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_fields, write_json
 
 MAX_PROBLEMS = 20
@@ -17,44 +17,43 @@ MAX_PROBLEMS = 20
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc info` takes."""
+    """Options of `topoloc info`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file, or an atlas."""
     json: File = None
-    """Write the same as JSON to this file (- for standard output)."""
+    """Write the facts as JSON to this file (- for standard output)."""
 
     check: Flag = False
-    """Also look at every byte of the map, and whether its nodes agree with their neighbours; exit
-    status 1 where something is wrong."""
+    """Also check all data of the map, and that its nodes agree with their neighbours. In an atlas,
+    compare every file with its checksum. The exit status is 1 if there is a fault."""
 
     graph: Annotated[
         str | None, tyro.conf.arg(metavar="FILE.graphml|FILE.geojson", help_behavior_hint="")
     ] = None
-    """Write nodes, junctions and the ways between them to this file; GeoJSON of a map that knows
-    its place on earth."""
+    """Write nodes, junctions and the paths between them to this file. GeoJSON needs a georeferenced
+    map."""
 
     def run(self) -> int:
-        from topoloc import TopoMetricMap
+        return open_place(self.map).visit(self._show_map, self._show_atlas)
 
-        if is_atlas(self.map) and self.graph:
-            raise UsageError("--graph is of one map; name a tile's file")
-        if is_atlas(self.map):
-            return atlas.Command("info", self.map, check=self.check, json=self.json).run()
-        check_outputs([self.json, self.graph], inputs=[self.map])
-        with TopoMetricMap.load(self.map) as topomap:
-            found = check_map(self.map) if self.check else []
+    def _show_atlas(self, atlas: Atlas) -> int:
+        if self.graph:
+            raise UsageError("--graph needs one map file, not an atlas")
+        return show_atlas(atlas, self.check, self.json)
+
+    def _show_map(self, path: str) -> int:
+        check_outputs([self.json, self.graph], inputs=[path])
+        with TopoMetricMap.load(path) as topomap:
+            found = check_map(path) if self.check else []
             if found:
                 print("\n".join(found[:MAX_PROBLEMS]))
-                raise MapError(
-                    f"map {self.map} is damaged: {len(found)} things are wrong, the first:"
-                    f" {found[0]}"
-                )
+                raise MapError(f"map {path} is damaged: {len(found)} faults, the first: {found[0]}")
             if self.graph:
                 from topoloc.apps.export.map_graph import write_graph
 
                 write_graph(topomap, Path(self.graph))
-            info = topomap.describe(self.map) | ({"check": "ok"} if self.check else {})
+            info = topomap.describe(path) | ({"check": "ok"} if self.check else {})
         if self.json != "-":
             _print(info)
         write_json(self.json, info)
@@ -62,11 +61,9 @@ class Command:
 
 
 def _print(info: dict[str, Any]) -> None:
-    nodes, normalization = (
-        info["config"].get("nodes", {}),
-        info["config"].get("features", {}).get("normalization"),
-    )
-    nan = float("nan")
+    nodes, features = (info["config"].get(name, {}) for name in ("nodes", "features"))
+    normalization, nan = features.get("normalization"), float("nan")
+    extent = " x ".join(f"{e:.1f}" for e in info["extent_m"])
     print_fields(
         [
             ("map", info["path"]),
@@ -75,13 +72,7 @@ def _print(info: dict[str, Any]) -> None:
             ("nodes", f"{info['num_nodes']}, {info['num_points']} points with 3-D position"),
             ("side nodes", str(info["num_side_nodes"])),
             ("place images", str(info["num_place_images"])),
-            (
-                "mapped",
-                (
-                    f"{info['length_m']:.1f} m, extent"
-                    f" {' x '.join(f'{e:.1f}' for e in info['extent_m'])} m"
-                ),
-            ),
+            ("mapped", f"{info['length_m']:.1f} m, extent {extent} m"),
             ("recordings", ", ".join(info["recordings"])),
             ("on earth", _format_place(info["georeference"])),
             *(
@@ -90,10 +81,8 @@ def _print(info: dict[str, Any]) -> None:
             ),
             (
                 "Eq. 1",
-                (
-                    f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda"
-                    f" {nodes.get('lambda_rot', nan):.3g} m/rad"
-                ),
+                f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda"
+                f" {nodes.get('lambda_rot', nan):.3g} m/rad",
             ),
             (
                 "features",
@@ -106,14 +95,12 @@ def _print(info: dict[str, Any]) -> None:
 
 
 def _format_place(facts: dict[str, Any] | None) -> str:
+    if facts is None:
+        return "unknown (topoloc georeference sets it)"
     from topoloc import Georeference
     from topoloc.apps.cli.maps.georeference import format_georeference
 
-    return (
-        "unknown (topoloc georeference says where)"
-        if facts is None
-        else format_georeference(Georeference.from_json(facts))
-    )
+    return format_georeference(Georeference.from_json(facts))
 
 
 def _format_coarse(facts: dict[str, Any], default: str) -> str:

@@ -2,36 +2,34 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from topoloc import Atlas, LocalizerConfig, is_atlas, merge
-from topoloc.apps.cli.maps.atlas import describe, print_atlas
+from topoloc import Atlas, LocalizerConfig, merge, open_place
+from topoloc.apps.cli.maps.atlas import join_overlapping_tiles, report_joined
 from topoloc.apps.cli.maps.session_update import describe_outdated_models
-from topoloc.apps.cli.maps.tile_joining import join_overlapping_tiles
 from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
 from topoloc.apps.cli.settings_file import Settings, read_settings
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc merge` takes."""
+    """Options of `topoloc merge`."""
 
     first: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="A")]
-    """A map; its world is that of the result. Or an atlas."""
+    """A map, whose world is that of the result. Or an atlas."""
     second: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="B")]
-    """A map of a place that overlaps with it. Or an atlas."""
+    """A map that overlaps with it. Or an atlas."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
-    """The map file to write; neither A nor B. Where one of these is an atlas, the new atlas of the
-    tiles of both, joined where they overlap."""
+    """The map file to write. If A or B is an atlas, the new atlas with the tiles of both, joined
+    where they overlap."""
     json: File = None
-    """Write what was merged to this file (- for standard output)."""
+    """Write the changes to this file (- for standard output)."""
     config: File = None
-    """All other settings: a TOML file, as `topoloc config update` prints it."""
+    """TOML file with all other settings, as printed by `topoloc config update`."""
 
     def run(self) -> int:
         if Path(self.out).exists() and any(
@@ -39,15 +37,20 @@ class Command:
             for path in (self.first, self.second)
             if Path(path).exists()
         ):
-            raise UsageError("OUT is one of the maps that are merged; give it a name of its own")
-        is_of_tiles = is_atlas(self.first) or is_atlas(self.second)
-        check_outputs(
-            [None if is_of_tiles else self.out, self.json],
-            inputs=[path for path in (self.first, self.second, self.config) if path],
+            raise UsageError("OUT is A or B; choose another path")
+        return open_place(self.first).visit(
+            lambda _: open_place(self.second).visit(self._merge_maps, self._merge_tiles),
+            self._merge_tiles,
         )
-        settings = read_settings(self.config)
-        if is_of_tiles:
-            return self._merge_tiles(settings)
+
+    def _read_settings(self, *outputs: str | None) -> Settings:
+        check_outputs(
+            outputs, inputs=[path for path in (self.first, self.second, self.config) if path]
+        )
+        return read_settings(self.config)
+
+    def _merge_maps(self, _: str) -> int:
+        settings = self._read_settings(self.out, self.json)
         with progress_bar() as progress:
             c = merge(
                 self.first,
@@ -68,22 +71,11 @@ class Command:
         write_json(self.json, {"map": self.out} | c)
         return 0
 
-    def _merge_tiles(self, settings: Settings) -> int:
-        """An atlas of two; then tiles of the second are compared with those of the first. Status 1
-        where some could not be."""
-
-        first = Atlas.open(self.first).manifest.by_id if is_atlas(self.first) else {}
-        merged = Atlas.merge([self.first, self.second], self.out).manifest
-        second = (
-            Atlas.open(self.second).manifest.by_id
-            if is_atlas(self.second)
-            else merged.by_id.keys() - first.keys()
-        )
-        joined = join_overlapping_tiles(self.out, sorted(second), settings, self.json != "-")
-        facts = describe(self.out, joined.manifest) | {"tried": joined.rows}
-        if self.json != "-":
-            print_atlas(facts)
-        write_json(self.json, facts)
-        for problem in joined.not_compared:
-            print(f"error: {problem}", file=sys.stderr)
-        return 1 if joined.not_compared else 0
+    def _merge_tiles(self, _: Atlas) -> int:
+        """Create an atlas of both and compare the tiles of the second one with the others. The exit
+        status is 1 if some could not be compared."""
+        settings, second = self._read_settings(self.json), open_place(self.second)
+        Atlas.merge([self.first, self.second], self.out)
+        added = [tile_id or second.name for tile_id in second.select_tiles()]
+        joined = join_overlapping_tiles(self.out, added, settings, self.json != "-")
+        return report_joined(self.out, joined, self.json)

@@ -4,75 +4,56 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc import Atlas, is_atlas, prune
-from topoloc.apps.cli.output import File, UsageError, check_outputs, print_waiting, write_json
-from topoloc.apps.cli.tile_option import (
-    TileOption,
-    check_tile_option,
-    edit_map_or_tile,
-    run_for_each_tile,
-)
+from topoloc import open_place, prune
+from topoloc.apps.cli.output import File, UsageError, check_outputs, print_waiting
+from topoloc.apps.cli.tile_option import TileOption, run_for_each_tile
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc prune` takes."""
+    """Options of `topoloc prune`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file, which is replaced; or an atlas, whose tiles are, one after the other."""
+    """The map file, which is replaced. Or an atlas, whose tiles are replaced one by one."""
     max_mb: Annotated[
         float | None,
-        tyro.conf.arg(metavar="N", help_behavior_hint="(default: only what is gone is dropped)"),
+        tyro.conf.arg(
+            metavar="N", help_behavior_hint="(default: remove only landmarks that are gone)"
+        ),
     ] = None
-    """Megabytes that the file may have, of an atlas that of each tile: every node keeps the
-    landmarks that add most, and nodes that others hold go before it keeps few."""
+    """Maximum size of the map file in megabytes. In an atlas it holds for each tile. Every node
+    keeps its most useful landmarks. Redundant nodes are removed before nodes keep too few."""
     descriptors: Literal["fine", "coarse"] = "fine"
-    """With `coarse` descriptors are rounded, to a third of their bytes, before anything goes that
-    may be there."""
+    """`coarse` rounds descriptors to a third of their bytes before useful landmarks are removed."""
     tile: TileOption = None
-    """Of an atlas: only this tile is pruned."""
+    """Prune only this tile of an atlas."""
     json: File = None
-    """Write what was dropped to this file (- for standard output)."""
+    """Write the changes to this file (- for standard output)."""
 
     def run(self) -> int:
         if self.max_mb is not None and not 0.0 < self.max_mb < 1e6:
             raise UsageError(f"--max-mb must be megabytes, not {self.max_mb:g}")
         check_outputs([self.json], inputs=[self.map])
-        check_tile_option(self.map, self.tile)
-        if not is_atlas(self.map):
-            changes = self._prune_map(Path(self.map), self.map)
-            write_json(self.json, {"map": self.map} | changes)
-            return 0
-        atlas = Atlas.open(self.map)
-        ids = list(atlas.manifest.by_id) if self.tile is None else [atlas.tile(self.tile).tile_id]
-        tiles, are_all_pruned = run_for_each_tile(
-            atlas,
-            ids,
-            lambda name: edit_map_or_tile(
-                self.map,
-                name,
-                lambda path: self._prune_map(path, f"{self.map}, tile {name}"),
-            ),
-        )
-        write_json(self.json, {"atlas": self.map, "tiles": tiles})
-        return 0 if are_all_pruned else 1
+        place = open_place(self.map)
 
-    def _prune_map(self, path: Path, name: str) -> dict[str, Any]:
-        """What was dropped from a map file, which is said of it by its name."""
-        pruned = prune(path, self.max_mb, self.descriptors, print_waiting)
-        changes = pruned.changes
-        if self.json != "-":
-            print(f"{name}: {describe_prune(changes, pruned.length_m / 1e3)}")
-        return changes
+        def prune_tile(tile_id: str) -> dict[str, Any]:
+            pruned = place.edit(
+                tile_id, lambda path: prune(path, self.max_mb, self.descriptors, print_waiting)
+            )
+            if self.json != "-":
+                text = describe_prune(pruned.changes, pruned.length_m / 1e3)
+                print(f"{place.title(tile_id)}: {text}")
+            return pruned.changes
+
+        return run_for_each_tile(place, self.tile, prune_tile, self.json)
 
 
 def describe_prune(changes: Mapping[str, Any], walked_km: float) -> str:
-    """What was dropped, in one line."""
+    """Return the changes as one line."""
     c = changes
     nodes = f"{c['nodes_dropped']} nodes that others hold, " if c["nodes_dropped"] else ""
     dropped = (

@@ -1,33 +1,41 @@
-"""What becomes of a recording as a session of a map: how its camera moved, how that is written, all
-settings; and the map file, updated.
-
-`topoloc update` does so with a map, with a tile of an atlas, or sends it to other machines.
-"""
+"""Add recordings to a map file, or to the matching tiles of an atlas, here or on a cluster."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from topoloc import (
+    Atlas,
+    AtlasConfig,
+    DuplicateSessionError,
     LocalizerConfig,
     MapUpdate,
     PoseConventions,
     StereoSequence,
+    Tile,
+    find_tile_of_recording,
     run_slam,
     update,
     with_pose_conventions,
     with_trajectory,
 )
-from topoloc.apps.cli.output import UsageError, open_recording, print_waiting
+from topoloc.apps.cli.features_option import open_localizer
+from topoloc.apps.cli.mapping.recordings_table import print_notes, recordings_table
+from topoloc.apps.cli.output import UsageError, interruptible, open_recording, print_waiting
+from topoloc.apps.cluster.config import ClusterConfig
+from topoloc.apps.cluster.connection import connect_to_cluster
+from topoloc.apps.cluster.tasks import Job, JobProgress, OnJobState, run_locally, run_on_ray
+from topoloc.apps.cluster.tiles import Outcome, State, run_tile_work
 from topoloc.plugin import Progress
 
 
 @dataclass(frozen=True)
 class SessionUpdateOptions:
-    """A recording that joins a map, by the options of `topoloc update`. Nothing in it is open: it
-    may be sent to another machine."""
+    """The options of `topoloc update` for one recording. They can be sent to another machine."""
 
     recording: str
     localize: LocalizerConfig
@@ -39,23 +47,22 @@ class SessionUpdateOptions:
     light: str | None = None
 
     def open_session(self) -> OpenSessionUpdate:
-        """Raises RecordingError; what is to be known of the recording is said on standard error."""
+        """Open the recording and print its notes to standard error. Raises RecordingError."""
         return OpenSessionUpdate(
             self, open_recording(self.recording, self.format, self.camera, self.topics)
         )
 
 
 class OpenSessionUpdate:
-    """A recording that is open, to join one map, or another one after that was replaced by somebody
-    else."""
+    """An open recording. It joins one map, or again a newer version of the map that another process
+    wrote meanwhile."""
 
     def __init__(self, options: SessionUpdateOptions, sequence: StereoSequence) -> None:
         self.options, self.sequence = options, sequence
         self._posed_sequence: StereoSequence | None = None
 
     def join(self, path: Path, progress: Progress) -> MapUpdate:
-        """The map file, replaced by one with this session in it; the changes tell its bytes before
-        and after.
+        """Add the session to the map file. The changes contain its bytes before and after.
 
         Raises:
             UsageError: the options contradict each other.
@@ -81,10 +88,10 @@ class OpenSessionUpdate:
         )
 
     def _with_poses(self, poses_from: str, progress: Progress) -> StereoSequence:
-        """The recording with its own motion."""
+        """Return the recording with its own poses."""
         if poses_from in ("slam", "map") and self.options.poses is not None:
             raise UsageError(
-                "--poses says how given poses are written; those of SLAM and of the map are ours"
+                "--poses is the convention of given poses; omit it for those of SLAM and of the map"
             )
         if poses_from == "map":
             return self.sequence
@@ -97,8 +104,137 @@ class OpenSessionUpdate:
         return with_trajectory(self.sequence, Path(poses_from), reading)
 
 
+@dataclass(frozen=True)
+class TileSelectionJob:
+    """A job that finds the tile of a recording. Its outcome names the tile."""
+
+    options: SessionUpdateOptions
+    atlas: str
+    atlas_config: AtlasConfig
+
+    @property
+    def name(self) -> str:
+        return f"which tile {self.options.recording}"
+
+    def run(self, progress: Progress) -> Outcome:
+        def find_tile() -> tuple[State, Tile]:
+            with interruptible():
+                sequence = self.options.open_session().sequence
+                atlas = Atlas.open(self.atlas)
+                localizer = open_localizer(atlas, self.options.localize, None, self.atlas_config)
+                return "recognised", find_tile_of_recording(atlas, localizer, sequence, progress)
+
+        return run_tile_work(self.options.recording, "", find_tile)
+
+    def failure_outcome(self, reason: str) -> Outcome:
+        return Outcome(self.options.recording, "", "failed", reason)
+
+
+@dataclass(frozen=True)
+class TileSessionJob:
+    """A job that adds a recording to a tile, unless the tile contains it."""
+
+    options: SessionUpdateOptions
+    atlas: str
+    tile_id: str
+
+    @property
+    def name(self) -> str:
+        return f"update {self.tile_id} {self.options.recording}"
+
+    def run(self, progress: Progress) -> Outcome:
+        changes = dict[str, Any]()
+
+        def update_tile() -> tuple[State, Tile]:
+            session, state = self.options.open_session(), "there"
+            with suppress(DuplicateSessionError), interruptible():
+                update = Atlas.open(self.atlas).edit(
+                    self.tile_id, lambda path: session.join(path, progress)
+                )
+                changes.update(update.changes)
+                state = "updated"
+            return state, Atlas.open(self.atlas).tile(self.tile_id)
+
+        outcome = run_tile_work(self.options.recording, self.tile_id, update_tile)
+        return replace(outcome, changes=changes or None)
+
+    def failure_outcome(self, reason: str) -> Outcome:
+        return Outcome(self.options.recording, self.tile_id, "failed", reason)
+
+
+@dataclass(frozen=True)
+class AtlasUpdate:
+    """Add each recording to its tile, or all of them to the tile `tile_id`, on the cluster `ray` if
+    it is given. All tiles are found before the first recording joins."""
+
+    update_options: Sequence[SessionUpdateOptions]
+    atlas: Atlas
+    tile_id: str | None
+    ray: str | None
+    atlas_config: AtlasConfig
+    cluster: ClusterConfig
+
+    def outcomes(self) -> list[Outcome]:
+        """Return the outcome of each recording, and print them as they finish.
+
+        Raises:
+            AtlasError: the atlas has no tile `tile_id`.
+            MissingExtraError, ClusterError: from `connect_to_cluster`.
+        """
+        where = self.atlas.address
+        tile = None if self.tile_id is None else self.atlas.tile(self.tile_id)
+        names = [options.recording for options in self.update_options]
+        with (
+            nullcontext() if self.ray is None else connect_to_cluster(self.ray),
+            recordings_table(names) as (show, is_live),
+        ):
+            chosen = (
+                [Outcome(name, tile.tile_id, "recognised") for name in names]
+                if tile
+                else self._select_tiles(where, show, is_live)
+            )
+            known = [number for number, one in enumerate(chosen) if one.state == "recognised"]
+            jobs = [
+                TileSessionJob(self.update_options[number], where, chosen[number].tile_id)
+                for number in known
+            ]
+            joined = self._run(
+                jobs, lambda k, state: show(known[k], state), is_live, [job.tile_id for job in jobs]
+            )
+        for number, outcome in zip(known, joined, strict=True):
+            chosen[number] = replace(
+                outcome, notes=tuple(dict.fromkeys(chosen[number].notes + outcome.notes))
+            )
+        print_notes(chosen, is_live)
+        return chosen
+
+    def _select_tiles(self, where: str, show: OnJobState[Outcome], is_live: bool) -> list[Outcome]:
+        """Return the tile of each recording. The outcome is failed if there is none."""
+
+        def show_failures(number: int, state: Outcome | JobProgress) -> None:
+            if is_live or (isinstance(state, Outcome) and state.reason is not None):
+                show(number, state)
+
+        return self._run(
+            [TileSelectionJob(one, where, self.atlas_config) for one in self.update_options],
+            show_failures,
+            is_live,
+        )
+
+    def _run(
+        self,
+        jobs: Sequence[Job[Outcome]],
+        show: OnJobState[Outcome],
+        is_live: bool,
+        lines: Sequence[str] | None = None,
+    ) -> list[Outcome]:
+        if self.ray is None or not jobs:
+            return run_locally(jobs, show, is_live)
+        return run_on_ray(jobs, self.ray, self.cluster, show, is_live, lines)
+
+
 def describe_update(changes: dict[str, Any]) -> str:
-    """What a session changed, in one line."""
+    """Return the changes of a session as one line."""
     c = changes
     seen = (
         f"{c['recording']} joins as session {c['session']}: {c['frames_with_pose']} of"
@@ -110,21 +246,21 @@ def describe_update(changes: dict[str, Any]) -> str:
             f"{seen} ({c['frames_with_pose'] - carried} by the map, {carried} by odometry,"
             f" {without} without a pose)"
         )
-    asked = f"{c['localized']} of {c['asked']} pictures asked were recognised"
+    localized = f"{c['localized']} of {c['asked']} images were localized"
     added = f"{c['nodes_added']} nodes added"
     return (
-        f"{seen}, {asked}, {added}, {c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f}"
+        f"{seen}, {localized}, {added}, {c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f}"
         f" MB{describe_outdated_models(changes)}"
     )
 
 
 def describe_outdated_models(changes: dict[str, Any]) -> str:
-    """Which coarse localizers know nothing of new nodes, and what to do about it."""
+    """Return the coarse localizers that do not rank new nodes, each with a remedy."""
     if not changes["not_taught"] or not changes["nodes_added"]:
         return ""
-    ways = {"cnn-fc": "`topoloc train --coarse cnn-fc --weights map` teaches it"}
+    remedies = {"cnn-fc": "`topoloc train --coarse cnn-fc --weights map` teaches it"}
     named = [
-        f"{name} knows nothing of them: {ways.get(name, 'PyTorch is missing here')}"
+        f"{name} knows nothing of them: {remedies.get(name, 'PyTorch is missing here')}"
         for name in changes["not_taught"]
     ]
     return "".join(f"; {line}" for line in named)

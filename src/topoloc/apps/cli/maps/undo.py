@@ -7,30 +7,29 @@ from typing import Annotated
 
 import tyro
 
-from topoloc import undo_edit
+from topoloc import open_place, undo_edit
 from topoloc.apps.cli.output import File, print_waiting, write_json
-from topoloc.apps.cli.tile_option import TileOption, edit_map_or_tile
+from topoloc.apps.cli.tile_option import TileOption, select_tile
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc undo` takes."""
+    """Options of `topoloc undo`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; it becomes what it was before its last edit, to the byte. Or an atlas, with
+    """The map file. It becomes byte-identical to the file before its last edit. Or an atlas, with
     `--tile`."""
     tile: TileOption = None
-    """Of an atlas: the tile whose last edit is taken back."""
+    """The tile of an atlas whose last edit is undone."""
     json: File = None
-    """Write which edit was taken back to this file (- for standard output)."""
+    """Write the undone edit to this file (- for standard output)."""
 
     def run(self) -> int:
-        undone = edit_map_or_tile(self.map, self.tile, lambda path: undo_edit(path, print_waiting))
-        tile = {} if self.tile is None else {"tile": self.tile}
+        place = open_place(self.map)
+        tile_id = select_tile(place, self.tile)
+        undone = place.edit(tile_id, lambda path: undo_edit(path, print_waiting))
         if self.json != "-":
-            print(
-                f"{self.map}{', tile ' * bool(tile)}{self.tile or ''}: {undone.name!r} of"
-                f" {undone.date} is taken back"
-            )
+            print(f"{place.title(tile_id)}: {undone.name!r} of {undone.date} is taken back")
+        tile = {"tile": tile_id} if tile_id else {}
         write_json(self.json, {"map": self.map, **tile, "undone": asdict(undone)})
         return 0

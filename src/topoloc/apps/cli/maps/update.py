@@ -9,13 +9,17 @@ from typing import Annotated
 import tyro
 
 from topoloc import (
+    Atlas,
     AtlasConfig,
     LocalizerConfig,
     Trajectory,
-    is_atlas,
-    write_tum,
+    open_place,
 )
-from topoloc.apps.cli.maps.session_update import SessionUpdateOptions, describe_update
+from topoloc.apps.cli.maps.session_update import (
+    AtlasUpdate,
+    SessionUpdateOptions,
+    describe_update,
+)
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -33,27 +37,27 @@ from topoloc.apps.cluster.config import ClusterConfig
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc update` takes."""
+    """Options of `topoloc update`."""
 
     paths: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(metavar="MAP|ATLAS SEQ [SEQ ...]", help_behavior_hint="(required)"),
     ] = ()
-    """The map file, which is replaced, and recordings of its place, of stereo, RGB-D or a single
-    camera, which join it one after the other. PATH@0::2 takes every second frame of PATH. Of an
-    atlas each joins the tile that its pictures are of."""
+    """The map file, which is replaced, and recordings of its place (stereo, RGB-D or a single
+    camera), which join it one by one. PATH@0::2 takes every second frame of PATH. In an atlas each
+    recording joins the tile that its images match."""
     trajectory: Annotated[
         str | None,
         tyro.conf.arg(
             metavar="truth|slam|map|FILE",
             help_behavior_hint=(
-                "(default: truth where there is one, slam of stereo or RGB-D, else map)"
+                "(default: truth if there is one, slam for stereo or RGB-D, else map)"
             ),
         ),
     ] = None
-    """How the camera moved: `truth` (the recording's own poses, in any metric world), `slam` (of
-    stereo or RGB-D), or a TUM or KITTI file. With `map` the map is asked where each picture was
-    taken, as in a stream, and odometry goes on where it does not know."""
+    """Source of the poses: `truth` (the recording's own, in any metric world), `slam` (stereo or
+    RGB-D), or a TUM or KITTI file. `map` localizes each image in the map, as in a stream, and
+    bridges gaps by odometry."""
     poses: Annotated[
         str | None,
         tyro.conf.arg(
@@ -61,67 +65,74 @@ class Command:
             help_behavior_hint="(default: world_from_cam, metres)",
         ),
     ] = None
-    """How the poses of truth or FILE are written, as in `topoloc build`."""
+    """Convention of the poses of truth or FILE, as in `topoloc build`."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
+    """Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
     rosbag, mcap, zed, video or folder."""
     camera: CameraOption = None
     """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML,
     SN*.conf, or `fx,fy,cx,cy`."""
     topics: Topics = None
-    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    """Topics of a bag by role: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     light: Annotated[
         str | None,
-        tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: as its pictures show)"),
+        tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: from the images)"),
     ] = None
-    """What the recordings' light is called, such as `evening`: sessions of one name count for one
-    light, of two names for two."""
+    """Name of the illumination, such as `evening`. Sessions of one name have one illumination."""
     joined: Annotated[str | None, tyro.conf.arg(metavar="FILE.tum", help_behavior_hint="")] = None
-    """Write where the frames of the (one) recording were taken, in the map's world, to this TUM
-    file."""
+    """Write the poses of the (one) recording in the map's world to this TUM file."""
     tile: Annotated[
         str | None,
-        tyro.conf.arg(metavar="ID", help_behavior_hint="(default: as its pictures show)"),
+        tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from the images)"),
     ] = None
-    """Of an atlas, the tile that all recordings join."""
+    """The tile of an atlas that all recordings join."""
     ray: RayOption = None
-    """Of an atlas, a Ray cluster on which recordings of different tiles join them side by side, as
-    in `topoloc build`."""
+    """The Ray cluster that updates different tiles of an atlas in parallel, as in `topoloc
+    build`."""
     json: File = None
-    """Write what each session changed to this file (- for standard output)."""
+    """Write the changes of each session to this file (- for standard output)."""
     config: File = None
-    """All other settings: a TOML file, as `topoloc config update` prints it."""
+    """TOML file with all other settings, as printed by `topoloc config update`."""
 
     def run(self) -> int:
-        self._check_usage()
-        target, *recordings = self.paths
+        if len(self.paths) < 2:
+            raise UsageError("update takes a map or an atlas, and at least one recording")
+        if self.joined and len(self.paths) > 2:
+            raise UsageError("--joined takes the frames of one recording")
+        if self.light is not None and not self.light.strip():
+            raise UsageError("--light is a name, such as evening")
+        place = open_place(self.paths[0])
         check_outputs(
-            [self.json, self.joined], inputs=[path for path in (target, self.config) if path]
+            [self.json, self.joined], inputs=[path for path in (self.paths[0], self.config) if path]
         )
         settings = read_settings(self.config)
-        update_options = [self._session_options(path, settings) for path in recordings]
-        return (
-            self._update_atlas(target, update_options, settings)
-            if is_atlas(target)
-            else self._update_map(target, update_options)
+        return place.visit(
+            lambda path: self._update_map(path, settings),
+            lambda atlas: self._update_atlas(atlas, settings),
         )
 
-    def _session_options(self, path: str, settings: Settings) -> SessionUpdateOptions:
-        return SessionUpdateOptions(
-            path,
-            settings.of(LocalizerConfig),
-            self.trajectory,
-            self.poses,
-            self.format,
-            self.camera,
-            self.topics,
-            self.light,
-        )
+    def _session_options(self, settings: Settings) -> list[SessionUpdateOptions]:
+        config = settings.of(LocalizerConfig)
+        return [
+            SessionUpdateOptions(
+                path,
+                config,
+                self.trajectory,
+                self.poses,
+                self.format,
+                self.camera,
+                self.topics,
+                self.light,
+            )
+            for path in self.paths[1:]
+        ]
 
-    def _update_map(self, target: str, update_options: list[SessionUpdateOptions]) -> int:
+    def _update_map(self, target: str, settings: Settings) -> int:
+        if self.tile is not None or self.ray is not None:
+            raise UsageError(f"--tile and --ray need an atlas, and {target} is a map file")
         done = []
-        for joining in update_options:
-            session = joining.open_session()
+        for options in self._session_options(settings):
+            session = options.open_session()
             with progress_bar() as progress:
                 update = session.join(Path(target), progress)
             if self.joined:
@@ -130,9 +141,8 @@ class Command:
                     for t_ns, pose in zip(update.sequence.t_ns, update.sequence.poses, strict=True)
                     if pose is not None
                 ]
-                write_tum(
-                    Path(self.joined),
-                    Trajectory([pose for _, pose in known], [t_ns for t_ns, _ in known]),
+                Trajectory([pose for _, pose in known], [t_ns for t_ns, _ in known]).write_tum(
+                    Path(self.joined)
                 )
             if self.json != "-":
                 print(f"{target}: {describe_update(update.changes)}")
@@ -140,40 +150,28 @@ class Command:
         write_json(self.json, {"map": target, "updates": done})
         return 0
 
-    def _update_atlas(
-        self, target: str, update_options: list[SessionUpdateOptions], settings: Settings
-    ) -> int:
-        """Each recording joins the tile that it is of; status 1 where one could not."""
-        from topoloc.apps.cli.maps.tile_sessions import AtlasUpdate
-
+    def _update_atlas(self, atlas: Atlas, settings: Settings) -> int:
+        """Add each recording to its tile. The exit status is 1 if one fails."""
+        if self.joined:
+            raise UsageError("--joined needs a map file, not an atlas")
         configs = settings.of(AtlasConfig), settings.of(ClusterConfig)
-        outcomes = AtlasUpdate(update_options, target, self.tile, self.ray, *configs).outcomes()
+        options = self._session_options(settings)
+        outcomes = AtlasUpdate(options, atlas, self.tile, self.ray, *configs).outcomes()
         counts = {
             state: sum(outcome.state == state for outcome in outcomes)
             for state in ("updated", "there", "failed")
         }
+        where = self.paths[0]
         if self.json != "-":
             for outcome in outcomes:
                 if outcome.changes is not None:
-                    print(f"{target}, tile {outcome.tile_id}: {describe_update(outcome.changes)}")
+                    print(f"{where}, tile {outcome.tile_id}: {describe_update(outcome.changes)}")
             print(
-                f"{target}: {counts['updated']} recordings joined, {counts['there']} there already,"
+                f"{where}: {counts['updated']} recordings joined, {counts['there']} there already,"
                 f" {counts['failed']} failed"
             )
         write_json(
             self.json,
-            {"atlas": target, **counts, "recordings": [outcome.to_json() for outcome in outcomes]},
+            {"atlas": where, **counts, "recordings": [outcome.to_json() for outcome in outcomes]},
         )
         return 1 if counts["failed"] else 0
-
-    def _check_usage(self) -> None:
-        if len(self.paths) < 2:
-            raise UsageError("update takes a map or an atlas, and at least one recording")
-        if self.joined and len(self.paths) > 2:
-            raise UsageError("--joined takes the frames of one recording")
-        if self.light is not None and not self.light.strip():
-            raise UsageError("--light is a name, such as evening")
-        if is_atlas(self.paths[0]) and self.joined:
-            raise UsageError("--joined is of a map")
-        if not is_atlas(self.paths[0]) and (self.tile is not None or self.ray is not None):
-            raise UsageError(f"--tile and --ray are of an atlas, and {self.paths[0]} is none")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
@@ -12,19 +11,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc import Atlas, TopoMetricMap, is_atlas
-from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
-from topoloc.apps.cli.tile_option import (
-    TileOption,
-    atlas_name,
-    check_tile_option,
-    print_warning,
-    select_world,
-)
+from topoloc import Atlas, TopoMetricMap, open_place
+from topoloc.apps.cli.output import File, UsageError, check_outputs, print_warning, write_json
+from topoloc.apps.cli.tile_option import TileOption, select_world
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
-from topoloc.apps.viewer.page import write_scene_page
+from topoloc.apps.viewer.page import find_browser, write_scene_page, write_screenshot
 from topoloc.apps.viewer.result_files import read_results
-from topoloc.apps.viewer.screenshot import find_browser, write_screenshot
 from topoloc.apps.viewer.world_document import create_world_document
 
 _DEFAULT_MAX_POINTS = SceneBudget().max_points
@@ -32,54 +24,55 @@ _DEFAULT_MAX_POINTS = SceneBudget().max_points
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc view` takes."""
+    """Options of `topoloc view`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; or an atlas, of which the tiles are shown that share a world, those with most
-    nodes."""
+    """The map file or an atlas. Of an atlas, the tiles of the shared world with most nodes are
+    shown."""
     results: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(metavar="RESULTS ...", help_behavior_hint=""),
     ] = ()
-    """What to show in it: result files of `topoloc localize` and `topoloc evaluate` (JSON),
+    """Files to show in it: results of `topoloc localize` and `topoloc evaluate` (JSON),
     trajectories (TUM, KITTI)."""
     out: File = None
     """Write the page to this file (HTML, self-contained) instead of opening it in the browser."""
     screenshot: File = None
-    """Write a picture of the page to this file (PNG) instead, by a Chromium or Chrome that is
-    installed."""
+    """Write an image of the page to this file (PNG) instead. It needs an installed Chromium or
+    Chrome."""
     tile: TileOption = None
-    """Of an atlas: only this tile, in its own world."""
+    """Show only this tile of an atlas, in its own world."""
     points: Annotated[
         int, tyro.conf.arg(metavar="N", help_behavior_hint=f"(default: {_DEFAULT_MAX_POINTS})")
     ] = _DEFAULT_MAX_POINTS
-    """At most so many of the map's points are shown; with the default a page has some 10 MB at
-    most."""
+    """The maximum number of points shown. With the default a page has at most about 10 MB."""
 
     json: File = None
-    """Write the scene itself to this file instead, as the service gives it (JSON; - for standard
-    output)."""
+    """Write the scene of the page to this file instead (JSON; - for standard output)."""
 
     def run(self) -> int:
         check_outputs([self.out, self.screenshot, self.json], inputs=[self.map, *self.results])
         if self.points < 0:
-            raise UsageError(f"--points {self.points}: 0 or more are expected")
+            raise UsageError(f"--points {self.points}: use 0 or more")
         if self.screenshot:
             find_browser()
-        check_tile_option(self.map, self.tile)
+        place = open_place(self.map)
+        place.select_tiles(self.tile)  # refuses a tile that does not exist
         results = [one for path in self.results for one in read_results(Path(path))]
         budget = SceneBudget(max_points=self.points)
-        if is_atlas(self.map):
-            atlas = Atlas.open(self.map)
-            world = select_world(atlas, self.tile)
-            document = create_world_document(
-                atlas, world, self.tile or atlas_name(self.map), results, budget, print_warning
-            )
-            _warn_of_other_worlds(results, document["results"])
-        else:
-            with TopoMetricMap.load(self.map) as topomap:
+
+        def show_map(path: str) -> dict[str, Any]:
+            with TopoMetricMap.load(path) as topomap:
                 _warn_of_other_maps(results, topomap.id)
-                document = create_document(topomap, Path(self.map).stem, results, budget)
+                return create_document(topomap, place.name, results, budget)
+
+        def show_tiles(atlas: Atlas) -> dict[str, Any]:
+            world, name = select_world(atlas, self.tile), self.tile or place.name
+            shown = create_world_document(atlas, world, name, results, budget, print_warning)
+            _warn_of_other_worlds(results, shown["results"])
+            return shown
+
+        document = place.visit(show_map, show_tiles)
         if self.out:
             write_scene_page(Path(self.out), document)
         if self.screenshot:
@@ -98,15 +91,12 @@ class Command:
 
 
 def _open_in_browser(document: Mapping[str, Any]) -> str:
-    """The page, which the browser reads after we have ended: it stays in the system's folder for
-    such files."""
+    """Open the page in the browser and return its path. The file stays in the system's temporary
+    folder, because the browser reads it after this process has ended."""
     page = Path(tempfile.mkdtemp(prefix="topoloc-")) / "scene.html"
     write_scene_page(page, document)
     if not webbrowser.open(page.as_uri()):
-        print(
-            "warning: no browser opens here; --out FILE.html writes the page to a place of yours",
-            file=sys.stderr,
-        )
+        print_warning("no browser can be opened; --out FILE.html writes the page to a file")
     return str(page)
 
 
@@ -121,7 +111,7 @@ def _format_summary(facts: dict[str, Any], results: Sequence[ResultSet]) -> str:
 
 
 def _warn_of_other_worlds(results: Sequence[ResultSet], shown: Sequence[Mapping[str, Any]]) -> None:
-    """One line where answers are of tiles that are not shown, or of no tile."""
+    """Print a warning if results belong to tiles that are not shown, or to no tile."""
     given = sum(len(one.answers) for one in results)
     missing = given - sum(one["num_answers"] for one in shown)
     if missing:
@@ -129,14 +119,12 @@ def _warn_of_other_worlds(results: Sequence[ResultSet], shown: Sequence[Mapping[
 
 
 def _warn_of_other_maps(results: Sequence[ResultSet], map_id: str) -> None:
-    """One line where answers are of another map: they are shown all the same, for two maps may
-    share their world."""
+    """Print a warning if results belong to another map. They are shown, because two maps may share
+    a world."""
     others = {
         str(answer["map"]) for one in results for answer in one.answers if answer.get("map")
     } - {map_id}
     if others:
-        print(
-            f"warning: some answers are of another map ({', '.join(sorted(others)[:3])}; this is"
-            f" {map_id})",
-            file=sys.stderr,
+        print_warning(
+            f"some answers are of another map ({', '.join(sorted(others)[:3])}; this is {map_id})"
         )

@@ -25,10 +25,9 @@ from topoloc import (
     TopolocError,
     Tracker,
     TrackerConfig,
+    Trajectory,
     UncalibratedCamera,
     UnreadableImageError,
-    read_trajectory,
-    write_tum,
 )
 from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
 from topoloc.apps.cli.output import (
@@ -238,7 +237,7 @@ class Command:
                     f"--odometry is for streams, and {path} is none; --stream makes it one"
                 )
             odometry = match_frame_poses(
-                read_trajectory(Path(self.streams.odometry)),
+                Trajectory.read(Path(self.streams.odometry)),
                 sequence.t_ns,
                 Path(self.streams.odometry),
             )
@@ -261,7 +260,7 @@ class Command:
             write_text(Path(self.json), "".join(json.dumps(a.to_json()) + "\n" for a in answers))
             files.append(self.json)
         if self.tum is not None:
-            write_tum(Path(self.tum), to_trajectory(answers, self.streams.smoothed))
+            to_trajectory(answers, self.streams.smoothed).write_tum(Path(self.tum))
             files.append(self.tum)
         return files
 

@@ -42,11 +42,11 @@ export class Viewer {
     const frustums = objects.frustumsOf(cameras, this.depth, objects.COLOURS.node, { opacity: 0.6 });
     this.layer("nodes", frustums, `${nodes.length} nodes`, objects.COLOURS.node);
     nodes.forEach((node, i) => this.places.push(this.nodePlace(node, cameras[i].matrix)));
-    if (nodes.some((node) => node.picture)) this.layer("pictures", null, "their pictures");
+    if (nodes.some((node) => node.picture)) this.layer("pictures", null, "their images");
     paths.forEach((path, n) => {
       const ofMap = path.session !== undefined;
       const colour = ofMap && paths.length === 1 ? objects.COLOURS.path : objects.setColour(n + this.document.results.length);
-      const label = `${ofMap ? "way of" : "trajectory"} ${path.name}`;
+      const label = `${ofMap ? "trajectory of" : "trajectory"} ${path.name}`;
       this.layer(`path ${n}`, objects.linesOf(path.lines, colour), label, colour);
     });
   }
@@ -59,7 +59,7 @@ export class Viewer {
       const session = this.document.map.sessions.find((one) => one.id === node.session);
       const said = [`At ${pointText(node.world_from_cam.translation)}.`, `${node.num_points} points.`];
       if (session) said.push(`Session ${session.name}${session.date ? `, ${session.date.slice(0, 10)}` : ""}.`);
-      const picture = node.picture && { address: pictureAddress(node), words: `what node ${called} shows` };
+      const picture = node.picture && { address: pictureAddress(node), words: `image of node ${called}` };
       this.tell(`Node ${called}: ${node.name}`, said, picture);
     };
     const centre = node.world_from_cam.translation;
@@ -99,7 +99,7 @@ export class Viewer {
     this.stage.draw();
   }
 
-  /** An answer from elsewhere, such as a live one, takes the place of what was chosen. */
+  /** Show another result, such as a live one, instead of the selected one. */
   showLive(answer, options) {
     this.clearChosen();
     this.part("list").value = "";
@@ -108,7 +108,7 @@ export class Viewer {
     if (place && options.follow !== false) this.travel(place);
   }
 
-  /** The way of a live stream: positions [[x, y, z], ...] in lines. */
+  /** The trajectory of a live stream: positions [[x, y, z], ...] in lines. */
   showTrack(lines) {
     objects.dispose(this.live);
     this.live.clear();
@@ -222,7 +222,7 @@ export class Viewer {
 
 const pictureAddress = (node) => `data:image/jpeg;base64,${node.picture}`;
 
-/** The tracked way of a stream; answers without a state are no stream. */
+/** The trajectory of a stream; results without a state are no stream. */
 function trackOf(answers) {
   const lines = [[]];
   for (const one of answers.filter((answer) => answer.state)) {
@@ -255,8 +255,8 @@ const SHELL = `
 <div class="side">
   <div class="chooser">
     <label>Go to <select data-part="list"><option value="">the whole map</option></select></label>
-    <button type="button" data-part="before" aria-label="The one before">&lsaquo;</button>
-    <button type="button" data-part="next" aria-label="The next one">&rsaquo;</button>
+    <button type="button" data-part="before" aria-label="Previous">&lsaquo;</button>
+    <button type="button" data-part="next" aria-label="Next">&rsaquo;</button>
   </div>
   <div class="details" data-part="details" aria-live="polite"></div>
   <fieldset data-part="layers"><legend>Shown</legend></fieldset>

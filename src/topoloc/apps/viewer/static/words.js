@@ -1,17 +1,17 @@
-// What a result means, in words.
+// Texts of results.
 
 const REASONS = {
-  too_few_matches: "Too little of the picture was recognised in the map.",
-  too_few_inliers: "What was recognised does not agree on one place.",
-  ambiguous: "It may be one of several places that look alike.",
-  not_in_map: "It was not taken in this map, as far as the map shows.",
-  jump: "It contradicts the pictures before it.",
-  unreadable: "The picture cannot be read.",
+  too_few_matches: "Too few features of the image match the map.",
+  too_few_inliers: "The matches do not agree on one pose.",
+  ambiguous: "Several similar places are possible.",
+  not_in_map: "The image is probably out of the map.",
+  jump: "It contradicts the previous images.",
+  unreadable: "The image cannot be read.",
 };
 const STATES = {
-  localized: "recognised in the map",
-  tracked: "followed from the picture before",
-  predicted: "expected from the motion so far",
+  localized: "localized in the map",
+  tracked: "tracked from the previous image",
+  predicted: "predicted from the motion",
   ambiguous: "one of several places",
   lost: "lost",
 };
@@ -29,15 +29,15 @@ export const pointText = (p) => `(${p.map((value) => value.toFixed(2)).join(", "
 /** Whether a result has a pose of its own. */
 export const isLocalized = (result) => result.localized === true;
 
-/** One line: here, or why not. */
+/** Return the result in one line. */
 export function verdict(result) {
-  if (result.state === "predicted") return "Not seen; the place is what the motion so far lets expect.";
+  if (result.state === "predicted") return "Not localized; the pose is predicted from the motion.";
   if (!isLocalized(result)) return `Not localized. ${REASONS[result.reason] ?? result.reason ?? ""}`;
-  const doubt = errorOf(result) > MAX_ERROR ? "Wrongly placed" : result.probability < 0.9 ? "Probably here" : "Here";
+  const doubt = errorOf(result) > MAX_ERROR ? "Wrong pose" : result.probability < 0.9 ? "Probably here" : "Here";
   return `${doubt}, at ${pointText(result.world_from_cam.translation)}.`;
 }
 
-/** What else there is to say, a sentence an item. */
+/** Return further facts, one sentence each. */
 export function sentences(result) {
   const said = [];
   if (result.state) said.push(`State of the stream: ${STATES[result.state] ?? result.state}.`);
@@ -45,8 +45,8 @@ export function sentences(result) {
     const sigmas = `${lengthText(result.position_sigma_m)} and ${result.rotation_sigma_deg.toFixed(2)}°`;
     said.push(`Standard deviation ${sigmas}, probability ${result.probability.toFixed(2)}.`);
     said.push(`${result.num_inliers} of ${result.num_matches} matches agree, most with node ${result.node}.`);
-    if (result.focal_length_px) said.push(`Focal length found with the pose: ${result.focal_length_px.toFixed(0)} pixels.`);
-    if (result.calibration_doubt) said.push("The picture contradicts its calibration; the uncertainty has paid for it.");
+    if (result.focal_length_px) said.push(`Estimated focal length: ${result.focal_length_px.toFixed(0)} pixels.`);
+    if (result.calibration_doubt) said.push("The image contradicts its calibration, so the uncertainty is larger.");
     const earth = result.geopose?.position;
     if (earth) said.push(`On earth: ${earth.lat.toFixed(7)}°, ${earth.lon.toFixed(7)}°, height ${earth.h.toFixed(1)} m.`);
   } else {
@@ -55,20 +55,20 @@ export function sentences(result) {
       const place = `${pointText(one.world_from_cam.translation)}, near node ${one.node}`;
       said.push(`Alternative ${i + 1}: ${place}, probability ${one.probability.toFixed(2)}.`);
     }
-    if (result.num_matches) said.push(`${result.num_inliers} of ${result.num_matches} matches agreed on a place.`);
+    if (result.num_matches) said.push(`${result.num_inliers} of ${result.num_matches} matches agreed on a pose.`);
   }
   const error = errorOf(result);
-  if (error !== null) said.push(`Off the truth by ${lengthText(error)}.`);
-  else if (result.true_world_from_cam) said.push(`In truth it was taken at ${pointText(result.true_world_from_cam.translation)}.`);
+  if (error !== null) said.push(`Error: ${lengthText(error)}.`);
+  else if (result.true_world_from_cam) said.push(`The true position is ${pointText(result.true_world_from_cam.translation)}.`);
   else if (result.true_world_from_cam === null) {
-    said.push(`It was taken elsewhere: ${isLocalized(result) ? "this pose is false" : "rightly rejected"}.`);
+    said.push(`The image is out of the map: ${isLocalized(result) ? "this pose is false" : "rightly rejected"}.`);
   }
   const times = timesText(result.times_ms);
   if (times) said.push(times);
   return said;
 }
 
-/** Metres from the truth, null where either is not known. */
+/** Return the error in metres, null without a pose or truth. */
 export function errorOf(result) {
   if (!isLocalized(result) || !result.true_world_from_cam) return null;
   const [a, b] = [result.world_from_cam.translation, result.true_world_from_cam.translation];

@@ -25,7 +25,7 @@ export class Live {
       this.video.srcObject = await navigator.mediaDevices.getUserMedia({ video: wanted });
     } catch (error) {
       const isMissing = error.name === "NotFoundError";
-      throw new Error(isMissing ? "This machine has no webcam." : "The browser does not lend its webcam to this page.");
+      throw new Error(isMissing ? "This machine has no webcam." : "The browser does not allow this page to use the webcam.");
     }
     await this.video.play();
     return true;

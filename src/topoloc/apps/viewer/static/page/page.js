@@ -57,7 +57,7 @@ async function ask(file) {
   const { signal } = (state.asked = new AbortController());
   const picture = (state.picture = URL.createObjectURL(file));
   part("answer").setAttribute("aria-live", "polite");
-  tell("Looking for it ...", []);
+  tell("Localizing ...", []);
   part("answer").setAttribute("aria-busy", "true");
   try {
     const result = await askAbout(state.map, "localize", file, camera(), signal);
@@ -82,7 +82,7 @@ async function explain(file, picture, signal) {
     const [canvas, caption] = part("matches").children;
     await drawMatches(canvas, picture, explained.picture_size, nodePicture, best);
     const became = isLocalized(explained) ? "" : `, which is ${best.verdict}`;
-    caption.textContent = `Left the picture, right node ${best.node}: ${best.num_inliers} matches agree on a pose${became}.`;
+    caption.textContent = `Left the image, right node ${best.node}: ${best.num_inliers} matches agree on a pose${became}.`;
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", caption.textContent);
     if (signal.aborted) return;
@@ -130,7 +130,7 @@ function listenForPictures() {
 }
 
 function listenForCamera() {
-  const words = { exif: "as the file says", unknown: "unknown", map: "the map's", numbers: "fx, fy, cx, cy" };
+  const words = { exif: "from the file", unknown: "unknown", map: "the map's", numbers: "fx, fy, cx, cy" };
   part("numbers").addEventListener("input", () => (document.querySelector("input[value=numbers]").checked = true));
   part("camera-field").addEventListener("input", () => {
     const said = camera();

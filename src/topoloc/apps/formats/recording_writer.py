@@ -1,8 +1,7 @@
-"""Frames become a recording on disk while they come: a plain folder, readable after every frame.
+"""Write frames to a folder that is a valid recording after every frame.
 
-Stereo lies in ``left/ right/``, RGB-D in ``rgb/ depth/``, single pictures in ``images/``; depth of
-a stereo pair in ``depth/`` beside it. Each picture is whole or not there; the line of its time
-follows once all pictures of the frame are.
+Stereo is in ``left/ right/``, RGB-D in ``rgb/ depth/``, single images in ``images/``, and depth of
+a stereo pair in ``depth/``. Images are written atomically, then the time of the frame.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import json
 from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TextIO
 
 import cv2
@@ -19,30 +17,30 @@ import numpy as np
 from jaxtyping import Float32, UInt16
 
 from topoloc import (
+    Camera,
     Image,
     RecordingError,
     StereoFrame,
     StereoRig,
     TopolocError,
     Trajectory,
-    tum_text,
 )
 from topoloc.plugin import write_bytes, write_text
 
 DEPTH_FACTOR = 256.0
-"""Units a metre of depth pictures: 4 mm steps up to 256 m."""
-_MAX_UNITS = 65534  # units; what is further is unknown
+"""Units per metre of depth images: steps of 4 mm up to 256 m."""
+_MAX_UNITS = 65534  # larger depths are unknown
 
 
 class RecordingWriter:
-    """Writes frames one by one; all are of the same kind as the first. A context manager.
+    """Writes frames of the same kind. A context manager.
 
     Args:
-        folder: a new folder, or an empty one.
-        jpeg: quality of JPEG pictures, 1 to 100; None for PNG.
+        folder: a new or empty folder.
+        jpeg: quality of JPEG images, 1 to 100; None for PNG.
 
     Raises:
-        TopolocError: the folder holds something, or cannot be made.
+        TopolocError: the folder is not empty, or cannot be created.
     """
 
     def __init__(self, folder: Path, jpeg: int | None = None) -> None:
@@ -59,67 +57,54 @@ class RecordingWriter:
             raise TopolocError(f"cannot write {folder}: {error.strerror}") from None
         if other is not None:
             raise TopolocError(
-                f"cannot write {folder}: it holds other things, such as {other}; name a new folder"
+                f"cannot write {folder}: it is not empty and has {other}; use a new folder"
             )
 
     def __enter__(self) -> RecordingWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for file in (self._times, self._truth):
             if file is not None:
                 file.close()
-        if self._is_new and self.num_frames == 0:  # nothing came, or nothing could be written
+        if self._is_new and self.num_frames == 0:  # no frame was written
             with suppress(OSError):
                 self.folder.rmdir()
 
     def write(self, frame: StereoFrame) -> None:
-        """Raises:
-        RecordingError: the frame is of another kind than the first.
-        TopolocError: it cannot be written.
+        """Write a frame.
+
+        Raises:
+            RecordingError: the frame is of another kind than the first.
+            TopolocError: it cannot be written.
         """
         images = self._frame_images(frame)
-        if self._times is None:
-            self._create_folder(frame, images)
-        if set(images) != set(self._subfolders) or (self._truth is None) != (
-            frame.world_from_cam is None
-        ):
-            raise RecordingError(f"{frame.name}: of another kind than the frames before")
-        suffix = "png" if self._jpeg is None else "jpg"
-        paths = {
-            kind: (
-                self.folder
-                / self._subfolders[kind]
-                / f"{self.num_frames:06d}.{'png' if kind == 'depth' else suffix}"
-            )
-            for kind in images
-        }
+        times = self._times or self._create_folder(frame, images)
+        has_pose = frame.world_from_cam is not None
+        if set(images) != set(self._subfolders) or (self._truth is not None) != has_pose:
+            raise RecordingError(f"{frame.name}: of another kind than the previous frames")
+        paths = list[Path]()
         try:
-            for kind, path in paths.items():
-                write_bytes(
-                    path, _encode_image(images[kind], None if kind == "depth" else self._jpeg)
-                )
-            self._write_lines(frame)
-        except BaseException:  # a frame is whole, or none of it is there
-            for path in paths.values():
+            for kind, image in images.items():
+                jpeg = None if kind == "depth" else self._jpeg
+                name = f"{self.num_frames:06d}.{'png' if jpeg is None else 'jpg'}"
+                paths.append(self.folder / self._subfolders[kind] / name)
+                write_bytes(paths[-1], _encode_image(image, jpeg))
+            self._write_lines(frame, times)
+        except BaseException:  # all of a frame, or nothing
+            for path in paths:
                 path.unlink(missing_ok=True)
             raise
         self.num_frames += 1
 
-    def _write_lines(self, frame: StereoFrame) -> None:
-        assert self._times is not None
+    def _write_lines(self, frame: StereoFrame, times: TextIO) -> None:
         try:
             if self._truth is not None and frame.world_from_cam is not None:
                 trajectory = Trajectory([frame.world_from_cam], [frame.t_ns])
-                self._truth.write(tum_text(trajectory, header=False))
+                self._truth.write(trajectory.to_tum(header=False))
                 self._truth.flush()
-            self._times.write(f"{Decimal(frame.t_ns).scaleb(-9):.9f}\n")
-            self._times.flush()
+            times.write(f"{Decimal(frame.t_ns).scaleb(-9):.9f}\n")
+            times.flush()
         except OSError as error:
             raise TopolocError(f"cannot write {self.folder}: {error.strerror}") from None
 
@@ -131,28 +116,28 @@ class RecordingWriter:
             images["depth"] = _to_depth_units(frame.depth.depth)
         return images
 
-    def _create_folder(self, frame: StereoFrame, images: dict[str, Any]) -> None:
-        """The folders, the calibration, and the files that grow."""
+    def _create_folder(self, frame: StereoFrame, images: dict[str, Any]) -> TextIO:
+        """Create the folders, the calibration, the truth and the times. Return the latter."""
         own = "left" if "right" in images else "rgb" if "depth" in images else "images"
         self._subfolders = {kind: own if kind == "left" else kind for kind in images}
         try:
             for name in self._subfolders.values():
                 (self.folder / name).mkdir()
             if frame.camera is not None:
-                calibration = json.dumps(calibration_json(frame), indent=1)
+                calibration = json.dumps(calibration_json(frame, frame.camera), indent=1)
                 write_text(self.folder / "camera.json", calibration + "\n")
             if frame.world_from_cam is not None:
                 self._truth = (self.folder / "truth.tum").open("x", encoding="utf-8")
-                self._truth.write(tum_text(Trajectory([], [])))
+                self._truth.write(Trajectory([], []).to_tum())
             self._times = (self.folder / "times.txt").open("x", encoding="utf-8")
+            return self._times
         except OSError as error:
             raise TopolocError(f"cannot write {self.folder}: {error.strerror}") from None
 
 
-def calibration_json(frame: StereoFrame) -> dict[str, Any]:
-    """The camera.json of a recording with such frames, which have a camera."""
-    assert frame.camera is not None
-    calibration = frame.camera.to_json() if frame.rig is None else _rig_json(frame.rig)
+def calibration_json(frame: StereoFrame, camera: Camera) -> dict[str, Any]:
+    """Return the camera.json of a recording with such frames."""
+    calibration = camera.to_json() if frame.rig is None else _rig_json(frame.rig)
     return calibration if frame.depth is None else calibration | {"depth_factor": DEPTH_FACTOR}
 
 
@@ -167,7 +152,7 @@ def _rig_json(rig: StereoRig) -> dict[str, Any]:
 
 
 def _to_depth_units(depth: Float32[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    """As it is stored; 0 where unknown or too far."""
+    """Convert metres to stored units, 0 if unknown or too far."""
     units = np.rint(np.nan_to_num(depth.astype(np.float64), nan=0.0, posinf=0.0) * DEPTH_FACTOR)
     return np.where((units > 0) & (units <= _MAX_UNITS), units, 0).astype(np.uint16)
 
@@ -182,7 +167,7 @@ def _encode_image(pixels: Image | UInt16[np.ndarray, "h w"], jpeg: int | None) -
     is_done, data = cv2.imencode(suffix, bgr, settings)
     if not is_done:
         raise RecordingError(
-            f"a picture of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be stored as"
+            f"an image of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be stored as"
             f" {suffix[1:]}"
         )
     return data.tobytes()
