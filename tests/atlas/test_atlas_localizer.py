@@ -27,6 +27,13 @@ from topoloc.mapping.topomap import TopoMetricMap
 BUDGET = 100_000_000
 
 
+class Wide(AtlasConfig):
+    """Search tiles although others are far more similar, each coarse only first."""
+
+    settled_gap = 2.0
+    hopeless_gap = 2.0
+
+
 def _localizer(
     where: Path,
     config: AtlasConfig | None = None,
@@ -92,9 +99,7 @@ def test_features_are_extracted_once_for_all_tiles(atlas: Path, monkeypatch: pyt
         return extract(normalized, config)
 
     monkeypatch.setattr(query, "extract_from_normalized", counted)
-    _localizer(atlas, AtlasConfig(settled_gap=2.0, hopeless_gap=2.0)).localize(
-        unseen_views(seed=2)[0][0], CAMERA
-    )
+    _localizer(atlas, Wide()).localize(unseen_views(seed=2)[0][0], CAMERA)
     assert kinds == ["surf"]
 
 
@@ -109,7 +114,8 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
         "localize_exhaustive",
         lambda self: asked.append(self.features) or localize_exhaustive(self),
     )
-    config = AtlasConfig(settled_gap=2.0, hopeless_gap=2.0, least_likeness=least_likeness)
+    monkeypatch.setattr(Wide, "least_likeness", least_likeness)
+    config = Wide()
     result = _localizer(atlas, config).localize(unseen_views(seed=2)[0][0], CAMERA)
     assert isinstance(result, NotLocalized)
     assert len(asked) == num_asked
@@ -138,7 +144,8 @@ def test_a_look_alike_that_cannot_come_near_is_left_at_that(
         "localize_coarse_only",
         lambda self: asked.append(self.features) or glance(self),
     )
-    wide = AtlasConfig(settled_gap=2.0, hopeless_gap=2.0, alike_gap=2.0, num_glanced=1)
+    monkeypatch.setattr(Wide, "alike_gap", 2.0)
+    wide = Wide(num_glanced=1)
     result = _localizer(atlas, wide).localize(unseen_views()[0][0], CAMERA)
     assert isinstance(result, Localization)
     assert asked == ["surf"], "the tile that answers, not the other one"
@@ -146,9 +153,7 @@ def test_a_look_alike_that_cannot_come_near_is_left_at_that(
 
 def test_a_twin_that_is_asked_last_is_heard(own_atlas: Path, room_map: Path):
     add_tiles(str(own_atlas), new_tiles([str(room_map)], "twin"))
-    result = _localizer(own_atlas, AtlasConfig(settled_gap=2.0, num_glanced=1)).localize(
-        unseen_views()[0][0], CAMERA
-    )
+    result = _localizer(own_atlas, Wide(num_glanced=1)).localize(unseen_views()[0][0], CAMERA)
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
 
@@ -193,7 +198,7 @@ def test_a_tile_that_cannot_be_read_leaves_the_rest(own_atlas: Path, harm: str):
     else:
         path.unlink()
     said = list[str]()
-    localizer = _localizer(own_atlas, AtlasConfig(hopeless_gap=2.0), said)
+    localizer = _localizer(own_atlas, Wide(), said)
     result = localizer.localize(unseen_views()[0][0], CAMERA)
     assert result.provenance.tile == "room"
     assert result.localized
