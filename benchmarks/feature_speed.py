@@ -17,9 +17,14 @@ import numpy as np
 import tyro
 
 from topoloc.features.config import MatchingConfig
-from topoloc.features.extraction import FeatureConfig, extract_from_normalized, normalize_image
+from topoloc.features.extraction import (
+    FeatureConfig,
+    PatchNormalizationConfig,
+    extract_from_normalized,
+    normalize_image,
+    patch_normalize,
+)
 from topoloc.features.matching import match_features, match_pooled
-from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 from topoloc.recordings.image_io import to_grey
 from topoloc.recordings.open import open_sequence
 

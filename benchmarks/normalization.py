@@ -23,10 +23,14 @@ import numpy as np
 import tyro
 
 from topoloc.features.config import MatchingConfig
-from topoloc.features.extraction import FeatureConfig, extract_features
+from topoloc.features.extraction import (
+    FeatureConfig,
+    PatchNormalizationConfig,
+    extract_features,
+    patch_normalize,
+)
 from topoloc.features.features import Features
 from topoloc.features.matching import match_features
-from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 from topoloc.features.surf import SurfConfig, extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error

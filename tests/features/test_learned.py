@@ -11,9 +11,13 @@ import pytest
 from tiny_network import STRIDE, cells, write_network
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features import learned
-from topoloc.features.dense import SingleLevelDescriptors
 from topoloc.features.feature_types import check_available, default_learned_type
-from topoloc.features.learned import LearnedConfig, extract_learned, run_network
+from topoloc.features.learned import (
+    LearnedConfig,
+    SingleLevelDescriptors,
+    extract_learned,
+    run_network,
+)
 from topoloc.features.learned_kernels import find_maxima, refine_subpixel, sample_descriptors
 
 CONFIG = LearnedConfig("xfeat", 64, min_score=0.05)

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
+from topoloc.features.extraction import PatchNormalizationConfig, patch_normalize
 
 
 def picture(seed: int, height: int, width: int, contrast: float = 255.0) -> np.ndarray:

@@ -16,7 +16,7 @@ from topoloc.apps.report.figure_style import STYLE, svg_text
 from topoloc.apps.report.figures import draw_error_curves
 from topoloc.apps.report.map_figure import draw_map
 from topoloc.apps.report.page_template import page_style
-from topoloc.apps.report.query_gallery import (
+from topoloc.apps.report.report import (
     render_gallery,
     select_typical_queries,
     select_worst_queries,

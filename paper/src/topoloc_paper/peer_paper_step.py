@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
+from topoloc.features.extraction import PatchNormalizationConfig, patch_normalize
 from topoloc.features.features import Features
-from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap

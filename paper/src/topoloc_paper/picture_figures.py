@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
+from topoloc.features.extraction import PatchNormalizationConfig, patch_normalize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import NodePoses, node_distances

@@ -5,14 +5,95 @@ A map and its queries must use the same `FeatureConfig`. Each map stores its own
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from topoloc.bounds import Above, AtLeast, Between
 from topoloc.features.feature_types import FeatureConfig, find_feature_type
 from topoloc.features.features import Features
-from topoloc.features.patch_normalization import PatchNormalizationConfig, patch_normalize
+from topoloc.features.parallel import parallel_for_rows
+from topoloc.features.patch_normalization_kernels import normalize_band
+
+
+@dataclass(frozen=True)
+class PatchNormalizationConfig:
+    """Hold the settings of patch normalisation. `PatchNormalizationConfig.paper` is the paper's
+    form."""
+
+    window_px: Annotated[int, Between(3, 127)] = 17
+    """Side of the window, odd."""
+    epsilon: Annotated[float, AtLeast(0)] = 1e-3
+    """Grey levels added to sigma. A tiny value, as in the paper, only prevents a division by zero.
+    A few grey levels also prevent that sensor noise of plain surfaces is amplified."""
+    shape: Literal["square", "round"] = "square"
+    """`square` weighs all pixels of the window equally. `round` applies a box of half the width
+    twice: a bell of the same support, without axis-parallel ringing."""
+    gain: Annotated[float, Above(0)] = 40.0
+    """Grey levels of the result per unit of N, which is mapped to 128 + gain N and clipped."""
+
+    def __post_init__(self) -> None:
+        largest = 127 if self.shape == "square" else 37  # sums of squares stay within 32 bits
+        if not 3 <= self.window_px <= largest or self.window_px % 2 == 0:
+            raise ValueError(
+                f"window_px must be odd and within 3 .. {largest}, not {self.window_px}"
+            )
+        if not self.epsilon >= 0.0 or not self.gain > 0.0:
+            raise ValueError(
+                f"epsilon must not be negative and gain be positive, not {self.epsilon} and"
+                f" {self.gain}"
+            )
+
+    @staticmethod
+    def paper() -> PatchNormalizationConfig:
+        """Return the paper's form: square 17x17 windows, with epsilon only against a division by
+        zero."""
+        return PatchNormalizationConfig(window_px=17, epsilon=1e-3, shape="square")
+
+    def box_sizes(self) -> tuple[int, int]:
+        """Return the sides of the two boxes applied one after the other. Together they cover
+        `window_px`."""
+        if self.shape == "square":
+            return self.window_px, 1
+        second = (self.window_px + 1) // 2
+        return self.window_px + 1 - second, second
+
+
+def patch_normalize(
+    image: UInt8[np.ndarray, "h w"],
+    config: PatchNormalizationConfig,
+    num_threads: int | None = None,
+) -> UInt8[np.ndarray, "h w"]:
+    """Return the normalised image N as 8 bit: 128 + gain N, rounded and clipped to 0 .. 255.
+
+    The paper, section III-C: ``N(p) = (I(p) - mu_P) / (sigma_P + epsilon)`` in 17x17 windows, before
+    key points are detected. Features then survive changes of lighting (Zhang and Kleeman, 2009).
+    The image is reflected at its borders without repeating the border row. If sigma + epsilon is 0,
+    N is 0. The result is byte-identical for any `num_threads`.
+    """
+    first_box, second_box = config.box_sizes()
+    radius = config.window_px // 2
+    padded = cv2.copyMakeBorder(image, radius, radius, radius, radius, cv2.BORDER_REFLECT_101)
+    normalized = np.empty_like(image, order="C")
+
+    def run(first_row: int, last_row: int) -> None:
+        normalize_band(
+            padded,
+            normalized,
+            first_row,
+            last_row,
+            first_box,
+            second_box,
+            config.epsilon,
+            config.gain,
+        )
+
+    parallel_for_rows(run, len(image), num_threads)
+    return normalized
+
 
 NORMALIZATIONS: dict[str, PatchNormalizationConfig | None] = {
     "none": None,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,6 @@ from jaxtyping import Bool, Float
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.control_points import ControlPoints, read_control_points, read_gnss
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.georeferencing import (
     GeoreferenceFit,
@@ -21,6 +22,166 @@ from topoloc.mapping.georeferencing import (
     georeference_from_heading,
 )
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.text_files import parse_times, read_rows
+
+_MAX_GAP_NS = 2_000_000_000
+"""Positions are not interpolated between fixes further apart in time."""
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Hold points of the world (metres), their places on earth and their names for display."""
+
+    points_world: Float[np.ndarray, "n 3"]
+    places: Sequence[GeoPoint]
+    names: list[str]
+
+
+def read_control_points(path: Path) -> ControlPoints:
+    """Read lines of ``x, y, z, lat, lon, h``: metres of the map's world, degrees, metres above the
+    ellipsoid. A header line is optional.
+
+    Raises:
+        GeoreferenceError: the file is missing or empty, columns or numbers are missing, or a place
+            is not on earth. Names the line.
+    """
+    rows = _read_table(path, 6, 0, "x, y, z, lat, lon, h")
+    numbers = [_parse_numbers(path, line, columns[:6]) for line, columns in rows]
+    places = [
+        _parse_geo_point(path, line, values[3:])
+        for (line, _), values in zip(rows, numbers, strict=True)
+    ]
+    return ControlPoints(
+        np.array([values[:3] for values in numbers]), places, [f"line {line}" for line, _ in rows]
+    )
+
+
+def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
+    """Read lines of ``name, lat, lon, h`` or ``time, lat, lon, h``: the places of mapping images by
+    name, or of the camera by time.
+
+    Times are in the recordings' clock, in seconds, or in nanoseconds if they are large. Places
+    between two fixes are interpolated.
+
+    Raises:
+        GeoreferenceError: the file is missing or empty, columns or numbers are missing, a place is
+            not on earth, or no line matches the map. Names the line.
+    """
+    rows = _read_table(path, 4, 1, "time or name, lat, lon, h")
+    places = [
+        _parse_geo_point(path, line, _parse_numbers(path, line, columns[1:4]))
+        for line, columns in rows
+    ]
+    positions = _find_positions_by_name(topomap)
+    named = [
+        (columns[0], place)
+        for (_, columns), place in zip(rows, places, strict=True)
+        if columns[0] in positions
+    ]
+    if named:
+        return ControlPoints(
+            np.array([positions[name] for name, _ in named]),
+            [place for _, place in named],
+            [name for name, _ in named],
+        )
+    if not all(_is_number(columns[0]) for _, columns in rows):
+        example = next(iter(positions), "none")
+        raise GeoreferenceError(
+            f"{path}: no line begins with a time, or the name of a mapping picture, such as"
+            f" {example}"
+        )
+    return _interpolate_at_times(path, topomap, parse_times(rows, path, GeoreferenceError), places)
+
+
+def _interpolate_at_times(
+    path: Path, topomap: TopoMetricMap, t_ns: Sequence[int], places: Sequence[GeoPoint]
+) -> ControlPoints:
+    """Interpolate the places of the nodes at their times."""
+    origin = places[0].ecef_from_enu()
+    points_enu = np.array([origin.inverse().apply(place.ecef()) for place in places])
+    found: list[tuple[np.ndarray, GeoPoint, str]] = []
+    for summary in topomap.summaries:
+        after = int(np.searchsorted(t_ns, summary.t_ns))
+        if after < len(t_ns) and t_ns[after] == summary.t_ns:
+            point_enu = points_enu[after]
+        elif 0 < after < len(t_ns) and t_ns[after] - t_ns[after - 1] <= _MAX_GAP_NS:
+            share = (summary.t_ns - t_ns[after - 1]) / (t_ns[after] - t_ns[after - 1])
+            point_enu = (1.0 - share) * points_enu[after - 1] + share * points_enu[after]
+        else:
+            continue
+        found.append(
+            (
+                summary.world_from_cam.translation,
+                GeoPoint.from_ecef(origin.apply(point_enu)),
+                summary.name,
+            )
+        )
+    if not found:
+        times = [summary.t_ns for summary in topomap.summaries]
+        spans = " and ".join(
+            f"{min(span) / 1e9:.3f} to {max(span) / 1e9:.3f} s" for span in (t_ns, times)
+        )
+        raise GeoreferenceError(f"{path}: no fix is of a time of the map ({spans})")
+    return ControlPoints(
+        np.array([point for point, _, _ in found]),
+        [place for _, place, _ in found],
+        [name for _, _, name in found],
+    )
+
+
+def _find_positions_by_name(topomap: TopoMetricMap) -> dict[str, Float[np.ndarray, "3"]]:
+    """Return the positions of mapping images by full name, file name, and name with the recording.
+    Ambiguous names are left out."""
+    positions, twice = dict[str, np.ndarray](), set[str]()
+    for image in (*topomap.place_images, *topomap.summaries):
+        for name in {image.name, Path(image.name).name, f"{image.recording}/{image.name}"}:
+            position = image.world_from_cam.translation
+            if name in positions and not np.allclose(positions[name], position, atol=0.05):
+                twice.add(name)
+            positions[name] = position
+    return {name: position for name, position in positions.items() if name not in twice}
+
+
+def _read_table(
+    path: Path, num_columns: int, first_numeric_column: int, wanted: str
+) -> list[tuple[int, list[str]]]:
+    """Return line numbers and columns, without a header line."""
+    if path.exists() and not path.is_file():
+        raise GeoreferenceError(f"{path}: no file")
+    rows = read_rows(path, GeoreferenceError)
+    if not all(_is_number(text) for text in rows[0][1][first_numeric_column:num_columns]):
+        rows = rows[1:]
+    for line, columns in rows:
+        if len(columns) < num_columns:
+            raise GeoreferenceError(
+                f"{path}, line {line}: {len(columns)} columns; {wanted} are needed"
+            )
+    if not rows:
+        raise GeoreferenceError(f"{path}: nothing in this file but titles")
+    return rows
+
+
+def _parse_numbers(path: Path, line: int, columns: Sequence[str]) -> list[float]:
+    for text in columns:
+        if not _is_number(text):
+            raise GeoreferenceError(f"{path}, line {line}: {text[:40]!r} is not a number")
+    return [float(text) for text in columns]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        number = Decimal(text)
+    except InvalidOperation:
+        return False
+    return number.is_finite() and abs(number.adjusted()) < 300
+
+
+def _parse_geo_point(path: Path, line: int, values: Sequence[float]) -> GeoPoint:
+    try:
+        return GeoPoint(*values)
+    except GeoreferenceError as error:
+        raise GeoreferenceError(f"{path}, line {line}: {error}") from None
+
 
 _Fitted = tuple[ControlPoints, GeoreferenceFit]
 

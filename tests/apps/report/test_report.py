@@ -13,12 +13,12 @@ import pytest
 
 from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
 from topoloc.apps.report.map_figure import _insert_gaps, draw_map, find_horizontal_axes
-from topoloc.apps.report.query_gallery import (
+from topoloc.apps.report.report import (
     render_gallery,
     select_typical_queries,
     select_worst_queries,
+    write_report,
 )
-from topoloc.apps.report.report import write_report
 from topoloc.apps.report.report_tables import PublishedResult, ReportTexts
 from topoloc.errors import TopolocError, UnreadableImageError
 from topoloc.evaluation.metrics import EvaluatedQuery, summarize

@@ -3,7 +3,7 @@
 Two rewritings, both of what is linear. A normalisation after a sum of convolutions becomes a part
 of their weights. And where descriptors are a sum of an enlarged coarse level and a 1x1 convolution
 of a fine one, the two levels are given instead of the sum, pixel after pixel
-(`topoloc.features.dense.TwoLevelDescriptors`): asked for at a thousand key points, the sum costs
+(`topoloc.features.learned.TwoLevelDescriptors`): asked for at a thousand key points, the sum costs
 next to nothing; everywhere, a tenth of the network.
 """
 
