@@ -69,8 +69,9 @@ def patch_normalize(
 ) -> UInt8[np.ndarray, "h w"]:
     """Return the normalised image N as 8 bit: 128 + gain N, rounded and clipped to 0 .. 255.
 
-    The paper, section III-C: ``N(p) = (I(p) - mu_P) / (sigma_P + epsilon)`` in 17x17 windows, before
-    key points are detected. Features then survive changes of lighting (Zhang and Kleeman, 2009).
+    The paper, section III-C: ``N(p) = (I(p) - mu_P) / (sigma_P + epsilon)`` in 17x17 windows,
+    before key points are detected. Features then survive changes of lighting (Zhang and Kleeman,
+    2009).
     The image is reflected at its borders without repeating the border row. If sigma + epsilon is 0,
     N is 0. The result is byte-identical for any `num_threads`.
     """
