@@ -37,8 +37,8 @@ from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.lifelong.prune import _drop_landmarks
 from topoloc.localization.result import Localization
-from topoloc.mapping.map_writing import write_map
-from topoloc.mapping.point_encoding import compress_array, dequantize_descriptors
+from topoloc.mapping.storage.map_writing import write_map
+from topoloc.mapping.storage.point_encoding import compress_array, dequantize_descriptors
 from topoloc.mapping.topomap import TopoNode
 
 _WRONG_M, _WRONG_DEG, _WORDS, _LEARNED_FROM = 0.5, 5.0, 256, 40_000

@@ -16,7 +16,7 @@ from matplotlib.collections import EllipseCollection
 
 import topoloc
 from topoloc.demo.recordings import SHIPPED
-from topoloc.localization.local_map import LocalMap
+from topoloc.localization.pose_fit import LocalMap
 
 CHI_95 = np.sqrt(5.991)  # radius of the 95 % ellipse of a plane Gaussian, in standard deviations
 PLAN = np.ix_(range(2), range(2))  # x and y of the lab's world, whose z is up

@@ -19,7 +19,7 @@ from topoloc.apps.cli import all_commands, main
 from topoloc.evaluation.metrics import EvaluatedQuery, summarize
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import CandidateNode, Localization, NotLocalized
-from topoloc.mapping import schema
+from topoloc.mapping.storage import schema
 
 DOORS = (topoloc, topoloc.plugin)
 ROOT = Path(__file__).parents[1]

@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from topoloc.geometry.rigid import Rigid3
     from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
     from topoloc.lifelong.map_files import merge, prune, update
-    from topoloc.lifelong.tile_joining import PairResult, join_tiles
-    from topoloc.lifelong.tile_selection import find_tile_of_recording
+    from topoloc.lifelong.tiles.tile_joining import PairResult, join_tiles
+    from topoloc.lifelong.tiles.tile_selection import find_tile_of_recording
     from topoloc.lifelong.update import MapUpdate
     from topoloc.lifelong.weak_regions import (
         NodeQuality,
@@ -83,9 +83,9 @@ if TYPE_CHECKING:
     from topoloc.localization.search import Trace, TriedProposal
     from topoloc.mapping.build import BuildConfig
     from topoloc.mapping.edit import read_history, undo_edit
-    from topoloc.mapping.entries import TopoNode
     from topoloc.mapping.georeference import GeoreferenceResult, georeference
     from topoloc.mapping.sessions import Illumination
+    from topoloc.mapping.storage.entries import TopoNode
     from topoloc.mapping.topomap import TopoMetricMap
     from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
     from topoloc.recordings.image_io import read_depth, read_image
@@ -245,7 +245,7 @@ _MODULES = {
     "NodeQuality": "topoloc.lifelong.weak_regions",
     "NotLocalized": "topoloc.localization.result",
     "ObjectStoreError": "topoloc.errors",
-    "PairResult": "topoloc.lifelong.tile_joining",
+    "PairResult": "topoloc.lifelong.tiles.tile_joining",
     "PoseConventions": "topoloc.geometry.pose_conventions",
     "Provenance": "topoloc.localization.provenance",
     "QueryError": "topoloc.errors",
@@ -264,7 +264,7 @@ _MODULES = {
     "Tile": "topoloc.atlas.manifest",
     "TileFetcher": "topoloc.atlas.tile_fetcher",
     "TopoMetricMap": "topoloc.mapping.topomap",
-    "TopoNode": "topoloc.mapping.entries",
+    "TopoNode": "topoloc.mapping.storage.entries",
     "TopolocError": "topoloc.errors",
     "Trace": "topoloc.localization.search",
     "Tracker": "topoloc.tracking.tracker",
@@ -286,10 +286,10 @@ _MODULES = {
     "explain": "topoloc.apps.report.explanation",
     "export": "topoloc.apps.export.formats",
     "find_frames_with_truth": "topoloc.evaluation.query_localization",
-    "find_tile_of_recording": "topoloc.lifelong.tile_selection",
+    "find_tile_of_recording": "topoloc.lifelong.tiles.tile_selection",
     "find_weak_regions": "topoloc.lifelong.weak_regions",
     "georeference": "topoloc.mapping.georeference",
-    "join_tiles": "topoloc.lifelong.tile_joining",
+    "join_tiles": "topoloc.lifelong.tiles.tile_joining",
     "localize_out_of_map": "topoloc.evaluation.query_localization",
     "localize_queries": "topoloc.evaluation.query_localization",
     "merge": "topoloc.lifelong.map_files",

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
         suggest_name,
     )
     from topoloc.evaluation.metrics import format_length
+    from topoloc.evaluation.node_matching import NodeMatcher
     from topoloc.features.feature_types import check_available, parse_feature_types
     from topoloc.features.network_files import NetworkInfo, cache_folder, read_bytes
     from topoloc.json_data import Finite, decode_json
-    from topoloc.localization.node_matching import NodeMatcher
     from topoloc.mapping.build import Progress
     from topoloc.recordings.atomic import (
         atomic_write,
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from topoloc.recordings.calibration import parse_calibration
     from topoloc.recordings.camera_json import read_camera_json
     from topoloc.recordings.format import RecordingFormat
+    from topoloc.recordings.formats.video import Video, silence_opencv
     from topoloc.recordings.image_io import (
         MAX_PIXELS,
         EncodedImage,
@@ -69,7 +70,6 @@ if TYPE_CHECKING:
         match_frame_poses,
         read_ground_truth,
     )
-    from topoloc.recordings.video import Video, silence_opencv
     from topoloc.removed_settings import drop_removed_settings
 
 
@@ -142,12 +142,12 @@ _MODULES = {
     "Finite": "topoloc.json_data",
     "MAX_PIXELS": "topoloc.recordings.image_io",
     "NetworkInfo": "topoloc.features.network_files",
-    "NodeMatcher": "topoloc.localization.node_matching",
+    "NodeMatcher": "topoloc.evaluation.node_matching",
     "Progress": "topoloc.mapping.build",
     "Recording": "topoloc.recordings.recording",
     "RecordingFormat": "topoloc.recordings.format",
     "TilePending": "topoloc.atlas.tile_fetcher",
-    "Video": "topoloc.recordings.video",
+    "Video": "topoloc.recordings.formats.video",
     "absolute_address": "topoloc.atlas.atlas",
     "as_monocular": "topoloc.recordings.recording",
     "atomic_write": "topoloc.recordings.atomic",
@@ -183,7 +183,7 @@ _MODULES = {
     "recording_notes": "topoloc.recordings.recording",
     "remove_stale_files": "topoloc.recordings.atomic",
     "scale_poses": "topoloc.recordings.recording",
-    "silence_opencv": "topoloc.recordings.video",
+    "silence_opencv": "topoloc.recordings.formats.video",
     "split_selection": "topoloc.recordings.open",
     "suggest_name": "topoloc.bounds",
     "temporary_folder": "topoloc.recordings.atomic",

@@ -14,8 +14,8 @@ from topoloc.geometry.absolute_pose import (
 )
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import depth_sigmas, ray_covariances
 from topoloc.geometry.rigid import Rigid3, inverse_covariance, position_covariance
-from topoloc.geometry.stereo import depth_sigmas, ray_covariances
 
 PINHOLE = CAMERAS["PINHOLE"]
 METHODS = ("poselib", "opencv")

@@ -5,9 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import StereoRig
-from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.stereo import (
+from topoloc.geometry.rig import (
+    StereoRig,
     depth_from_disparity,
     depth_sigmas,
     depth_sigmas_of_disparity,
@@ -15,6 +14,7 @@ from topoloc.geometry.stereo import (
     points_from_disparity,
     ray_covariances,
 )
+from topoloc.geometry.rigid import Rigid3
 
 LEFT = Camera.pinhole(640, 480, 500.0, 505.0, 320.0, 240.0)
 RIG = StereoRig.rectified(LEFT, 0.12)

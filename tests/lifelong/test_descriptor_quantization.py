@@ -16,8 +16,8 @@ from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
 from topoloc.lifelong.descriptor_quantization import quantize_node_descriptors
 from topoloc.localization.result import Localization
-from topoloc.mapping.integrity_check import find_map_damage
-from topoloc.mapping.point_encoding import compress_array
+from topoloc.mapping.storage.integrity_check import find_map_damage
+from topoloc.mapping.storage.point_encoding import compress_array
 
 STEP = 0.64
 

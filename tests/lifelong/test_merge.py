@@ -23,7 +23,7 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import Layer
 from topoloc.recordings.recording import SequenceView
 

@@ -23,7 +23,7 @@ from topoloc.lifelong.node_pruning import (
     remove_nodes,
 )
 from topoloc.localization.result import Localization
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.storage.integrity_check import find_map_damage
 
 
 def _holds(landmarks: list[list[int]], pictures: list[int]) -> NodeSupport:

@@ -20,8 +20,8 @@ from topoloc.geometry.alignment import translation_error
 from topoloc.lifelong.prune import select_landmarks
 from topoloc.localization.result import Localization
 from topoloc.mapping.edit import edit_map
-from topoloc.mapping.integrity_check import find_map_damage
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
+from topoloc.mapping.storage.integrity_check import find_map_damage
 
 
 def _counts(num_points: int, expected: int, seen: np.ndarray) -> LandmarkStatistics:

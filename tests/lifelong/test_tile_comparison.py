@@ -23,9 +23,9 @@ from topoloc.atlas.manifest import Manifest
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.shared_images import estimate_by_shared_images
-from topoloc.lifelong.tile_comparison import NotJoined, compare_tiles
-from topoloc.lifelong.tile_joining import TileJoiningResult, find_candidate_pairs, join_tiles
+from topoloc.lifelong.tiles.shared_images import estimate_by_shared_images
+from topoloc.lifelong.tiles.tile_comparison import NotJoined, compare_tiles
+from topoloc.lifelong.tiles.tile_joining import TileJoiningResult, find_candidate_pairs, join_tiles
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import SkippedChecks, build_map
 from topoloc.localization.result import Localization
@@ -75,7 +75,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def few_nodes() -> Iterator[None]:
     """The tiles have fewer nodes than a join takes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("topoloc.lifelong.tile_joining.compare_tiles", FEW)
+        patch.setattr("topoloc.lifelong.tiles.tile_joining.compare_tiles", FEW)
         yield
 
 
@@ -271,7 +271,7 @@ def test_the_command_line(
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setattr(
-        "topoloc.lifelong.tile_joining.find_candidate_pairs",
+        "topoloc.lifelong.tiles.tile_joining.find_candidate_pairs",
         lambda *of: find_candidate_pairs(*of)[:1],
     )
     remove_tiles(str(own), ["other", "middle"])
@@ -302,7 +302,9 @@ def test_the_command_line(
     assert [(one["first"], one["second"], one["joined"]) for one in facts["tried"]] == [
         ("centre", "right", True)
     ]
-    monkeypatch.setattr("topoloc.lifelong.tile_joining.compare_tiles", partial(FEW, min_near=1000))
+    monkeypatch.setattr(
+        "topoloc.lifelong.tiles.tile_joining.compare_tiles", partial(FEW, min_near=1000)
+    )
     remove_tiles(str(own), ["right", "centre"])
     add_tiles(str(own), new_tiles([str(parts["middle"])]))
     assert main(["atlas", "join", str(own), "middle"]) == 0

@@ -35,7 +35,7 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.edit import edit_map
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.recordings.recording import SequenceView
 
 ON = np.arange(3.0, 24.0, 0.75)

@@ -13,9 +13,8 @@ from topoloc.localization.belief import Hypothesis
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.evidence import Evidence
 from topoloc.localization.fitted_weights import load_fitted_weights
-from topoloc.localization.local_map import LocalMap
 from topoloc.localization.open_map import OpenMap
-from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.pose_fit import LocalMap, PoseFit
 from topoloc.localization.query import Query
 from topoloc.localization.result import CandidateNode
 from topoloc.localization.search import Search

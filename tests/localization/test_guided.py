@@ -18,7 +18,7 @@ from topoloc.localization.guided import (
     predict_key_points,
     select_visible_points,
 )
-from topoloc.localization.local_map import LocalMap
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.mapping.topomap import NodeSummary, TopoNode
 
 GUIDED = GuidedConfig().resolved(SURF)

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from topoloc.mapping.map_writing import compute_map_digest
-from topoloc.mapping.point_encoding import compress_array
-from topoloc.mapping.schema import SORT_COLUMNS, TABLES, compute_checksum
+from topoloc.mapping.storage.map_writing import compute_map_digest
+from topoloc.mapping.storage.point_encoding import compress_array
+from topoloc.mapping.storage.schema import SORT_COLUMNS, TABLES, compute_checksum
 
 Rng = np.random.Generator
 POINTS = {

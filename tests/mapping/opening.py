@@ -17,7 +17,7 @@ from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.contradictions import find_contradictions
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 
 

@@ -9,10 +9,10 @@ from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 
-from topoloc.mapping.entries import TopoNode
-from topoloc.mapping.map_writing import _arrays_bytes, _pose_to_bytes
-from topoloc.mapping.point_encoding import node_to_arrays
-from topoloc.mapping.schema import APPLICATION_ID, SCHEMA_1, VIRTUAL_PREFIX
+from topoloc.mapping.storage.entries import TopoNode
+from topoloc.mapping.storage.map_writing import _arrays_bytes, _pose_to_bytes
+from topoloc.mapping.storage.point_encoding import node_to_arrays
+from topoloc.mapping.storage.schema import APPLICATION_ID, SCHEMA_1, VIRTUAL_PREFIX
 from topoloc.mapping.topomap import TopoMetricMap
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mutations import forge
 
-from topoloc.mapping.point_encoding import node_to_arrays
+from topoloc.mapping.storage.point_encoding import node_to_arrays
 from topoloc.mapping.topomap import TopoMetricMap
 
 

@@ -13,7 +13,7 @@ from topoloc.apps.cli import main
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.contradictions import find_contradictions
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 
 

@@ -11,13 +11,13 @@ import numpy as np
 
 import topoloc
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.landmark_statistics import (
     PULL_SCALE,
     LandmarkStatistics,
     merge_count_statistics,
 )
 from topoloc.mapping.landmarks import Observations, compute_session_statistics, refine_points
+from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.topomap import TopoMetricMap
 
 

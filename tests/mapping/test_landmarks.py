@@ -10,8 +10,8 @@ import pytest
 
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import ray_covariances
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.geometry.stereo import ray_covariances
 from topoloc.mapping.landmarks import Observations, observe_points, refine_points
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)

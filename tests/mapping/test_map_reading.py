@@ -45,7 +45,7 @@ def test_a_loaded_map_can_be_saved_again_also_over_itself(saved: Path):
 
 QUERIES_OF_OPENING = """
 import sqlite3, sys
-from topoloc.mapping import map_file
+from topoloc.mapping.storage import map_file
 from topoloc.mapping.topomap import TopoMetricMap
 connect, asked = sqlite3.connect, []
 def traced(*args, **kwargs):

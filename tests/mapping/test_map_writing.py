@@ -13,8 +13,8 @@ import pytest
 
 from topoloc.errors import MapError, MapVersionError
 from topoloc.features.feature_types import FEATURE_TYPES, SURF
-from topoloc.mapping import map_writing
-from topoloc.mapping.schema import SCHEMA_VERSION
+from topoloc.mapping.storage import map_writing
+from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
 
 

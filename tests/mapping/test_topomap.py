@@ -19,8 +19,8 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.coarse_models import node_ids_to_rows
-from topoloc.mapping.entries import Edge, VirtualNodes
 from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.storage.entries import Edge, VirtualNodes
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.recording import SequenceView
 from topoloc_training.coarse_training import in_ids

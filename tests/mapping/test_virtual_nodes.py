@@ -253,7 +253,7 @@ def test_a_loaded_map_keeps_its_sides_when_it_is_saved_again(
 
 QUERIES_OF_OPENING = """
 import sqlite3, sys
-from topoloc.mapping import map_file
+from topoloc.mapping.storage import map_file
 from topoloc.mapping.topomap import TopoMetricMap
 connect, asked = sqlite3.connect, []
 def traced(*args, **kwargs):

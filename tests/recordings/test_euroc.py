@@ -7,7 +7,7 @@ from tiny_recordings import BODY_FROM_CAM, EUROC_TIMES, assert_same_pose, pictur
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.euroc import open_euroc, read_sensor
+from topoloc.recordings.formats.euroc import open_euroc, read_sensor
 
 MILLISECOND = 1_000_000
 

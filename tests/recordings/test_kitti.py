@@ -7,7 +7,7 @@ from tiny_recordings import CALIB, assert_same_pose, kitti_row, picture, pose, t
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.kitti import open_kitti
+from topoloc.recordings.formats.kitti import open_kitti
 from topoloc.recordings.open import open_sequence
 
 

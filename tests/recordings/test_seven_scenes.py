@@ -7,8 +7,8 @@ import pytest
 from tiny_recordings import assert_same_pose, picture, pose
 from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.formats.seven_scenes import COLOUR_FROM_DEPTH, open_seven_scenes
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.seven_scenes import COLOUR_FROM_DEPTH, open_seven_scenes
 
 
 def test_frames(seven_scenes: Path):

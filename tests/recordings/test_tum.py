@@ -5,7 +5,7 @@ import pytest
 
 from tiny_recordings import assert_same_pose, picture, pose
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
-from topoloc.recordings.tum import open_tum
+from topoloc.recordings.formats.tum import open_tum
 
 
 def test_frames(tum: Path):

@@ -11,7 +11,7 @@ import pytest
 
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
-from topoloc.recordings import video
+from topoloc.recordings.formats import video
 from topoloc.recordings.open import find_format, open_sequence
 
 SIZE = (64, 48)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topoloc.slam.block_system import BlockPattern, solve_blocks
+from topoloc.slam.bundle.block_system import BlockPattern, solve_blocks
 
 
 def dense_of(num: int, pairs: list[tuple[int, int]], seed: int = 0) -> np.ndarray:

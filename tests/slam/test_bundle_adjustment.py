@@ -8,7 +8,7 @@ import pytest
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import StereoCamera
-from topoloc.slam.bundle_adjustment import PosePrior, adjust_bundle
+from topoloc.slam.bundle.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks, Observations
 
 STEREO = StereoCamera(Camera.pinhole(640, 400, 380.0, 380.0, 319.5, 199.5), 45.0)

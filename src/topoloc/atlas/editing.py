@@ -23,7 +23,7 @@ from topoloc.atlas.manifest import TILES, Manifest, PlacesFile, StoredFile, Tile
 from topoloc.atlas.store import MANIFEST, Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.geometry.geodesy import Georeference
-from topoloc.mapping.kept_files import find_kept_files, select_kept
+from topoloc.mapping.storage.kept_files import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import temporary_file
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary

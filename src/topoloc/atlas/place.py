@@ -15,7 +15,7 @@ from topoloc.atlas.manifest import StoredFile
 from topoloc.atlas.store import MANIFEST, sha256_of
 from topoloc.errors import AtlasError, TopolocError
 from topoloc.mapping.edit import read_history
-from topoloc.mapping.kept_files import kept_path
+from topoloc.mapping.storage.kept_files import kept_path
 from topoloc.recordings.atomic import temporary_folder
 
 _MAX_TRIES = 5

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Int8
 
 from topoloc.lifelong.lazy_sequences import TransformedSequence
-from topoloc.mapping.point_encoding import dequantize_descriptors
+from topoloc.mapping.storage.point_encoding import dequantize_descriptors
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 
 # A node counts as quantized if the median norm of its stored descriptors is at most this many times

@@ -17,8 +17,8 @@ from topoloc.lifelong.update import MapUpdate, check_session_is_new, update_map
 from topoloc.localization.config import LocalizerConfig
 from topoloc.mapping.build import Progress
 from topoloc.mapping.edit import WaitCallback, edit_map
-from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence

@@ -16,9 +16,9 @@ from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.coarse_model_update import PlaceFeatures, update_coarse_models
 from topoloc.lifelong.lazy_sequences import OverlaySequence
-from topoloc.lifelong.node_localization import localize_nodes
 from topoloc.lifelong.recall_change import measure_recall_change
 from topoloc.lifelong.session_poses import Progress, SessionPoses, align_motion_to_map
+from topoloc.lifelong.tiles.node_localization import localize_nodes
 from topoloc.lifelong.update import is_well_localized
 from topoloc.lifelong.virtual_node_update import add_virtual_nodes
 from topoloc.localization.localizer import Localizer, LocalizerConfig

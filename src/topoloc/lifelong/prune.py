@@ -29,7 +29,7 @@ from topoloc.lifelong.node_pruning import compute_node_support, remove_nodes, se
 from topoloc.lifelong.recall_change import measure_recall_change
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.landmark_statistics import LandmarkStatistics, merge_count_statistics
-from topoloc.mapping.map_writing import write_map
+from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.recordings.atomic import temporary_file
 

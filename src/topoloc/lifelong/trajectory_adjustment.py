@@ -25,7 +25,7 @@ from jaxtyping import Float
 from topoloc.geometry.alignment import compute_path_lengths
 from topoloc.geometry.rigid import Rigid3, exp_so3, inverse_covariance, log_so3
 from topoloc.localization.result import Localization
-from topoloc.slam.bundle_adjustment import PosePrior, adjust_bundle
+from topoloc.slam.bundle.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import FramePose, KeyFrame
 from topoloc.slam.monocular_odometry import MonocularSubmap
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.entries import TopoNode, VirtualNodes
+from topoloc.mapping.storage.entries import TopoNode, VirtualNodes
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
 

@@ -24,7 +24,7 @@ from topoloc.localization.guided_kernels import (
     predict_from_pixels,
     project_undistorted,
 )
-from topoloc.localization.local_map import LocalMap
+from topoloc.localization.pose_fit import LocalMap
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import predict_key_points
-from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.repetition import (
     NUM_NEIGHBOURS,
     digest_of,
@@ -26,6 +25,7 @@ from topoloc.localization.map_facts.repetition import (
     find_repetition_shifts,
     has_repetitions,
 )
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
 from topoloc.mapping.coarse_models import open_map_coarse_localizer
 from topoloc.mapping.node_cache import CachedNodes

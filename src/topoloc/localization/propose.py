@@ -35,9 +35,8 @@ from topoloc.localization.guided import (
     match_guided,
     match_predicted,
 )
-from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.repetition import MIN_SHIFT
-from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
+from topoloc.localization.pose_fit import LocalMap, PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search, Source
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 from topoloc.mapping.nodes import node_distances

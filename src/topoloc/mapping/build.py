@@ -22,7 +22,6 @@ from topoloc.features.feature_types import find_feature_type
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.entries import Edge, PlaceImage, TopoNode
 from topoloc.mapping.landmarks import NODES_PER_IMAGE, Observations
 from topoloc.mapping.mapping_frames import (
     MappingFrame,
@@ -41,8 +40,9 @@ from topoloc.mapping.node_drafts import (
     observe_draft,
 )
 from topoloc.mapping.nodes import NearestNodeSearch, NodeConfig, NodePoses, select_node_frames
-from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.sessions import Edit, Illumination, Session, average_illumination, today
+from topoloc.mapping.storage.entries import Edge, PlaceImage, TopoNode
+from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import Layer, TopoMetricMap
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
 from topoloc.node_ids import NodeId, Row, as_rows

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from topoloc.errors import EmptyMapError
-from topoloc.mapping.integrity_check import list_coarse_models
 from topoloc.mapping.sessions import Session
+from topoloc.mapping.storage.integrity_check import list_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 
 

@@ -15,10 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError
-from topoloc.mapping.kept_files import drop_kept_files, find_kept_files, keep_file, restore_file
-from topoloc.mapping.map_writing import write_map
-from topoloc.mapping.schema import SCHEMA_VERSION
 from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.storage.kept_files import (
+    drop_kept_files,
+    find_kept_files,
+    keep_file,
+    restore_file,
+)
+from topoloc.mapping.storage.map_writing import write_map
+from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import atomic_write
 

@@ -13,7 +13,6 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.entries import NodeSummary, TopoNode
 from topoloc.mapping.landmarks import (
     Observations,
     compute_session_statistics,
@@ -26,6 +25,7 @@ from topoloc.mapping.mapping_frames import (
     PointLocator,
     encode_thumbnail,
 )
+from topoloc.mapping.storage.entries import NodeSummary, TopoNode
 from topoloc.mapping.virtual_nodes import create_virtual_nodes
 from topoloc.node_ids import NodeId, Row
 from topoloc.points.metric_points import keypoint_sigmas

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.entries import NodeSummary
+from topoloc.mapping.storage.entries import NodeSummary
 
 # The default D_thresh is this share of the scene's median depth. The parallax between nodes is then
 # the same in a kitchen (0.25 m) and in a street (3 m).

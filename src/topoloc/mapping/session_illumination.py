@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.mapping.entries import NodeSummary
 from topoloc.mapping.sessions import Illumination, Session
+from topoloc.mapping.storage.entries import NodeSummary
 
 
 def compute_illumination_distance(a: Illumination, b: Illumination) -> float:

@@ -23,7 +23,9 @@ from topoloc.errors import FeatureTypeError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.entries import (
+from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
+from topoloc.mapping.sessions import Edit, Session
+from topoloc.mapping.storage.entries import (
     CorrelatedErrors,
     Edge,
     NodeSummary,
@@ -32,14 +34,12 @@ from topoloc.mapping.entries import (
     TopoNode,
     VirtualNodes,
 )
-from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
-from topoloc.mapping.schema import SCHEMA_VERSION
-from topoloc.mapping.sessions import Edit, Session
+from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseModel
 
 if TYPE_CHECKING:
-    from topoloc.mapping.map_file import MapFile
+    from topoloc.mapping.storage.map_file import MapFile
 
 __all__ = [
     "CorrelatedErrors",
@@ -225,14 +225,14 @@ class TopoMetricMap:
 
     def save(self, path: str | Path) -> None:
         """Write the map file atomically. Raises MapError."""
-        from topoloc.mapping.map_writing import save_map
+        from topoloc.mapping.storage.map_writing import save_map
 
         save_map(self, Path(path))
 
     @staticmethod
     def load(path: str | Path) -> TopoMetricMap:
         """Open a map file. Nodes are read when accessed. Raises MapError, MapVersionError."""
-        from topoloc.mapping.map_reading import open_map
+        from topoloc.mapping.storage.map_reading import open_map
 
         return open_map(Path(path))
 
@@ -261,6 +261,6 @@ class TopoMetricMap:
     def __reduce__(self) -> Any:
         if self.file is None:
             return super().__reduce__()
-        from topoloc.mapping.map_reading import open_map
+        from topoloc.mapping.storage.map_reading import open_map
 
         return open_map, (self.file.path.absolute(), self.file.digest)

@@ -20,8 +20,8 @@ from topoloc.disk_list import DiskList
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.mapping.nodes import NodeConfig, select_node_frames
+from topoloc.mapping.storage.entries import NodeSummary, TopoNode, VirtualNodes
 from topoloc.node_ids import NodeId, Row
 from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame

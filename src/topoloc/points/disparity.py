@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32
 
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.stereo import depth_sigmas
+from topoloc.geometry.rig import depth_sigmas
 from topoloc.points.epipolar_kernels import match_in_ranges
 from topoloc.points.metric_points import smooth_depth
 from topoloc.recordings.frame import StereoFrame

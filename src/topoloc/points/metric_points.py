@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.stereo import (
+from topoloc.geometry.rig import (
     depth_sigmas,
     depth_sigmas_of_disparity,
     points_from_depth,

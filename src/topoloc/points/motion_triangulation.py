@@ -18,8 +18,8 @@ from topoloc.features.config import MatchingConfig
 from topoloc.features.features import Features
 from topoloc.features.matching import match_features
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import points_from_depth
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.stereo import points_from_depth
 from topoloc.points.metric_points import MetricPoints, select_certain_points
 
 

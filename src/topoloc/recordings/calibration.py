@@ -16,11 +16,11 @@ from topoloc.errors import CalibrationError, RecordingError, UnreadableImageErro
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration, read_camera_json
+from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import image_size
 from topoloc.recordings.recording import Recording
 from topoloc.recordings.stereo_yaml import YAML_SUFFIXES, is_calibration, read_calibration_yaml
-from topoloc.recordings.video import Video
 
 CalibrationForSize = Callable[[int, int], CameraCalibration]
 """Returns the calibration for images of this width and height (pixels). Raises CalibrationError."""

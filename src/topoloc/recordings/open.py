@@ -11,26 +11,26 @@ from pathlib import Path
 from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.recordings.calibration import parse_calibration, with_calibration
 from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.recording import parse_selection, sequence_subset
-from topoloc.recordings.video import Video
 
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
 # accepts any other folder with images. A format's module is imported when the format is tried.
 FORMATS = {
-    "euroc": "topoloc.recordings.euroc:FORMAT",
-    "tum": "topoloc.recordings.tum:FORMAT",
-    "seven_scenes": "topoloc.recordings.seven_scenes:FORMAT",
+    "euroc": "topoloc.recordings.formats.euroc:FORMAT",
+    "tum": "topoloc.recordings.formats.tum:FORMAT",
+    "seven_scenes": "topoloc.recordings.formats.seven_scenes:FORMAT",
     "nerfstudio": "topoloc.apps.formats.nerfstudio:FORMAT",
     "record3d": "topoloc.apps.formats.record3d:FORMAT",
     "colmap": "topoloc.apps.formats.colmap:FORMAT",
     "colmap_database": "topoloc.apps.formats.colmap_database:FORMAT",
-    "kitti": "topoloc.recordings.kitti:FORMAT",
+    "kitti": "topoloc.recordings.formats.kitti:FORMAT",
     "rosbag": "topoloc.apps.formats.bags.bag_recording:ROSBAG_FORMAT",
     "mcap": "topoloc.apps.formats.bags.bag_recording:MCAP_FORMAT",
     "zed": "topoloc.apps.formats.zed:FORMAT",
-    "video": "topoloc.recordings.video:FORMAT",
-    "folder": "topoloc.recordings.folder:FORMAT",
+    "video": "topoloc.recordings.formats.video:FORMAT",
+    "folder": "topoloc.recordings.formats.folder:FORMAT",
 }
 
 

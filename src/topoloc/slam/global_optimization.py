@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import diagonal_covariance
-from topoloc.slam.bundle_adjustment import adjust_bundle
+from topoloc.slam.bundle.bundle_adjustment import adjust_bundle
 from topoloc.slam.keyframes import KeyFrame, Landmarks, Observations
 from topoloc.slam.loop_closure import Link
 from topoloc.slam.pose_graph import (

@@ -21,7 +21,7 @@ from topoloc.points.disparity import MeasuredView, StereoCamera
 from topoloc.points.point_tracking import find_corners, track_points
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.frame_preparation import undistort_frame
-from topoloc.slam.bundle_adjustment import adjust_bundle, adjust_window
+from topoloc.slam.bundle.bundle_adjustment import adjust_bundle, adjust_window
 from topoloc.slam.frame_tracker import FrameTracker
 from topoloc.slam.keyframes import (
     FramePose,

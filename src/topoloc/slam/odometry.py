@@ -23,7 +23,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import MeasuredView, measure_disparities, measured_view
 from topoloc.points.point_tracking import find_corners
 from topoloc.recordings.frame import StereoFrame
-from topoloc.slam.bundle_adjustment import adjust_window
+from topoloc.slam.bundle.bundle_adjustment import adjust_window
 from topoloc.slam.frame_tracker import FrameTracker
 from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import (

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.block_system import BlockPattern, solve_blocks
+from topoloc.slam.bundle.block_system import BlockPattern, solve_blocks
 
 
 @dataclass(frozen=True, eq=False)

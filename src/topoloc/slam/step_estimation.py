@@ -13,8 +13,8 @@ from jaxtyping import Float, Float32, Int
 
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.rig import ray_covariances
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.stereo import ray_covariances
 from topoloc.points.disparity import MeasuredView, StereoCamera
 from topoloc.points.point_tracking import align_with_reference, track_points
 from topoloc.slam.keyframes import KeyFrame, Landmarks

@@ -16,8 +16,8 @@ from jaxtyping import Float, Float32, UInt8
 
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import ray_covariances
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.stereo import ray_covariances
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.points.point_tracking import align_with_reference, track_points
 

@@ -27,7 +27,7 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.walls.upright_pose import estimate_upright_pose
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import DepthImage, StereoFrame
-from topoloc.slam.block_kernels import solve_factored
+from topoloc.slam.bundle.block_kernels import solve_factored
 from topoloc.tracking.tracker import Tracker
 
 Progress = Callable[[str, int, int], None]

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from topoloc.apps.cli import main
-from topoloc.mapping.schema import SCHEMA_VERSION
+from topoloc.mapping.storage.schema import SCHEMA_VERSION
 
 Complaint = Callable[..., str]
 

@@ -12,10 +12,10 @@ from built_room import built_room, unseen_views
 from tiny_world import CAMERA
 from topoloc.apps.report.match_images import MAX_LINES, NodeMatches, draw_pair, match_with_node
 from topoloc.evaluation.metrics import EvaluatedQuery
+from topoloc.evaluation.node_matching import NodeMatcher
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.node_matching import NodeMatcher
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.image_io import encode_jpeg

@@ -11,7 +11,7 @@ from built_room import built_room
 from topoloc.apps.export.colmap import to_colmap_model
 from topoloc.apps.viewer.map_scene import create_map_scene
 from topoloc.apps.viewer.tracks import MAX_ERROR_PX, find_tracks
-from topoloc.mapping.entries import TopoNode
+from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.topomap import TopoMetricMap
 
 

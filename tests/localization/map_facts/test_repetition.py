@@ -15,7 +15,6 @@ from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import open_map
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.local_map import LocalMap
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import with_repetitions
 from topoloc.localization.map_facts.repetition import (
@@ -24,8 +23,9 @@ from topoloc.localization.map_facts.repetition import (
     shifted_copies,
 )
 from topoloc.localization.open_map import OpenMap
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import Image, NodeScore
 

@@ -16,7 +16,7 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig
-from topoloc.localization.local_map import LocalMap
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.walls.virtual_view_matching import (
     QueryVirtualView,
     count_virtual_views,

@@ -19,11 +19,11 @@ from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.fitted_weights import load_fitted_weights
-from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
-from topoloc.mapping.entries import TopoNode
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.mapping.nodes import node_distances
+from topoloc.mapping.storage.entries import TopoNode
+from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
 

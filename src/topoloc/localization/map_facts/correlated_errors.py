@@ -25,7 +25,7 @@ from msgspec import to_builtins
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.localization.fitted_weights import CorrelatedErrorWeights
 from topoloc.localization.guided import GuidedConfig, match_guided
-from topoloc.localization.local_map import LocalMap
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.mapping.nodes import compute_nodes_digest, node_distances
 from topoloc.mapping.topomap import CorrelatedErrors, TopoMetricMap, TopoNode
 from topoloc.node_ids import as_rows

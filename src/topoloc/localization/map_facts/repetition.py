@@ -25,9 +25,9 @@ from topoloc.features.config import MatchingConfig
 from topoloc.features.matching import find_similar_pairs, match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.local_map import LocalMap
-from topoloc.mapping.entries import NodeSummary, TopoNode
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.mapping.nodes import compute_nodes_digest
+from topoloc.mapping.storage.entries import NodeSummary, TopoNode
 
 NUM_NEIGHBOURS = 9
 MIN_SHIFT = 0.3

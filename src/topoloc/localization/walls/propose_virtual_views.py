@@ -39,9 +39,8 @@ from topoloc.localization.evidence import (
     compute_uniform_inlier_ratio,
 )
 from topoloc.localization.guided import GuidedConfig
-from topoloc.localization.local_map import LocalMap
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
-from topoloc.localization.pose_fit import PointMatches, PoseFit
+from topoloc.localization.pose_fit import LocalMap, PointMatches, PoseFit
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.candidate_places import CandidatePlaces, select_likeliest_places
 from topoloc.localization.walls.upright_pose import estimate_upright_pose

@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32
 
 from topoloc.errors import MapError
 from topoloc.features.features import Features
-from topoloc.localization.local_map import LocalMap
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.walls.virtual_view_matching import with_node_id
 from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.node_cache import CachedNodes

@@ -18,7 +18,7 @@ from topoloc.localization.guided import (
     match_guided,
     select_visible_points,
 )
-from topoloc.localization.local_map import LocalMap
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.node_ids import NodeId, Row
 
 _CELL_PX = 8

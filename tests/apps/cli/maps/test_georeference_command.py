@@ -14,7 +14,7 @@ from schemas import check_result
 from topoloc.apps.cli import main
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.mapping.integrity_check import find_map_damage
+from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import TopoMetricMap
 
 Complaint = Callable[..., str]

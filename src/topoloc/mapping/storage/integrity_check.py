@@ -11,9 +11,9 @@ from typing import Any
 from topoloc.errors import MapError
 from topoloc.json_data import decode_json
 from topoloc.mapping.coarse_models import open_map_coarse_localizer
-from topoloc.mapping.map_file import MapFile
-from topoloc.mapping.map_writing import compute_map_digest
-from topoloc.mapping.schema import SORT_COLUMNS, TABLES
+from topoloc.mapping.storage.map_file import MapFile
+from topoloc.mapping.storage.map_writing import compute_map_digest
+from topoloc.mapping.storage.schema import SORT_COLUMNS, TABLES
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.validation import CorruptDataError
 from topoloc.retrieval.coarse import open_coarse_localizer

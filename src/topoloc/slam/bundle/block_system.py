@@ -15,7 +15,7 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.slam.block_kernels import factor_blocks, find_block_idx, solve_factored
+from topoloc.slam.bundle.block_kernels import factor_blocks, find_block_idx, solve_factored
 
 
 @dataclass(frozen=True, eq=False)

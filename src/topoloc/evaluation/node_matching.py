@@ -16,8 +16,8 @@ from topoloc.features.matching import Matches, match_pooled
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig, match_guided
-from topoloc.localization.local_map import LocalMap
-from topoloc.mapping.entries import TopoNode
+from topoloc.localization.pose_fit import LocalMap
+from topoloc.mapping.storage.entries import TopoNode
 from topoloc.recordings.frame import Image
 from topoloc.recordings.image_io import to_grey
 

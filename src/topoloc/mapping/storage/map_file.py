@@ -26,7 +26,7 @@ from topoloc.errors import (
     MapError,
     MapVersionError,
 )
-from topoloc.mapping.schema import (
+from topoloc.mapping.storage.schema import (
     APPLICATION_ID,
     SCHEMA_1,
     SCHEMA_2_VIEWS,

@@ -18,7 +18,7 @@ from jaxtyping import Float32, Int8
 
 from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
-from topoloc.mapping.entries import TopoNode
+from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.validation import (
     MAX_POINTS,
     CorruptDataError,

@@ -20,7 +20,7 @@ from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError, MapError
-from topoloc.lifelong.tile_comparison import (
+from topoloc.lifelong.tiles.tile_comparison import (
     NotJoined,
     OpenTile,
     TileTransform,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.compiled import kernel
-from topoloc.slam.block_kernels import find_block_idx
+from topoloc.slam.bundle.block_kernels import find_block_idx
 
 _OPTIONS = {"error_model": "numpy"}
 _MIN_DEPTH = 0.02

@@ -24,10 +24,11 @@ from topoloc.errors import MapError
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import config_to_text
-from topoloc.mapping.entries import TopoNode
 from topoloc.mapping.landmark_statistics import encode_statistics
-from topoloc.mapping.point_encoding import compress_array, node_to_arrays
-from topoloc.mapping.schema import (
+from topoloc.mapping.sessions import Session, sessions_from_names
+from topoloc.mapping.storage.entries import TopoNode
+from topoloc.mapping.storage.point_encoding import compress_array, node_to_arrays
+from topoloc.mapping.storage.schema import (
     APPLICATION_ID,
     SCHEMA_VERSION,
     SORT_COLUMNS,
@@ -37,7 +38,6 @@ from topoloc.mapping.schema import (
     create_table_statement,
     layer_suffix,
 )
-from topoloc.mapping.sessions import Session, sessions_from_names
 from topoloc.mapping.topomap import NextIds, TopoMetricMap
 from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.coarse import CoarseModel

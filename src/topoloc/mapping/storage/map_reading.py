@@ -19,7 +19,9 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.json_data import decode_json
 from topoloc.mapping.config import CONFIG_VERSION, MapConfig, config_from_text
-from topoloc.mapping.entries import (
+from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
+from topoloc.mapping.sessions import Edit, Session
+from topoloc.mapping.storage.entries import (
     CorrelatedErrors,
     Edge,
     NodeSummary,
@@ -28,11 +30,14 @@ from topoloc.mapping.entries import (
     TopoNode,
     VirtualNodes,
 )
-from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
-from topoloc.mapping.map_file import MapFile
-from topoloc.mapping.point_encoding import points_from_row
-from topoloc.mapping.schema import SORT_COLUMNS, VIRTUAL_PREFIX, layer_suffix, split_layer_name
-from topoloc.mapping.sessions import Edit, Session
+from topoloc.mapping.storage.map_file import MapFile
+from topoloc.mapping.storage.point_encoding import points_from_row
+from topoloc.mapping.storage.schema import (
+    SORT_COLUMNS,
+    VIRTUAL_PREFIX,
+    layer_suffix,
+    split_layer_name,
+)
 from topoloc.mapping.topomap import Layer, NextIds, TopoMetricMap
 from topoloc.mapping.validation import (
     MAX_POINTS,

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.slam.block_system import BlockPattern, solve_blocks
-from topoloc.slam.bundle_kernels import (
+from topoloc.slam.bundle.block_system import BlockPattern, solve_blocks
+from topoloc.slam.bundle.bundle_kernels import (
     count_covisible_pairs,
     eliminate_points,
     find_covisible_pairs,
@@ -25,8 +25,8 @@ from topoloc.slam.bundle_kernels import (
     squared_residuals,
     update_points,
 )
+from topoloc.slam.bundle.observation_chunks import ObservationChunk, ObservationChunks
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
-from topoloc.slam.observation_chunks import ObservationChunk, ObservationChunks
 
 
 @dataclass(frozen=True, eq=False)
