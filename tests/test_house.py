@@ -34,20 +34,20 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 # The figures of `python tools/house.py .` (`--help` has the rule of each). A ceiling only goes
 # down, unless an issue grants an allowance. The goals stand behind the ceilings.
 CEILINGS = {
-    "lines.core": 42249,  # goal 30000
-    "lines.apps": 17109,  # goal 15500
-    "statements.core": 18339,  # goal 13500
-    "statements.apps": 8408,  # goal 7500
-    "files_over_300": 36,  # goal 20
-    "functions_over_45": 19,  # goal 15
-    "folders_over_20": 6,  # goal 0
-    "one_importer": 98,  # goal 50
+    "lines.core": 41141,  # goal 30000
+    "lines.apps": 16916,  # goal 15500
+    "statements.core": 18054,  # goal 13500
+    "statements.apps": 8340,  # goal 7500
+    "files_over_300": 32,  # goal 20
+    "functions_over_45": 18,  # goal 15
+    "folders_over_20": 0,  # goal 0
+    "one_importer": 97,  # goal 50
     "apps.deep_names": 0,  # goal 0
-    "apps.public_names": 152,  # goal: at most 120
-    "asserts.sum": 129,  # goal 40
+    "apps.public_names": 146,  # goal: at most 120
+    "asserts.sum": 69,  # goal 40
     "branches.map_or_atlas": 0,
     "branches.walls": 23,  # goal 0
-    "constants.all": 473,  # goal 474, localization 25
+    "constants.all": 463,  # goal 474, localization 25
     "constants.core/localization": 57,
     "user_docs_bytes": 142629,  # goal 150000
     "readme_lines": 150,  # goal 150

@@ -68,4 +68,4 @@ def test_old_maps_are_read(schema: int):
         topomap = TopoMetricMap.load(FIXTURES / f"schema_{schema}.topo")
     with topomap:
         assert len(topomap.nodes) > 0
-        assert len(topomap.coarse_models) > 0
+        assert len(topomap.layers[topomap.kind].coarse_models) > 0

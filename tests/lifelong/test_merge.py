@@ -99,7 +99,7 @@ def test_what_cannot_be_merged_is_named(
     first, second = maps
     again = Path(shutil.copy(first, tmp_path / "again.topo"))
     assert "one map in two versions" in complaint("merge", first, again, tmp_path / "both.topo")
-    assert "a name of its own" in complaint("merge", again, second, again, status=2)
+    assert "choose another path" in complaint("merge", again, second, again, status=2)
     assert "No such file" in complaint(
         "merge", first, tmp_path / "none.topo", tmp_path / "both.topo"
     )

@@ -98,7 +98,7 @@ def _done_again(change: Callable[[], object]) -> set[str]:
         ("topoloc_training/cnn_nn.py", {"learning cnn-nn"}),
         ("topoloc_training/training.py", {"learning cnn-fc", "learning PoseNet"}),
         ("topoloc_training/coarse_training.py", {*LEARNING, "learning PoseNet"}),
-        ("topoloc/mapping/landmarks.py", {"mapping", *ASKING, *PEERS}),
+        ("topoloc/mapping/landmarks.py", {"mapping"}),
         ("topoloc/mapping/storage/map_reading.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc/features/surf_detector_kernels.py", {"mapping", *ASKING, *PEERS}),
         ("topoloc_paper/colmap_worker.py", {"pycolmap, SIFT"}),

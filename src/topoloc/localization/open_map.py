@@ -36,12 +36,6 @@ from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
 
 _NO_MOVES = np.zeros((0, 4, 4))
-_MIN_SHIFT_REACH = 2.5  # metres: minimum search range of repetition shifts
-_NUM_SIMILAR_NODES, _MAX_SIMILAR_GROUPS, _GROUP_RADIUS = (
-    64,
-    6,
-    5.0,
-)  # nodes alike; groups of them; group radius in D_thresh (Eq. 1)
 
 
 class OpenMap:
@@ -157,24 +151,19 @@ class OpenMap:
     def _similar_distant_nodes(self, node: TopoNode) -> Iterator[list[Row]]:
         """Generate groups of rows of distant nodes that look like this one, most similar first.
 
-        Each group holds up to three nodes near each other.
+        The 64 most similar nodes form up to six groups of up to three nodes near each other.
         """
         if self._appearance_ranker is None:
             return
         blank = np.zeros((node.camera.height, node.camera.width), np.uint8)
-        far = self.distances(node.summary.world_from_cam) > _GROUP_RADIUS * self.d_thresh
-        left = [
-            found.row
-            for found in self._appearance_ranker.rank(blank, node.features, _NUM_SIMILAR_NODES)
-            if far[found.row]
-        ]
-        for _ in range(_MAX_SIMILAR_GROUPS):
+        radius = 5.0 * self.d_thresh  # of a group, Eq. 1
+        far = self.distances(node.summary.world_from_cam) > radius
+        similar = self._appearance_ranker.rank(blank, node.features, 64)
+        left = [found.row for found in similar if far[found.row]]
+        for _ in range(6):
             if not left:
                 return
-            near = (
-                self.distances(self.topomap.summaries[left[0]].world_from_cam)
-                <= _GROUP_RADIUS * self.d_thresh
-            )
+            near = self.distances(self.topomap.summaries[left[0]].world_from_cam) <= radius
             yield [row for row in left if near[row]][:3]
             left = [row for row in left if not near[row]]
 
@@ -196,7 +185,7 @@ class OpenMap:
         away = np.linalg.norm(poses.centres - poses.centres[row], axis=1)
         looks_alike = poses.rotations[:, :, 2] @ poses.rotations[row, :, 2] > 0.85
         near = np.flatnonzero(
-            looks_alike & (away < max(_MIN_SHIFT_REACH, 1.5 * float(np.median(depths))))
+            looks_alike & (away < max(2.5, 1.5 * float(np.median(depths))))  # metres
         )
         near = near[np.argsort(away[near], kind="stable")]
         spread = np.unique(np.linspace(0, len(near) - 1, NUM_NEIGHBOURS).round().astype(int))

@@ -44,8 +44,6 @@ from topoloc.node_ids import Row
 from topoloc.retrieval.coarse import NodeScore
 
 _MAX_SAME_POSE_ANGLE = 0.25  # radians
-_MAX_OTHER_POSES = 3  # maximum number of poses from the preceding feature type
-_MIN_FOUND_RATIO = 0.2  # minimum points found at a repeated pose, relative to the original
 
 
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
@@ -281,7 +279,8 @@ def _propose_from_other_features(search: Search) -> Iterator[Proposal]:
     config, previous = search.config, search.previous
     if previous is None or search.is_clear or config.guided.num_nodes == 0:
         return
-    for hypothesis in previous.belief.ranked(previous.weights.rivals)[:_MAX_OTHER_POSES]:
+    likeliest = previous.belief.ranked(previous.weights.rivals)[:3]
+    for hypothesis in likeliest:
         fit = _fit_around_pose(
             search,
             hypothesis.world_from_cam,
@@ -331,7 +330,7 @@ def _fit_moved_pose(
         search,
         world_from_cam,
         hypothesis.fit.camera,
-        _MIN_FOUND_RATIO * hypothesis.evidence.num_found,
+        0.2 * hypothesis.evidence.num_found,  # far fewer points refute a repetition
     )
 
 

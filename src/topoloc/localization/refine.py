@@ -41,8 +41,6 @@ _MAX_CROSS_CHECK_LOG_ODDS, _HALF_WEIGHT_MATCHES = (
     3.0,
     30.0,
 )  # maximum log-odds from a second feature type; number of matches with half weight
-_MAX_COMPARED_POINTS = 512  # visible points that are compared with dense descriptors
-_MIN_SHARED_POINT_RATIO = 0.75  # of a known pose's points, within the guided search radius
 _HOPELESS_LOG_ODDS = -3.0  # unguided matches cannot raise lower log-odds enough
 
 
@@ -100,7 +98,8 @@ def is_already_found(search: Search, proposal: Proposal) -> bool:
                 - seen.points_img,
                 axis=1,
             )
-        if np.count_nonzero(apart < radius_px) >= _MIN_SHARED_POINT_RATIO * len(apart):
+        min_shared = 0.75 * len(apart)  # the rest may be occluded or out of view
+        if np.count_nonzero(apart < radius_px) >= min_shared:
             return True
     return False
 
@@ -292,7 +291,8 @@ def _compute_uniform_inlier_ratio(
     """
     camera, dense = final.camera, final.features.dense
     if dense is not None and len(visible) > 0:
-        sampled = np.unique(np.linspace(0, len(visible) - 1, _MAX_COMPARED_POINTS).astype(int))
+        # 512 points bound the time; more do not change the ratio
+        sampled = np.unique(np.linspace(0, len(visible) - 1, 512).astype(int))
         visible_img = visible_img[sampled]
         found_img = visible_img[
             dense.check_agreement(visible_img, final.local_map.descriptors[visible[sampled]])

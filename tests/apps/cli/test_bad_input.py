@@ -187,7 +187,7 @@ def test_outputs_never_replace_inputs_or_folders(
 ):
     assert "it is a folder" in complaint(*command_with_output(command, option, tmp_path))
     target = tmp_path / "room.topo" if command == "build" else room_map
-    assert "used twice, too" in complaint(*command_with_output(command, option, target))
+    assert "used twice" in complaint(*command_with_output(command, option, target))
 
 
 def test_ctrl_c_in_mid_build(
@@ -262,12 +262,12 @@ def test_too_few_arguments_are_wrong_usage(
         ("nan,500,320,240", "not finite"),
         ("0,500,320,240", "positive"),
         ("nowhere.json", "nowhere.json: no such camera file"),
-        ('{"width": 320}', "'fx' is missing"),
+        ('{"width": 320}', "missing required field `height`"),
         (
             '{"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}',
             "the image is 320x240, its camera 640x480",
         ),
-        ("not json", "not a JSON file"),
+        ("not json", "not JSON"),
     ],
 )
 def test_a_camera_that_is_none(

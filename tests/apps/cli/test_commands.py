@@ -342,7 +342,7 @@ def test_a_report_needs_no_truth(
         main(["evaluate", str(room_map), "--elsewhere", str(elsewhere), "--report", str(report)])
         == 0
     )
-    assert "images from elsewhere" in report.read_text()
+    assert "out-of-map images" in report.read_text()
     assert "median error" not in capsys.readouterr().out
 
 

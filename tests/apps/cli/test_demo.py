@@ -77,7 +77,7 @@ def test_the_demo_maps_asks_and_reports(
     found = Trajectory.read(out / "day.tum")
     assert found.t_ns == [number * 100_000_000 for number in range(9)]
     page = (out / "report.html").read_text()
-    assert "What the night costs: of 3 pictures 100 % get a pose" in page
+    assert "By night, 100 % of 3 images get a pose" in page
     assert page.count("</article>") == 4 + 6
 
 

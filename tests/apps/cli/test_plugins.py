@@ -64,7 +64,7 @@ def test_help_warns_of_a_broken_plugin_once(broken: tuple[Path, str]):
 def test_localize_works_with_a_broken_plugin(
     broken: tuple[Path, str], room_map: Path, queries: Path, tmp_path: Path
 ):
-    folder, reason = broken
+    folder, _ = broken
     settings = tmp_path / "settings.toml"
     settings.write_text("[localize]\n")
     results = tmp_path / "results.jsonl"
@@ -73,4 +73,4 @@ def test_localize_works_with_a_broken_plugin(
     )
     assert answer.returncode == 0, answer.stderr
     assert '"localized": true' in results.read_text(encoding="utf-8")
-    assert [reason in line for line in _warnings(answer)] == [True]
+    assert _warnings(answer) == [], "localize needs no plug-in"

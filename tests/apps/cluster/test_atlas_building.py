@@ -95,7 +95,7 @@ def test_a_ray_of_another_version(
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setattr("ray.__version__", "1.0.0")
-    assert "is of another version" in complaint(
+    assert "has another version" in complaint(
         "build", walks[0], tmp_path / "campus", "--ray", cluster.address
     )
 

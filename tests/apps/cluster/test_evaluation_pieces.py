@@ -21,7 +21,7 @@ from topoloc.apps.cli.queries.remote_queries import OpenQueries, Piece, QueryRec
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.errors import MapError, MissingExtraError, RecordingError, TrajectoryError
 from topoloc.evaluation.metrics import summarize
-from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.localizer import Localizer
 from topoloc.mapping.topomap import TopoMetricMap
 
 Complaint = Callable[..., str]
@@ -101,7 +101,7 @@ def test_an_atlas_and_a_tile_that_cannot_be_read(
     (rotten,) = (campus / "tiles").glob("other-*.topo")
     rotten.write_bytes(b"rotten")
     alone = _evaluated(capsys, *args)
-    assert alone[1].startswith("warning: tile other is not asked: ")
+    assert alone[1].startswith("warning: tile other is not searched: ")
     assert alone[1].count("\n") == 1
     assert _evaluated(capsys, *args, "--ray", cluster.address) == alone
 
@@ -134,7 +134,7 @@ def piece(queried_map: Path) -> Piece:
     topomap = TopoMetricMap.load(queried_map / "room.topo")
     recording = QueryRecording(str(queried_map / "pictures"), None, None, None, None)
     queries = OpenQueries(recording, recording.open(), "walk", None)
-    sent = RemoteMap.of(Localizer(topomap), LocalizerConfig(), None)
+    sent = RemoteMap.of(Localizer(topomap), "", None)
     (piece,) = remote_queries._split_queries(sent, queries)
     return piece
 

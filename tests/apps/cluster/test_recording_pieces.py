@@ -53,7 +53,7 @@ def test_the_pieces_of_one_trajectory_are_one_world(long_walk: Path):
         "2:8",
         "4:10",
     ]
-    assert [making.asked.trajectory for making in pieces.piece_jobs] == [("truth",)] * 3
+    assert [making.pose_options.trajectory for making in pieces.piece_jobs] == [("truth",)] * 3
     assert pieces.world is not None
     assert pieces.world.startswith("walk-")
     assert split_recording(_making(long_walk, "slam"), "walk", SplitOptions(6, 3)).world is None

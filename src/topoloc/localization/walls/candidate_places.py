@@ -17,7 +17,6 @@ from topoloc.features.virtual_views import VirtualView
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
 
-_NUM_CANDIDATES = 64  # most similar virtual views per side that may give a place
 # minimum cosine between the viewing directions of two cameras in the same place
 _MIN_DIRECTION_COSINE = 0.5
 
@@ -81,7 +80,7 @@ def select_likeliest_places(
     if not candidates:
         return chosen
     first = [
-        view.rows(np.argsort(-view.likeness, kind="stable")[:_NUM_CANDIDATES])
+        view.rows(np.argsort(-view.likeness, kind="stable")[:64])  # the most similar ones
         for view in candidates
     ]
     places = CandidatePlaces(

@@ -22,7 +22,6 @@ from topoloc.localization.pose_fit import LocalMap
 from topoloc.node_ids import NodeId, Row
 
 _CELL_PX = 8
-_MAX_COMPARED_POINTS = 512  # visible points per side that are compared with dense descriptors
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +120,7 @@ def count_virtual_views(
             side.features, local_map, side_from_world, view.camera, config
         )
         seen = (
-            seen[np.unique(np.linspace(0, len(seen) - 1, _MAX_COMPARED_POINTS).astype(int))]
+            seen[np.unique(np.linspace(0, len(seen) - 1, 512).astype(int))]  # bounds the time
             if len(seen)
             else seen
         )

@@ -34,7 +34,7 @@ def test_whatever_decides_changes_it(
     digests = [
         making.digest(),
         replace(making, recordings=(f"{recording}@0:5",)).digest(),
-        replace(making, build=BuildConfig(max_node_points=500)).digest(),
+        replace(making, build=BuildConfig(other_kinds=())).digest(),
         replace(making, camera="500,500,160,120").digest(),
         replace(making, pose_options=PoseOptions(("slam",))).digest(),
         replace(making, pose_options=PoseOptions((str(poses),))).digest(),

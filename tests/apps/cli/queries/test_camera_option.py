@@ -109,7 +109,7 @@ def test_one_picture_of_another_shape_in_a_list(
             2,
             "--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not nan",
         ),
-        (["--scale", "2", "--trajectory", "slam"], 2, "slam finds others"),
+        (["--scale", "2", "--trajectory", "slam"], 2, "slam computes its own"),
         (["--images", "."], 1, "takes no images"),
         (["--camera", "nowhere.yaml"], 1, "nowhere.yaml: no calibration here"),
     ],
