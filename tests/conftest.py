@@ -3,6 +3,7 @@ project are found here."""
 
 from __future__ import annotations
 
+import logging
 import os
 import pkgutil
 from collections.abc import Callable, Iterator
@@ -129,3 +130,14 @@ def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...
         return printed.err
 
     return run
+
+
+@pytest.fixture(autouse=True)
+def _service_loggers() -> Iterator[None]:
+    """Restore the loggers that `serve` sets up, which would hide records from later tests."""
+    loggers = [logging.getLogger(name) for name in ("topoloc.apps.service", "uvicorn", "asyncio")]
+    before = [(one.handlers[:], one.propagate, one.level) for one in loggers]
+    yield
+    for one, (handlers, propagate, level) in zip(loggers, before, strict=True):
+        one.handlers, one.propagate = handlers, propagate
+        one.setLevel(level)
