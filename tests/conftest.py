@@ -133,11 +133,10 @@ def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...
 
 
 @pytest.fixture(autouse=True)
-def _service_loggers() -> Iterator[None]:
-    """Restore the loggers that `serve` sets up, which would hide records from later tests."""
-    loggers = [logging.getLogger(name) for name in ("topoloc.apps.service", "uvicorn", "asyncio")]
-    before = [(one.handlers[:], one.propagate, one.level) for one in loggers]
+def loggers_of_the_service_are_plain() -> Iterator[None]:
+    """Undo what `topoloc serve`, called here, sets up. It hides records from `caplog`."""
     yield
-    for one, (handlers, propagate, level) in zip(loggers, before, strict=True):
-        one.handlers, one.propagate = handlers, propagate
-        one.setLevel(level)
+    for name in ("topoloc.apps.service", "uvicorn", "asyncio"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [], True
+        logger.setLevel(logging.NOTSET)

@@ -222,7 +222,7 @@ def run_network(
     """Run a network on an image. The image is padded with its border pixels to sides that are
     multiples of 32."""
     height, width = image.shape
-    padding = [(0, -side % _SIDE_MULTIPLE) for side in (height, width)]
+    padding = np.array([(0, -side % _SIDE_MULTIPLE) for side in (height, width)])
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
     session = _session_for_size(
         network,

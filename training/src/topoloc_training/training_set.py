@@ -50,8 +50,7 @@ def decode_pictures(training_set: TrainingSet) -> tuple[list[RgbImage], ImageSha
     """The mapping pictures in colour, and the size that most of them have. Raises MapError where
     one is damaged."""
     pictures = [decode_stored_image(jpeg) for jpeg in training_set.jpegs]
-    sizes, counts = np.unique(
-        [picture.shape[1::-1] for picture in pictures], axis=0, return_counts=True
-    )
+    shapes = np.array([picture.shape[1::-1] for picture in pictures])
+    sizes, counts = np.unique(shapes, axis=0, return_counts=True)
     width, height = sizes[int(counts.argmax())]
     return pictures, ImageShape(int(width), int(height))

@@ -160,4 +160,4 @@ def _kept_views(frame: StereoFrame, recording: str, pictures: Path) -> list[_Sho
 
 def _filled(picture: UInt8[np.ndarray, "a b"]) -> UInt8[np.ndarray, "c d"]:
     missing = (max(0, HEIGHT - picture.shape[0]), max(0, WIDTH - picture.shape[1]))
-    return np.pad(picture, ((0, missing[0]), (0, missing[1])), mode="edge")
+    return np.pad(picture, np.array([(0, missing[0]), (0, missing[1])]), mode="edge")

@@ -60,8 +60,8 @@ def wall(
 ) -> tuple[Mesh, Openings]:
     """A wall from z[0] to z[1] with openings where columns and rows cross, except the blind ones;
     and these openings."""
-    xs = np.unique(np.concatenate([[0.0, width], np.ravel(columns)]))
-    zs = np.unique(np.concatenate([z, np.ravel(rows)]))
+    xs = np.unique([0.0, width, *(x for column in columns for x in column)])
+    zs = np.unique([*z, *(height for row in rows for height in row)])
     holes = np.array(
         [
             [c[0], c[1], r[0], r[1]]
