@@ -134,9 +134,10 @@ def complaint(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...
 
 @pytest.fixture(autouse=True)
 def loggers_of_the_service_are_plain() -> Iterator[None]:
-    """Undo what `topoloc serve`, called here, sets up. It hides records from `caplog`."""
+    """Undo what hides records from `caplog`: `topoloc serve` sets loggers up, and import-linter
+    disables them."""
     yield
     for name in ("topoloc.apps.service", "uvicorn", "asyncio"):
         logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = [], True
+        logger.handlers, logger.propagate, logger.disabled = [], True, False
         logger.setLevel(logging.NOTSET)
