@@ -65,6 +65,8 @@ def merge_tile_results(
     Returns:
         The tile of the result, the result, and its reported poses.
     """
+    if len(results) == 1:
+        return results[0].tile_id, results[0].result, results[0].named
     localized = [
         (one, found, _rivals(tiles, one, found, results))
         for one in results
