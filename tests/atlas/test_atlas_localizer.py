@@ -30,8 +30,8 @@ BUDGET = 100_000_000
 class Wide(AtlasConfig):
     """Search tiles although others are far more similar, each coarse only first."""
 
-    settled_gap = 2.0
-    hopeless_gap = 2.0
+    min_ranking_margin = 2.0
+    max_similarity_gap = 2.0
 
 
 def _localizer(
@@ -103,9 +103,9 @@ def test_features_are_extracted_once_for_all_tiles(atlas: Path, monkeypatch: pyt
     assert kinds == ["surf"]
 
 
-@pytest.mark.parametrize(("least_likeness", "num_asked"), [(-1.0, 2), (2.0, 1)])
+@pytest.mark.parametrize(("min_similarity", "num_asked"), [(-1.0, 2), (2.0, 1)])
 def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all_means(
-    atlas: Path, monkeypatch: pytest.MonkeyPatch, least_likeness: float, num_asked: int
+    atlas: Path, monkeypatch: pytest.MonkeyPatch, min_similarity: float, num_asked: int
 ):
     asked = list[str]()
     localize_exhaustive = QuerySession.localize_exhaustive
@@ -114,7 +114,7 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
         "localize_exhaustive",
         lambda self: asked.append(self.features) or localize_exhaustive(self),
     )
-    monkeypatch.setattr(Wide, "least_likeness", least_likeness)
+    monkeypatch.setattr(Wide, "min_similarity", min_similarity)
     config = Wide()
     result = _localizer(atlas, config).localize(unseen_views(seed=2)[0][0], CAMERA)
     assert isinstance(result, NotLocalized)
@@ -144,7 +144,7 @@ def test_a_look_alike_that_cannot_come_near_is_left_at_that(
         "localize_coarse_only",
         lambda self: asked.append(self.features) or glance(self),
     )
-    monkeypatch.setattr(Wide, "alike_gap", 2.0)
+    monkeypatch.setattr(Wide, "max_rival_gap", 2.0)
     wide = Wide(num_glanced=1)
     result = _localizer(atlas, wide).localize(unseen_views()[0][0], CAMERA)
     assert isinstance(result, Localization)

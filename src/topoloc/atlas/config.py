@@ -20,18 +20,18 @@ class AtlasConfig:
 
     num_ranked: ClassVar[int] = 64
     """Number of tiles ranked by the index. No others are searched."""
-    settled_gap: ClassVar[float] = 0.15
+    min_ranking_margin: ClassVar[float] = 0.15
     """Minimum similarity margin of the best tile for an immediate exhaustive search. If no tile has
     it, the next feature type ranks them."""
-    num_glanced_first: ClassVar[int] = 2
+    num_coarse_first: ClassVar[int] = 2
     """Maximum number of tiles searched coarse only before the next feature type ranks them."""
-    hopeless_gap: ClassVar[float] = 0.25
+    max_similarity_gap: ClassVar[float] = 0.25
     """Tiles whose similarity is lower than the best tile's by more than this are not searched."""
-    least_likeness: ClassVar[float] = 0.33
+    min_similarity: ClassVar[float] = 0.33
     """Similarity that any place reaches. After the first tile, less similar ones are searched
     exhaustively only if the coarse search found a pose."""
-    alike_gap: ClassVar[float] = 0.1
+    max_rival_gap: ClassVar[float] = 0.1
     """Tiles whose similarity is within this of the tile that localized the image are checked for a
     rival pose."""
-    num_alike: ClassVar[int] = 2
+    num_rivals: ClassVar[int] = 2
     """Maximum number of these similar tiles that are checked."""

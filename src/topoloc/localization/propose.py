@@ -16,7 +16,7 @@
 - **repetition**: the shifted poses of each hypothesis in a repetitive place (`repetition.py`).
 - **walls**: virtual views of the walls, seen from the reverse direction (`walls/`).
 
-Each source reads the current belief and proposes nothing if it is settled.
+Each source reads the current belief and skips what it makes needless.
 """
 
 from __future__ import annotations

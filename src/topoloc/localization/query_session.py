@@ -94,25 +94,25 @@ class QuerySession:
             _evaluate_proposals(
                 search, propose(search, self.prior) if number else self._first_proposals
             )
-            is_last = search.is_stopped or search.is_settled or search.is_last
-            outcome = decide_final_result(search) if is_last else decide_result(search)
+            is_final = search.is_stopped or search.is_settled or search.is_last
+            outcome = decide_final_result(search) if is_final else decide_result(search)
             if (
                 search.is_stopped
-                or (is_last and isinstance(outcome[0], Localization))
+                or (is_final and isinstance(outcome[0], Localization))
                 or _is_calibration_contradicted(outcome[0])
             ):
                 return outcome
-            is_open = number == 0 and self.prior is not None and not is_last
-            if is_open and outcome[1] and (confirmed := self._confirm_with_other_features())[1]:
+            may_confirm = number == 0 and self.prior is not None and not is_final
+            if may_confirm and outcome[1] and (confirmed := self._confirm_with_last_type())[1]:
                 return confirmed
         assert outcome is not None
         if len(self.searches) > 1 and not outcome[1] and self.prior is None:
             _evaluate_proposals(self.searches[0], propose_more(self.searches[0]))
-            by_first = self._confirm_with_other_features()
+            by_first = self._confirm_with_last_type()
             return by_first if by_first[1] else outcome
         return outcome
 
-    def _confirm_with_other_features(self) -> ResultWithInliers:
+    def _confirm_with_last_type(self) -> ResultWithInliers:
         """Confirm the hypotheses of the first feature type with the last one.
 
         The reported pose is the one with the higher log-odds. In changed light, points of the first

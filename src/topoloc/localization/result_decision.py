@@ -147,7 +147,7 @@ def _build_localization(
         covariance=inverse_covariance(best.fit.cam_from_world, best.covariance),
         probability=probability,
         node_id=best.fit.node_id,
-        candidates=search.named,
+        candidates=search.candidate_nodes,
         num_matches=len(best.fit.matches),
         num_inliers=best.fit.num_inliers,
         times_ms=search.query.clock.times_ms(),
@@ -225,7 +225,7 @@ def _explain_not_localized(search: Search, ranked: list[Hypothesis]) -> NotLocal
         )
         return NotLocalized(
             reason,
-            search.named,
+            search.candidate_nodes,
             num_matches,
             num_inliers,
             search.query.clock.times_ms(),
@@ -258,7 +258,7 @@ def _build_not_localized(
     )
     return NotLocalized(
         reason,
-        search.named,
+        search.candidate_nodes,
         len(best.fit.matches),
         best.fit.num_inliers,
         times_ms,

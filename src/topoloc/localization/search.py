@@ -111,7 +111,7 @@ class Search:
         return self.ranked[: self.config.num_candidates]
 
     @property
-    def named(self) -> list[CandidateNode]:
+    def candidate_nodes(self) -> list[CandidateNode]:
         """Return the candidates by node id, as they are reported."""
         return [CandidateNode(self.map.node_ids[one.row], one.score) for one in self.candidates]
 

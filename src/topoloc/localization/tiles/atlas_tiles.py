@@ -109,7 +109,7 @@ class AtlasTiles:
                 vectors[kind] = vocabulary.global_descriptor(features, camera.width, camera.height)
                 ranking = self.atlas.index.rank(vectors, self.config.num_ranked, reach)
             yield ranking + unranked
-            if ranking_margin(ranking) >= self.config.settled_gap:
+            if ranking_margin(ranking) >= self.config.min_ranking_margin:
                 return
         if not vectors:
             yield unranked

@@ -31,7 +31,7 @@ class TileResult:
 
     tile_id: str
     result: Localization | NotLocalized
-    named: list[LocalizationWithInliers]
+    poses: list[LocalizationWithInliers]
     is_exhaustive: bool
     similarity: float = 0.0
 
@@ -66,7 +66,7 @@ def merge_tile_results(
         The tile of the result, the result, and its reported poses.
     """
     if len(results) == 1:
-        return results[0].tile_id, results[0].result, results[0].named
+        return results[0].tile_id, results[0].result, results[0].poses
     localized = [
         (one, found, _rivals(tiles, one, found, results))
         for one in results
@@ -78,12 +78,12 @@ def merge_tile_results(
         localized, key=lambda one: min((rival.margin for rival in one[2]), default=math.inf)
     )
     if not rivals:
-        return best.tile_id, found, best.named
+        return best.tile_id, found, best.poses
     others = 1.0 / max(found.probability, 1e-6) - 1.0
     others += sum(math.exp(-rival.margin) for rival in rivals)
     if all(rival.margin >= MIN_LOG_ODDS_MARGIN for rival in rivals):
         found = replace(found, probability=1.0 / (1.0 + others))
-        return best.tile_id, found, [(found, seen) for _, seen in best.named]
+        return best.tile_id, found, [(found, seen) for _, seen in best.poses]
     return best.tile_id, *_ambiguous_result(best, found, rivals, others)
 
 
@@ -109,7 +109,7 @@ def _rivals(
         _Rival(other.tile_id, pose, _log_odds_margin(found, pose[0]))
         for other in results
         if other is not one
-        for pose in other.named
+        for pose in other.poses
         if not tiles.may_be_same_pose(one.tile_id, found, other.tile_id, pose[0])
     ]
 
@@ -118,7 +118,7 @@ def _ambiguous_result(
     best: TileResult, found: Localization, rivals: Sequence[_Rival], others: float
 ) -> tuple[NotLocalized, list[LocalizationWithInliers]]:
     """Return an ambiguous result with the probability of each alternative."""
-    shares = [(1.0 / (1.0 + others), best.tile_id, best.named[0])]
+    shares = [(1.0 / (1.0 + others), best.tile_id, best.poses[0])]
     shares += [(math.exp(-one.margin) / (1.0 + others), one.tile_id, one.pose) for one in rivals]
     probable = sorted(
         (one for one in shares if one[0] >= _MIN_ALTERNATIVE_RATIO * shares[0][0]),
@@ -159,7 +159,7 @@ def _best_refusal(
             one[0].similarity,
         ),
     )
-    return best.tile_id, result, best.named
+    return best.tile_id, result, best.poses
 
 
 def _log_odds_margin(a: Localization, b: Localization) -> float:

@@ -87,7 +87,7 @@ class TileSearch:
                 if mode == "rival" and not self._can_be_rival(session):
                     return
                 is_exhaustive = mode == "exhaustive"
-                result, named = (
+                result, poses = (
                     session.localize_exhaustive()
                     if is_exhaustive
                     else session.localize_coarse_only()
@@ -98,19 +98,19 @@ class TileSearch:
             self.results.pop(tile_id, None)
             self.tiles.report(tile_id, error)
             return
-        self.results[tile_id] = TileResult(tile_id, result, named, is_exhaustive, similarity)
+        self.results[tile_id] = TileResult(tile_id, result, poses, is_exhaustive, similarity)
 
     def search_all(self) -> None:
         """Search tiles until one localizes the image, then the similar tiles."""
-        num_coarse = self.config.num_glanced_first
+        num_coarse = self.config.num_coarse_first
         for ranking in self.tiles.rankings(self.query_image, self.clock, self.reach):
             self.ranking = ranking
-            if ranking_margin(self._readable(ranking)) < self.config.settled_gap:
+            if ranking_margin(self._readable(ranking)) < self.config.min_ranking_margin:
                 self._search_coarse_only(num_coarse)
-            if self._is_settled or self._is_past_deadline:
+            if self._has_clear_pose or self._is_past_deadline:
                 break
         else:
-            if ranking_margin(self._readable(self.ranking)) < self.config.settled_gap:
+            if ranking_margin(self._readable(self.ranking)) < self.config.min_ranking_margin:
                 self._search_coarse_only(self.config.num_glanced)
         hopeful = self._candidates()
         for number in range(self.config.num_asked):
@@ -133,14 +133,14 @@ class TileSearch:
         if not self.results:
             reason = next(iter(self.tiles.problems.values()), "no time")
             raise AtlasError(f"no tile of the atlas can be searched: {reason}")
-        tile_id, result, named = merge_tile_results(self.tiles, list(self.results.values()))
+        tile_id, result, poses = merge_tile_results(self.tiles, list(self.results.values()))
         result = replace(self.tiles.with_tile(result, tile_id), times_ms=self._times_ms())
-        return result, named
+        return result, poses
 
     def _search_coarse_only(self, num_tiles: int) -> None:
         """Search the likeliest tiles coarse only, until a pose is clear."""
         for tile_id, similarity in self._candidates()[:num_tiles]:
-            if self._is_settled or self._is_past_deadline:
+            if self._has_clear_pose or self._is_past_deadline:
                 return
             if tile_id not in self.results:
                 self.search_tile(tile_id, similarity, "coarse")
@@ -152,9 +152,9 @@ class TileSearch:
         """
         if not self._localized:
             return
-        least = min(one.similarity for one in self._localized) - self.config.alike_gap
+        least = min(one.similarity for one in self._localized) - self.config.max_rival_gap
         alike = [one for one in self.ranking if one[1] >= least and one[0] not in self.results]
-        for tile_id, similarity in alike[: self.config.num_alike]:
+        for tile_id, similarity in alike[: self.config.num_rivals]:
             if not self._is_past_deadline:
                 self.search_tile(tile_id, similarity, "rival")
         for one in [
@@ -168,7 +168,8 @@ class TileSearch:
         return [
             one
             for one in ranking
-            if one[1] >= ranking[0][1] - self.config.hopeless_gap or one[0] in self.tiles.unranked
+            if one[1] >= ranking[0][1] - self.config.max_similarity_gap
+            or one[0] in self.tiles.unranked
         ]
 
     def _is_promising(self, ranked: tuple[str, float]) -> bool:
@@ -177,7 +178,7 @@ class TileSearch:
         Tiles that cannot be ranked are always promising.
         """
         return (
-            self._priority(ranked) >= (0.0, self.config.least_likeness)
+            self._priority(ranked) >= (0.0, self.config.min_similarity)
             or ranked[0] in self.tiles.unranked
         )
 
@@ -206,7 +207,7 @@ class TileSearch:
         """Return the sort key of a tile: first the probability of its coarse pose, then its
         similarity."""
         known = self.results.get(ranked[0])
-        found = [one.probability for one, _ in known.named] if known else []
+        found = [one.probability for one, _ in known.poses] if known else []
         return max(found, default=0.0), ranked[1]
 
     @property
@@ -219,7 +220,7 @@ class TileSearch:
         ]
 
     @property
-    def _is_settled(self) -> bool:
+    def _has_clear_pose(self) -> bool:
         return any(one.is_clear for one in self.results.values())
 
     @property

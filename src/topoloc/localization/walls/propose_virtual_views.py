@@ -145,13 +145,13 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     """Generate the proposals with the most agreeing matches."""
     clear_log_odds = 2.5  # virtual views are skipped if a pose of the nodes has higher log-odds
     config, best = search.config.walls, search.best
-    is_settled = (
+    is_explained_by_nodes = (
         best is not None
         and best.probability >= search.config.evidence.min_probability
         and best.log_odds > clear_log_odds
     )
     if (
-        is_settled
+        is_explained_by_nodes
         or search.is_repetitive
         or config.num_places == 0
         or isinstance(search.query.input_camera, UncalibratedCamera)
