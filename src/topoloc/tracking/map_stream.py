@@ -294,8 +294,6 @@ class MapStream:
                 update_motion(predicted, (offset @ smoothed).inverse(), measured),
                 frame.odom_from_cam,
             )
-        points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
-        follower = PointTracker(frame.grey, points, cam_from_world, frame.grey_camera)
         self._reference = ReferenceImage(
             t_ns,
             found.result,
@@ -304,7 +302,7 @@ class MapStream:
             smoothed,
             pose_covariance + errors.correlated,
             offset,
-            follower,
+            _follow_points(frame, found),
         )
         best = self._hypotheses.best
         assert best is not None
@@ -390,3 +388,10 @@ class MapStream:
             predicted.world_from_cam,
             compute_smoothed_covariance(self._reference, predicted),
         )
+
+
+def _follow_points(frame: StreamFrame, found: LocalizedPose) -> PointTracker:
+    """Return a tracker of the map points that were found in the image."""
+    points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
+    cam_from_world = found.result.world_from_cam.inverse()
+    return PointTracker(frame.grey, points, cam_from_world, frame.grey_camera)

@@ -19,6 +19,7 @@ from topoloc import (
     LocalizerConfig,
     Rigid3,
     StereoSequence,
+    TopoMetricMap,
     TrajectoryError,
     WorldFit,
 )
@@ -124,18 +125,9 @@ class Command:
             self._check_no_recordings()
             outputs = {"json": self.json, "report": self.report}
             return evaluate_map_itself(self.map, self.coarse, self.features, outputs, self.config)
-        if not self.sequences and not self.elsewhere:
-            raise UsageError(
-                "evaluate takes a map and at least one recording, with truth or --elsewhere, or"
-                " --against-itself"
-            )
-        if self.fit_map_from_truth and (self.map_from_truth or len(self.sequences) != 1):
-            raise UsageError("--fit-map-from-truth is of one recording, without --map-from-truth")
-        inputs = [path for path in (self.map, self.map_from_truth, self.config) if path]
-        check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
+        self._check_usage()
         settings = read_settings(self.config)
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
-        write_report = import_report_writer() if self.report else None
         localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
         tile_id = self._select_tile(localizer)
         with localizer.in_tile(tile_id) as in_tile:
@@ -155,7 +147,30 @@ class Command:
                 answers = localize_on_ray(
                     sent, asked, self.ray, settings.of(ClusterConfig), progress
                 )
-        evaluated = Evaluation(answers)
+        self._report(Evaluation(answers), localizer, topomap, info)
+        return 0
+
+    def _check_usage(self) -> None:
+        if not self.sequences and not self.elsewhere:
+            raise UsageError(
+                "evaluate takes a map and at least one recording, with truth or --elsewhere, or"
+                " --against-itself"
+            )
+        if self.fit_map_from_truth and (self.map_from_truth or len(self.sequences) != 1):
+            raise UsageError("--fit-map-from-truth is of one recording, without --map-from-truth")
+        if self.report:
+            import_report_writer()
+        inputs = [path for path in (self.map, self.map_from_truth, self.config) if path]
+        check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
+
+    def _report(
+        self,
+        evaluated: Evaluation,
+        localizer: Localizer,
+        topomap: TopoMetricMap,
+        info: dict[str, Any],
+    ) -> None:
+        """Print the figures and write the files that the options name."""
         fits = evaluated.world_fits if len(localizer.tile_ids) == 1 else []
         evaluation = evaluated.to_json() | {
             "map": info,
@@ -169,13 +184,13 @@ class Command:
                 _report_world_fit(fit, self.fit_map_from_truth),
                 file=sys.stderr if self.json == "-" else sys.stdout,
             )
+        answers = evaluated.answers
         write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
-        if write_report and self.report:
-            write_report(Path(self.report), evaluation, answers, topomap)
+        if self.report:
+            import_report_writer()(Path(self.report), evaluation, answers, topomap)
             if self.json != "-":
                 print(f"report: {self.report}")
         self._write_fit(fits)
-        return 0
 
     def _open_recordings(self, map_from_truth: Rigid3 | None) -> list[OpenQueries]:
         """The recordings, those with truth first."""
@@ -280,72 +295,34 @@ def _print(evaluation: dict[str, Any]) -> None:
     if len(e["recordings"]) > 1:
         print_recordings(e)
         print()
-    facts = []
-    if e["num_queries"]:
-        facts.append(
-            (
-                "localized",
-                (
-                    f"{e['num_localized']} of {e['num_queries']}"
-                    f" ({100 * e['num_localized'] / e['num_queries']:.1f} %)"
-                ),
-            )
-        )
-    if e["num_localized"]:
-        facts.append(
-            (
-                "median error",
-                f"{100 * e['median_translation_m']:.2f} cm, {e['median_rotation_deg']:.3f} deg",
-            )
-        )
-    if e["num_queries"]:
-        facts.append(
-            (
-                "recall",
-                ", ".join(
-                    f"{name.replace('_', ' ')} {100 * share:.1f} %"
-                    for name, share in e["recall"].items()
-                ),
-            )
-        )
-    if e["topological_accuracy"] is not None:
-        facts.append(
-            (
-                "nearest node named first",
-                (
-                    f"{100 * e['topological_accuracy']:.1f} %, or a neighbour"
-                    f" {100 * e['neighbour_accuracy']:.1f} %"
-                ),
-            )
-        )
-    elsewhere = f"of {e['num_elsewhere']} images from elsewhere, and " if e["num_elsewhere"] else ""
-    facts.append(
-        (
-            "false accepts",
-            (
-                f"{e['false_accepts']} ({elsewhere}of poses off by more than"
-                f" {EvaluatedQuery.MAX_TRANSLATION} m or {EvaluatedQuery.MAX_ROTATION_DEG:g} deg)"
-            ),
-        )
-    )
+    facts = _facts_with_truth(e) if e["num_queries"] else []
+    out_of_map = f"of {e['num_elsewhere']} out-of-map images, and " if e["num_elsewhere"] else ""
+    limits = f"{EvaluatedQuery.MAX_TRANSLATION} m or {EvaluatedQuery.MAX_ROTATION_DEG:g} deg"
+    false = f"{e['false_accepts']} ({out_of_map}of poses off by more than {limits})"
+    facts.append(("false accepts", false))
     if e["not_localized"]:
-        facts.append(
-            (
-                "not localized",
-                ", ".join(f"{reason} {count}" for reason, count in e["not_localized"].items()),
-            )
-        )
-    facts.append(
-        ("median ms", ", ".join(f"{stage} {ms:.1f}" for stage, ms in e["median_times_ms"].items()))
-    )
+        reasons = [f"{reason} {count}" for reason, count in e["not_localized"].items()]
+        facts.append(("not localized", ", ".join(reasons)))
+    times = [f"{stage} {ms:.1f}" for stage, ms in e["median_times_ms"].items()]
+    facts.append(("median ms", ", ".join(times)))
     facts += [("calibration", f"{one['recording']}: {one['detail']}") for one in e["calibrations"]]
-    facts.append(
-        (
-            "map",
-            (
-                f"{e['map']['num_nodes']} nodes, {e['map']['bytes'] / 1e6:.2f} MB,"
-                f" {e['map']['length_m']:.1f} m"
-            ),
-        )
-    )
+    of = e["map"]
+    size = f"{of['num_nodes']} nodes, {of['bytes'] / 1e6:.2f} MB, {of['length_m']:.1f} m"
+    facts.append(("map", size))
     print_fields(facts)
+
+
+def _facts_with_truth(e: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the figures of queries with a known pose."""
+    share = 100 * e["num_localized"] / e["num_queries"]
+    facts = [("localized", f"{e['num_localized']} of {e['num_queries']} ({share:.1f} %)")]
+    if e["num_localized"]:
+        error = f"{100 * e['median_translation_m']:.2f} cm, {e['median_rotation_deg']:.3f} deg"
+        facts.append(("median error", error))
+    recalls = [f"{name.replace('_', ' ')} {100 * one:.1f} %" for name, one in e["recall"].items()]
+    facts.append(("recall", ", ".join(recalls)))
+    if e["topological_accuracy"] is not None:
+        nearest, neighbour = 100 * e["topological_accuracy"], 100 * e["neighbour_accuracy"]
+        text = f"{nearest:.1f} %, or a neighbour {neighbour:.1f} %"
+        facts.append(("nearest node named first", text))
+    return facts

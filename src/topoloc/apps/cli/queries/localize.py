@@ -166,7 +166,6 @@ class Command:
         )
         live = find_live_input(self.inputs)
         queries = [] if live else [self._open_query(path) for path in self.inputs]
-        answers: list[QueryAnswer] = []
         total = sum(len(query.sequence) for query in queries)
         coming = _localize_queries(localizer, tracking, queries, camera)
         if live:
@@ -175,6 +174,17 @@ class Command:
             tracker = None if self.streams.single else Tracker(localizer, tracking)
             coming = localize_live(localizer, tracker, live, camera)
         start = time.perf_counter()
+        answers = self._print_answers(coming, total)
+        self._write_files(answers)
+        if any(answer.streamed for answer in answers) and self.json != "-":
+            print(summarize_stream(answers, time.perf_counter() - start))
+        report_calibrations(answers)
+        return exit_status(answers)
+
+    def _print_answers(self, coming: Iterator[QueryAnswer], total: int) -> list[QueryAnswer]:
+        """Print each answer when it comes, and return all. If the queries are interrupted, the
+        files hold the answers so far."""
+        answers = list[QueryAnswer]()
         try:
             with interruptible(), progress_bar() as progress:
                 for answer in coming:
@@ -193,11 +203,7 @@ class Command:
             raise TopolocError(
                 f"{what} (results of the {len(answers)} queries before: {', '.join(files)})"
             ) from stopped
-        self._write_files(answers)
-        if any(answer.streamed for answer in answers) and self.json != "-":
-            print(summarize_stream(answers, time.perf_counter() - start))
-        report_calibrations(answers)
-        return exit_status(answers)
+        return answers
 
     def _localizer(self, settings: Settings, near: GeoPositionPrior | None) -> Localizer:
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
