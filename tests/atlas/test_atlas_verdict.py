@@ -15,10 +15,9 @@ from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.store import FolderStore
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.evidence import Evidence
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.localization.provenance import Provenance
+from topoloc.localization.provenance import Evidence, Provenance
 from topoloc.localization.result import CandidateNode, Localization, NotLocalized
 from topoloc.localization.tiles.atlas_tiles import AtlasTiles
 from topoloc.localization.tiles.tile_results import TileResult, merge_tile_results

@@ -11,10 +11,10 @@ from topoloc.geometry.absolute_pose import AbsolutePose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.evidence import Evidence
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import LocalMap, PoseFit
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.query import Query
 from topoloc.localization.result import CandidateNode
 from topoloc.localization.search import Search

@@ -22,7 +22,8 @@ from topoloc.localization.belief import (
     log_odds_margin,
 )
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.evidence import Evidence, EvidenceConfig
+from topoloc.localization.evidence import EvidenceConfig
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.result_decision import decide_result
 

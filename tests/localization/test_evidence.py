@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from topoloc.localization.evidence import (
-    Evidence,
     EvidenceConfig,
     compute_inlier_spread,
     compute_log_odds,
@@ -23,6 +22,7 @@ from topoloc.localization.evidence import (
     is_only_imprecise,
 )
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
+from topoloc.localization.provenance import Evidence
 
 CONFIG, WEIGHTS = EvidenceConfig(), load_fitted_weights("surf")
 STRONG = Evidence(

@@ -21,9 +21,8 @@ from topoloc.errors import ResultError
 from topoloc.geometry.calibration_mismatch import CalibrationMismatch
 from topoloc.geometry.geodesy import CAM_FROM_BODY, GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.evidence import Evidence
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.provenance import Provenance
+from topoloc.localization.provenance import Evidence, Provenance
 from topoloc.localization.result import (
     Alternative,
     CandidateNode,

@@ -10,7 +10,7 @@ import numpy as np
 
 from topoloc.evaluation.metrics import EvaluatedQuery
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.evidence import Evidence
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization, NotLocalized, result_from_json
 from topoloc.recordings.frame import StereoSequence
 

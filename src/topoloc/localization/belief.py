@@ -21,13 +21,13 @@ from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.evidence import (
-    Evidence,
     EvidenceConfig,
     compute_precision_probability,
     compute_rival_score,
 )
 from topoloc.localization.fitted_weights import RivalWeights
 from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.provenance import Evidence
 
 MIN_LOG_ODDS_MARGIN = 2.0
 """Minimum log-odds margin of the best hypothesis over each other one to be reported."""

@@ -29,48 +29,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.bounds import AtLeast, Between
-from topoloc.json_data import Count, Finite
 from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, RivalWeights
+from topoloc.localization.provenance import Evidence
 
 COLUMNS, ROWS = 8, 6
 """Grid of cells over the image. The inlier spread is the share of cells with an inlier."""
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Hold the evidence for a pose.
-
-    Attributes:
-        num_matches: number of unguided matches.
-        num_inliers: number of unguided matches that agree with the pose.
-        num_found: number of visible map points found at their predicted pixels.
-        num_visible: number of map points in view.
-        num_by_chance: number of points that would be found if the pose were wrong.
-        spread: share of the image's cells with a found point.
-        doubt: normalized uncertainty, the standard deviation in the worst direction over the
-            tolerance. It is 1 if the two are equal.
-        even_share: spatially uniform inlier ratio, the found share of the visible points, averaged
-            over all parts of the view (`compute_uniform_inlier_ratio`).
-        num_distinct: number of found points that match here better than anywhere else in the map.
-            Virtual views only.
-        num_lesser_side: number of found points of the side view that has fewer. Virtual views only.
-    """
-
-    num_matches: Count
-    num_inliers: Count
-    num_found: Count
-    num_visible: Count
-    num_by_chance: Count
-    spread: Finite
-    doubt: Finite
-    even_share: Finite
-    num_distinct: Count | None = None
-    num_lesser_side: Count | None = None
-
-    @property
-    def is_from_virtual_views(self) -> bool:
-        """Return whether the pose was found by virtual views, not by the map's nodes."""
-        return self.num_distinct is not None
 
 
 @dataclass(frozen=True)

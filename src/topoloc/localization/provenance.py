@@ -1,4 +1,4 @@
-"""Describe the source of a result: map, features, time and camera."""
+"""Describe the source of a result: its evidence, map, features, time and camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,44 @@ from msgspec.structs import asdict
 from topoloc.errors import CalibrationError, ResultError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Count, Nanoseconds, decode_json
+from topoloc.json_data import Count, Finite, Nanoseconds, decode_json
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Hold the evidence for a pose.
+
+    Attributes:
+        num_matches: number of unguided matches.
+        num_inliers: number of unguided matches that agree with the pose.
+        num_found: number of visible map points found at their predicted pixels.
+        num_visible: number of map points in view.
+        num_by_chance: number of points that would be found if the pose were wrong.
+        spread: share of the image's cells with a found point.
+        doubt: normalized uncertainty, the standard deviation in the worst direction over the
+            tolerance. It is 1 if the two are equal.
+        even_share: spatially uniform inlier ratio, the found share of the visible points, averaged
+            over all parts of the view (`compute_uniform_inlier_ratio`).
+        num_distinct: number of found points that match here better than anywhere else in the map.
+            Virtual views only.
+        num_lesser_side: number of found points of the side view that has fewer. Virtual views only.
+    """
+
+    num_matches: Count
+    num_inliers: Count
+    num_found: Count
+    num_visible: Count
+    num_by_chance: Count
+    spread: Finite
+    doubt: Finite
+    even_share: Finite
+    num_distinct: Count | None = None
+    num_lesser_side: Count | None = None
+
+    @property
+    def is_from_virtual_views(self) -> bool:
+        """Return whether the pose was found by virtual views, not by the map's nodes."""
+        return self.num_distinct is not None
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from itertools import islice
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.evidence import Evidence
 from topoloc.localization.propose import min_rival_inliers, propose, propose_more, propose_quick
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.refine import (
     compute_best_case_evidence,
     cross_check_hypothesis,

@@ -20,7 +20,6 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import (
-    Evidence,
     compute_inlier_spread,
     compute_log_odds,
     compute_normalized_uncertainty,
@@ -30,6 +29,7 @@ from topoloc.localization.guided import count_chance_matches, match_guided, sele
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.map_facts.repetition import fold_repetitions, shifted_copies
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.search import Proposal, Search, TriedProposal
 from topoloc.localization.walls.propose_virtual_views import (
     VirtualViewProposal,

@@ -19,8 +19,7 @@ from topoloc.geometry.calibration_mismatch import (
 from topoloc.geometry.geodesy import GeoPose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Count, Finite, NonNegative, decode_json
-from topoloc.localization.evidence import Evidence
-from topoloc.localization.provenance import EMPTY_PROVENANCE, Provenance
+from topoloc.localization.provenance import EMPTY_PROVENANCE, Evidence, Provenance
 from topoloc.node_ids import NodeId
 
 Share = Annotated[float, Meta(ge=0, le=1)]

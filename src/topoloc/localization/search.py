@@ -8,10 +8,10 @@ from typing import Literal
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.evidence import Evidence
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PointMatches, PoseFit
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.query import Query
 from topoloc.localization.result import CandidateNode
 from topoloc.retrieval.coarse import NodeScore

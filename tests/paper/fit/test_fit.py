@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from topoloc.localization.evidence import Evidence, compute_log_odds, compute_node_log_odds
+from topoloc.localization.evidence import compute_log_odds, compute_node_log_odds
 from topoloc.localization.fitted_weights import (
     CorrelatedErrorWeights,
     EvidenceWeights,
@@ -21,6 +21,7 @@ from topoloc.localization.fitted_weights import (
     load_fitted_weights,
     read_weights,
 )
+from topoloc.localization.provenance import Evidence
 from topoloc_paper.fit import __main__ as command
 from topoloc_paper.fit.evidence import (
     Judged,

@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from topoloc.localization.belief import MIN_LOG_ODDS_MARGIN
-from topoloc.localization.evidence import Evidence, compute_log_odds, compute_rival_score
+from topoloc.localization.evidence import compute_log_odds, compute_rival_score
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.localization.result_decision import LocalizationWithInliers
 from topoloc.localization.tiles.tiles import Tiles

@@ -32,7 +32,6 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.evidence import (
-    Evidence,
     compute_inlier_spread,
     compute_log_odds,
     compute_normalized_uncertainty,
@@ -41,6 +40,7 @@ from topoloc.localization.evidence import (
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.pose_fit import LocalMap, PointMatches, PoseFit
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.candidate_places import CandidatePlaces, select_likeliest_places
 from topoloc.localization.walls.upright_pose import estimate_upright_pose
