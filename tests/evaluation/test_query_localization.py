@@ -68,7 +68,7 @@ def test_images_from_elsewhere_have_no_truth(localizer: Localizer, views: Path):
     )
     assert [a.world_from_cam for a in answers] == [None] * 3
     assert all(a.is_false_accept for a in answers)  # they are of the room after all
-    assert told[-1] == ("views (elsewhere)", 3, 3)
+    assert told[-1] == ("views (out of map)", 3, 3)
 
 
 def test_without_truth_or_calibration_nothing_is_asked(localizer: Localizer, views: Path):

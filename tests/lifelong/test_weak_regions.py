@@ -178,7 +178,7 @@ def test_what_is_of_recordings_is_not_taken_beside_it(
 ):
     path = Path(shutil.copy(room_map, tmp_path / "room.topo"))
     refused = complaint("evaluate", path, queries, "--against-itself", "--poses", "mm", status=2)
-    assert "asks the map alone, without recordings, --poses" in refused
+    assert "uses the map alone, without recordings, --poses" in refused
     assert "name the file of the tile" in complaint(
         "evaluate", _atlas(path, with_outpost, tmp_path), "--against-itself", status=2
     )

@@ -111,7 +111,7 @@ def localize_out_of_map(
             )
         )
         if progress:
-            progress(f"{label} (elsewhere)", done + 1, len(frames))
+            progress(f"{label} (out of map)", done + 1, len(frames))
     return answers
 
 

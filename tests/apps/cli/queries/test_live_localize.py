@@ -39,7 +39,7 @@ def test_the_newest_pictures_are_localized(
         assert main(command) == 0
     printed = capsys.readouterr()
     lines = [json.loads(line) for line in results.read_text().splitlines()]
-    assert f"{url} ended after 12 pictures, {len(lines)} of them asked" in printed.err
+    assert f"{url} ended after 12 images, {len(lines)} were localized" in printed.err
     assert len(lines) >= 3
     assert lines[-1]["query"] == "000011"  # the last picture is never left out
     assert all(line["localized"] for line in lines)
@@ -56,7 +56,7 @@ def test_the_newest_pictures_are_localized(
         (
             ["rtsp://127.0.0.1:9/none", "http://127.0.0.1:9/a", "--camera", NUMBERS],
             2,
-            "asked alone",
+            "must be the only input",
         ),
         (
             ["rtsp://127.0.0.1:9/none", "--camera", NUMBERS, "--odometry", "odometry.tum"],

@@ -52,7 +52,7 @@ from topoloc.plugin import decode_json, format_length, read_text
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc evaluate` takes."""
+    """Hold the arguments of `topoloc evaluate`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file, or an atlas."""
@@ -60,40 +60,37 @@ class Command:
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(metavar="SEQ ...", help_behavior_hint=""),
     ] = ()
-    """Recordings with known truth. PATH@1::2 takes every second frame of PATH, from the second
-    on."""
+    """Recordings with true poses. PATH@1::2 selects every second frame of PATH from frame 1 on."""
     tile: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(atlases only)")
     ] = None
-    """Of an atlas: the tile in whose world the recordings' truth is given. A pose in a tile of
-    another world is a false accept."""
+    """Tile in whose world the true poses are given. A pose in a tile of another world is a false
+    accept."""
     elsewhere: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(metavar="SEQ", help_behavior_hint="(may be given several times)"),
     ] = ()
-    """A recording of another place: every pose given for one of its images counts as a false
-    accept."""
+    """A recording of another place. Every pose of one of its images is a false accept."""
     against_itself: Flag = False
-    """No recording is needed: which parts of the map are weakly held, and where to walk next. Each
-    node is asked of the rest of the map."""
+    """Find the weak parts of the map without a recording, and the best place to record next. Each
+    node is localized in the rest of the map."""
     map_from_truth: File = None
-    """A JSON file with the 4x4 matrix (metres) that takes the world of the recordings' truth into
-    the map's, where they differ."""
+    """JSON file with the 4x4 transform (metres) from the world of the true poses to the map's, if
+    they differ."""
     fit_map_from_truth: File = None
-    """Where one rigid transform between the two worlds explains the errors, write it to this file;
+    """Write the rigid transform between the two worlds to this file, if one explains the errors.
     --map-from-truth reads it."""
     coarse: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
     ] = None
-    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    """Coarse localizer to use. `topoloc info` lists those of the map."""
     features: QUERY_FEATURES = None
-    """Which of the map's features are asked; of several, the next where the one before leaves the
-    pose unclear."""
+    """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
+    """Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
     rosbag, mcap, zed, video or folder."""
     camera: CameraOption = None
-    """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML,
+    """Calibration that replaces the recordings' own: camera.json, YAML of OpenCV or Kalibr,
     SN*.conf, or `fx,fy,cx,cy`."""
     poses: Annotated[
         str | None,
@@ -102,23 +99,23 @@ class Command:
             help_behavior_hint="(default: world_from_cam, metres)",
         ),
     ] = None
-    """How the recordings' truth is written, where it is not world_from_cam in metres: inverse,
-    opengl, wxyz, mm, as of `build`."""
+    """Convention of the true poses if it is not world_from_cam in metres: inverse, opengl, wxyz,
+    mm, as in `build`."""
     topics: Topics = None
-    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    """Topics of a bag: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
     report: File = None
-    """Write a page with the table, the map from above, the error curves and the worst queries to
-    this file (report.html)."""
+    """Write a page with tables, a plan of the map, error curves and the worst queries to this file
+    (HTML)."""
     ray: Annotated[
         str | None,
         tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)"),
     ] = None
-    """A Ray cluster whose machines answer the pictures, with the same figures: `auto` is the one
-    that runs on this machine, `local` one of this machine's processors alone."""
+    """Ray cluster that localizes the images, with the same results. `auto` is the running cluster
+    of this machine, `local` starts one on this machine."""
     config: File = None
-    """All other settings: a TOML file, as `topoloc config evaluate` prints it."""
+    """TOML file with all other settings, as printed by `topoloc config evaluate`."""
 
     def run(self) -> int:
         if self.against_itself:
@@ -157,7 +154,7 @@ class Command:
                 " --against-itself"
             )
         if self.fit_map_from_truth and (self.map_from_truth or len(self.sequences) != 1):
-            raise UsageError("--fit-map-from-truth is of one recording, without --map-from-truth")
+            raise UsageError("--fit-map-from-truth needs one recording and no --map-from-truth")
         if self.report:
             import_report_writer()
         inputs = [path for path in (self.map, self.map_from_truth, self.config) if path]
@@ -193,7 +190,7 @@ class Command:
         self._write_fit(fits)
 
     def _open_recordings(self, map_from_truth: Rigid3 | None) -> list[OpenQueries]:
-        """The recordings, those with truth first."""
+        """Open the recordings, those with true poses first."""
         paths, count = [*self.sequences, *self.elsewhere], len(self.sequences)
         how = (self.format, self.camera, self.topics, self.poses)
         recordings = [
@@ -208,7 +205,7 @@ class Command:
         ]
 
     def _check_no_recordings(self) -> None:
-        """Hold that nothing is given that is of recordings."""
+        """Refuse options that need a recording."""
         names = (
             "elsewhere",
             "tile",
@@ -224,17 +221,17 @@ class Command:
             f"--{name.replace('_', '-')}" for name in names if getattr(self, name)
         ]
         if given:
-            raise UsageError(f"--against-itself asks the map alone, without {', '.join(given)}")
+            raise UsageError(f"--against-itself uses the map alone, without {', '.join(given)}")
 
     def _select_tile(self, localizer: Localizer) -> str:
         """Return the tile in whose world the true poses are. Raises UsageError: there are several,
         and none is named."""
         ids = localizer.tile_ids
         if self.tile is None and len(ids) > 1 and self.sequences:
-            raise UsageError("--tile: which tile's world is the recordings' truth in?")
+            raise UsageError("--tile NAME is needed: the tile in whose world the true poses are")
         if len(ids) > 1 and (self.report or self.fit_map_from_truth):
             raise UsageError(
-                "--report and --fit-map-from-truth are of a map: give the tile's own file"
+                "--report and --fit-map-from-truth need one map: name the file of the tile"
             )
         return self.tile or ids[0]
 
@@ -252,8 +249,7 @@ class Command:
 
 
 def _report_world_fit(fit: WorldFit, written: str | None) -> str:
-    """One line: that the worlds differ, what is left of the errors in one world, and how to judge
-    by that."""
+    """Return one line: the worlds differ, the errors in one world, and the option that uses it."""
     left = f"{format_length(fit.median_translation_m)} and {fit.median_rotation_deg:.2f} deg"
     apart = (
         f"{format_length(float(np.linalg.norm(fit.map_from_truth.translation)))},"
@@ -272,7 +268,8 @@ def _report_world_fit(fit: WorldFit, written: str | None) -> str:
 
 
 def _unique_labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) -> list[str]:
-    """The recordings' names; where two have one name, the ends of their paths, or all of them."""
+    """Return the names of the recordings, or the ends of their paths or the paths, if names are
+    equal."""
     choices = ([sequence.name for sequence in sequences], [Path(path).name for path in paths])
     return next((names for names in choices if len(set(names)) == len(names)), list(paths))
 

@@ -29,12 +29,12 @@ from topoloc.plugin import as_monocular
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc explain` takes."""
+    """Hold the arguments of `topoloc explain`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
-    """The map file; or an atlas, of which the tile is explained that answers."""
+    """The map file, or an atlas. In an atlas the tile of the result is explained."""
     image: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IMAGE")]
-    """The picture; or one of a recording, as in walk@17."""
+    """The image, or one frame of a recording, as in walk@17."""
     camera: Annotated[
         str | None,
         tyro.conf.arg(
@@ -42,20 +42,19 @@ class Command:
             help_behavior_hint="(default: that of the recording)",
         ),
     ] = None
-    """Its calibration, as `topoloc localize` takes it."""
+    """Calibration of the image, as in `topoloc localize`."""
     coarse: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
     ] = None
-    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    """Coarse localizer to use. `topoloc info` lists those of the map."""
     features: QUERY_FEATURES = None
-    """Which of the map's features are asked; of several, the next where the one before leaves the
-    pose unclear."""
+    """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     out: File = None
-    """Write a page with the pictures, the matches and all that was tried to this file (HTML)."""
+    """Write a page with the images, the matches and all tried poses to this file (HTML)."""
     json: File = None
-    """Write what is printed as JSON to this file (- for standard output)."""
+    """Write the printed facts as JSON to this file (- for standard output)."""
     config: File = None
-    """All other settings: a TOML file, as `topoloc config explain` prints it."""
+    """TOML file with all other settings, as printed by `topoloc config explain`."""
 
     def run(self) -> int:
         check_outputs(

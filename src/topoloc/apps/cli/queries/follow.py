@@ -43,12 +43,12 @@ from topoloc.apps.robots.ros_publisher import RosPublisher
 from topoloc.plugin import as_monocular
 
 ReadFrame = Callable[[], StereoFrame]
-"""Reads a picture whose turn it is. Raises UnreadableImageError."""
+"""A function that reads the next image. It raises UnreadableImageError."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc follow` takes."""
+    """Hold the arguments of `topoloc follow`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """A map file, or an atlas."""
@@ -60,23 +60,22 @@ class Command:
             metavar="FILE|fx,fy,cx,cy|map", help_behavior_hint="(default: that of the recording)"
         ),
     ] = None
-    """Calibration of the pictures: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in
+    """Calibration of the images: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in
     pixels, or `map` for that of the map."""
     format: Format = None
-    """A recording's format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag,
+    """Format of a recording: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap, rosbag,
     mcap, zed, video or folder."""
     topics: Topics = None
-    """Of a bag, which topic is what: left=/cam0/image_raw."""
+    """Topic of a bag: left=/cam0/image_raw."""
     features: QUERY_FEATURES = None
-    """Which of the map's features are asked; of several, the next where the one before leaves the
-    pose unclear."""
+    """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     plain: Flag = False
-    """Lines for people instead of JSON."""
+    """Print readable lines instead of JSON."""
     ros: Annotated[int | None, tyro.conf.arg(metavar="DOMAIN", help_behavior_hint="")] = None
-    """Also publish the poses to the ROS 2 robots of this domain: /topoloc/pose, and TF from map to
+    """Also publish the poses in this ROS 2 domain: /topoloc/pose, and TF from map to
     topoloc_camera."""
     config: File = None
-    """All other settings: a TOML file, as `topoloc config follow` prints it."""
+    """TOML file with all other settings, as printed by `topoloc config follow`."""
 
     def run(self) -> int:
         if self.camera == "unknown":
@@ -115,7 +114,7 @@ class Command:
 def _track_frame(
     tracker: Tracker, t_ns: int, read: ReadFrame, of_size: CameraOfSize | None
 ) -> StreamedPose:
-    """The answer to the next picture. Raises CalibrationError where its camera is not known."""
+    """Localize the next image. Raises CalibrationError: its camera is unknown."""
     try:
         frame = read()
     except UnreadableImageError as error:
@@ -127,14 +126,13 @@ def _track_frame(
 
 
 def _read_recording(sequence: StereoSequence) -> Iterator[tuple[str, int, ReadFrame]]:
-    """The pictures of a recording, by its own clock."""
+    """Yield the images of a recording with its own times."""
     for index, (name, t_ns) in enumerate(zip(sequence.names, sequence.t_ns, strict=True)):
         yield name, t_ns, lambda index=index: sequence[index]
 
 
 def _capture_frames(source: str, is_ended: threading.Event) -> Iterator[tuple[str, int, ReadFrame]]:
-    """The newest picture of a camera or an address whenever the one before is answered, by this
-    machine's clock."""
+    """Yield the newest image of a live source each time, with this machine's time."""
     with LiveSource(source) as live:
         live.stop = is_ended
         for picture in live:

@@ -1,5 +1,5 @@
-"""Answers to a camera that runs now: each picture alone, or as the next of a stream; what it shows
-meanwhile is left out."""
+"""Localize the images of a live camera, alone or as a stream. Images that arrive during a query are
+skipped."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ NEEDS_CALIBRATION = (
 
 
 def find_live_input(inputs: tuple[str, ...]) -> str | None:
-    """The live source among the inputs. Raises UsageError: it is not the only one."""
+    """Return the live source among the inputs. Raises UsageError: there are other inputs."""
     live = next((path for path in inputs if is_live(path)), None)
     if live is not None and len(inputs) > 1:
-        raise UsageError(f"{live} is a live source, which is asked alone")
+        raise UsageError(f"{live} is a live source, which must be the only input")
     return live
 
 
@@ -32,8 +32,8 @@ def localize_live(
     source: str,
     camera_of_size: CameraOfSize,
 ) -> Iterator[QueryAnswer]:
-    """Answers until the source ends, or Ctrl-C or SIGTERM come. Raises RecordingError where it does
-    not answer, or stalls."""
+    """Yield results until the source ends or the process is interrupted. Raises RecordingError: the
+    source does not respond or stalls."""
     with ExitStack() as stack:
         live = stack.enter_context(LiveSource(source))
         live.stop = stack.enter_context(catch_stop_signals())
@@ -43,7 +43,7 @@ def localize_live(
             asked += 1
         if not live.stop.is_set():
             print(
-                f"warning: {source} ended after {live.num_read} pictures, {asked} of them asked",
+                f"warning: {source} ended after {live.num_read} images, {asked} were localized",
                 file=sys.stderr,
             )
 

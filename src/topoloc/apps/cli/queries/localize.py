@@ -62,8 +62,8 @@ from topoloc.plugin import as_monocular, find_format, find_source_path, match_fr
 
 @dataclass(frozen=True, eq=False)
 class _Query:
-    """An input: its pictures, whether they are a stream, the pose of each by external odometry, and
-    whether their times mean anything."""
+    """Hold an input: its images, whether they are a stream, the odometry pose of each, and whether
+    they have times."""
 
     path: str
     sequence: StereoSequence
@@ -74,25 +74,25 @@ class _Query:
 
 @dataclass(frozen=True)
 class StreamOptions:
-    """Videos and recordings are streams: each picture helps with the next."""
+    """Streams: each image helps to localize the next. Videos and recordings are streams."""
 
     stream: Flag = False
-    """Take folders of pictures for streams, too."""
+    """Treat folders of images as streams, too."""
     single: Flag = False
-    """Localize each picture alone, those of videos and recordings, too."""
+    """Localize each image alone, also of videos and recordings."""
     smoothed: Flag = False
-    """--tum takes the smoothed poses instead of the raw ones."""
+    """Write smoothed poses to --tum instead of raw ones."""
     odometry: File = None
-    """Poses of the stream by external odometry, TUM format, in any world: they predict where the
-    next picture was taken."""
+    """Poses of the stream from external odometry (TUM format, any world). They predict the next
+    pose."""
     max_jump: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
-    """The paper's rule instead of the motion model: a pose further than this from the one before is
-    refused, and that one copied."""
+    """Use the paper's rule instead of the motion model: a pose farther than this from the previous
+    one is replaced by it."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc localize` takes."""
+    """Hold the arguments of `topoloc localize`."""
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """A map file, or an atlas."""
@@ -100,9 +100,8 @@ class Command:
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(metavar="INPUT ...", help_behavior_hint="(required)"),
     ] = ()
-    """Images, folders of images, videos, recordings; PATH@0:100 takes the first hundred frames of
-    PATH. Or one camera that runs now: a device number, rtsp:// or http:// URL, or GStreamer
-    pipeline."""
+    """Images, folders of images, videos, recordings. PATH@0:100 selects the first hundred frames of
+    PATH. Or one live camera: a device number, rtsp:// or http:// URL, or GStreamer pipeline."""
     camera: Annotated[
         str | None,
         tyro.conf.arg(
@@ -111,38 +110,36 @@ class Command:
         ),
     ] = None
     """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels,
-    `map` for that of the map, `unknown` to find the focal length."""
+    `map` for the map's camera, `unknown` to estimate the focal length."""
     format: Format = None
-    """The recordings' format: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
+    """Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
     rosbag, mcap, zed, video or folder."""
     topics: Topics = None
-    """Of a bag, which topic is what: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
+    """Topics of a bag: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     coarse: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
     ] = None
-    """Coarse localizer that is asked; `topoloc info` names those of the map."""
+    """Coarse localizer to use. `topoloc info` lists those of the map."""
     features: QUERY_FEATURES = None
-    """Which of the map's features are asked; of several, the next where the one before leaves the
-    pose unclear."""
+    """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     max_ms: Annotated[
         float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: no limit)")
     ] = None
-    """After so many milliseconds no further hypothesis is sought for an image; the first one is
-    always tried."""
+    """Time limit for an image in milliseconds. The first hypothesis is always tested."""
     near: Annotated[
         str | None, tyro.conf.arg(metavar="LAT,LON,METRES", help_behavior_hint="(atlases only)")
     ] = None
-    """Of an atlas: tiles that are known to lie further from this place on earth are not asked."""
+    """Skip tiles of an atlas that are known to lie farther from this position."""
     json: File = None
-    """Write one JSON line a query to this file (- for standard output)."""
+    """Write one JSON line for each query to this file (- for standard output)."""
     tum: File = None
-    """Write the poses found to this file: TUM format, world_from_cam. Single photos have no times:
-    t is then the query's number."""
+    """Write the poses to this file (TUM format, world_from_cam). Single photos have no times; t is
+    then the number of the query."""
     streams: Annotated[tyro.conf.OmitArgPrefixes[StreamOptions], tyro.conf.arg(name="stream")] = (
         field(default_factory=StreamOptions)
     )
     config: File = None
-    """All other settings: a TOML file, as `topoloc config localize` prints it."""
+    """TOML file with all other settings, as printed by `topoloc config localize`."""
 
     def run(self) -> int:
         if not self.inputs:
@@ -170,7 +167,7 @@ class Command:
         coming = _localize_queries(localizer, tracking, queries, camera)
         if live:
             if camera is None:
-                raise UsageError(f"{live} has no calibration: --camera says it")
+                raise UsageError(f"{live} has no calibration: --camera gives it")
             tracker = None if self.streams.single else Tracker(localizer, tracking)
             coming = localize_live(localizer, tracker, live, camera)
         start = time.perf_counter()
@@ -220,15 +217,15 @@ class Command:
 
     def _check_usage(self) -> None:
         if self.streams.stream and self.streams.single:
-            raise UsageError("--stream and --single cannot both be meant")
+            raise UsageError("--stream and --single exclude each other")
         if self.streams.odometry is not None and (
             len(self.inputs) > 1 or find_live_input(self.inputs)
         ):
-            raise UsageError("--odometry is that of one recorded stream: give one input with it")
+            raise UsageError("--odometry needs one recorded stream as the only input")
 
     def _open_query(self, path: str) -> _Query:
-        """Recordings and videos are streams; pictures, and folders of them, are single unless they
-        are said not to be."""
+        """Open an input. Recordings and videos are streams. Images and folders of images are single
+        unless --stream is given."""
         is_stream = self.streams.stream or (
             not self.streams.single and find_format(path, self.format) != "folder"
         )
@@ -240,7 +237,7 @@ class Command:
         if self.streams.odometry is not None:
             if not is_stream:
                 raise UsageError(
-                    f"--odometry is for streams, and {path} is none; --stream makes it one"
+                    f"--odometry needs a stream, and {path} is none; --stream makes it one"
                 )
             odometry = match_frame_poses(
                 Trajectory.read(Path(self.streams.odometry)),
@@ -252,7 +249,7 @@ class Command:
 
     @property
     def _stereo_calibration(self) -> str | None:
-        """`--camera` where it is a pair's, which its recording is opened with."""
+        """Return `--camera` if it calibrates a stereo pair; the recording is opened with it."""
         return self.camera if self.camera is not None and self.camera.endswith(".conf") else None
 
     def _create_tracker(self, config: TrackerConfig) -> TrackerConfig:
@@ -260,7 +257,7 @@ class Command:
         return config if self.streams.max_jump is None else replace(config, mode="paper")
 
     def _write_files(self, answers: list[QueryAnswer]) -> list[str]:
-        """The paths written."""
+        """Write the files and return their paths."""
         files = []
         if self.json is not None and self.json != "-":
             write_text(Path(self.json), "".join(json.dumps(a.to_json()) + "\n" for a in answers))
@@ -292,7 +289,7 @@ def _localize_queries(
             except (QueryError, CalibrationError) as error:
                 if query.is_stream or len(queries) == len(query.sequence) == 1:
                     raise type(error)(f"{name}: {error}") from error
-                # One picture of another shape than its camera; the rest are asked.
+                # One image has another size than its camera; the others are localized.
                 answer = QueryAnswer(
                     name,
                     query.sequence.t_ns[i],
@@ -302,8 +299,7 @@ def _localize_queries(
 
 
 def _has_times(photos: StereoSequence) -> bool:
-    """Photos, and folders of them without times.txt, are read as if they were taken ten a
-    second."""
+    """Return whether the images have times. Photos and folders without times.txt have none."""
     root = find_source_path(photos)
     return root is None or (photos.names != [photos.name] and (Path(root) / "times.txt").is_file())
 
@@ -316,7 +312,7 @@ def _localize_frame(
     tracker: Tracker | None,
     camera_of_size: CameraOfSize | None,
 ) -> QueryAnswer:
-    """One picture, alone or as the next of a stream."""
+    """Localize one image, alone or as the next of a stream."""
     t_ns, odom_from_cam = query.sequence.t_ns[index], query.odom_from_cams[index]
     try:
         frame = query.sequence[index]

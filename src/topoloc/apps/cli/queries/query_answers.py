@@ -1,4 +1,4 @@
-"""Answers to queries, alone or of a stream: a line for people, a trajectory, the exit status."""
+"""Results of queries: printed lines, the trajectory and the exit status."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from topoloc import (
 
 @dataclass(frozen=True, eq=False)
 class QueryAnswer:
-    """A query with the time of its frame; `streamed` where it was one of a stream."""
+    """Hold a query with the time of its frame, and `streamed` if it is part of a stream."""
 
     query: str
     t_ns: int
@@ -31,7 +31,7 @@ class QueryAnswer:
         return (self.streamed or self.result).to_json(self.query)
 
     def pose(self, smoothed: bool) -> Rigid3 | None:
-        """world_from_cam, measured in this picture: a predicted pose is none."""
+        """Return world_from_cam as measured in this image, None if the pose is only predicted."""
         if not isinstance(self.result, Localization):
             return None
         return (
@@ -42,8 +42,8 @@ class QueryAnswer:
 
 
 def to_trajectory(answers: list[QueryAnswer], smoothed: bool) -> Trajectory:
-    """The poses found, in the order of the queries; their numbers are their seconds where the times
-    do not increase."""
+    """Return the poses in the order of the queries. If the times do not increase, the numbers of
+    the queries are the seconds."""
     times = [answer.t_ns for answer in answers]
     if any(after <= before for before, after in pairwise(times)):
         times = [number * 1_000_000_000 for number in range(len(answers))]
@@ -53,7 +53,7 @@ def to_trajectory(answers: list[QueryAnswer], smoothed: bool) -> Trajectory:
 
 
 def exit_status(answers: list[QueryAnswer]) -> int:
-    """The exit status; one line on stderr where pictures could not be read."""
+    """Return the exit status. Unreadable images cost one line on standard error."""
     details = [
         a.result.detail
         for a in answers
@@ -78,14 +78,14 @@ def exit_status(answers: list[QueryAnswer]) -> int:
 
 
 def report_calibrations(answers: list[QueryAnswer]) -> None:
-    """One line on stderr for each camera whose calibration the pictures contradict together."""
+    """Print a warning for each camera whose calibration the images contradict together."""
     for verdict in check_camera_calibrations(answer.result for answer in answers):
         if verdict.is_contradicted:
             print(f"warning: {verdict}", file=sys.stderr)
 
 
 def format_answer(answer: QueryAnswer) -> str:
-    """One query for people."""
+    """Return one readable line."""
     result, state = (
         answer.result,
         f"{answer.streamed.state}  " if answer.streamed is not None else "",
@@ -110,7 +110,7 @@ def format_answer(answer: QueryAnswer) -> str:
 
 
 def summarize_stream(answers: list[QueryAnswer], seconds: float) -> str:
-    """How often each state, and frames a second."""
+    """Return the count of each state, and the frames per second."""
     states = Counter(answer.streamed.state for answer in answers if answer.streamed is not None)
     counts = ", ".join(
         f"{states[state]} {state}"

@@ -1,5 +1,4 @@
-"""Recordings as queries of a map or an atlas, asked here or, in pieces, on the machines of a
-cluster: the answers are the same.
+"""Localize recordings in a map or an atlas, here or in pieces on a cluster, with equal results.
 
 A piece opens map and recording by their paths where it is asked, holds that they are those that the
 command opened, and sends back its answers, without pictures.
@@ -39,13 +38,13 @@ from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
 from topoloc.plugin import Progress
 
 MAX_IMAGES = 50
-"""Of a piece: a second or so for map and recording to be opened is little beside them."""
+"""Images of a piece. To open map and recording takes about a second, much less than these."""
 
 
 @dataclass(frozen=True)
 class QueryRecording:
-    """A recording, and how it is read: as the options of `topoloc evaluate` say it;
-    `is_out_of_map`: of another place than the map."""
+    """Hold a recording and the options of `topoloc evaluate` that read it. `is_out_of_map` is True
+    if it shows another place."""
 
     path: str
     format: str | None
@@ -55,8 +54,8 @@ class QueryRecording:
     is_out_of_map: bool = False
 
     def open(self) -> StereoSequence:
-        """What is to be known of it is said on standard error. Raises as `open_sequence`;
-        UsageError of the poses."""
+        """Open the recording. Notes about it go to standard error. Raises the errors of
+        `open_sequence`; UsageError: the pose convention is unknown."""
         reading = PoseConventions.of(self.poses)
         sequence = open_recording(self.path, self.format, self.camera, self.topics)
         return sequence if self.is_out_of_map else with_pose_conventions(sequence, reading)
@@ -64,7 +63,7 @@ class QueryRecording:
 
 @dataclass(frozen=True, eq=False)
 class OpenQueries:
-    """A recording that is open, by the name that its answers call it; `map_from_truth` as of
+    """Hold an open recording and its label in the results. `map_from_truth` is as in
     `localize_queries`."""
 
     recording: QueryRecording
@@ -74,13 +73,12 @@ class OpenQueries:
 
     @property
     def stage(self) -> str:
-        """What progress calls it."""
-        return f"{self.label} (elsewhere)" if self.recording.is_out_of_map else self.label
+        """Return the name for the progress bar."""
+        return f"{self.label} (out of map)" if self.recording.is_out_of_map else self.label
 
     @property
     def frames(self) -> list[int]:
-        """Which of its frames are asked. Raises TrajectoryError where none has a pose to judge
-        against."""
+        """Return the frames to localize. Raises TrajectoryError: no frame has a true pose."""
         return (
             list(range(len(self.sequence)))
             if self.recording.is_out_of_map
@@ -154,8 +152,8 @@ class RemoteMap:
 
 @dataclass(frozen=True, eq=False)
 class PieceAnswers:
-    """The answers of a piece, without their pictures; what was wrong with tiles; why there are
-    none, where it failed."""
+    """Hold the results of a piece without images, the problems of tiles, and the reason if the
+    piece failed."""
 
     answers: list[EvaluatedQuery]
     notes: list[str]
@@ -164,7 +162,7 @@ class PieceAnswers:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Some frames of a recording, as a `Job`; `image_names` are their names."""
+    """Hold some frames of a recording as a `Job`. `image_names` are their names."""
 
     queried_map: RemoteMap
     recording: QueryRecording
@@ -178,8 +176,8 @@ class Piece:
         return f"evaluate {self.label} {self.frames[0]}-{self.frames[-1]}"
 
     def run(self, progress: Progress) -> PieceAnswers:
-        """Raises RecordingError where the recording is not the one that the command opened, and as
-        of `OpenQueries.answers`."""
+        """Localize the frames. Raises the errors of `OpenQueries.answers`; RecordingError: the
+        recording differs from the one that the command opened."""
         notes = list[str]()
         queries = OpenQueries(
             self.recording, self.recording.open(), self.label, self.map_from_truth
@@ -205,8 +203,7 @@ def localize_on_ray(
     config: ClusterConfig,
     progress: Progress,
 ) -> list[EvaluatedQuery]:
-    """What these recordings are answered, in their order and that of their frames, by the tasks of
-    a cluster.
+    """Localize recordings on a cluster. The results are in the order of recordings and frames.
 
     Raises:
         MissingExtraError, ClusterError: as of `connect_to_cluster`.
@@ -240,7 +237,7 @@ def _read_image(sequence: StereoSequence, index: int) -> Any:
 
 
 def _split_queries(queried_map: RemoteMap, queries: OpenQueries) -> Iterator[Piece]:
-    """Of one recording, of about the same number of pictures each."""
+    """Split one recording into pieces of about the same number of images."""
     frames, names = queries.frames, queries.sequence.names
     count = -(-len(frames) // MAX_IMAGES)
     for number in range(count):
@@ -258,8 +255,8 @@ def _split_queries(queried_map: RemoteMap, queries: OpenQueries) -> Iterator[Pie
 def _create_progress_callback(
     pieces: Sequence[tuple[str, int]], progress: Progress
 ) -> OnJobState[PieceAnswers]:
-    """Tells how many pictures of each recording are answered; of each piece its recording's stage
-    and its pictures are given."""
+    """Return a callback that reports the localized images of each recording. `pieces` holds the
+    stage and the number of images of each piece."""
     done = [0] * len(pieces)
 
     def show(number: int, state: PieceAnswers | JobProgress) -> None:
