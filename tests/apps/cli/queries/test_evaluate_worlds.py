@@ -73,7 +73,7 @@ def test_nothing_is_written_where_nothing_is_to_be_explained(
     assert "no rigid transform" in complaint(
         "evaluate", room_map, queries, "--fit-map-from-truth", fit
     )
-    assert "of one recording" in complaint(
+    assert "needs one recording" in complaint(
         "evaluate", room_map, queries, queries, "--fit-map-from-truth", fit, status=2
     )
 
