@@ -3,7 +3,7 @@ or take much memory?
 
     python benchmarks/fuzz_maps.py MAP PICTURE CAMERA.json --mutations 100000 --first-seed 0
 
-A child opens 50 mutations in a row (`tests/map/mutations.py`, `tests/map/opening.py`): it asks each
+A child opens 50 mutations (`tests/mapping/mutations.py`, `tests/mapping/opening.py`): it asks each
 about the picture and looks at all its bytes. Every finding is printed with its seed; exit status 1
 where there is any.
 """
@@ -22,7 +22,7 @@ import numpy as np
 
 from topoloc.recordings.image_io import read_image
 
-TESTS = Path(__file__).parents[1] / "tests" / "map"
+TESTS = Path(__file__).parents[1] / "tests" / "mapping"
 sys.path.insert(0, str(TESTS))
 from mutations import mutate  # noqa: E402
 

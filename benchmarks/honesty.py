@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from real_recordings import PLACES, Place
-from topoloc.apps.cli.features_option import create_localizer
+from topoloc.apps.cli.features_option import open_localizer
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -125,7 +125,7 @@ def main() -> None:
                 ),
                 place.mapping,
             )
-        localizer = create_localizer(topomap, LocalizerConfig(), arguments.features)
+        localizer = open_localizer(topomap, LocalizerConfig(), arguments.features)
         ask_place(place, places, localizer, data, arguments.step, groups)
         for name, asked in groups.items():
             if name.startswith(place.name):

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -73,7 +73,7 @@ def made_up_map(num_nodes: int) -> TopoMetricMap:
             PlaceImage("made up", f"{n}.png", int(node), poses[node], small)
             for n, node in enumerate(image_nodes)
         ],
-        asdict(effective) | {"nodes": asdict(effective.nodes.resolved(4.0))},
+        replace(effective, nodes=effective.nodes.resolved(4.0)),
     )
 
 

@@ -96,12 +96,14 @@ def main(args: Args) -> None:
     config = FeatureConfig()
     nodes = []
     for node_id in range(0, len(sequence), 10):
-        view = prepare_frame(sequence[node_id])
+        frame = sequence[node_id]
+        view = prepare_frame(frame)
         features = extract_features(view.grey, config)
         located = locate_points(features, view)
         rows = np.flatnonzero(located.valid)
         sigmas = np.sqrt(np.trace(located.covariances[rows], axis1=1, axis2=2))
-        points_world = view.world_from_cam.apply(located.points_cam[rows])
+        world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
+        points_world = world_from_view.apply(located.points_cam[rows])
         nodes.append(
             Pool(features.descriptors[rows], points_world, sigmas, np.full(len(rows), node_id))
         )
