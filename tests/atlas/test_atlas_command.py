@@ -98,13 +98,15 @@ def test_check_names_the_tile_that_is_damaged(own_atlas: Path, capsys: pytest.Ca
 
 
 def test_pictures_are_localized_in_their_tiles(
-    atlas: Path, of_both: Path, capsys: pytest.CaptureFixture[str]
+    atlas: Path, of_both: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     lines = [json.loads(line) for line in _json(capsys, "localize", atlas, of_both).splitlines()]
     assert [line["tile"] for line in lines] == ["room", "room", "other"]
     for line in lines:
         assert line["localized"]
         check_result(line)
+    assert main(["localize", str(atlas), str(of_both), "--tum", str(tmp_path / "both.tum")]) == 0
+    assert "poses of 2 tiles, each in its tile's world" in capsys.readouterr().err
     assert main(["localize", str(atlas), str(of_both)]) == 0
     assert "tile other" in capsys.readouterr().out
 

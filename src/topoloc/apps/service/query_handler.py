@@ -1,5 +1,5 @@
-"""What a worker does: the picture decoded, its camera made out, the map asked, the answer written.
-No step of it touches the loop."""
+"""Run one query in a worker: decode the image, find its camera, localize it, write the result. No
+step uses the event loop."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class QueryHandler:
-    """Answers from these maps; pictures of more than `max_pixels` are refused, searches end after
-    `max_ms`."""
+    """Localize images in the maps of the service. Images of more than `max_pixels` are refused, and
+    searches end after `max_ms` milliseconds."""
 
     maps: MapCache[Localizer]
     max_pixels: int
@@ -42,14 +42,14 @@ class QueryHandler:
     atlases: ServedAtlases
 
     def localize(self, name: str, query_request: QueryRequest) -> Localization | NotLocalized:
-        """Raises RequestError, and TopolocError of the picture, its camera or the map."""
+        """Localize in one map. Raises RequestError; TopolocError: image, camera or map is bad."""
         return self._run_query(name, query_request, self._localize_image)
 
     def localize_everywhere(
         self, query_request: QueryRequest
     ) -> dict[str, Localization | NotLocalized]:
-        """By every map of the service, and by each atlas, of which the tile answers that knows most
-        of the picture; the time that is left is shared by those that are still to be asked."""
+        """Localize in every map and every atlas of the service. Those that are left share the time
+        that is left."""
         localizers, end = (
             [localizer for _, localizer in self.atlases.opened()],
             time.perf_counter() + self._limit_ms(query_request) / 1e3,
@@ -80,7 +80,7 @@ class QueryHandler:
         return localizer.localize(image, camera, max_ms=query_request.max_ms)
 
     def explain(self, name: str, query_request: QueryRequest, as_page: bool) -> str:
-        """Why the picture got its answer: a page, or JSON."""
+        """Explain the result of an image as a page or as JSON."""
 
         def explain_image(
             localizer: Localizer,
@@ -105,7 +105,7 @@ class QueryHandler:
     def decode_query(
         self, query_request: QueryRequest, topomap: TopoMetricMap
     ) -> tuple[Image, Camera | UncalibratedCamera]:
-        """The picture and its camera."""
+        """Return the image and its camera."""
         image = decode_image(query_request.picture, self.max_pixels)
         return image, parse_camera_field(
             query_request.camera, query_request.picture, (image.shape[1], image.shape[0]), topomap
@@ -135,10 +135,10 @@ class QueryHandler:
 
 
 def decode_image(picture: EncodedImage, max_pixels: int) -> Image:
-    """Its size is looked at before anything is decoded.
+    """Decode an image, after a check of its size.
 
     Raises:
-        UnreadableImageError: it is no picture, or a damaged one.
+        UnreadableImageError: it is no image, or damaged.
         RequestError: it is too large.
     """
     width, height = image_size(picture)
@@ -150,13 +150,13 @@ def decode_image(picture: EncodedImage, max_pixels: int) -> Image:
 
 
 def result_to_line(result: Localization | NotLocalized, query: str) -> str:
-    """As the command line prints it."""
+    """Return the result as a JSON line, as `topoloc localize` prints it."""
     return json.dumps(result.to_json(query))
 
 
 def combine_results(answers: dict[str, Localization | NotLocalized], query: str) -> dict[str, Any]:
-    """The answers of several maps, those that vouch for a pose first. Where several do, whoever
-    asks must choose: maps may overlap."""
+    """Return the results of several maps, those with a pose first. If several have one, the client
+    chooses, because maps may overlap."""
     found = {name: result for name, result in answers.items() if isinstance(result, Localization)}
     ranked = sorted(answers, key=lambda name: -found[name].probability if name in found else 1.0)
     (only,) = found if len(found) == 1 else (None,)

@@ -1,7 +1,7 @@
-"""The atlases among what is served: each opened anew when its manifest was written again.
+"""Serve atlases. Each one is reopened when its manifest changes.
 
-Stores are looked at by threads of their own, every few seconds: a silent one keeps nobody waiting,
-and what was opened of it goes on answering.
+A thread for each object store checks its manifest every few seconds. While a store is silent, the
+last version is served.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ from topoloc import Atlas, AtlasConfig, Localizer, MapCache, TopolocError
 from topoloc.apps.service.logs import log
 
 POLL_INTERVAL_S = 5.0
-"""Seconds between two looks at an object store: one listing each, a reading where a manifest was
-written."""
+"""Seconds between two checks of an object store: one listing each, and a reading if it changed."""
 
 
 class ServedAtlases:
-    """Localizers of the atlases of these maps, which open their tiles as the maps of the
-    service."""
+    """Hold a localizer for each atlas. The service's cache of maps opens their tiles."""
 
     def __init__(self, maps: MapCache[Localizer], config: AtlasConfig) -> None:
         self._maps, self._config = maps, config
@@ -33,7 +31,7 @@ class ServedAtlases:
             return [self._open_localizer(where) for where in self._watched]
 
     def watch(self) -> None:
-        """Look at those in object stores from now on, until `close`."""
+        """Check the atlases in object stores until `close`."""
         for where, watched in self._watched.items():
             if watched.is_remote:
                 threading.Thread(
@@ -41,7 +39,7 @@ class ServedAtlases:
                 ).start()
 
     def close(self) -> None:
-        """No more looks; one that waits for its store is not waited for."""
+        """Stop the checks, without waiting for one in progress."""
         self._ended.set()
 
     def _open_localizer(self, where: str) -> tuple[Atlas, Localizer]:

@@ -39,6 +39,7 @@ from topoloc.apps.cli.output import (
     check_outputs,
     interruptible,
     open_recording,
+    print_warning,
     progress_bar,
     write_text,
 )
@@ -263,6 +264,9 @@ class Command:
             write_text(Path(self.json), "".join(json.dumps(a.to_json()) + "\n" for a in answers))
             files.append(self.json)
         if self.tum is not None:
+            tiles = {answer.result.provenance.tile for answer in answers if answer.result.localized}
+            if len(tiles) > 1:
+                print_warning(f"{self.tum}: poses of {len(tiles)} tiles, each in its tile's world")
             to_trajectory(answers, self.streams.smoothed).write_tum(Path(self.tum))
             files.append(self.tum)
         return files

@@ -1,4 +1,4 @@
-"""What `topoloc serve` answers from, and how: all that another process needs to answer the same."""
+"""Describe the maps and settings of `topoloc serve`, so that another process can serve the same."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ MIN_TOKEN_LENGTH = 16
 
 @dataclass(frozen=True)
 class ServedMaps:
-    """Maps, and how they are asked. The token is named by its file, so that it is nowhere but
-    there."""
+    """Hold the maps and the settings of their queries. The token is read from its file, so that it
+    is stored nowhere else."""
 
     paths: tuple[str, ...]
     features: str | None
@@ -38,15 +38,14 @@ class ServedMaps:
     atlas: AtlasConfig
 
     def application(self):  # no return type: the service is an extra, and loaded here alone
-        """The application, its maps opened as they are asked for. Raises TopolocError."""
+        """Return the application. It opens maps at their first request. Raises TopolocError."""
         from topoloc.apps.service.application import Access, create_application
 
         access = Access(read_token(self.token_file), self.loopback_only)
         return create_application(self._open_maps(), self.service, access, self.tracker, self.atlas)
 
     def _open_maps(self) -> MapCache[Localizer]:
-        """The maps, with half of the memory for nodes, and half for the rest of those that are
-        open."""
+        """Return a cache of the maps, after the kernels are compiled."""
         warm_up(
             only_if_cold=lambda: print("compiling, once, a minute ...", file=sys.stderr, flush=True)
         )
@@ -62,7 +61,7 @@ class ServedMaps:
 
 
 def read_token(path: str | None) -> str | None:
-    """The token in a file. Raises TopolocError where there is none that can be used."""
+    """Read the token from a file. Raises TopolocError: it has no usable token."""
     if path is None:
         return None
     try:
