@@ -192,7 +192,7 @@ def main(args: Args) -> None:
             for kind in whole.kinds
         }
         for most in args.landmarks:
-            fewer = _drop_landmarks(whole, nothing, most).topomap
+            fewer = _drop_landmarks(whole, nothing, most)[0]
             size, of_descriptors = written(fewer)
             for name in args.forms:
                 quantised, num_bytes = with_descriptors(fewer, name, whole)

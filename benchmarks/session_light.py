@@ -27,11 +27,11 @@ from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.config import MapConfig
-from topoloc.mapping.session_illumination import (
+from topoloc.mapping.coarse_models import (
     compute_illumination_distance,
     group_by_illumination,
 )
+from topoloc.mapping.config import MapConfig
 from topoloc.mapping.sessions import (
     Illumination,
     Session,

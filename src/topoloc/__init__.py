@@ -59,10 +59,11 @@ if TYPE_CHECKING:
     from topoloc.geometry.rig import StereoRig
     from topoloc.geometry.rigid import Rigid3
     from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-    from topoloc.lifelong.map_files import merge, prune, update
+    from topoloc.lifelong.merge import merge
+    from topoloc.lifelong.prune import prune
     from topoloc.lifelong.tiles.tile_joining import PairResult, join_tiles
     from topoloc.lifelong.tiles.tile_selection import find_tile_of_recording
-    from topoloc.lifelong.update import MapUpdate
+    from topoloc.lifelong.update import MapUpdate, update
     from topoloc.lifelong.weak_regions import (
         NodeQuality,
         WeakRegion,
@@ -292,10 +293,10 @@ _MODULES = {
     "join_tiles": "topoloc.lifelong.tiles.tile_joining",
     "localize_out_of_map": "topoloc.evaluation.query_localization",
     "localize_queries": "topoloc.evaluation.query_localization",
-    "merge": "topoloc.lifelong.map_files",
+    "merge": "topoloc.lifelong.merge",
     "open_place": "topoloc.atlas.place",
     "open_sequence": "topoloc.recordings.open",
-    "prune": "topoloc.lifelong.map_files",
+    "prune": "topoloc.lifelong.prune",
     "read_depth": "topoloc.recordings.image_io",
     "read_history": "topoloc.mapping.edit",
     "read_image": "topoloc.recordings.image_io",
@@ -303,7 +304,7 @@ _MODULES = {
     "run_slam": "topoloc.slam.slam",
     "set_num_threads": "topoloc.compiled",
     "undo_edit": "topoloc.mapping.edit",
-    "update": "topoloc.lifelong.map_files",
+    "update": "topoloc.lifelong.update",
     "view": "topoloc.apps.viewer.page",
     "warm_up": "topoloc.tracking.warm_up",
     "with_pose_conventions": "topoloc.recordings.trajectory",

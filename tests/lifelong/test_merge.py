@@ -18,7 +18,7 @@ from topoloc import Localizer, TopoMetricMap, open_sequence
 from topoloc.apps.cli import main
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.update import is_well_localized
+from topoloc.lifelong.session_content import is_well_localized
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization

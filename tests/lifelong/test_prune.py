@@ -17,7 +17,7 @@ from tiny_world import CAMERA
 from topoloc import Localizer, TopoMetricMap
 from topoloc.apps.cli import main
 from topoloc.geometry.alignment import translation_error
-from topoloc.lifelong.prune import select_landmarks
+from topoloc.lifelong.landmark_pruning import select_landmarks
 from topoloc.localization.result import Localization
 from topoloc.mapping.edit import edit_map
 from topoloc.mapping.landmark_statistics import LandmarkStatistics

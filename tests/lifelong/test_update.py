@@ -30,7 +30,7 @@ from topoloc.apps.cli import main
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.update import is_well_localized, update_map
+from topoloc.lifelong.session_content import is_well_localized, update_map
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
@@ -101,7 +101,8 @@ def test_a_session_goes_on_from_what_is_mapped(
     known = [0 if answer is None else answer.num_inliers for answer in _answers(map_file, far)]
     joined, said = tmp_path / "joined.tum", tmp_path / "said.json"
     monkeypatch.setattr(
-        "topoloc.lifelong.update.is_well_localized", partial(is_well_localized, min_inliers=250)
+        "topoloc.lifelong.session_content.is_well_localized",
+        partial(is_well_localized, min_inliers=250),
     )
     options = ["--joined", str(joined), "--json", str(said)]
     assert main(["update", str(map_file), str(second_half), *options]) == 0
@@ -218,7 +219,7 @@ def test_a_changed_room_is_learnt_from_a_single_camera(
     (folder / "camera.json").write_text(json.dumps(CAMERA.to_json()))
     before = _answers(map_file, asked, panels)
     monkeypatch.setattr(  # all of it is to be learnt
-        "topoloc.lifelong.update.is_well_localized", lambda answer, d_thresh: False
+        "topoloc.lifelong.session_content.is_well_localized", lambda answer, d_thresh: False
     )
     assert main(["update", str(map_file), str(folder)]) == 0
     after = _answers(map_file, asked, panels)

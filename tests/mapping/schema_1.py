@@ -3,14 +3,18 @@ left on people's disks."""
 
 from __future__ import annotations
 
+import io
 import json
 import sqlite3
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from topoloc.mapping.storage.entries import TopoNode
-from topoloc.mapping.storage.map_writing import _arrays_bytes, _pose_to_bytes
+from topoloc.mapping.storage.map_writing import _pose_to_bytes
 from topoloc.mapping.storage.point_encoding import node_to_arrays
 from topoloc.mapping.storage.schema import APPLICATION_ID, SCHEMA_1, VIRTUAL_PREFIX
 from topoloc.mapping.topomap import TopoMetricMap
@@ -62,7 +66,7 @@ def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
             row = (
                 model.name,
                 json.dumps(dict(model.settings), sort_keys=True),
-                _arrays_bytes(model.arrays),
+                _npz(dict(model.arrays)),
             )
             database.execute(f"INSERT INTO {prefix}coarse_models VALUES (?, ?, ?)", row)
         database.commit()
@@ -91,3 +95,9 @@ def _insert(database: sqlite3.Connection, node: TopoNode, prefix: str) -> None:
         *(array.tobytes() for array in node_to_arrays(node, "surf")),
     )
     database.execute(f"INSERT INTO {prefix}node_points VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+
+
+def _npz(arrays: dict[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()

@@ -13,6 +13,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import ray_covariances
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.landmarks import Observations, observe_points, refine_points
+from topoloc.points.metric_points import keypoint_sigmas
 
 CAMERA = Camera.pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
 SIGMA_PX = 0.8
@@ -122,13 +123,11 @@ def observed(offset_px: np.ndarray) -> tuple[Observations, np.ndarray]:
         Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), np.array([0.3, 0.0, 0.1])),
     )
     points_img = CAMERA.img_from_cam(cam_from_node.apply(s.truth))
-    sigmas = np.full(60, SIGMA_PX)
     seen = observe_points(
         features_at(points_img),
         s.truth,
         s.covariances,
         features_at(points_img + offset_px),
-        sigmas,
         CAMERA,
         cam_from_node,
     )
@@ -141,7 +140,8 @@ def test_points_are_found_by_descriptor_where_they_must_be():
     np.testing.assert_allclose(
         seen.normalized, CAMERA.normalized_from_img(points_img)[seen.rows], atol=1e-6
     )
-    assert seen.sigmas == pytest.approx(np.hypot(SIGMA_PX, 0.7) / 500.0)
+    sigmas_px = keypoint_sigmas(features_at(points_img))
+    assert seen.sigmas == pytest.approx(np.hypot(sigmas_px, 0.7) / 500.0)
 
 
 def test_a_match_that_geometry_forbids_is_no_observation():
@@ -155,7 +155,5 @@ def test_points_behind_the_other_camera_are_not_observed():
     s = scene(30)
     behind = Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     features = features_at(CAMERA.img_from_cam(s.truth))
-    seen = observe_points(
-        features, s.truth, s.covariances, features, np.full(30, 1.0), CAMERA, behind
-    )
+    seen = observe_points(features, s.truth, s.covariances, features, CAMERA, behind)
     assert len(seen.rows) == 0

@@ -124,7 +124,7 @@ def test_a_failed_write_leaves_the_old_map_and_nothing_else(
         tiny_map.save(path)
     before = path.read_bytes() if there_before else None
     monkeypatch.setattr(
-        map_writing, "_arrays_bytes", stop(error)
+        map_writing, "compute_map_digest", stop(error)
     )  # asked for last, after all nodes are written
     with pytest.raises(MapError, match=r"cannot write map .*room\.topo"):
         tiny_map.save(path)

@@ -45,22 +45,22 @@ def test_angle_is_that_of_the_relative_rotation_up_to_half_a_turn():
 def test_a_straight_walk_places_a_node_where_the_threshold_is_passed():
     walk = [moved(0.25 * k) for k in range(9)]
     # 0.5 m is not more than the threshold of 0.5 m
-    assert select_node_frames(walk, NodeConfig(0.5, 1.0)).tolist() == [0, 3, 6]
+    assert select_node_frames(walk, 0.5, 1.0).tolist() == [0, 3, 6]
 
 
 def test_a_turn_on_the_spot_places_nodes_by_lambda():
     turn = [moved(0.0, 0.1 * k) for k in range(7)]
-    assert select_node_frames(turn, NodeConfig(0.5, 2.0)).tolist() == [0, 3, 6]
-    assert select_node_frames(turn, NodeConfig(0.5, 0.0)).tolist() == [0]
+    assert select_node_frames(turn, 0.5, 2.0).tolist() == [0, 3, 6]
+    assert select_node_frames(turn, 0.5, 0.0).tolist() == [0]
 
 
 def test_a_second_lap_joins_the_nodes_of_the_first():
     lap = [moved(float(k)) for k in range(6)]
-    assert len(select_node_frames(lap + lap[::-1], NodeConfig(0.9, 1.0))) == len(lap)
+    assert len(select_node_frames(lap + lap[::-1], 0.9, 1.0)) == len(lap)
 
 
 def test_one_frame_is_one_node():
-    assert select_node_frames([moved(0.0)], NodeConfig(1.0, 1.0)).tolist() == [0]
+    assert select_node_frames([moved(0.0)], 1.0, 1.0).tolist() == [0]
 
 
 @given(
@@ -72,7 +72,7 @@ def test_every_frame_is_near_a_node_and_no_two_nodes_are_near(
     steps: list[tuple[float, float]], d_thresh: float, lambda_rot: float
 ):
     poses = [moved(x, yaw) for x, yaw in steps]
-    frame_idx = select_node_frames(poses, NodeConfig(d_thresh, lambda_rot))
+    frame_idx = select_node_frames(poses, d_thresh, lambda_rot)
     nodes = NodePoses.of([poses[i] for i in frame_idx])
     rounding = (
         1.0 + 1e-12

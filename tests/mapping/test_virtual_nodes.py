@@ -34,7 +34,10 @@ from topoloc.mapping.virtual_nodes import (
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.retrieval.vlad import SurfVlad
 
-SPACED = NodeConfig(d_thresh=0.3, lambda_rot=3.0)
+
+def spaced(spacing: float) -> BuildConfig:
+    nodes = NodeConfig(d_thresh=0.3, lambda_rot=3.0)
+    return BuildConfig(nodes=nodes, sides=VirtualNodesConfig(spacing))
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +152,7 @@ def test_pictures_that_show_no_walls_have_no_sides():
 
 
 def test_without_spacing_a_map_has_none(tiny_recording: Path):
-    assert select_virtual_view_nodes([Rigid3.identity()], SPACED, 0.0) == set()
+    assert select_virtual_view_nodes([Rigid3.identity()], spaced(0.0)) == set()
     config = BuildConfig(
         nodes=NodeConfig(d_thresh=0.5, lambda_rot=1.0), sides=VirtualNodesConfig(spacing=0.0)
     )
@@ -172,7 +175,7 @@ def test_no_node_is_far_from_one_with_sides_and_these_are_far_from_each_other(
         Rigid3(exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, way]))
         for way, turn in zip(ways, turns, strict=True)
     ]
-    chosen = sorted(select_virtual_view_nodes(poses, SPACED, spacing))
+    chosen = sorted(select_virtual_view_nodes(poses, spaced(spacing)))
     assert chosen[0] == 0
     for k, pose in enumerate(poses):
         distances = node_distances(pose, NodePoses.of([poses[i] for i in chosen]), 1.5)
@@ -188,7 +191,7 @@ def test_a_way_that_was_mapped_in_both_directions_needs_no_sides():
         for k in reversed(range(40))
     ]
     alone, both = (
-        select_virtual_view_nodes(poses, SPACED, 3.0) for poses in (there, there + back_again)
+        select_virtual_view_nodes(poses, spaced(3.0)) for poses in (there, there + back_again)
     )
     assert both < alone
     assert all(0.3 * k > 0.3 * 39 for k in both)  # only beyond where anybody came back

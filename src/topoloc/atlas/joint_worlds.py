@@ -20,11 +20,7 @@ from msgspec.structs import replace
 from topoloc.atlas.joins import Join, JointPose
 from topoloc.geometry.geodesy import GeoPoint
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.slam.pose_graph import (
-    Edge,
-    compute_normalized_residuals,
-    optimize_pose_graph,
-)
+from topoloc.slam.pose_graph import Edge, compute_normalized_residuals, optimize_pose_graph
 
 if TYPE_CHECKING:
     from topoloc.atlas.manifest import Tile
@@ -239,9 +235,7 @@ def _reachable_worlds(
 
 
 def _optimize_worlds(
-    joins: Sequence[Join],
-    worlds: Mapping[str, str],
-    anchored: Mapping[str, Rigid3],
+    joins: Sequence[Join], worlds: Mapping[str, str], anchored: Mapping[str, Rigid3]
 ) -> dict[str, JointPose]:
     """Return the pose of each world after the adjustment of all joins.
 

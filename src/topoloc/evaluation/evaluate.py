@@ -8,10 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording, summarize
-from topoloc.evaluation.query_localization import (
-    localize_out_of_map,
-    localize_queries,
-)
+from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
 from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.image_calibration_check import check_camera_calibrations

@@ -6,32 +6,26 @@ k-NN localizers receive new vectors. Their vocabulary or network stays the same.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from topoloc.errors import MissingExtraError
 from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
 from topoloc.mapping.topomap import Layer, PlaceImage, TopoMetricMap
 from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseModel, ExtendableLocalizer, open_coarse_localizer
 from topoloc.retrieval.network_images import decode_stored_image
 from topoloc.retrieval.vlad import SurfVlad
 
-
-@dataclass(frozen=True, eq=False)
-class PlaceFeatures:
-    """Hold the local features of a mapping image, its size (pixels) and the id of its node."""
-
-    features: Features
-    width: int
-    height: int
-    node_id: NodeId
+DescribedPlace = tuple[Features, Camera, NodeId]
+"""The local features of a mapping image, its camera model, and the id of its node."""
 
 
 def update_coarse_models(
     topomap: TopoMetricMap,
-    views: Mapping[str, Sequence[PlaceFeatures]],
+    views: Mapping[str, Sequence[DescribedPlace]],
     images: Sequence[PlaceImage],
 ) -> tuple[TopoMetricMap, list[str]]:
     """Return the map with new places added to its coarse localizers, and the names of those that
@@ -41,11 +35,6 @@ def update_coarse_models(
     descriptors are extended with `images`. A localizer with one output per node (cnn-fc) cannot be
     extended, because it would need training. No network localizer is extended if PyTorch is
     missing.
-
-    Args:
-        topomap: the map.
-        views: the local features of the new places, by feature type.
-        images: the small images of the new places.
 
     Raises:
         MapError: a coarse localizer of the map, or an image, is damaged.
@@ -64,11 +53,11 @@ def update_coarse_models(
     return replace(topomap, layers=layers), sorted(not_updated)
 
 
-def _add_features(model: CoarseModel, views: Sequence[PlaceFeatures]) -> CoarseModel:
+def _add_features(model: CoarseModel, views: Sequence[DescribedPlace]) -> CoarseModel:
     if not views:
         return model
-    described = [(view.features, view.width, view.height) for view in views]
-    node_ids = np.array([view.node_id for view in views])
+    described = [(features, camera.width, camera.height) for features, camera, _ in views]
+    node_ids = np.array([node_id for *_, node_id in views])
     return SurfVlad.from_model(model).extend_with_features(described, node_ids).to_model()
 
 

@@ -3,61 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import TypeVar
+
+from topoloc.mapping.storage.entries import LazySequence
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 
 T = TypeVar("T")
 
 
-class OverlaySequence(Sequence[T]):
-    """Show `base` with the entries of `changed` (by row) replaced and the entries of `added`
+def overlay(base: Sequence[T], changed: Mapping[int, T], added: Sequence[T]) -> LazySequence[T]:
+    """Return `base` with the entries of `changed` (by row) replaced and those of `added`
     appended."""
 
-    def __init__(self, base: Sequence[T], changed: Mapping[int, T], added: Sequence[T]) -> None:
-        self._base, self._changed, self._added = base, changed, added
+    def read(row: int) -> T:
+        if row in changed:
+            return changed[row]
+        return base[row] if row < len(base) else added[row - len(base)]
 
-    def __len__(self) -> int:
-        return len(self._base) + len(self._added)
-
-    def __getitem__(self, index):  # type: ignore[override]
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        row = index + len(self) if index < 0 else index
-        if not 0 <= row < len(self):
-            raise IndexError(index)
-        if row in self._changed:
-            return self._changed[row]
-        return self._base[row] if row < len(self._base) else self._added[row - len(self._base)]
+    return LazySequence(lambda: len(base) + len(added), read)
 
 
-class SelectedSequence(Sequence[T]):
-    """Show the given rows of `base`."""
-
-    def __init__(self, base: Sequence[T], rows: Sequence[int]) -> None:
-        self._base, self._rows = base, rows
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __getitem__(self, index):  # type: ignore[override]
-        return (
-            [self._base[row] for row in self._rows[index]]
-            if isinstance(index, slice)
-            else self._base[self._rows[index]]
+def transform_nodes(
+    topomap: TopoMetricMap, transform: Callable[[TopoNode], TopoNode]
+) -> TopoMetricMap:
+    """Return the map with each node transformed at every access, or the same map if `transform`
+    returns all nodes unchanged."""
+    if all(transform(node) is node for layer in topomap.layers.values() for node in layer.nodes):
+        return topomap
+    layers = {
+        kind: replace(
+            layer,
+            nodes=LazySequence(
+                partial(len, layer.nodes), lambda row, layer=layer: transform(layer.nodes[row])
+            ),
         )
-
-
-class TransformedSequence(Sequence[T]):
-    """Show the entries of `base`, each transformed by `transform` at every access."""
-
-    def __init__(self, base: Sequence[T], transform: Callable[[T], T]) -> None:
-        self._base, self._transform = base, transform
-
-    def __len__(self) -> int:
-        return len(self._base)
-
-    def __getitem__(self, index):  # type: ignore[override]
-        return (
-            [self._transform(one) for one in self._base[index]]
-            if isinstance(index, slice)
-            else self._transform(self._base[index])
-        )
+        for kind, layer in topomap.layers.items()
+    }
+    return replace(topomap, layers=layers)

@@ -1,4 +1,5 @@
-"""Merge two maps of overlapping places. Start reading at `merge_maps`.
+"""Merge two maps of overlapping places. `merge` does so with map files. Start reading at
+`merge_maps`.
 
 Only the two maps are needed. The stored features of the second map's nodes are localized in the
 first map. The second map's nodes are then aligned like the frames of a session
@@ -9,32 +10,52 @@ with their sessions, landmark statistics and virtual nodes.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.coarse_model_update import PlaceFeatures, update_coarse_models
-from topoloc.lifelong.lazy_sequences import OverlaySequence
-from topoloc.lifelong.recall_change import measure_recall_change
+from topoloc.lifelong.coarse_model_update import update_coarse_models
+from topoloc.lifelong.lazy_sequences import overlay
+from topoloc.lifelong.node_localization import localize_nodes, measure_recall_change
+from topoloc.lifelong.session_content import is_well_localized
 from topoloc.lifelong.session_poses import Progress, SessionPoses, align_motion_to_map
-from topoloc.lifelong.tiles.node_localization import localize_nodes
-from topoloc.lifelong.update import is_well_localized
-from topoloc.lifelong.virtual_node_update import add_virtual_nodes
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
-from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.mapping.nodes import node_distances
+from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
+from topoloc.mapping.virtual_nodes import add_virtual_nodes
 from topoloc.node_ids import NodeId, Row, as_rows
 
 
-@dataclass(frozen=True, eq=False)
-class MergedMap:
-    """Hold the merged map and the numbers of changes, by name."""
+def merge(
+    first: str | Path,
+    second: str | Path,
+    out: str | Path,
+    localizer_config: LocalizerConfig | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Merge two map files of overlapping places into a new one, in the world of the first.
 
-    topomap: TopoMetricMap
-    changes: dict[str, Any]
+    Returns:
+        The changes: numbers and texts by their names, with the bytes of the new file.
+
+    Raises:
+        ConfigError: a setting is out of its bounds.
+        MapError: a map is missing or damaged, both are one map, the second lacks a feature type of
+            the first, or the new file cannot be written.
+        TrajectoryError: the maps have too little in common.
+        FeatureTypeError, MissingExtraError, WeightsError: their features are not available here.
+    """
+    with TopoMetricMap.load(first) as one, TopoMetricMap.load(second) as other:
+        merged, changes = merge_maps(one, other, localizer_config, progress)
+        name = f"merge {Path(second).name}"
+        edit = Edit(one.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
+        replace(merged, edits=[*one.edits, edit]).save(out)
+    return changes | {"bytes": Path(out).stat().st_size}
 
 
 def merge_maps(
@@ -42,8 +63,9 @@ def merge_maps(
     second: TopoMetricMap,
     localizer_config: LocalizerConfig | None = None,
     progress: Progress | None = None,
-) -> MergedMap:
-    """Merge the second map into the first and return the result in the first map's world.
+) -> tuple[TopoMetricMap, dict[str, Any]]:
+    """Merge the second map into the first. Return the result in the first map's world, and the
+    numbers of changes by name.
 
     Raises:
         ConfigError: a setting of the localizer is out of its bounds.
@@ -76,10 +98,7 @@ def merge_maps(
         "not_taught": not_updated,
     }
     merged = with_map_statistics(merged, progress)
-    return MergedMap(
-        merged,
-        changes | measure_recall_change(first, merged, localizer_config),
-    )
+    return merged, changes | measure_recall_change(first, merged, localizer_config)
 
 
 def _align_second_map(
@@ -89,20 +108,16 @@ def _align_second_map(
     progress: Progress,
 ) -> SessionPoses:
     """Return poses of the second map's nodes, by row, in the world of the first map."""
-    rows = second.rows
+    rows, localizer = second.rows, Localizer(first, localizer_config)
     answers = localize_nodes(
-        Localizer(first, localizer_config),
-        second,
-        rows,
-        lambda done: progress("comparing the maps", done, len(rows)),
+        localizer, second, rows, lambda done: progress("comparing the maps", done, len(rows))
     )
     odom = dict(enumerate(summary.world_from_cam for summary in second.summaries))
     try:
         return align_motion_to_map("the second map", odom, {**answers}, first.config.d_thresh)
     except TrajectoryError as error:
-        raise TrajectoryError(
-            str(error).replace("the map stays as it is", "nothing is merged")
-        ) from None
+        text = str(error).replace("the map stays as it is", "nothing is merged")
+        raise TrajectoryError(text) from None
 
 
 def _add_nodes(
@@ -110,14 +125,10 @@ def _add_nodes(
 ) -> tuple[TopoMetricMap, list[str]]:
     """Return the first map with these nodes of the second, and the names of the coarse localizers
     that were not updated."""
-    base = first.free_ids.session
-    sessions = {
-        session.session_id: replace(session, session_id=base + k)
-        for k, session in enumerate(second.sessions)
-    }
-    session_ids = {old: session.session_id for old, session in sessions.items()}
-    first_id = first.free_ids.node
-    new_id = {row: NodeId(first_id + k) for k, row in enumerate(added)}
+    free = first.free_ids
+    session_ids = {one.session_id: free.session + k for k, one in enumerate(second.sessions)}
+    sessions = [replace(one, session_id=session_ids[one.session_id]) for one in second.sessions]
+    new_id = {row: NodeId(free.node + k) for k, row in enumerate(added)}
     nodes = {
         kind: [
             _transform_node(second.layers[kind].nodes[row], new_id[row], poses[row], session_ids)
@@ -125,10 +136,13 @@ def _add_nodes(
         ]
         for kind in first.kinds
     }
-    views = {kind: [_place_features(node) for node in of_kind] for kind, of_kind in nodes.items()}
+    views = {
+        kind: [(node.features, node.camera, node.summary.node_id) for node in of_kind]
+        for kind, of_kind in nodes.items()
+    }
     summaries = [*first.summaries, *(node.summary for node in nodes[first.kind])]
     layers = {
-        kind: replace(layer, nodes=OverlaySequence(layer.nodes, {}, nodes[kind]))
+        kind: replace(layer, nodes=overlay(layer.nodes, {}, nodes[kind]))
         for kind, layer in first.layers.items()
     }
     images = _select_images(second, new_id, poses, session_ids)
@@ -136,20 +150,13 @@ def _add_nodes(
         first,
         summaries=summaries,
         layers=layers,
-        edges=sorted(
-            {*first.edges, *_transfer_edges(first, second, new_id, poses)},
-            key=lambda edge: (edge.source_id, edge.target_id),
-        ),
-        place_images=OverlaySequence(first.place_images, {}, images),
+        edges=sorted({*first.edges, *_transfer_edges(first, second, new_id, poses)}),
+        place_images=overlay(first.place_images, {}, images),
         length_m=first.length_m + second.length_m * len(added) / max(len(second.summaries), 1),
-        sessions=[*first.sessions, *sessions.values()],
+        sessions=[*first.sessions, *sessions],
         sides=_transfer_virtual_nodes(first, second, new_id, poses, summaries),
     )
     return update_coarse_models(merged, views, images)
-
-
-def _place_features(node: TopoNode) -> PlaceFeatures:
-    return PlaceFeatures(node.features, node.camera.width, node.camera.height, node.summary.node_id)
 
 
 def _transform_node(
@@ -164,20 +171,11 @@ def _transform_node(
         world_from_cam=world_from_cam,
         session_id=session_ids.get(of.session_id, of.session_id),
     )
-    session_statistics = [
-        _renumber_session(session_statistics, session_ids)
-        for session_statistics in node.session_statistics
+    statistics = [
+        replace(one, session_id=session_ids.get(one.session_id, one.session_id))
+        for one in node.session_statistics
     ]
-    return replace(node, summary=summary, session_statistics=session_statistics)
-
-
-def _renumber_session(
-    session_statistics: LandmarkStatistics, session_ids: Mapping[int, int]
-) -> LandmarkStatistics:
-    return replace(
-        session_statistics,
-        session_id=session_ids.get(session_statistics.session_id, session_statistics.session_id),
-    )
+    return replace(node, summary=summary, session_statistics=statistics)
 
 
 def _select_images(
@@ -193,14 +191,9 @@ def _select_images(
     for image in second.place_images:
         row = wanted.get((image.session_id, image.name))
         if row is not None:
+            moved = replace(image, node_id=new_id[row], world_from_cam=poses[row], image_id=None)
             session_id = session_ids.get(image.session_id, image.session_id)
-            changes = {
-                "node_id": new_id[row],
-                "world_from_cam": poses[row],
-                "session_id": session_id,
-                "image_id": None,
-            }
-            found.append(replace(image, **changes))
+            found.append(replace(moved, session_id=session_id))
     return found
 
 
@@ -214,10 +207,9 @@ def _transfer_edges(
     map."""
     ids = {}
     for row, summary in zip(second.rows, second.summaries, strict=True):
-        nearest = int(
-            node_distances(poses[row], first.node_poses, first.config.lambda_rot).argmin()
-        )
-        ids[summary.node_id] = new_id.get(row, first.summaries[nearest].node_id)
+        distances = node_distances(poses[row], first.node_poses, first.config.lambda_rot)
+        nearest = first.summaries[int(distances.argmin())].node_id
+        ids[summary.node_id] = new_id.get(row, nearest)
     return {
         Edge(ids[e.source_id], ids[e.target_id])
         for e in second.edges
@@ -236,22 +228,14 @@ def _transfer_virtual_nodes(
     map's."""
     if first.sides is None or second.sides is None or first.sides.kind != second.sides.kind:
         return first.sides
-    nodes = list[TopoNode]()
-    known = {summary.node_id: summary for summary in summaries}
+    nodes, known = list[TopoNode](), {summary.node_id: summary for summary in summaries}
     for side in second.sides.nodes:
-        row = None if side.summary.of_node is None else second.row_of(side.summary.of_node)
+        of = side.summary
+        row = None if of.of_node is None else second.row_of(of.of_node)
         if row is not None and row in new_id:
-            of_node = known[new_id[row]]
-            moved = (
-                poses[row]
-                @ second.summaries[row].world_from_cam.inverse()
-                @ side.summary.world_from_cam
-            )
-            summary = replace(
-                side.summary,
-                of_node=of_node.node_id,
-                session_id=of_node.session_id,
-                world_from_cam=moved,
-            )
-            nodes.append(replace(side, summary=summary))
+            owner = known[new_id[row]]
+            second_from_node = second.summaries[row].world_from_cam
+            moved = poses[row] @ second_from_node.inverse() @ of.world_from_cam
+            ids = {"of_node": owner.node_id, "session_id": owner.session_id}
+            nodes.append(replace(side, summary=replace(of, world_from_cam=moved, **ids)))
     return add_virtual_nodes(first, nodes)

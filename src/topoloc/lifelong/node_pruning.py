@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Int
 
-from topoloc.lifelong.lazy_sequences import SelectedSequence
-from topoloc.lifelong.node_observation import observe_node
+from topoloc.mapping.node_drafts import observe_node
 from topoloc.mapping.nodes import NearestNodeSearch
+from topoloc.mapping.storage.entries import LazySequence
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes
 from topoloc.node_ids import NodeId, Row
@@ -57,20 +58,18 @@ def compute_node_support(topomap: TopoMetricMap, num_compared: int) -> NodeSuppo
     for layer in topomap.layers.values():
         nodes = layer.nodes
         for row, others in enumerate(supporters):
+            view = nodes[row]
             seen = [
-                _count_recognised_landmarks(nodes[int(k)], nodes[row], topomap)
-                if k != row
-                else len(nodes[row].features)
-                for k in others
+                _count_recognised_landmarks(nodes[k], view) if k != row else len(view.features)
+                for k in others.tolist()
             ]
             landmarks[row] = np.maximum(landmarks[row], seen)
     owners = [topomap.row_of(image.node_id) for image in topomap.place_images]
-    return NodeSupport(
-        supporters, landmarks, np.maximum(np.bincount(owners, minlength=len(supporters)), 1)
-    )
+    num_images = np.bincount(owners, minlength=len(supporters))
+    return NodeSupport(supporters, landmarks, np.maximum(num_images, 1))
 
 
-def _count_recognised_landmarks(node: TopoNode, view: TopoNode, topomap: TopoMetricMap) -> int:
+def _count_recognised_landmarks(node: TopoNode, view: TopoNode) -> int:
     """Count the landmarks of `node` that are found in the features of `view` near their
     projections."""
     if len(node.features) == 0 or len(view.features) == 0:
@@ -111,15 +110,11 @@ def iterate_node_removals(
 def remove_nodes(
     topomap: TopoMetricMap, removed: Sequence[Row], supporter: Int[np.ndarray, " nodes"]
 ) -> TopoMetricMap:
-    """Return the map without the nodes `removed`.
+    """Return the map without the nodes `removed`, given the row of the supporting node of each
+    node.
 
     Edges and images of a removed node pass to its supporter. One mapping image and one global
     descriptor of each removed node are kept.
-
-    Args:
-        topomap: the map.
-        removed: the rows of the nodes to remove.
-        supporter: the row of the supporting node, for each node.
     """
     gone = set(removed)
     kept = [row for row in topomap.rows if row not in gone]
@@ -127,20 +122,21 @@ def remove_nodes(
     new_id = {ids[row]: ids[int(supporter[row])] for row in gone}
     layers = {}
     for kind, layer in topomap.layers.items():
-        models = layer.coarse_models.items()
-        reassigned = {name: _reassign_descriptors(model, new_id) for name, model in models}
-        layers[kind] = replace(
-            layer, nodes=SelectedSequence(layer.nodes, kept), coarse_models=reassigned
-        )
+        models = {
+            name: _reassign_descriptors(model, new_id)
+            for name, model in layer.coarse_models.items()
+        }
+        nodes = LazySequence(partial(len, kept), lambda k, nodes=layer.nodes: nodes[kept[k]])
+        layers[kind] = replace(layer, nodes=nodes, coarse_models=models)
     edges = {
-        tuple(new_id.get(one, one) for one in (edge.source_id, edge.target_id))
+        Edge(*(new_id.get(one, one) for one in (edge.source_id, edge.target_id)))
         for edge in topomap.edges
     }
     return replace(
         topomap,
         summaries=[topomap.summaries[row] for row in kept],
         layers=layers,
-        edges=[Edge(source, target) for source, target in sorted(edges) if source != target],
+        edges=sorted(edge for edge in edges if edge.source_id != edge.target_id),
         place_images=_reassign_images(topomap.place_images, new_id),
         sides=_remove_virtual_nodes(topomap, new_id),
     )
@@ -166,10 +162,7 @@ def _reassign_descriptors(model: CoarseModel, new_id: Mapping[NodeId, NodeId]) -
     The descriptor nearest to the node's mean is kept and passes to the supporter."""
     vectors, of_node = model.arrays.get("vectors"), model.arrays.get("node_ids")
     if vectors is None or of_node is None:
-        return (
-            # a model with one output per node: the outputs of missing nodes are ignored later
-            model
-        )
+        return model  # it has one output per node; those of missing nodes are ignored later
     is_kept, ids = np.ones(len(of_node), bool), of_node.copy()
     for node_id, supporter_id in new_id.items():
         rows = np.flatnonzero(of_node == node_id)
@@ -192,8 +185,7 @@ def _remove_virtual_nodes(
     if sides is None or not any(summary.of_node in new_id for summary in sides.summaries):
         return sides
     return collect_virtual_nodes(
-        [node for node in sides.nodes if node.summary.of_node not in new_id],
-        sides.kind,
+        [node for node in sides.nodes if node.summary.of_node not in new_id], sides.kind
     )
 
 
@@ -205,10 +197,10 @@ def select_removed_nodes(
     Removal ends when `is_enough` returns true or no further node can be removed. Returns None if no
     node can be removed.
     """
-    removed, last = list[Row](), None
+    removed, chosen = list[Row](), None
     for row, supporter in iterate_node_removals(support, min_held):
         removed.append(row)
-        last = supporter
+        chosen = removed, supporter
         if is_enough(removed):
             break
-    return (removed, last) if last is not None else None
+    return chosen

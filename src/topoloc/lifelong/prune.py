@@ -1,18 +1,16 @@
-"""Make a map smaller. Start reading at `prune_map`.
+"""Make a map smaller. Start reading at `prune`.
 
 Vanished landmarks are removed first. A landmark has vanished if many images that show its
 neighbours again never show it. Descriptors are then quantized on request
-(`descriptor_quantization.py`). With a size budget, nodes supported by others are removed if every
+(`landmark_pruning.py`). With a size budget, nodes supported by others are removed if every
 node would otherwise keep few landmarks (`node_pruning.py`). Each remaining node then keeps as many
-landmarks as fit. Landmarks with a high observation probability are preferred. They are spread over
-the image, because a landmark beside others adds less. The objective is a submodular coverage: a
-cell of the image counts as the square root of the sum of its probabilities (Krause & Golovin 2014,
-greedy choice).
+landmarks as fit.
 """
 
 from __future__ import annotations
 
 import sqlite3
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -20,15 +18,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from topoloc.errors import MapError
-from topoloc.lifelong.descriptor_quantization import quantize_map_descriptors
-from topoloc.lifelong.lazy_sequences import OverlaySequence, TransformedSequence
+from topoloc.lifelong.landmark_pruning import (
+    choose_landmarks,
+    find_vanished,
+    quantize_map_descriptors,
+    select_landmarks,
+)
+from topoloc.lifelong.lazy_sequences import overlay, transform_nodes
+from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.node_pruning import compute_node_support, remove_nodes, select_removed_nodes
-from topoloc.lifelong.recall_change import measure_recall_change
 from topoloc.localization.map_facts.map_building import with_map_statistics
-from topoloc.mapping.landmark_statistics import LandmarkStatistics, merge_count_statistics
+from topoloc.mapping.edit import WaitCallback, edit_map
+from topoloc.mapping.landmark_statistics import merge_count_statistics
 from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.recordings.atomic import temporary_file
@@ -94,11 +97,41 @@ def _measure_file_size(topomap: TopoMetricMap, path: Path) -> _FileSize:
 
 
 @dataclass(frozen=True, eq=False)
-class PrunedMap:
-    """Hold the pruned map and the numbers of changes, by name."""
+class PrunedFile:
+    """The changes of a pruned map file, numbers by their names, and its mapped length (m)."""
 
-    topomap: TopoMetricMap
     changes: dict[str, Any]
+    length_m: float
+
+
+def prune(
+    path: str | Path,
+    max_mb: float | None = None,
+    descriptors: Literal["fine", "coarse"] = "fine",
+    on_wait: WaitCallback | None = None,
+) -> PrunedFile:
+    """Remove from a map file the landmarks that are gone and, with a budget, those that add least.
+
+    Args:
+        path: the map file, which is replaced if anything is removed.
+        max_mb: megabytes that the file may have; None removes only landmarks that are gone.
+        descriptors: as of `prune_map`.
+        on_wait: called if another process edits the map, before this one waits.
+
+    Raises:
+        ConfigError: a setting is out of its bounds.
+        MapError: the budget is too small, or the map is missing, damaged, or cannot be written.
+    """
+    with edit_map(path, on_wait) as edit:
+        before, length_m = edit.path.stat().st_size, edit.topomap.length_m
+        max_bytes = None if max_mb is None else round(max_mb * 1e6)
+        topomap, changes = prune_map(edit.topomap, edit.path, max_bytes, descriptors)
+        changes |= {"bytes_before": before}
+        if topomap is not edit.topomap:
+            to_size = "" if max_mb is None else f" to {max_mb:g} MB"
+            how = ", descriptors coarse" if descriptors == "coarse" else ""
+            edit.commit(topomap, f"prune{to_size}{how}", changes)
+    return PrunedFile(changes | {"bytes": Path(path).stat().st_size}, length_m)
 
 
 def prune_map(
@@ -106,56 +139,33 @@ def prune_map(
     path: Path,
     max_bytes: int | None = None,
     descriptors: Literal["fine", "coarse"] = "fine",
-) -> PrunedMap:
-    """Return the map without vanished landmarks and, if there is a budget, small enough for it.
+) -> tuple[TopoMetricMap, dict[str, Any]]:
+    """Return the map without vanished landmarks and, if there is a budget (`max_bytes`), small
+    enough for it. Return the numbers of changes by name, too.
 
-    Args:
-        topomap: the map.
-        path: the map's file. Its size is the basis of the budget.
-        max_bytes: the budget in bytes. None removes vanished landmarks only.
-        descriptors: `coarse` quantizes the descriptors before any landmark is removed for the
-            budget. `fine` keeps them.
-
-    Raises:
-        MapError: the budget is too small for the map with `min_points` landmarks per node.
+    The file of the map at `path` is the basis of the budget. `coarse` quantizes the descriptors
+    before any landmark is removed for the budget, `fine` keeps them. Raises MapError if the budget
+    is too small for 100 landmarks per node.
     """
     # Step of coarse descriptors, in root mean squares of a descriptor's numbers. They are
     # quantized before any landmark is removed for the budget.
     descriptor_step = 0.64
-    counted = _merge_session_counts(topomap)
+    counted = transform_nodes(topomap, _merge_session_counts)
     if descriptors == "coarse":
         counted = quantize_map_descriptors(counted, descriptor_step)
-    file = (
-        _FileSize.of(path, topomap.kinds)
-        if counted is topomap
-        else _measure_file_size(counted, path)
-    )
+    is_same = counted is topomap
+    file = _FileSize.of(path, topomap.kinds) if is_same else _measure_file_size(counted, path)
     fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes)
     file = file if fewer is counted else _measure_file_size(fewer, path)
     return _prune_landmarks(topomap, fewer, path, file, max_bytes)
 
 
-def _merge_session_counts(topomap: TopoMetricMap) -> TopoMetricMap:
-    """Merge the observation counts of sessions that only counted. Return the same map if nothing
+def _merge_session_counts(node: TopoNode) -> TopoNode:
+    """Merge the observation counts of sessions that only counted. Return the same node if nothing
     changes."""
-
-    def merge_counts(node: TopoNode) -> TopoNode:
-        return replace(
-            node,
-            session_statistics=merge_count_statistics(node.session_statistics),
-        )
-
-    if not any(
-        len(list(node.session_statistics)) > len(list(merge_counts(node).session_statistics))
-        for layer in topomap.layers.values()
-        for node in layer.nodes
-    ):
-        return topomap
-    layers = {
-        kind: replace(layer, nodes=TransformedSequence(layer.nodes, merge_counts))
-        for kind, layer in topomap.layers.items()
-    }
-    return replace(topomap, layers=layers)
+    before = list(node.session_statistics)
+    merged = merge_count_statistics(before)
+    return node if len(merged) == len(before) else replace(node, session_statistics=merged)
 
 
 def _drop_nodes(topomap: TopoMetricMap, file: _FileSize, max_bytes: int) -> TopoMetricMap:
@@ -167,17 +177,10 @@ def _drop_nodes(topomap: TopoMetricMap, file: _FileSize, max_bytes: int) -> Topo
     # A node is removed only if every place keeps a node with at least this many recognised
     # landmarks.
     min_held = 60
-    remaining = {
-        kind: np.array([(~_find_vanished(node)).sum() for node in topomap.layers[kind].nodes])
-        for kind in topomap.kinds
-    }
-    min_bytes = sum(
-        (
-            np.minimum(remaining[kind], few_points) * file.bytes_per_point[kind]
-            for kind in topomap.kinds
-        ),
-        np.zeros(1),
-    )
+    min_bytes = np.zeros(len(topomap.summaries))
+    for kind, layer in topomap.layers.items():
+        remaining = np.array([(~find_vanished(node)).sum() for node in layer.nodes])
+        min_bytes += np.minimum(remaining, few_points) * file.bytes_per_point[kind]
     excess_bytes = file.bytes_without_points(topomap) + float(min_bytes.sum()) - max_bytes
     if excess_bytes <= 0:
         return topomap
@@ -194,171 +197,58 @@ def _prune_landmarks(
     path: Path,
     file: _FileSize,
     max_bytes: int | None,
-) -> PrunedMap:
-    """Remove vanished landmarks and reduce the others to the budget.
-
-    Args:
-        before: the original map.
-        topomap: the map after the earlier steps.
-        path: the map's file.
-        file: the file sizes of `topomap`.
-        max_bytes: the budget in bytes, or None.
-    """
+) -> tuple[TopoMetricMap, dict[str, Any]]:
+    """Remove vanished landmarks and reduce the others to the budget. `before` is the original map,
+    `topomap` the map after the earlier steps with its sizes `file`."""
     vanished = {
-        kind: [_find_vanished(node) for node in topomap.layers[kind].nodes]
-        for kind in topomap.kinds
+        kind: [find_vanished(node) for node in layer.nodes]
+        for kind, layer in topomap.layers.items()
     }
     remaining = {
-        kind: [int((~of_node).sum()) for of_node in vanished[kind]] for kind in topomap.kinds
+        kind: [int((~of_node).sum()) for of_node in masks] for kind, masks in vanished.items()
     }
-    largest = max(max(of_kind) for of_kind in remaining.values())
-    most, budget, fixed_bytes = largest, max_bytes, file.bytes_without_points(topomap)
+    is_any_vanished = any(of_node.any() for masks in vanished.values() for of_node in masks)
+    most = largest = max(max(of_kind) for of_kind in remaining.values())
+    fixed_bytes, excess = file.bytes_without_points(topomap), 0
     num_nodes = len(before.summaries) - len(topomap.summaries)
     while True:
-        if budget is not None:
+        if max_bytes is not None:
+            limit = max_bytes - excess
             most = min(
-                most,
-                _max_points_per_node(remaining, file.bytes_per_point, fixed_bytes, budget),
+                most, _max_points_per_node(remaining, file.bytes_per_point, fixed_bytes, limit)
             )
-        if (
-            topomap is before
-            and most >= largest
-            and not any(of_node.any() for of_kind in vanished.values() for of_node in of_kind)
-        ):
-            return PrunedMap(
-                before, {"nodes_dropped": 0, "landmarks_gone": 0, "landmarks_dropped": 0}
-            )
-        pruned = _drop_landmarks(topomap, vanished, most)
-        if (
-            max_bytes is None
-            or budget is None
-            or (written := _measure_file_size(pruned.topomap, path).size + _PAGE_SLACK_BYTES)
-            <= max_bytes
-        ):
-            changes = {"nodes_dropped": num_nodes} | pruned.changes
-            return replace(
-                pruned,
-                changes=changes | measure_recall_change(before, pruned.topomap),
-            )
-        budget -= (
-            round(1.1 * (written - max_bytes)) + _PAGE_SLACK_BYTES
-        )  # the compressed size is known only after writing
+        if topomap is before and most >= largest and not is_any_vanished:
+            return before, {"nodes_dropped": 0, "landmarks_gone": 0, "landmarks_dropped": 0}
+        pruned, changes = _drop_landmarks(topomap, vanished, most)
+        written = 0
+        if max_bytes is not None:
+            written = _measure_file_size(pruned, path).size + _PAGE_SLACK_BYTES
+        if max_bytes is None or written <= max_bytes:
+            changes = {"nodes_dropped": num_nodes} | changes
+            return pruned, changes | measure_recall_change(before, pruned)
+        # the compressed size is known only after writing
+        excess += round(1.1 * (written - max_bytes)) + _PAGE_SLACK_BYTES
 
 
 def _drop_landmarks(
     topomap: TopoMetricMap, vanished: Mapping[str, list[np.ndarray]], most: int
-) -> PrunedMap:
+) -> tuple[TopoMetricMap, dict[str, Any]]:
     """Remove the `vanished` landmarks (a mask per node) and keep at most `most` of the others per
-    node."""
-    pruned, num_gone, num_dropped = {}, 0, 0
+    node. Return the map and the numbers of removed landmarks."""
+    layers, num_gone, num_dropped = {}, 0, 0
     for kind, layer in topomap.layers.items():
         changed = {}
         for row, (node, of_node) in enumerate(zip(layer.nodes, vanished[kind], strict=True)):
             rows = np.flatnonzero(~of_node)
-            kept = rows if len(rows) <= most else rows[_select_landmarks(node, rows, most)]
-            num_gone, num_dropped = (
-                num_gone + int(of_node.sum()),
-                num_dropped + len(rows) - len(kept),
-            )
+            kept = rows if len(rows) <= most else rows[choose_landmarks(node, rows, most)]
+            num_gone += len(of_node) - len(rows)
+            num_dropped += len(rows) - len(kept)
             if len(kept) < len(of_node):
                 changed[row] = select_landmarks(node, kept)
-        pruned[kind] = replace(layer, nodes=OverlaySequence(layer.nodes, changed, []))
-    summaries = [node.summary for node in pruned[topomap.kind].nodes]
-    smaller = replace(topomap, summaries=summaries, layers=pruned)
-    return PrunedMap(
-        with_map_statistics(smaller), {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped}
-    )
-
-
-def select_landmarks(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
-    """Return the node with the landmarks `kept` (rows in increasing order) and their session
-    statistics."""
-    new_row = np.full(len(node.features), -1)
-    new_row[kept] = np.arange(len(kept))
-    session_statistics = []
-    for of_session in node.session_statistics:
-        stays = new_row[of_session.rows] >= 0
-        if stays.any():
-            parts = (
-                getattr(of_session, name)[stays] for name in ("roots", "pulls", "expected", "seen")
-            )
-            session_statistics.append(
-                LandmarkStatistics(of_session.session_id, new_row[of_session.rows[stays]], *parts)
-            )
-    stored = node.stored_descriptors
-    return replace(
-        node,
-        summary=replace(node.summary, num_points=len(kept)),
-        features=node.features.select(kept),
-        points_cam=node.points_cam[kept],
-        point_sqrt_covs=node.point_sqrt_covs[kept],
-        session_statistics=session_statistics,
-        stored_descriptors=None if stored is None else stored[kept],
-    )
-
-
-def _find_vanished(node: TopoNode) -> Bool[np.ndarray, " n"]:
-    """Return the mask of landmarks that later sessions never saw although they saw the rest of the
-    node.
-
-    The number of missed images must be large enough: a session that finds a third of the landmarks
-    misses an existing one in four images with a probability of one in five.
-    """
-    # Minimum number of images of later sessions that should have shown a landmark, before it
-    # can count as vanished.
-    min_expected = 4
-    # A landmark counts as vanished if an existing landmark would stay unseen in all these
-    # images with at most this probability. The probability follows from the shares that the
-    # sessions saw of the node.
-    max_chance = 0.02
-    # If more than this share of a node's landmarks would count as vanished, none of them
-    # does.
-    max_gone_share = 0.7
-    num = len(node.features)
-    expected, seen, log_missed = np.zeros(num, np.int64), np.zeros(num, np.int64), np.zeros(num)
-    for session_statistics in node.session_statistics:
-        later = session_statistics.session_id != node.summary.session_id
-        if later and session_statistics.is_reobserved():
-            share = session_statistics.seen.sum(dtype=np.int64) / max(
-                int(session_statistics.expected.sum(dtype=np.int64)), 1
-            )
-            expected[session_statistics.rows] += session_statistics.expected
-            seen[session_statistics.rows] += session_statistics.seen
-            log_missed[session_statistics.rows] += session_statistics.expected * np.log1p(
-                -min(share, 0.99)
-            )
-    vanished = (expected >= min_expected) & (seen == 0) & (log_missed <= np.log(max_chance))
-    return vanished if vanished.sum() <= max_gone_share * num else np.zeros(num, bool)
-
-
-def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
-    """Return each landmark's probability of being seen if it should be visible, over all sessions
-    (Laplace's rule)."""
-    expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
-    for session_statistics in node.session_statistics:
-        expected[session_statistics.rows] += session_statistics.expected
-        seen[session_statistics.rows] += session_statistics.seen
-    return seen / expected
-
-
-def _select_landmarks(
-    node: TopoNode, rows: Int[np.ndarray, " m"], most: int
-) -> Int[np.ndarray, " k"]:
-    """Select the rows that a node keeps. Greedy choice: each next landmark adds most to the
-    coverage of its cell."""
-    cells = 8  # number of cell columns in the image. The kept landmarks are spread over the cells
-    size = node.camera.width / cells
-    cell = (node.features.points_img[rows] / size).astype(np.int64)
-    key = cell[:, 1] * (cells + 1) + cell[:, 0]
-    chances, gains = _observation_probability(node)[rows], np.empty(len(rows))
-    for one in np.unique(key):
-        of_cell = np.flatnonzero(key == one)
-        best_first = of_cell[np.argsort(-chances[of_cell], kind="stable")]
-        total = np.cumsum(chances[best_first])
-        gains[best_first] = np.sqrt(total) - np.sqrt(
-            total - chances[best_first]
-        )  # gains decrease within a cell, so sorting is the greedy choice
-    return np.sort(np.argsort(-gains, kind="stable")[:most])
+        layers[kind] = replace(layer, nodes=overlay(layer.nodes, changed, []))
+    summaries = [node.summary for node in layers[topomap.kind].nodes]
+    smaller = with_map_statistics(replace(topomap, summaries=summaries, layers=layers))
+    return smaller, {"landmarks_gone": num_gone, "landmarks_dropped": num_dropped}
 
 
 def _max_points_per_node(
@@ -379,16 +269,11 @@ def _max_points_per_node(
         )
 
     if file_size_with(min_points) > max_bytes:
-        least, num = (
-            file_size_with(min_points) / 1e6,
-            max(len(of_kind) for of_kind in remaining.values()),
-        )
+        least, num = file_size_with(min_points) / 1e6, max(map(len, remaining.values()))
         raise MapError(
             f"with {min_points} landmarks each its {num} nodes take {least:.2f} MB; nothing"
             " is dropped"
         )
-    low, high = min_points, max(max(of_kind) for of_kind in remaining.values())
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if file_size_with(middle) <= max_bytes else (low, middle - 1)
-    return low
+    largest = max(max(of_kind) for of_kind in remaining.values())
+    counts = range(min_points, max(largest, min_points) + 1)
+    return counts[bisect_right(counts, max_bytes, key=file_size_with) - 1]

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from topoloc.geometry.alignment import compute_path_lengths
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import select_hypothesis
-from topoloc.lifelong.leave_one_out import sample_evenly
+from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.localization.result import Localization
 
 # Factor applied to the sigmas of localizations, because neighbours share errors of the map.

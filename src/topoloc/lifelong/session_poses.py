@@ -18,9 +18,9 @@ from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
-from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
 from topoloc.lifelong.noise_scale import LocalizedStep, NoiseScale, estimate_noise_scale
 from topoloc.lifelong.scale_estimation import WIDENED, MotionTolerance, find_motion_consensus
+from topoloc.lifelong.session_checks import check_calibration, check_focal_length
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.config import MapConfig
@@ -55,10 +55,7 @@ class SessionPoses:
 
 
 def estimate_poses_by_motion(
-    sequence: StereoSequence,
-    localizer: Localizer,
-    map_config: MapConfig,
-    progress: Progress,
+    sequence: StereoSequence, localizer: Localizer, map_config: MapConfig, progress: Progress
 ) -> SessionPoses:
     """Estimate the poses of a session that has its own poses.
 
@@ -105,7 +102,8 @@ def _known_poses(poses: Sequence[Rigid3 | None]) -> dict[int, Rigid3]:
 def _select_node_frames(odom: Mapping[int, Rigid3], map_config: MapConfig) -> list[int]:
     """Return frames of a motion that are about as far apart as nodes of the map."""
     indices = list(odom)
-    return [indices[k] for k in select_node_frames(list(odom.values()), map_config.nodes)]
+    poses, spacing = list(odom.values()), (map_config.d_thresh, map_config.lambda_rot)
+    return [indices[k] for k in select_node_frames(poses, *spacing)]
 
 
 def _align_stretches(
@@ -202,9 +200,7 @@ def _too_few_message(num_queried: int) -> str:
 
 
 def _check_scale(
-    name: str,
-    odom: Mapping[int, Rigid3],
-    localized: Mapping[int, Localization],
+    name: str, odom: Mapping[int, Rigid3], localized: Mapping[int, Localization]
 ) -> None:
     """Check by distances between localized frames that the motion is in metres of the map. Raises
     TrajectoryError."""
@@ -236,9 +232,7 @@ def _check_scale(
 
 
 def _optimize_motion(
-    odom: Mapping[int, Rigid3],
-    anchors: Mapping[int, Localization],
-    noise_scale: NoiseScale,
+    odom: Mapping[int, Rigid3], anchors: Mapping[int, Localization], noise_scale: NoiseScale
 ) -> list[Rigid3 | None]:
     """Optimize the motion with its anchors as a pose graph. The first node is the world of the map
     and is fixed."""

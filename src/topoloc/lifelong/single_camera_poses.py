@@ -18,7 +18,6 @@ import numpy as np
 
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.calibration_check import check_calibration, check_focal_length
 from topoloc.lifelong.noise_scale import NoiseScale
 from topoloc.lifelong.scale_estimation import (
     WIDENED,
@@ -26,6 +25,7 @@ from topoloc.lifelong.scale_estimation import (
     find_motion_consensus,
     scale_to_metres,
 )
+from topoloc.lifelong.session_checks import check_calibration, check_focal_length
 from topoloc.lifelong.session_poses import (
     MIN_AGREEING,
     SLACK,
@@ -46,10 +46,7 @@ _NUM_FRAMES_AROUND = 3
 
 
 def estimate_poses_by_map(
-    sequence: StereoSequence,
-    tracker: Tracker,
-    map_config: MapConfig,
-    progress: Progress,
+    sequence: StereoSequence, tracker: Tracker, map_config: MapConfig, progress: Progress
 ) -> SessionPoses:
     """Estimate the poses of a session without poses by localizing each of its images.
 
@@ -123,9 +120,9 @@ def estimate_poses_by_map(
         raise TrajectoryError(
             f"{sequence.name}: {_failure_reason(localized)}; the map stays as it is"
         )
-    queried = [
-        known[k][0] for k in select_node_frames([pose for _, pose in known], map_config.nodes)
-    ]
+    known_poses = [pose for _, pose in known]
+    rows = select_node_frames(known_poses, d_thresh, map_config.lambda_rot)
+    queried = [known[k][0] for k in rows]
     answers = {index: localized.get(index) for index in queried}
     propagated_idx = [index for index, _ in known if index not in localized]
     return SessionPoses(
@@ -146,10 +143,7 @@ def _failure_reason(localized: Mapping[int, Localization]) -> str:
 
 
 def align_stretch_to_map(
-    name: str,
-    odom: Mapping[int, Rigid3],
-    localized: Mapping[int, Localization],
-    d_thresh: float,
+    name: str, odom: Mapping[int, Rigid3], localized: Mapping[int, Localization], d_thresh: float
 ) -> tuple[list[Rigid3 | None] | None, list[int]]:
     """Align a stretch of odometry with the map.
 
@@ -184,9 +178,7 @@ def align_stretch_to_map(
 
 
 def _find_consensus(
-    odom: Mapping[int, Rigid3],
-    localized: Mapping[int, Localization],
-    d_thresh: float,
+    odom: Mapping[int, Rigid3], localized: Mapping[int, Localization], d_thresh: float
 ) -> list[int]:
     """Return the frames of the most localizations that one similarity transform of the motion
     explains. Return none if they are fewer than three, because a similarity explains any two."""

@@ -179,9 +179,7 @@ class _Corrections:
 
 
 def correct_trajectory(
-    world_from_cams: Sequence[Rigid3 | None],
-    answers: Mapping[int, Localization],
-    d_thresh: float,
+    world_from_cams: Sequence[Rigid3 | None], answers: Mapping[int, Localization], d_thresh: float
 ) -> list[Rigid3 | None]:
     """Return the corrected poses. None stays None.
 
@@ -207,10 +205,7 @@ def correct_trajectory(
     )
     at = np.array([path_lengths[index] for index in answered])
     corrections = _estimate_corrections(
-        [poses[index] for index in answered],
-        [answers[index] for index in answered],
-        at,
-        d_thresh,
+        [poses[index] for index in answered], [answers[index] for index in answered], at, d_thresh
     )
     moved = {
         index: _apply_correction(pose, *corrections.at(path_lengths[index], d_thresh))

@@ -1,7 +1,7 @@
 """Find the weak regions of a map from the map alone. Start reading at `find_weak_regions`.
 
 A node is weak for one of four reasons. The rest of the map does not localize it
-(`leave_one_out.py`). It has few landmarks. No node near it looks in the opposite direction. No
+(`node_localization.py`). It has few landmarks. No node near it looks in the opposite direction. No
 other session saw it again or has a node beside it. Weak nodes near each other form a region, which
 a new recording can visit.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.leave_one_out import LeaveOneOutResult, localize_left_out, sample_evenly
+from topoloc.lifelong.node_localization import LeaveOneOutResult, localize_left_out, sample_evenly
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
@@ -200,10 +200,7 @@ def find_weak_regions(
     """
     min_turn_deg = 120.0  # minimum angle between opposite views, in degrees
     apart = 3.0  # weak nodes within this many D_thresh of each other form one region
-    topomap, rows = (
-        localizer.topomap,
-        sample_evenly(localizer.topomap.rows, max_queries),
-    )
+    topomap, rows = (localizer.topomap, sample_evenly(localizer.topomap.rows, max_queries))
 
     def report_progress(done: int, total: int) -> None:
         if progress is not None:

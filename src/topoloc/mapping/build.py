@@ -8,8 +8,7 @@ the coarse localizer.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -18,15 +17,17 @@ from jaxtyping import Float, Float32
 from topoloc.bounds import check_bounds
 from topoloc.disk_list import DiskList
 from topoloc.errors import EmptyMapError
-from topoloc.features.feature_types import find_feature_type
 from topoloc.features.parallel import parallel_map
-from topoloc.geometry.camera import Camera
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.landmarks import NODES_PER_IMAGE, Observations
 from topoloc.mapping.mapping_frames import (
     MappingFrame,
     MappingImage,
     PointLocator,
+    compute_trajectory_length,
+    connect_nodes,
+    create_place_image,
+    create_session,
     extract_mapping_image,
     prepare_view,
     select_posed_frames,
@@ -40,14 +41,14 @@ from topoloc.mapping.node_drafts import (
     observe_draft,
 )
 from topoloc.mapping.nodes import NearestNodeSearch, NodeConfig, NodePoses, select_node_frames
-from topoloc.mapping.sessions import Edit, Illumination, Session, average_illumination, today
-from topoloc.mapping.storage.entries import Edge, PlaceImage, TopoNode
+from topoloc.mapping.sessions import Edit, Illumination, Session, today
+from topoloc.mapping.storage.entries import PlaceImage, TopoNode
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import Layer, TopoMetricMap
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.recording import find_pose_source, find_source_path
+from topoloc.recordings.recording import find_pose_source
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
@@ -96,55 +97,30 @@ def build_map(
         for frame in select_posed_frames(sequence, session_id)
     ]
     locator = PointLocator(frames, config)
-    node_config = _resolve_node_config(frames, locator, config)
-    drafts = _draft_nodes(frames, locator, node_config, config, progress)
-    place_images, lights, models = _process_mapping_images(
-        frames, drafts, node_config, config, progress
-    )
+    config = replace(config, nodes=_resolve_node_config(frames, locator, config))
+    drafts = _draft_nodes(frames, locator, config, progress)
+    place_images, lights, models = _process_mapping_images(frames, drafts, config, progress)
     of_kind, sides = _finish_nodes(drafts, config)
     layers = {
         kind: Layer(nodes, {models[kind].name: models[kind]}) for kind, nodes in of_kind.items()
     }
     poses_from = poses_from or [find_pose_source(sequence) for sequence in sequences]
+    sessions = list[Session]()
+    for k, sequence in enumerate(sequences):
+        rows = [row for row, frame in enumerate(frames) if frame.session_id == k]
+        own, camera = [frames[row] for row in rows], drafts.cameras.get(k)
+        own_lights = [lights[row] for row in rows]
+        sessions.append(create_session(sequence, own, poses_from[k], camera, own_lights))
     return TopoMetricMap(
         summaries=[node.summary for node in of_kind[config.features.kind]],
         layers=layers,
-        edges=_connect_nodes(frames, [image.node_id for image in place_images]),
+        edges=sorted(connect_nodes(frames, [image.node_id for image in place_images])),
         place_images=place_images,
-        config=replace(config, nodes=node_config),
-        length_m=_compute_trajectory_length(frames),
+        config=config,
+        length_m=compute_trajectory_length(frames),
         sides=collect_virtual_nodes(sides, config.virtual_view_type),
-        sessions=[
-            _make_session(k, sequence, frames, lights, poses_from[k], drafts.cameras)
-            for k, sequence in enumerate(sequences)
-        ],
+        sessions=sessions,
         edits=[Edit(1, "build", today(), SCHEMA_VERSION)],
-    )
-
-
-def _make_session(
-    session_id: int,
-    sequence: StereoSequence,
-    frames: list[MappingFrame],
-    lights: list[Illumination],
-    poses_from: str,
-    cameras: dict[int, Camera],
-) -> Session:
-    """Return the map's record of a recording. `lights` holds the illumination of each frame,
-    `cameras` the camera of each session."""
-    of_session = [k for k, frame in enumerate(frames) if frame.session_id == session_id]
-    t_ns = [frames[k].t_ns for k in of_session]
-    light = average_illumination([lights[k] for k in of_session])
-    camera = cameras.get(session_id)
-    return Session(
-        session_id,
-        sequence.name,
-        find_source_path(sequence),
-        poses_from,
-        min(t_ns),
-        max(t_ns),
-        camera,
-        light,
     )
 
 
@@ -154,16 +130,13 @@ def _resolve_node_config(
     """Set D_thresh from the depth of the scene, if the user set none."""
     if config.nodes.d_thresh is not None:
         return config.nodes.resolved(0.0)
-    samples, first = (
-        [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 7).astype(int))],
-        replace(config, other_kinds=()),
-    )
+    samples = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 7).astype(int))]
+    first = replace(config, other_kinds=())
 
     def depths(read: tuple[MappingFrame, StereoFrame]) -> Float[np.ndarray, " n"]:
         frame, view = read[0], prepare_view(read[1])
-        located = locator.locate(frame, view, extract_mapping_image(frame, view, first))[0][
-            config.features.kind
-        ]
+        points, _ = locator.locate(frame, view, extract_mapping_image(frame, view, first))
+        located = points[config.features.kind]
         return located.points_cam[located.valid, 2]
 
     all_depths = np.concatenate(list(locator.map_frames(depths, samples)))
@@ -178,20 +151,14 @@ def _resolve_node_config(
 def _draft_nodes(
     frames: list[MappingFrame],
     locator: PointLocator,
-    node_config: NodeConfig,
     config: BuildConfig,
     progress: Progress,
 ) -> NodeDrafts:
     """Discretise the trajectory by Eq. 1. Images with too few points (dark, blurred, blank) become
     no nodes."""
-    chosen = [
-        frames[i]
-        for i in select_node_frames([frame.world_from_cam for frame in frames], node_config)
-    ]
-    kind = find_feature_type(config.features.kind)
-    rows = select_virtual_view_nodes(
-        [frame.world_from_cam for frame in chosen], node_config, config.sides.spacing
-    )
+    poses = [frame.world_from_cam for frame in frames]
+    chosen = [frames[i] for i in select_node_frames(poses, config.d_thresh, config.lambda_rot)]
+    rows = select_virtual_view_nodes([frame.world_from_cam for frame in chosen], config)
     virtual_view_frames = {chosen[row] for row in rows}
     drafts = NodeDrafts(DiskList(shared_objects=frames))
 
@@ -201,7 +168,7 @@ def _draft_nodes(
         )
 
     for done, draft in enumerate(locator.map_frames(make_draft, chosen)):
-        if len(draft.points[kind.name].features) >= MIN_NODE_POINTS:
+        if len(draft.points[config.features.kind].features) >= MIN_NODE_POINTS:
             drafts.append(draft)
         progress("nodes", done + 1, len(chosen))
     if not drafts.rows:
@@ -213,65 +180,46 @@ def _draft_nodes(
 
 
 def _process_mapping_images(
-    frames: list[MappingFrame],
-    drafts: NodeDrafts,
-    node_config: NodeConfig,
-    config: BuildConfig,
-    progress: Progress,
+    frames: list[MappingFrame], drafts: NodeDrafts, config: BuildConfig, progress: Progress
 ) -> tuple[list[PlaceImage], list[Illumination], dict[str, CoarseModel]]:
     """Process every mapping image after the nodes are drafted.
 
     Each image is labelled with its nearest node and observes the points of near nodes. Its
     illumination is measured. Finally the coarse localizers of all feature types are fitted.
     """
-    assert node_config.lambda_rot is not None
-    words = {kind: _learn_vocabulary(drafts, kind, config) for kind in config.kinds}
-    nodes = NearestNodeSearch(NodePoses.of(drafts.world_from_nodes), node_config.lambda_rot)
-    images: list[PlaceImage] = []
-    lights, vlads, cells = (
-        [],
-        {kind: DiskList[np.ndarray]() for kind in config.kinds},
-        {kind: [] for kind in config.kinds},
-    )
+    words = {
+        kind: learn_words_from_parts(
+            drafts.num_points[kind],
+            lambda row, kind=kind: drafts.disk_list[row].vlad_descriptors(kind, config),
+            config.vlad,
+        )
+        for kind in config.kinds
+    }
+    nodes = NearestNodeSearch(NodePoses.of(drafts.world_from_nodes), config.lambda_rot)
+    images, lights = list[PlaceImage](), list[Illumination]()
+    vlads = {kind: DiskList[np.ndarray]() for kind in config.kinds}
+    cells = {kind: [] for kind in config.kinds}
     read = ((frame, None if frame in drafts.rows else frame.read_left()) for frame in frames)
     visits = parallel_map(lambda one: _observe_image(*one, drafts, nodes, words, config), read)
     for done, (frame, visit) in enumerate(zip(frames, visits, strict=True)):
-        for row, observed in visit.observed.items():
+        image, nearest, observations, own_vlads = visit
+        for row, observed in observations.items():
             draft = drafts.disk_list[row]
             draft.add(observed)
             drafts.disk_list[row] = draft
-        image = visit.image
         for kind, features in image.features.items():
-            vlads[kind].append(visit.vlads[kind])
+            vlads[kind].append(own_vlads[kind])
             cells[kind].append(features.cells)
-        of_image = (
-            NodeId(visit.nearest),
-            image.world_from_cam,
-            image.place_jpeg,
-            frame.session_id,
-            done + 1,
-        )
-        images.append(PlaceImage(frame.sequence.name, frame.name, *of_image))
+        node_id, image_id = NodeId(nearest), done + 1
+        images.append(create_place_image(frame, image, node_id, image_id))
         lights.append(image.light)
         progress("images", done + 1, len(frames))
-    node_ids = np.array([image.node_id for image in images])
-    learnt = {
-        kind: (words[kind], vlads[kind], node_ids, config.vlad_config_for(kind), cells[kind])
-        for kind in config.kinds
-    }
-    models = {kind: SurfVlad.fit(*of_kind).to_model() for kind, of_kind in learnt.items()}
+    node_ids, models = np.array([image.node_id for image in images]), dict[str, CoarseModel]()
+    for kind in config.kinds:
+        vlad_config = config.vlad_config_for(kind)
+        fitted = SurfVlad.fit(words[kind], vlads[kind], node_ids, vlad_config, cells[kind])
+        models[kind] = fitted.to_model()
     return images, lights, models
-
-
-@dataclass(frozen=True, eq=False)
-class _ImageObservations:
-    """Hold the results of a mapping image: the row of its nearest node, its observations of near
-    nodes by row, and its VLADs by feature type."""
-
-    image: MappingImage
-    nearest: Row
-    observed: dict[Row, dict[str, Observations]]
-    vlads: dict[str, Float32[np.ndarray, " v"]]
 
 
 def _observe_image(
@@ -281,9 +229,15 @@ def _observe_image(
     nodes: NearestNodeSearch,
     words: dict[str, Float32[np.ndarray, "k d"]],
     config: BuildConfig,
-) -> _ImageObservations:
-    """Process one mapping image. `read` is None for a frame that is a node, whose features are
-    known already. Changes no shared state, so several calls may run in parallel."""
+) -> tuple[MappingImage, Row, dict[Row, dict[str, Observations]], dict[str, np.ndarray]]:
+    """Process one mapping image. Changes no shared state, so several calls may run in parallel.
+
+    `read` is None for a frame that is a node, whose features are known already.
+
+    Returns:
+        The image, the row of its nearest node, its observations of near nodes by row, and its VLADs
+        by feature type.
+    """
     image = (
         drafts.image(frame)
         if read is None
@@ -296,31 +250,12 @@ def _observe_image(
         for row, draft in around.items()
         if frame not in draft.sources
     }
-    positioned = {
-        kind: append_positions(
-            of, image.camera.width, image.camera.height, config.vlad_config_for(kind)
-        )
+    size = image.camera.width, image.camera.height
+    vlads = {
+        kind: vlad(append_positions(of, *size, config.vlad_config_for(kind)), words[kind])
         for kind, of in image.features.items()
     }
-    return _ImageObservations(
-        image,
-        nearest[0],
-        observed,
-        {
-            kind: vlad(vlad_descriptors, words[kind])
-            for kind, vlad_descriptors in positioned.items()
-        },
-    )
-
-
-def _learn_vocabulary(
-    drafts: NodeDrafts, kind: str, config: BuildConfig
-) -> Float32[np.ndarray, "k d"]:
-    return learn_words_from_parts(
-        drafts.num_points[kind],
-        lambda row: drafts.disk_list[row].vlad_descriptors(kind, config),
-        config.vlad,
-    )
+    return image, nearest[0], observed, vlads
 
 
 def _finish_nodes(
@@ -341,23 +276,3 @@ def _finish_nodes(
         for side in of_node:
             sides.append(replace(side, summary=replace(side.summary, of_node=NodeId(row))))
     return dict(of_kind), sides
-
-
-def _connect_nodes(frames: list[MappingFrame], node_ids: list[NodeId]) -> list[Edge]:
-    """Return an edge for each transition of a recording between two nodes."""
-    steps = pairwise(zip(frames, node_ids, strict=True))
-    edges = {
-        (source, target)
-        for (a, source), (b, target) in steps
-        if a.sequence is b.sequence and source != target
-    }
-    return [Edge(source, target) for source, target in sorted(edges)]
-
-
-def _compute_trajectory_length(frames: list[MappingFrame]) -> float:
-    steps = [
-        b.world_from_cam.translation - a.world_from_cam.translation
-        for a, b in pairwise(frames)
-        if a.sequence is b.sequence
-    ]
-    return float(sum(np.linalg.norm(step) for step in steps))

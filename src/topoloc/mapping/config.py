@@ -60,42 +60,40 @@ class MapConfig:
         """Return the feature type of virtual nodes. It follows from the first learned type, or from
         the first type if none is learned."""
         kinds = [find_feature_type(kind) for kind in self.kinds]
-        return next(
-            (kind for kind in kinds if kind.network is not None), kinds[0]
-        ).virtual_view_type
+        return next((one for one in kinds if one.network is not None), kinds[0]).virtual_view_type
 
     def feature_config_for(self, kind: str) -> FeatureConfig:
         """Return the feature settings of a type. Other types than the first use their own default
         normalization."""
-        return (
-            self.features
-            if kind == self.features.kind
-            else replace(self.features, kind=kind, normalization=None)
-        )
+        if kind == self.features.kind:
+            return self.features
+        return replace(self.features, kind=kind, normalization=None)
 
     def vlad_config_for(self, kind: str) -> VladConfig:
         """Return the settings of surf-vlad for a feature type."""
-        weight = self.vlad.position_weight
-        return replace(
-            self.vlad,
-            position_weight=find_feature_type(kind).position_weight if weight is None else weight,
-        )
+        if self.vlad.position_weight is not None:
+            return self.vlad
+        return replace(self.vlad, position_weight=find_feature_type(kind).position_weight)
 
     @property
     def d_thresh(self) -> float:
         """Return D_thresh of Eq. 1 in metres. It must be resolved, as in any built map."""
-        assert self.nodes.d_thresh is not None, "the configuration of a map that is not built yet"
-        return self.nodes.d_thresh
+        return _resolved(self.nodes.d_thresh)
 
     @property
     def lambda_rot(self) -> float:
         """Return lambda of Eq. 1 in metres per radian."""
-        assert self.nodes.lambda_rot is not None, "the configuration of a map that is not built yet"
-        return self.nodes.lambda_rot
+        return _resolved(self.nodes.lambda_rot)
 
     def to_json(self) -> dict[str, Any]:
         """Return the settings and their version as JSON."""
         return {"version": CONFIG_VERSION, **asdict(self)}
+
+
+def _resolved(value: float | None) -> float:
+    if value is None:
+        raise ValueError("the configuration of a map that is not built yet")
+    return value
 
 
 def config_to_text(config: MapConfig) -> str:

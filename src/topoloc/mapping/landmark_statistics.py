@@ -26,11 +26,17 @@ PULL_SCALE = 1024.0
 """Pulls are stored as L^-1 g with A = L L', in steps of 1 / PULL_SCALE. They have no unit and are
 about 1."""
 MAX_COUNT = 65535
-_MIN_INFORMATION = (
-    # 1 / square metres; added to the diagonal, so that the Cholesky root of zero information exists
-    1e-6
-)
+# 1 / square metres; added to the diagonal, so that the Cholesky root of zero information exists
+_MIN_INFORMATION = 1e-6
 _MAX_EMPTY_ROOT = 1.01 * _MIN_INFORMATION**0.5
+_COLUMNS = (
+    ("rows", "<u2", 1),
+    ("roots", "<f2", 6),
+    ("pulls", "<i2", 3),
+    ("expected", "<u2", 1),
+    ("seen", "<u2", 1),
+)
+"""The arrays in the file: name, type and width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,23 +80,27 @@ class LandmarkStatistics:
             np.minimum(seen, MAX_COUNT).astype(np.uint16),
         )
 
+    @staticmethod
+    def of_counts(
+        session_id: int, expected: Int[np.ndarray, " n"], seen: Int[np.ndarray, " n"]
+    ) -> LandmarkStatistics:
+        """Create the statistics of a session that only counted, from the counts of all points of a
+        node. Points that it did not expect are left out."""
+        rows = np.flatnonzero(expected > 0)
+        nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
+        return LandmarkStatistics.of(session_id, rows, *nothing, expected[rows], seen[rows])
+
     @property
     def is_count_only(self) -> bool:
         """Return whether the session contains only counts and no information on positions."""
-        return (
-            len(self.rows) > 0
-            and not self.pulls.any()
-            and float(np.abs(self.roots).max()) <= _MAX_EMPTY_ROOT
-        )
+        is_empty = not self.pulls.any() and bool((np.abs(self.roots) <= _MAX_EMPTY_ROOT).all())
+        return len(self.rows) > 0 and is_empty
 
     def is_reobserved(self, min_seen_share: float = 0.3) -> bool:
-        """Return whether the session saw at least this share of its expected observations.
-
-        A session in other light may see none of them.
-        """
-        return bool(
-            self.seen.sum(dtype=np.int64) >= min_seen_share * self.expected.sum(dtype=np.int64)
-        )
+        """Return whether the session saw at least this share of its expected observations. A
+        session in other light may see none of them."""
+        seen, expected = (counts.sum(dtype=np.int64) for counts in (self.seen, self.expected))
+        return bool(seen >= min_seen_share * expected)
 
 
 def merge_count_statistics(statistics: Iterable[LandmarkStatistics]) -> list[LandmarkStatistics]:
@@ -118,22 +128,14 @@ def _add_counts(parts: Sequence[LandmarkStatistics]) -> LandmarkStatistics:
     for part in parts:
         expected[part.rows] += part.expected
         seen[part.rows] += part.seen
-    rows = np.flatnonzero(expected > 0)
-    nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
-    return LandmarkStatistics.of(last.session_id, rows, *nothing, expected[rows], seen[rows])
+    return LandmarkStatistics.of_counts(last.session_id, expected, seen)
 
 
 def encode_statistics(statistics: LandmarkStatistics) -> bytes:
     """Encode rows, roots, pulls and counts as 16-bit words, with all low bytes before all high
     bytes, compressed by zlib."""
-    parts = (
-        (statistics.rows, "<u2"),
-        (statistics.roots, "<f2"),
-        (statistics.pulls, "<i2"),
-        (statistics.expected, "<u2"),
-        (statistics.seen, "<u2"),
-    )
-    words = np.frombuffer(b"".join(part.astype(dtype).tobytes() for part, dtype in parts), np.uint8)
+    parts = (getattr(statistics, name).astype(dtype) for name, dtype, _ in _COLUMNS)
+    words = np.frombuffer(b"".join(part.tobytes() for part in parts), np.uint8)
     return zlib.compress(np.ascontiguousarray(words.reshape(-1, 2).T).tobytes(), 6)
 
 
@@ -146,14 +148,10 @@ def decode_statistics(
         decompress_bytes(data, 24 * num_rows, what), "u1", (2, 12 * num_rows), what
     )
     words = np.ascontiguousarray(planes.T).tobytes()
-    m, parts, start = num_rows, [], 0
-    for dtype, width in (("<u2", 1), ("<f2", 6), ("<i2", 3), ("<u2", 1), ("<u2", 1)):
-        parts.append(
-            array_from_bytes(
-                words[start : start + 2 * m * width], dtype, (m, width) if width > 1 else (m,), what
-            )
-        )
-        start += 2 * m * width
+    m, parts = num_rows, []
+    for _, dtype, width in _COLUMNS:
+        data, words = words[: 2 * m * width], words[2 * m * width :]
+        parts.append(array_from_bytes(data, dtype, (m, width) if width > 1 else (m,), what))
     rows = parts[0].astype(np.int64)
     if m and (int(rows[-1]) >= num_points or (np.diff(rows) <= 0).any()):
         raise CorruptDataError(f"{what}: of points that are not there")

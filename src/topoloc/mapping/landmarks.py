@@ -13,17 +13,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from topoloc.compiled import kernel
 from topoloc.features.config import MatchingConfig
 from topoloc.features.features import Features
 from topoloc.features.matching import match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.landmark_kernels import add_observations
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
+from topoloc.points.metric_points import keypoint_sigmas
 
 _CAUCHY_SCALE = 2.385  # in standard deviations of a residual
-
-
 NODES_PER_IMAGE = 3  # nodes whose points a mapping image observes, the nearest ones
 
 
@@ -60,7 +59,6 @@ def observe_points(
     points_cam: Float[np.ndarray, "n 3"],
     covariances: Float[np.ndarray, "n 3 3"],
     features: Features,
-    feature_sigmas_px: Float[np.ndarray, " m"],
     camera: Camera,
     cam_from_node: Rigid3,
     session_id: int = 0,
@@ -78,7 +76,7 @@ def observe_points(
     )
     rows, columns = matches.query_idx.astype(np.int64), matches.train_idx
     normalized = camera.normalized_from_img(features.points_img[columns].astype(np.float64))
-    sigmas = np.hypot(feature_sigmas_px[columns], pose_sigma_px) / camera.fx
+    sigmas = np.hypot(keypoint_sigmas(features)[columns], pose_sigma_px) / camera.fx
     residuals, jacobians, in_front = _project(points_cam[rows], normalized, cam_from_node)
     expected = jacobians @ covariances[rows] @ jacobians.transpose(0, 2, 1) + sigmas[
         :, None, None
@@ -98,14 +96,8 @@ def refine_points(
     num_iterations: int = 6,
 ) -> RefinedPoints:
     """Triangulate a node's points (node's camera frame, metres) from all observations with fixed
-    poses.
-
-    Gauss-Newton per point with Cauchy loss on each observation. The first measurement and its
-    covariance are the prior.
-
-    Args:
-        num_iterations: number of Gauss-Newton steps.
-    """
+    poses, by `num_iterations` Gauss-Newton steps per point with Cauchy loss on each observation.
+    The first measurement and its covariance are the prior."""
     # Points are dropped if the root mean square of their refined residuals exceeds this, in
     # standard deviations.
     max_disagreement = 3.0
@@ -116,9 +108,7 @@ def refine_points(
         information, gradient, _ = _normal_equations(points, points_cam, prior, observations)
         points = points - np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
     information, _, squares = _normal_equations(points, points_cam, prior, observations)
-    num_observations = np.zeros(len(points), np.int64)
-    for seen in observations:
-        num_observations[seen.rows] += 1
+    num_observations = _count_observations(len(points), observations)[1]
     rms = np.sqrt(squares / np.maximum(2 * num_observations, 1))
     is_consistent = (rms < max_disagreement) & np.isfinite(points).all(axis=1) & (points[:, 2] > 0)
     return RefinedPoints(points, np.linalg.inv(information), num_observations, is_consistent)
@@ -133,42 +123,19 @@ def compute_session_statistics(
     node_session_id: int,
 ) -> list[LandmarkStatistics]:
     """Return each session's contribution to the `refined` positions. Rows count within the points
-    `kept`.
-
-    Args:
-        refined: the refined positions of all points.
-        points_cam, covariances: the first measurement. It belongs to the session `node_session_id`,
-            whose image saw every point.
-        observations: the observations of all sessions.
-        kept: the rows of the points that stay.
-        node_session_id: the session of the node.
-    """
+    `kept`. The first measurement (`points_cam`, `covariances`) belongs to the session
+    `node_session_id`, whose image saw every point."""
     prior, statistics = np.linalg.inv(covariances), []
     for session_id in sorted({node_session_id, *(seen.session_id for seen in observations)}):
-        is_own, of_session = (
-            session_id == node_session_id,
-            [seen for seen in observations if seen.session_id == session_id],
-        )
-        information, pulls, _ = _normal_equations(
-            refined, points_cam, prior if is_own else np.zeros_like(prior), of_session
-        )
-        expected, num_seen = (np.full(len(refined), int(is_own)) for _ in range(2))
-        for seen in of_session:
-            expected[np.union1d(seen.in_view, seen.rows)] += 1
-            num_seen[seen.rows] += 1
+        is_own = session_id == node_session_id
+        of_session = [seen for seen in observations if seen.session_id == session_id]
+        own_prior = prior if is_own else np.zeros_like(prior)
+        information, pulls, _ = _normal_equations(refined, points_cam, own_prior, of_session)
+        expected, num_seen = int(is_own) + _count_observations(len(refined), of_session)
         rows = np.flatnonzero(expected[kept] > 0)
-        known = kept[rows]
         if len(rows):
-            statistics.append(
-                LandmarkStatistics.of(
-                    session_id,
-                    rows,
-                    information[known],
-                    pulls[known],
-                    expected[known],
-                    num_seen[known],
-                )
-            )
+            of_rows = (sums[kept[rows]] for sums in (information, pulls, expected, num_seen))
+            statistics.append(LandmarkStatistics.of(session_id, rows, *of_rows))
     return statistics
 
 
@@ -180,15 +147,19 @@ def count_session_observations(
 
     The positions stay, so the information is 0 and only the counts take space in the file.
     """
-    expected, num_seen = np.zeros(num_points, np.int64), np.zeros(num_points, np.int64)
+    expected, num_seen = _count_observations(num_points, observations)
+    return LandmarkStatistics.of_counts(session_id, expected, num_seen) if expected.any() else None
+
+
+def _count_observations(
+    num_points: int, observations: list[Observations]
+) -> Int[np.ndarray, "2 n"]:
+    """Return how often each point should have been seen, and how often it was."""
+    counts = np.zeros((2, num_points), np.int64)
     for seen in observations:
-        expected[np.union1d(seen.in_view, seen.rows)] += 1
-        num_seen[seen.rows] += 1
-    rows = np.flatnonzero(expected > 0)
-    if len(rows) == 0:
-        return None
-    nothing = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
-    return LandmarkStatistics.of(session_id, rows, *nothing, expected[rows], num_seen[rows])
+        counts[0, np.union1d(seen.in_view, seen.rows)] += 1
+        counts[1, seen.rows] += 1
+    return counts
 
 
 def _in_view(
@@ -218,7 +189,7 @@ def _normal_equations(
     squares = np.einsum("ni,ni->n", gradient, offset)
     for seen in observations:
         pose = seen.cam_from_node
-        add_observations(
+        _add_observations(
             points,
             seen.rows,
             seen.normalized,
@@ -231,6 +202,53 @@ def _normal_equations(
             squares,
         )
     return information, gradient, squares
+
+
+@kernel(error_model="numpy")
+def _add_observations(
+    points,
+    rows,
+    normalized,
+    sigmas,
+    rotation,
+    translation,
+    cauchy_scale,
+    information,
+    gradient,
+    squares,
+):
+    """Add observations of one image to `information`, `gradient` and `squares`, which have one row
+    per point.
+
+    Point `rows[m]` is observed at `normalized[m]` (plane z = 1) with standard deviation
+    `sigmas[m]`. The pose of the camera is `rotation` and `translation`. A point behind the camera
+    adds only to its squared residual.
+    """
+    jacobian = np.empty((2, 3))
+    residual = np.empty(2)
+    for m in range(len(rows)):
+        n, sigma = rows[m], sigmas[m]
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
+        if not depth > 1e-3:
+            squares[n] += 1e6
+            continue
+        square = 0.0
+        for k in range(2):
+            projected = (
+                rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + translation[k]
+            ) / depth
+            residual[k] = projected - normalized[m, k]
+            square += (residual[k] / sigma) ** 2
+            for i in range(3):
+                jacobian[k, i] = rotation[k, i] / depth - projected / depth * rotation[2, i]
+        squares[n] += square
+        weight = 1.0 / (1.0 + square / cauchy_scale**2) / sigma**2
+        for i in range(3):
+            a, b = weight * jacobian[0, i], weight * jacobian[1, i]
+            gradient[n, i] += a * residual[0] + b * residual[1]
+            for j in range(3):
+                information[n, i, j] += a * jacobian[0, j] + b * jacobian[1, j]
 
 
 def _project(

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, groupby
+from itertools import chain, groupby, pairwise
 from typing import TypeVar
 
 import cv2
+import numpy as np
 
 from topoloc.errors import TrajectoryError
 from topoloc.features.extraction import extract_features
@@ -21,7 +22,9 @@ from topoloc.features.parallel import parallel_map
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.config import MapConfig
-from topoloc.mapping.sessions import Illumination
+from topoloc.mapping.sessions import Illumination, Session, average_illumination
+from topoloc.mapping.storage.entries import Edge, PlaceImage
+from topoloc.node_ids import NodeId
 from topoloc.points.metric_points import MetricPoints, keypoint_sigmas, locate_points
 from topoloc.points.motion_triangulation import (
     SourceImage,
@@ -32,13 +35,12 @@ from topoloc.points.motion_triangulation import (
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
 from topoloc.recordings.image_io import encode_jpeg
-from topoloc.recordings.recording import has_scale, read_left_frame
+from topoloc.recordings.recording import find_source_path, has_scale, read_left_frame
 
 R = TypeVar("R")
 
-_MAX_CACHED_IMAGES = (
-    48  # monocular images locate the points of several nodes, so their features are cached
-)
+# Monocular images locate the points of several nodes, so their features are cached.
+_MAX_CACHED_IMAGES = 48
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,18 +114,64 @@ def select_posed_frames(sequence: StereoSequence, session_id: int) -> list[Mappi
     return frames
 
 
+def create_session(
+    sequence: StereoSequence,
+    frames: Sequence[MappingFrame],
+    poses_from: str,
+    camera: Camera | None,
+    lights: Sequence[Illumination],
+) -> Session:
+    """Return the map's record of a recording with these mapping frames and illuminations."""
+    t_ns = [frame.t_ns for frame in frames]
+    return Session(
+        frames[0].session_id,
+        sequence.name,
+        find_source_path(sequence),
+        poses_from,
+        min(t_ns),
+        max(t_ns),
+        camera,
+        average_illumination(lights),
+    )
+
+
+def compute_trajectory_length(frames: Sequence[MappingFrame]) -> float:
+    """Return the length in metres of the trajectories of all recordings together."""
+    steps = [
+        b.world_from_cam.translation - a.world_from_cam.translation
+        for a, b in pairwise(frames)
+        if a.sequence is b.sequence
+    ]
+    return float(sum(np.linalg.norm(step) for step in steps))
+
+
+def connect_nodes(frames: Sequence[MappingFrame], node_ids: Sequence[NodeId]) -> set[Edge]:
+    """Return an edge for each transition of a recording between two nodes."""
+    return {
+        Edge(source, target)
+        for (a, source), (b, target) in pairwise(zip(frames, node_ids, strict=True))
+        if a.sequence is b.sequence and source != target
+    }
+
+
 def extract_mapping_image(
     frame: MappingFrame, view: PreparedFrame, config: MapConfig
 ) -> MappingImage:
     """Extract the features of all types from a frame that has been read."""
-    jpeg = encode_place_image(view.picture)
+    jpeg, light = encode_place_image(view.picture), Illumination.of_image(view.picture)
     world_from_view = frame.world_from_cam @ view.view_from_cam.inverse()
     features = {
         kind: extract_features(view.grey, config.feature_config_for(kind)) for kind in config.kinds
     }
-    return MappingImage(
-        view.camera, world_from_view, features, jpeg, Illumination.of_image(view.picture)
-    )
+    return MappingImage(view.camera, world_from_view, features, jpeg, light)
+
+
+def create_place_image(
+    frame: MappingFrame, image: MappingImage, node_id: NodeId, image_id: int | None = None
+) -> PlaceImage:
+    """Return the map's entry of a mapping image, labelled with its node."""
+    of_image = (node_id, image.world_from_cam, image.place_jpeg, frame.session_id, image_id)
+    return PlaceImage(frame.sequence.name, frame.name, *of_image)
 
 
 def encode_place_image(picture: Image, side_px: int = 160) -> bytes:
@@ -162,9 +210,8 @@ class PointLocator:
         for _, of_session in groupby(frames, lambda frame: frame.session_id):
             read = ((frame, frame.read()) for frame in of_session)
             first = next(read)
-            yield from (map if _is_monocular(first[1]) else parallel_map)(
-                work, chain([first], read)
-            )
+            run = map if _is_monocular(first[1]) else parallel_map
+            yield from run(work, chain([first], read))
 
     def image(self, frame: MappingFrame, view: PreparedFrame) -> MappingImage:
         """Return the extracted mapping image of a frame, from the cache if possible."""
@@ -194,18 +241,15 @@ class PointLocator:
         images = [self.image(other, other.view()) for other in others]
         points = {}
         for kind, features in image.features.items():
+            source_images = [
+                SourceImage(
+                    other.features[kind],
+                    keypoint_sigmas(other.features[kind]),
+                    other.camera,
+                    other.world_from_cam.inverse() @ image.world_from_cam,
+                )
+                for other in images
+            ]
             sigmas = keypoint_sigmas(features)
-            source_images = [self._make_source_image(of_other, kind, image) for of_other in images]
             points[kind] = triangulate_from_motion(features, sigmas, image.camera, source_images)
         return points, others
-
-    def _make_source_image(
-        self, other: MappingImage, kind: str, image: MappingImage
-    ) -> SourceImage:
-        sigmas = keypoint_sigmas(other.features[kind])
-        return SourceImage(
-            other.features[kind],
-            sigmas,
-            other.camera,
-            other.world_from_cam.inverse() @ image.world_from_cam,
-        )

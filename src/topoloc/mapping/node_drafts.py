@@ -3,7 +3,7 @@ node."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -28,7 +28,6 @@ from topoloc.mapping.mapping_frames import (
 from topoloc.mapping.storage.entries import NodeSummary, TopoNode
 from topoloc.mapping.virtual_nodes import create_virtual_nodes
 from topoloc.node_ids import NodeId, Row
-from topoloc.points.metric_points import keypoint_sigmas
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.retrieval.vlad import append_positions
 
@@ -48,9 +47,10 @@ class DraftPoints:
 
 @dataclass(frozen=True, eq=False)
 class NodeDraft:
-    """Hold a draft node with its points by feature type. `sources` are the frames of the first
-    measurement."""
+    """Hold a draft node with its points by feature type. `summary` has no id and no points yet.
+    `sources` are the frames of the first measurement."""
 
+    summary: NodeSummary
     frame: MappingFrame
     image: MappingImage
     template_jpeg: bytes
@@ -116,12 +116,8 @@ def create_node_draft(
     points = {}
     for kind, features in image.features.items():
         rows = np.flatnonzero(located[kind].valid)
-        points[kind] = DraftPoints(
-            features.select(rows),
-            located[kind].points_cam[rows],
-            located[kind].covariances[rows],
-            [],
-        )
+        positions, covariances = located[kind].points_cam[rows], located[kind].covariances[rows]
+        points[kind] = DraftPoints(features.select(rows), positions, covariances, [])
     template_jpeg = encode_thumbnail(view.picture, 240, quality=75)
     summary = NodeSummary(
         NodeId(-1),
@@ -133,15 +129,11 @@ def create_node_draft(
         frame.session_id,
     )
     sides = (
-        create_virtual_nodes(
-            summary,
-            view,
-            config.feature_config_for(config.virtual_view_type),
-        )
+        create_virtual_nodes(summary, view, config.feature_config_for(config.virtual_view_type))
         if has_virtual_views and not sources
         else []
     )
-    return NodeDraft(frame, image, template_jpeg, points, sides, [frame, *sources])
+    return NodeDraft(summary, frame, image, template_jpeg, points, sides, [frame, *sources])
 
 
 def observe_draft(
@@ -151,24 +143,31 @@ def observe_draft(
     cam_from_node = image.world_from_cam.inverse() @ draft.image.world_from_cam
     observed = {}
     for kind, features in image.features.items():
-        points, sigmas_px = draft.points[kind], keypoint_sigmas(features)
-        known, seen_by = (
-            (points.features, points.points_cam, points.covariances),
-            (features, sigmas_px, image.camera, cam_from_node),
-        )
-        observed[kind] = observe_points(*known, *seen_by, session_id)
+        points = draft.points[kind]
+        known = points.features, points.points_cam, points.covariances
+        observed[kind] = observe_points(*known, features, image.camera, cam_from_node, session_id)
     return observed
+
+
+def observe_node(
+    node: TopoNode, features: Features, camera: Camera, cam_from_node: Rigid3, session_id: int = 0
+) -> Observations:
+    """Search an image of `camera` for a finished node's landmarks near their projections. See
+    `observe_points`. `features` are the image's, of the node's feature type."""
+    roots = np.zeros((len(node.features), 3, 3))
+    roots[:, *np.tril_indices(3)] = node.point_sqrt_covs
+    known = (node.features, node.points_cam.astype(np.float64), roots @ roots.transpose(0, 2, 1))
+    return observe_points(*known, features, camera, cam_from_node, session_id)
 
 
 def finish_node(node_id: NodeId, draft: NodeDraft, kind: str, max_points: int = 800) -> TopoNode:
     """Refine the points of a feature type and return the node. Points observed again are preferred,
     then the strongest. At most `max_points` are kept."""
-    points, frame, image = draft.points[kind], draft.frame, draft.image
+    points, first = draft.points[kind], draft.summary
     refined = refine_points(points.points_cam, points.covariances, points.observations)
     rows = np.flatnonzero(refined.is_consistent)
-    rows = np.sort(
-        rows[np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")][:max_points]
-    )
+    best = np.argsort(-np.minimum(refined.num_observations[rows], 2), kind="stable")[:max_points]
+    rows = np.sort(rows[best])
     sqrt_covs = np.linalg.cholesky(refined.covariances[rows])[:, *np.tril_indices(3)]
     session_statistics = compute_session_statistics(
         refined.points_cam,
@@ -176,19 +175,11 @@ def finish_node(node_id: NodeId, draft: NodeDraft, kind: str, max_points: int = 
         points.covariances,
         points.observations,
         rows,
-        frame.session_id,
+        first.session_id,
     )
     return TopoNode(
-        NodeSummary(
-            node_id,
-            frame.sequence.name,
-            frame.name,
-            frame.t_ns,
-            image.world_from_cam,
-            len(rows),
-            frame.session_id,
-        ),
-        image.camera,
+        replace(first, node_id=node_id, num_points=len(rows)),
+        draft.image.camera,
         points.features.select(rows),
         refined.points_cam[rows].astype(np.float32),
         sqrt_covs.astype(np.float32),

@@ -59,8 +59,8 @@ class NodePoses:
     def of(world_from_nodes: list[Rigid3]) -> NodePoses:
         """Stack poses (world_from_node) into arrays."""
         return NodePoses(
-            np.array([p.translation for p in world_from_nodes]),
-            np.array([p.rotation for p in world_from_nodes]),
+            np.array([p.translation for p in world_from_nodes]).reshape(-1, 3),
+            np.array([p.rotation for p in world_from_nodes]).reshape(-1, 3, 3),
         )
 
     def rows(self, rows: Sequence[int] | Int[np.ndarray, " some"]) -> NodePoses:
@@ -79,27 +79,21 @@ def node_distances(
 
 
 def select_node_frames(
-    world_from_cams: list[Rigid3], config: NodeConfig
+    world_from_cams: list[Rigid3], d_thresh: float, lambda_rot: float
 ) -> Int[np.ndarray, " nodes"]:
-    """Return the frames along a trajectory that become nodes by Eq. 1. `config` must be
-    resolved."""
-    assert config.d_thresh is not None, "resolve the configuration first"
-    assert config.lambda_rot is not None, "resolve the configuration first"
+    """Return the frames along a trajectory that become nodes by Eq. 1."""
     poses, frame_idx = NodePoses.of(world_from_cams), list[int]()
     cells: dict[tuple[int, ...], list[int]] = {}  # selected frames by their cube of side D_thresh
     for k, (world_from_cam, cell) in enumerate(
-        zip(world_from_cams, np.floor(poses.centres / config.d_thresh).tolist(), strict=True)
+        zip(world_from_cams, np.floor(poses.centres / d_thresh).tolist(), strict=True)
     ):
         near = [
             frame
             for step in _STEPS
             for frame in cells.get((cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]), ())
         ]
-        if (
-            not near
-            or node_distances(world_from_cam, poses.rows(near), config.lambda_rot).min()
-            > config.d_thresh
-        ):
+        distances = node_distances(world_from_cam, poses.rows(near), lambda_rot)
+        if distances.min(initial=np.inf) > d_thresh:
             frame_idx.append(k)
             cells.setdefault(tuple(cell), []).append(k)
     return np.array(frame_idx)
@@ -136,8 +130,6 @@ def compute_nodes_digest(summaries: Sequence[NodeSummary], method: bytes) -> str
     identifies results computed from the nodes."""
     digest = hashlib.sha256(method)
     for summary in summaries:
-        digest.update(
-            summary.world_from_cam.matrix().astype("<f8").tobytes()
-            + summary.num_points.to_bytes(4, "little")
-        )
+        digest.update(summary.world_from_cam.matrix().astype("<f8").tobytes())
+        digest.update(summary.num_points.to_bytes(4, "little"))
     return digest.hexdigest()[:16]

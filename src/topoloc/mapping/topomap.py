@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar, no_type_check
 
 import numpy as np
@@ -139,13 +138,12 @@ class TopoMetricMap:
     @property
     def free_ids(self) -> NextIds:
         """Return ids that were never used in the map. Place images receive theirs at writing."""
+        known = self.next_ids
         return replace(
-            self.next_ids,
-            session=max(
-                [self.next_ids.session, *(session.session_id + 1 for session in self.sessions)]
-            ),
-            node=max([self.next_ids.node, *(summary.node_id + 1 for summary in self.summaries)]),
-            edit=max([self.next_ids.edit, *(edit.edit_id + 1 for edit in self.edits)]),
+            known,
+            session=max([known.session, *(session.session_id + 1 for session in self.sessions)]),
+            node=max([known.node, *(summary.node_id + 1 for summary in self.summaries)]),
+            edit=max([known.edit, *(edit.edit_id + 1 for edit in self.edits)]),
         )
 
     @property
@@ -176,7 +174,7 @@ class TopoMetricMap:
     def describe(self, path: str | Path) -> dict[str, Any]:
         """Return the facts of a map that is stored at `path` as JSON: counts, bytes, metres,
         sessions, edits, configuration. Raises EmptyMapError: the map has no node."""
-        from topoloc.mapping.description import describe_map
+        from topoloc.mapping.storage.integrity_check import describe_map
 
         return describe_map(self, Path(path))
 
@@ -244,12 +242,7 @@ class TopoMetricMap:
     def __enter__(self) -> TopoMetricMap:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *failure: object) -> None:
         self.close()
 
     @property

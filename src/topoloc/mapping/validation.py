@@ -7,7 +7,6 @@ import io
 import math
 import zipfile
 import zlib
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ import numpy as np
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Count, decode_json
 
 MAX_POINTS = 100_000
 MAX_SIDE_PX = 32_768
@@ -34,11 +32,7 @@ def array_from_bytes(data: bytes, dtype: str, shape: tuple[int, ...], what: str)
             f"{what}: {len(data)} bytes are not {' x '.join(map(str, shape))} {dtype}"
         )
     array = np.frombuffer(data, dtype).reshape(shape)
-    if (
-        array.dtype.kind == "f"
-        and array.size
-        and not (float(np.abs(array).max()) <= _MAX_MAGNITUDE)
-    ):  # NaN compares as false
+    if array.dtype.kind == "f" and not (np.abs(array) <= _MAX_MAGNITUDE).all():  # also if NaN
         raise CorruptDataError(f"{what}: a number that is not finite or beyond {_MAX_MAGNITUDE:g}")
     return array
 
@@ -74,14 +68,6 @@ def check_count(value: int, least: int, most: int, what: str) -> int:
     return value
 
 
-def parse_counts(text: str | None, tables: Iterable[str]) -> dict[str, int]:
-    """Return the number of rows of each table from the map's JSON. Raises CorruptDataError."""
-    counts = decode_json(text, dict[str, Count], CorruptDataError, "the numbers of rows")
-    if set(counts) != set(tables) - {"map"}:
-        raise CorruptDataError("the numbers of rows are missing")
-    return counts
-
-
 def decompress_bytes(data: bytes, num_bytes: int, what: str) -> bytes:
     """Decompress zlib data of exactly this length. Raises CorruptDataError."""
     unpacker = zlib.decompressobj()
@@ -102,10 +88,7 @@ def arrays_from_npz(data: bytes, what: str) -> dict[str, np.ndarray]:
             members = archive.infolist()
             if len(members) > 2000 or sum(member.file_size for member in members) > len(data):
                 raise CorruptDataError(f"{what}: larger than it can be")
-            if any(
-                member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1
-                for member in members
-            ):
+            if any(one.compress_type != zipfile.ZIP_STORED or one.flag_bits & 1 for one in members):
                 raise CorruptDataError(f"{what}: of a compression that no map has")
             return {
                 member.filename.removesuffix(".npy"): _array_from_npy(archive.read(member), what)

@@ -20,29 +20,26 @@ from topoloc.disk_list import DiskList
 from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.nodes import NodeConfig, select_node_frames
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.nodes import select_node_frames
 from topoloc.mapping.storage.entries import NodeSummary, TopoNode, VirtualNodes
-from topoloc.node_ids import NodeId, Row
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.points.metric_points import locate_points
 from topoloc.recordings.frame_preparation import PreparedFrame
 from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
 
-def select_virtual_view_nodes(
-    world_from_nodes: list[Rigid3], node_config: NodeConfig, spacing: float
-) -> set[Row]:
-    """Return the rows of the poses that need virtual views. `node_config` (of the map) must be
-    resolved. `spacing` is that of `VirtualNodesConfig`."""
+def select_virtual_view_nodes(world_from_nodes: list[Rigid3], config: MapConfig) -> set[Row]:
+    """Return the rows of the poses that need virtual views. `config` is that of the map."""
     # A node needs no virtual nodes if another node within this many D_thresh looks in the
     # opposite direction.
     max_opposite = 10.0
+    spacing = config.sides.spacing
     if spacing == 0.0:
         return set()
-    assert node_config.d_thresh is not None, "resolve the configuration first"
-    assert node_config.lambda_rot is not None, "resolve the configuration first"
-    reach = max_opposite * node_config.d_thresh
-    spaced = NodeConfig(spacing * node_config.d_thresh, node_config.lambda_rot / 2.0)
+    reach = max_opposite * config.d_thresh
     centres = np.array([pose.translation for pose in world_from_nodes])
     axes = np.array([pose.rotation[:, 2] for pose in world_from_nodes])
 
@@ -50,11 +47,30 @@ def select_virtual_view_nodes(
         near = np.linalg.norm(centres - centres[k], axis=1) < reach
         return bool((near & (axes @ axes[k] < -0.7)).any())
 
-    return {
-        Row(int(k))
-        for k in select_node_frames(world_from_nodes, spaced)
-        if not has_opposite_node(int(k))
-    }
+    d_thresh, lambda_rot = spacing * config.d_thresh, config.lambda_rot / 2.0
+    rows = as_rows(select_node_frames(world_from_nodes, d_thresh, lambda_rot))
+    return {row for row in rows if not has_opposite_node(row)}
+
+
+def find_new_virtual_views(topomap: TopoMetricMap, world_from_cams: Sequence[Rigid3]) -> set[int]:
+    """Return which of the poses need virtual views that no virtual node of the map provides. Return
+    an empty set if the map's virtual nodes have another feature type than new images."""
+    if topomap.sides is not None and topomap.sides.kind != topomap.config.virtual_view_type:
+        return set()
+    old = [summary.world_from_cam for summary in topomap.summaries]
+    chosen = select_virtual_view_nodes([*old, *world_from_cams], topomap.config)
+    return {row - len(old) for row in chosen if row >= len(old)}
+
+
+def add_virtual_nodes(topomap: TopoMetricMap, new_nodes: Sequence[TopoNode]) -> VirtualNodes | None:
+    """Return the map's virtual nodes with new ones of the same feature type. The retrieval model is
+    learned anew from all of them."""
+    before = topomap.sides
+    if not new_nodes:
+        return before
+    if before is None:
+        return collect_virtual_nodes(new_nodes, topomap.config.virtual_view_type)
+    return collect_virtual_nodes([*before.nodes, *new_nodes], before.kind)
 
 
 def create_virtual_nodes(
@@ -64,13 +80,8 @@ def create_virtual_nodes(
     max_points: int = 400,
     min_points: int = 20,
 ) -> list[TopoNode]:
-    """Return the virtual nodes of a node's image, at most two, without ids.
-
-    Args:
-        features: the settings of features.
-        max_points: maximum number of features per virtual node. The strongest are kept.
-        min_points: a virtual view with fewer features becomes no virtual node.
-    """
+    """Return the virtual nodes of a node's image, at most two, without ids. Each keeps the
+    `max_points` strongest features. A virtual view with fewer than `min_points` becomes none."""
     sides = (
         _create_virtual_node(of_node, view, virtual_view, features, max_points, min_points)
         for virtual_view in make_virtual_views(view.camera)
@@ -87,11 +98,8 @@ def collect_virtual_nodes(described: Sequence[TopoNode], kind: str) -> VirtualNo
         replace(node, summary=replace(node.summary, node_id=NodeId(k)))
         for k, node in enumerate(described)
     )
-    model = _fit_vlad(nodes).to_model()
-    model = replace(
-        model,
-        arrays={**model.arrays, "centres": np.array([_median_point_world(node) for node in nodes])},
-    )
+    model, centres = _fit_vlad(nodes).to_model(), np.array([*map(_median_point_world, nodes)])
+    model = replace(model, arrays={**model.arrays, "centres": centres})
     return VirtualNodes([node.summary for node in nodes], nodes, {model.name: model}, kind)
 
 
@@ -111,19 +119,15 @@ def _create_virtual_node(
     side_from_cam = virtual_view.cam_from_virtual.inverse()
     points_side = side_from_cam.apply(located.points_cam)
     with np.errstate(invalid="ignore"):
-        rows = np.flatnonzero(located.valid & (points_side[:, 2] > 0.1 * located.points_cam[:, 2]))[
-            :max_points
-        ]
+        in_front = located.valid & (points_side[:, 2] > 0.1 * located.points_cam[:, 2])
+    rows = np.flatnonzero(in_front)[:max_points]
     if len(rows) < min_points:
         return None
     turn = side_from_cam.rotation
     roots = np.linalg.cholesky(turn @ located.covariances[rows] @ turn.T)
+    pose = of_node.world_from_cam @ virtual_view.cam_from_virtual
     return TopoNode(
-        replace(
-            of_node,
-            world_from_cam=of_node.world_from_cam @ virtual_view.cam_from_virtual,
-            num_points=len(rows),
-        ),
+        replace(of_node, world_from_cam=pose, num_points=len(rows)),
         virtual_view.camera,
         features.select(rows),
         points_side[rows].astype(np.float32),
@@ -134,9 +138,8 @@ def _create_virtual_node(
 
 def _median_point_world(node: TopoNode) -> Float[np.ndarray, " 3"]:
     """Return the median point of a node in the world."""
-    return node.summary.world_from_cam.apply(
-        np.median(node.points_cam.astype(np.float64), axis=0)[None]
-    )[0]
+    median = np.median(node.points_cam.astype(np.float64), axis=0)
+    return node.summary.world_from_cam.apply(median[None])[0]
 
 
 def _fit_vlad(nodes: Sequence[TopoNode]) -> SurfVlad:

@@ -131,12 +131,7 @@ class PointTracker:
         scales = np.clip(depths[0] / np.maximum(depths[1], 1e-3), 0.5, 2.0).astype(np.float32)
         points_ref = self._inlier_points.points_img[rows]
         aligned = align_with_reference(
-            self._reference,
-            grey.astype(np.float32),
-            points_ref,
-            found,
-            scales,
-            max_shift_px=4.0,
+            self._reference, grey.astype(np.float32), points_ref, found, scales, max_shift_px=4.0
         )
         return rows[aligned.is_matched], aligned.points_img[aligned.is_matched]
 

@@ -234,10 +234,7 @@ class PoseHypotheses:
                 self._null_weight,
             )
             return
-        before, miss = (
-            self.best,
-            self.miss if len(candidates) == 1 else miss_ambiguous,
-        )
+        before, miss = (self.best, self.miss if len(candidates) == 1 else miss_ambiguous)
         none = max(miss, 1.0 - sum(one.probability for one in candidates))
         new = (
             self._merge_consistent(candidates[0], odom_from_cam, new_evidence_ratio)

@@ -167,12 +167,7 @@ class StreamLocalizer:
         depth = float(
             np.median(result.world_from_cam.inverse().apply(inlier_points.points_world)[:, 2])
         )
-        return LocalizedPose(
-            result,
-            inlier_points,
-            compute_pose_errors(result, depth),
-            probability,
-        )
+        return LocalizedPose(result, inlier_points, compute_pose_errors(result, depth), probability)
 
 
 def _place_probability(found: Localization) -> float:

@@ -332,7 +332,7 @@ def test_bugs_are_not_hidden(room_map: Path, monkeypatch: pytest.MonkeyPatch):
         def bug(*_: object, kind: type[Exception] = kind) -> None:
             raise kind
 
-        monkeypatch.setattr("topoloc.mapping.description.describe_map", bug)
+        monkeypatch.setattr("topoloc.mapping.storage.integrity_check.describe_map", bug)
         with pytest.raises(kind):
             main(["info", str(room_map)])
 

@@ -17,7 +17,7 @@ from topoloc.geometry.transform_consensus import (
     find_consensus,
     propagate_estimate,
 )
-from topoloc.lifelong.leave_one_out import sample_evenly
+from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.mapping.topomap import TopoMetricMap
 
 _SIGMA_M, _SIGMA_DEG = 0.01, 0.1  # of the transform between the maps as one image gives it

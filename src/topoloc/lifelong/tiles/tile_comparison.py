@@ -27,8 +27,7 @@ from topoloc.geometry.transform_consensus import (
     find_consensus,
     propagate_estimate,
 )
-from topoloc.lifelong.leave_one_out import sample_evenly
-from topoloc.lifelong.tiles.node_localization import localize_nodes
+from topoloc.lifelong.node_localization import localize_nodes, sample_evenly
 from topoloc.lifelong.tiles.shared_images import estimate_by_shared_images
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization

@@ -20,12 +20,7 @@ from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError, MapError
-from topoloc.lifelong.tiles.tile_comparison import (
-    NotJoined,
-    OpenTile,
-    TileTransform,
-    compare_tiles,
-)
+from topoloc.lifelong.tiles.tile_comparison import NotJoined, OpenTile, TileTransform, compare_tiles
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.build import Progress
 
@@ -160,9 +155,7 @@ class PairJob:
 
 
 def _select_pairs(
-    atlas: Atlas,
-    tile_ids: Sequence[str],
-    pairs: Sequence[tuple[str, str]] | None,
+    atlas: Atlas, tile_ids: Sequence[str], pairs: Sequence[tuple[str, str]] | None
 ) -> list[tuple[Tile, Tile]]:
     wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
     return (

@@ -17,10 +17,7 @@ from topoloc.recordings.frame import StereoSequence
 
 
 def find_tile_of_recording(
-    atlas: Atlas,
-    localizer: Localizer,
-    sequence: StereoSequence,
-    progress: Progress,
+    atlas: Atlas, localizer: Localizer, sequence: StereoSequence, progress: Progress
 ) -> Tile:
     """Return the tile in which most sampled images of a recording are localized.
 
@@ -46,10 +43,7 @@ def find_tile_of_recording(
 
 
 def select_tile(
-    name: str,
-    num_asked: int,
-    answers: Sequence[Localization],
-    tiles: Mapping[str, Tile],
+    name: str, num_asked: int, answers: Sequence[Localization], tiles: Mapping[str, Tile]
 ) -> Tile:
     """Return the tile with the most localizations.
 

@@ -3,9 +3,9 @@ nodes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import Any, TypeVar, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float32, Int8
@@ -15,8 +15,27 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
-from topoloc.node_ids import NodeId
+from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseModel
+
+T = TypeVar("T")
+
+
+class LazySequence(Sequence[T]):
+    """Show a sequence of `length()` entries. Each is the result of `read` for its row, at every
+    access."""
+
+    def __init__(self, length: Callable[[], int], read: Callable[[Row], T]) -> None:
+        self._length, self._read = length, read
+
+    def __len__(self) -> int:
+        return self._length()
+
+    def __getitem__(self, index: Any) -> Any:
+        rows = range(len(self))[index]  # raises IndexError
+        return (
+            [*map(self._read, as_rows(rows))] if isinstance(rows, range) else self._read(Row(rows))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +121,7 @@ class VirtualNodes:
         return self.kind in (kind, find_feature_type(kind).virtual_view_type)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class Edge:
     """A transition of the camera from node `source_id` to node `target_id`."""
 

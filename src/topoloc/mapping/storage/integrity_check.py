@@ -1,16 +1,20 @@
 """Check a whole map file: the checksum of every row, the digest, and the content of every entry.
-Also list its coarse localizers."""
+Also describe its contents in numbers and words."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from topoloc.errors import MapError
+import numpy as np
+
+from topoloc.errors import EmptyMapError, MapError
 from topoloc.json_data import decode_json
 from topoloc.mapping.coarse_models import open_map_coarse_localizer
+from topoloc.mapping.sessions import Session
 from topoloc.mapping.storage.map_file import MapFile
 from topoloc.mapping.storage.map_writing import compute_map_digest
 from topoloc.mapping.storage.schema import SORT_COLUMNS, TABLES
@@ -33,6 +37,48 @@ def find_map_damage(path: Path) -> list[str]:
     return list(dict.fromkeys(text.removeprefix(f"map {path} is damaged: ") for text in found))
 
 
+def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
+    """Return the facts of a map for evaluations and `info`: counts, bytes, extent, configuration.
+
+    Raises:
+        EmptyMapError: the map has no node.
+    """
+    if len(topomap.summaries) == 0:
+        raise EmptyMapError(f"map {path} has no nodes")
+    models = list_coarse_models(path)
+    centres = np.array([s.world_from_cam.translation for s in topomap.summaries])
+    return {
+        "path": str(path),
+        "map": topomap.id,
+        "version": topomap.version,
+        "georeference": None if topomap.georeference is None else topomap.georeference.to_json(),
+        "bytes": path.stat().st_size,
+        "num_nodes": len(topomap.summaries),
+        "num_points": sum(s.num_points for s in topomap.summaries),
+        "num_side_nodes": len(topomap.sides.summaries) if topomap.sides else 0,
+        "num_place_images": len(topomap.place_images),
+        "length_m": round(topomap.length_m, 3),
+        "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
+        "recordings": sorted({s.recording for s in topomap.summaries}),
+        "sessions": [_session_facts(session) for session in topomap.sessions],
+        "edits": [asdict(edit) for edit in topomap.edits],
+        "coarse": [model["name"] for model in models],
+        "default_coarse": topomap.default_coarse,
+        "kinds": topomap.kinds,
+        "coarse_models": models,
+        "config": topomap.config.to_json(),
+    }
+
+
+def _session_facts(session: Session) -> dict[str, Any]:
+    camera = None if session.camera is None else session.camera.to_json()
+    return asdict(session) | {
+        "camera": camera,
+        "start_date": session.start_date,
+        "end_date": session.end_date,
+    }
+
+
 def list_coarse_models(path: Path) -> list[dict[str, Any]]:
     """Return the name, bytes, backbone and weights of each coarse localizer of a map file. Raises
     MapError."""
@@ -42,10 +88,7 @@ def list_coarse_models(path: Path) -> list[dict[str, Any]]:
             query = (
                 "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
             )
-            return [
-                _model_facts(name, settings, num_bytes)
-                for name, settings, num_bytes in database.execute(query)
-            ]
+            return [_model_facts(*row) for row in database.execute(query)]
     finally:
         file.close()
 
@@ -54,46 +97,34 @@ def _check_rows(file: MapFile) -> Iterator[str]:
     checksums: dict[str, list[bytes]] = {}
     for table in TABLES:
         keys = tuple(SORT_COLUMNS[table].split(", "))
-        rows, damage = _try_read(lambda table=table, keys=keys: file.rows(table, keys))
+        rows, damage = _try_read(partial(file.rows, table, keys))
         yield from damage
-        for row in rows or ():
-            yield from _try_read(lambda table=table, row=row: file.row(table, **row))[1]
+        yield from _check_each(rows or (), lambda row, table=table: file.find(table, **row))
         if file.version > 1:
-            kept, _ = _try_read(lambda table=table: file.checksums(table))
-            checksums[table] = kept or []
+            checksums[table] = _try_read(partial(file.checksums, table))[0] or []
     if file.version > 1 and compute_map_digest(checksums) != file.digest:
         yield "its digest is not that of its rows"
 
 
 def _check_entries(topomap: TopoMetricMap) -> Iterator[str]:
     for layer in topomap.layers.values():
-        yield from _check_each(layer.nodes, _read_session_statistics)
+        yield from _check_each(layer.nodes, lambda node: list(node.session_statistics))
     yield from _check_each(topomap.place_images, lambda image: topomap.row_of(image.node_id))
     if topomap.repetitions is not None:
         moves = topomap.repetitions.moves
-        for node_id in moves:
-            yield from _try_read(lambda node_id=node_id: (moves[node_id], topomap.row_of(node_id)))[
-                1
-            ]
+        yield from _check_each(list(moves), lambda one: (moves[one], topomap.row_of(one)))
     known = {summary.node_id for summary in topomap.summaries}
     for edge in topomap.edges:
-        if not {edge.source_id, edge.target_id} <= known:
-            yield (
-                f"an edge from node {edge.source_id} to node {edge.target_id}, one of which is"
-                " missing"
-            )
+        ends = edge.source_id, edge.target_id
+        if not known.issuperset(ends):
+            yield "an edge from node {} to node {}, one of which is missing".format(*ends)
     for kind, layer in topomap.layers.items():
-        for name in layer.coarse_models:
-            yield from _try_read(partial(open_map_coarse_localizer, topomap, name, kind))[1]
+        opened = partial(open_map_coarse_localizer, topomap, kind=kind)
+        yield from _check_each(list(layer.coarse_models), opened)
     if topomap.sides is not None:
         yield from _check_each(topomap.sides.nodes, lambda node: None)
         sides = topomap.sides.coarse_models
-        for name in sides:
-            yield from _try_read(lambda name=name: open_coarse_localizer(sides[name]))[1]
-
-
-def _read_session_statistics(node: Any) -> None:
-    list(node.session_statistics)
+        yield from _check_each(list(sides), lambda name: open_coarse_localizer(sides[name]))
 
 
 def _check_each(entries: Any, look: Callable[[Any], Any]) -> Iterator[str]:

@@ -12,7 +12,7 @@ import sqlite3
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
@@ -26,19 +26,19 @@ from topoloc.errors import (
     MapError,
     MapVersionError,
 )
+from topoloc.json_data import Count, decode_json
 from topoloc.mapping.storage.schema import (
     APPLICATION_ID,
     SCHEMA_1,
-    SCHEMA_2_VIEWS,
     SCHEMA_VERSION,
     SORT_COLUMNS,
     TABLES,
     VIRTUAL_PREFIX,
-    Columns,
     compute_checksum,
     create_table_statement,
+    schema_2_views,
 )
-from topoloc.mapping.validation import CorruptDataError, parse_counts
+from topoloc.mapping.validation import CorruptDataError
 
 MAX_SECONDS = 5.0
 """Time limit of one read. The slowest valid read (all node summaries of a large map) takes a tenth
@@ -67,15 +67,16 @@ class MapFile:
     The content stays the same if another file is renamed over it.
 
     Raises:
-        MapError: the file is missing, not a topoloc map, truncated, or has unexpected tables.
+        MapError: the file is missing, not a topoloc map, truncated, has unexpected tables, or
+            another digest than the given one.
         MapVersionError: the schema is unknown to this version.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, digest: str | None = None) -> None:
         self.path = path
         self._lock = threading.RLock()
         self._deadline, self._database = 0.0, None
-        self.counts: dict[str, int] | None = None
+        self._counts: dict[str, int] = {}
         self._cache: dict[str, Any] = {}
         self.version = check_header(path)
         with self._guarded_read():
@@ -99,10 +100,18 @@ class MapFile:
                     database.execute(f"PRAGMA {pragma}")
                 tables = self._check_tables(database)
                 if self.version == 1:
-                    database.executescript(SCHEMA_2_VIEWS[f"{VIRTUAL_PREFIX}nodes" in tables])
+                    database.executescript(schema_2_views(f"{VIRTUAL_PREFIX}nodes" in tables))
                 self.facts: dict[str, str] = {row["key"]: row["value"] for row in self.rows("map")}
                 if self.version > 1:
-                    self.counts = parse_counts(self.facts.get("counts"), TABLES)
+                    self._counts = decode_json(
+                        self.facts.get("counts"), dict[str, Count], CorruptDataError, "counts"
+                    )
+                    if self._counts.keys() != TABLES.keys() - {"map"}:
+                        raise CorruptDataError("the numbers of rows are missing")
+                if digest is not None and self.digest != digest:
+                    raise MapError(
+                        f"map {path} is not the one that was pickled: it was replaced since"
+                    )
         except BaseException:
             self.close()
             raise
@@ -115,7 +124,7 @@ class MapFile:
             self._database = None
 
     def __reduce__(self) -> Any:
-        return _reopen, (str(self.path.absolute()), self.digest)
+        return MapFile, (self.path.absolute(), self.digest)
 
     @contextmanager
     def read_connection(self) -> Iterator[sqlite3.Connection]:
@@ -150,37 +159,41 @@ class MapFile:
     def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
         """Return all rows of a table with small rows, in its order. With `columns`, only these
         columns are read, without checking the checksum."""
-        wanted = (
-            TABLES[table] if columns is None else {name: TABLES[table][name] for name in columns}
-        )
+        shown, order = ", ".join(columns or (*TABLES[table], "checksum")), SORT_COLUMNS[table]
         with self.read_connection() as database:
-            self._check_count(table)
+            query = f"SELECT {shown} FROM {table} ORDER BY {order} LIMIT {MAX_ROWS + 1}"
+            found = database.execute(query).fetchall()
+            expected = min(self._counts.get(table, len(found)), MAX_ROWS)
+            if len(found) != expected:
+                raise CorruptDataError(f"table {table} has {len(found)} rows, not {expected}")
             if columns is not None:
-                query = f"SELECT {', '.join(wanted)} FROM {table} ORDER BY {SORT_COLUMNS[table]}"
-                return [_check_types(table, wanted, row) for row in database.execute(query)]
-            query = (
-                f"SELECT {', '.join(wanted)}, checksum FROM {table} ORDER BY {SORT_COLUMNS[table]}"
-            )
-            return [self._verify_checksum(table, row) for row in database.execute(query)]
+                return [_check_types(table, columns, row) for row in found]
+            return [self._verify_checksum(table, row) for row in found]
 
-    def row(self, table: str, **key: int | str) -> dict[str, Any] | None:
-        """Return one row, or None if there is none. Its lengths are checked before it is read, its
-        checksum after."""
-        wanted, where = TABLES[table], " AND ".join(f"{name} = ?" for name in key)
+    def find(self, table: str, **key: int | str) -> list[dict[str, Any]]:
+        """Return the rows with these values, in the order of the table. Their lengths are checked
+        before they are read, their checksums after."""
+        names = TABLES[table]
+        query = f"FROM {table} WHERE {' AND '.join(f'{name} = ?' for name in key)}"
+        query += f" ORDER BY {SORT_COLUMNS[table]} LIMIT {MAX_ROWS}"
         with self.read_connection() as database:
-            lengths = ", ".join(f"length({name})" for name in wanted)
-            found = database.execute(
-                f"SELECT {lengths} FROM {table} WHERE {where}", tuple(key.values())
-            ).fetchone()
-            if found is None:
-                return None
-            for name, length in zip(wanted, found, strict=True):
-                if length is None or length > (MAX_ARRAYS_BYTES if name == "arrays" else MAX_BYTES):
-                    raise CorruptDataError(f"{table}.{name} is empty or too large")
-            query = f"SELECT {', '.join(wanted)}, checksum FROM {table} WHERE {where}"
-            return self._verify_checksum(
-                table, database.execute(query, tuple(key.values())).fetchone()
-            )
+            lengths = f"SELECT {', '.join(f'length({name})' for name in names)} {query}"
+            for row in database.execute(lengths, tuple(key.values())):
+                for name, length in zip(names, row, strict=True):
+                    limit = MAX_ARRAYS_BYTES if name == "arrays" else MAX_BYTES
+                    if length is None or length > limit:
+                        raise CorruptDataError(f"{table}.{name} is empty or too large")
+            rows = f"SELECT {', '.join(names)}, checksum {query}"
+            found = database.execute(rows, tuple(key.values()))
+            return [self._verify_checksum(table, row) for row in found]
+
+    def row(self, table: str, what: str, **key: int | str) -> dict[str, Any]:
+        """Return the row with this key, as `find` does. If it is missing, the error names
+        `what`."""
+        found = self.find(table, **key)
+        if not found:
+            raise CorruptDataError(f"{what} is missing")
+        return found[0]
 
     def checksums(self, table: str) -> list[bytes]:
         """Return the checksums of all rows of a table in order, without the row of the digest."""
@@ -205,19 +218,10 @@ class MapFile:
     def count(self, table: str) -> int:
         """Return the number of rows of a table as stored in the file. Schema 1 stores none, so its
         rows are counted."""
-        if self.counts is not None:
-            return self.counts[table]
+        if table in self._counts:
+            return self._counts[table]
         with self.read_connection() as database:
             return int(database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-
-    def _check_count(self, table: str) -> None:
-        with self.read_connection() as database:
-            (found,) = database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
-            expected = found if table == "map" or self.counts is None else self.counts[table]
-            if found != expected or found > MAX_ROWS:
-                raise CorruptDataError(
-                    f"table {table} has {found} rows, not {min(expected, MAX_ROWS)}"
-                )
 
     @property
     def digest(self) -> str:
@@ -232,9 +236,9 @@ class MapFile:
         *values, checksum = row
         typed = _check_types(table, TABLES[table], values)
         if self.version > 1 and checksum != compute_checksum(table, values):
-            raise CorruptDataError(
-                f"the checksum of a row of {table} is wrong ({_format_key(table, typed)})"
-            )
+            names = SORT_COLUMNS[table].split(", ")
+            key = ", ".join(f"{name} {str(typed[name])[:40]}" for name in names)
+            raise CorruptDataError(f"the checksum of a row of {table} is wrong ({key})")
         return typed
 
     def _check_tables(self, database: sqlite3.Connection) -> set[str]:
@@ -250,25 +254,18 @@ class MapFile:
         ).fetchall()
         found = set()
         for kind, name, of_table, sql in entries:
-            if (
-                kind == "index"
-                and sql is None
-                and str(name).startswith("sqlite_autoindex_")
-                and of_table in wanted
-            ):
+            is_key = kind == "index" and sql is None and str(name).startswith("sqlite_autoindex_")
+            if is_key and of_table in wanted:
                 continue
             if kind != "table" or name not in wanted or sql != wanted[name]:
                 raise CorruptDataError(
                     f"{str(kind)[:20]} {str(name)[:60]!r} is none of a map of schema {self.version}"
                 )
             found.add(name)
-        optional = (
-            {name for name in wanted if name.startswith(VIRTUAL_PREFIX)}
-            if self.version == 1
-            else set()
-        )
-        missing = set(wanted) - found - (optional if not found & optional else set())
-        if missing:
+        optional = {name for name in wanted if name.startswith(VIRTUAL_PREFIX)}
+        if self.version > 1 or found & optional:
+            optional = set()
+        if missing := wanted.keys() - found - optional:
             raise CorruptDataError(f"table {min(missing)} is missing")
         return found
 
@@ -308,20 +305,10 @@ def check_header(path: Path) -> int:
     return version
 
 
-def _check_types(table: str, columns: Columns, row: Sequence[Any]) -> dict[str, Any]:
-    for (name, declared), value in zip(columns.items(), row, strict=True):
-        if type(value) is not _PYTHON_TYPES[declared.split()[0]]:
-            raise CorruptDataError(f"{table}.{name} is no {declared.split()[0].lower()} in one row")
-    return dict(zip(columns, row, strict=True))
-
-
-def _format_key(table: str, row: dict[str, Any]) -> str:
-    return ", ".join(f"{name} {str(row[name])[:40]}" for name in SORT_COLUMNS[table].split(", "))
-
-
-def _reopen(path: str, digest: str) -> MapFile:
-    file = MapFile(Path(path))
-    if file.digest != digest:
-        file.close()
-        raise MapError(f"map {path} is not the one that was pickled: it was replaced since")
-    return file
+def _check_types(table: str, names: Iterable[str], row: Sequence[Any]) -> dict[str, Any]:
+    typed = dict(zip(names, row, strict=True))
+    for name, value in typed.items():
+        declared = TABLES[table][name].split()[0]
+        if type(value) is not _PYTHON_TYPES[declared]:
+            raise CorruptDataError(f"{table}.{name} is no {declared.lower()} in one row")
+    return typed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,17 +13,17 @@ from typing import Any, TypeVar
 import numpy as np
 
 from topoloc.bounds import parse_settings
-from topoloc.errors import MapError
 from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
-from topoloc.json_data import decode_json
+from topoloc.json_data import Finite, decode_json
 from topoloc.mapping.config import CONFIG_VERSION, MapConfig, config_from_text
 from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
 from topoloc.mapping.sessions import Edit, Session
 from topoloc.mapping.storage.entries import (
     CorrelatedErrors,
     Edge,
+    LazySequence,
     NodeSummary,
     PlaceImage,
     Repetitions,
@@ -47,7 +47,7 @@ from topoloc.mapping.validation import (
     check_count,
     pose_from_bytes,
 )
-from topoloc.node_ids import NodeId, Row, as_rows
+from topoloc.node_ids import NodeId, Row
 from topoloc.retrieval.coarse import CoarseModel
 
 T = TypeVar("T")
@@ -68,10 +68,8 @@ def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
         MapError: the file is missing, not a topoloc map, truncated, damaged, or has another digest.
         MapVersionError: the schema is unknown to this version.
     """
-    file = MapFile(path)
+    file = MapFile(path, digest)
     try:
-        if digest is not None and file.digest != digest:
-            raise MapError(f"map {path} is not the one that was pickled: it was replaced since")
         with file.read_connection():
             topomap = _read_contents(file)
             topomap.__dict__["_opened"] = file  # not a field, so that a changed copy has no file
@@ -83,75 +81,42 @@ def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
 
 def _read_contents(file: MapFile) -> TopoMetricMap:
     facts = file.facts
-    missing = [key for key in ("config", "length_m") if key not in facts]
-    if missing:
-        raise CorruptDataError(f"key {missing[0]!r} of table map is missing")
+    for key in ("config", "length_m"):
+        if key not in facts:
+            raise CorruptDataError(f"key {key!r} of table map is missing")
     config = config_from_text(facts["config"], CONFIG_VERSION if file.version > 1 else None)
     kinds = _read_feature_types(facts, config)
-    sides = None
-    if file.count(f"{VIRTUAL_PREFIX}nodes") > 0:
-        kind = (
-            decode_json(facts["kind_of_sides"], str, CorruptDataError, "kind_of_sides")
-            if "kind_of_sides" in facts
-            else config.features.kind
-        )
-        if kind not in {*kinds, *(find_feature_type(one).virtual_view_type for one in kinds)}:
-            raise CorruptDataError(f"kind_of_sides: the map has no features {kind!r}")
-        models = _LazyMapping(file, f"{VIRTUAL_PREFIX}coarse_models", _model_from_row)
-        sides = VirtualNodes(
-            _lazy_summaries(file, VIRTUAL_PREFIX),
-            _lazy_nodes(file, kind, VIRTUAL_PREFIX),
-            models,
-            kind,
-        )
+    map_id = facts.get("map_id")
+    if map_id is not None and not re.fullmatch("[0-9a-f]{16}", map_id):
+        raise CorruptDataError("map_id: 16 hexadecimal digits are expected")
+    moves = _LazyMapping(file, "repetitions", _moves_from_row)
+    of_earth = facts.get("georeference")
     return TopoMetricMap(
-        summaries=_lazy_summaries(file),
+        summaries=_lazy_rows(file, "nodes", _read_summary, ""),
         layers={kind: _read_layer(file, kind, config.features.kind) for kind in kinds},
         edges=[Edge(row["source_id"], row["target_id"]) for row in file.rows("edges")],
-        place_images=_LazySequence(
-            partial(file.count, "place_images"), partial(_read_place_image, file)
-        ),
+        place_images=_lazy_rows(file, "place_images", _read_place_image),
         config=config,
-        length_m=_read_length(facts["length_m"]),
-        default_coarse=decode_json(
-            facts.get("default_coarse", '"surf-vlad"'), str, CorruptDataError, "default_coarse"
-        ),
-        repetitions=(
-            Repetitions(facts["repetitions"], _LazyMapping(file, "repetitions", _moves_from_row))
-            if "repetitions" in facts
-            else None
-        ),
-        sides=sides,
+        length_m=_decode_fact(facts, "length_m", Finite, 0.0),
+        default_coarse=_decode_fact(facts, "default_coarse", str, "surf-vlad"),
+        repetitions=Repetitions(facts["repetitions"], moves) if "repetitions" in facts else None,
+        sides=_read_virtual_nodes(file, kinds),
         sessions=list(_read_sessions(file).values()),
         edits=_read_edits(file),
-        next_ids=parse_settings(
-            NextIds, _decode_object(facts.get("next_ids", "{}"), "next_ids"), "next_ids"
-        ),
-        map_id=_read_map_id(facts),
-        georeference=(
-            Georeference.from_json(facts["georeference"]) if "georeference" in facts else None
-        ),
+        next_ids=parse_settings(NextIds, _decode_fact(facts, "next_ids", dict, {}), "next_ids"),
+        map_id=map_id,
+        georeference=None if of_earth is None else Georeference.from_json(of_earth),
     )
 
 
-def _decode_object(text: str, what: str) -> dict[str, Any]:
-    return decode_json(text, dict[str, Any], CorruptDataError, what)
-
-
-def _read_length(text: str) -> float:
-    length = decode_json(text, float, CorruptDataError, "length_m")
-    if not math.isfinite(length):
-        raise CorruptDataError("length_m: a finite number is expected")
-    return length
+def _decode_fact(facts: Mapping[str, str], key: str, kind: Any, default: T) -> T:
+    """Decode an entry of the table `map`. Return `default` if it is missing."""
+    return decode_json(facts[key], kind, CorruptDataError, key) if key in facts else default
 
 
 def _read_feature_types(facts: Mapping[str, str], config: MapConfig) -> list[str]:
     """Return the feature types of the map, the first type first."""
-    kinds = (
-        decode_json(facts["kinds"], list[str], CorruptDataError, "kinds")
-        if "kinds" in facts
-        else [config.features.kind]
-    )
+    kinds = _decode_fact(facts, "kinds", list[str], [config.features.kind])
     if len(kinds) > 8 or len(set(kinds)) < len(kinds):
         raise CorruptDataError("kinds: at most 8 different names are expected")
     if kinds[:1] != [config.features.kind]:
@@ -161,37 +126,41 @@ def _read_feature_types(facts: Mapping[str, str], config: MapConfig) -> list[str
     return kinds
 
 
-# No return type, see below.
-def _read_layer(file: MapFile, kind: str, first: str):
-    """Return the layer of a feature type, given the map's first type."""
-    suffix = layer_suffix(kind, first)
-    return Layer(
-        _lazy_nodes(file, kind, is_default=kind == first),
-        _LazyMapping(file, "coarse_models", _model_from_row, suffix),
-        _read_correlated_errors(file.facts, f"shared_errors{suffix}"),
+# No return types: a type check at run time would read an entry.
+def _read_virtual_nodes(file: MapFile, kinds: Sequence[str]):
+    """Return the virtual nodes, if any, of a map with these feature types."""
+    if file.count(f"{VIRTUAL_PREFIX}nodes") == 0:
+        return None
+    kind = _decode_fact(file.facts, "kind_of_sides", str, kinds[0])
+    if kind not in {*kinds, *(find_feature_type(one).virtual_view_type for one in kinds)}:
+        raise CorruptDataError(f"kind_of_sides: the map has no features {kind!r}")
+    table = f"{VIRTUAL_PREFIX}nodes"
+    return VirtualNodes(
+        _lazy_rows(file, table, _read_summary, VIRTUAL_PREFIX),
+        _lazy_rows(file, table, _read_node, kind, VIRTUAL_PREFIX, True),
+        _LazyMapping(file, f"{VIRTUAL_PREFIX}coarse_models", _model_from_row),
+        kind,
     )
 
 
-def _read_map_id(facts: Mapping[str, str]) -> str | None:
-    map_id = facts.get("map_id")
-    if map_id is not None and not re.fullmatch("[0-9a-f]{16}", map_id):
-        raise CorruptDataError("map_id: 16 hexadecimal digits are expected")
-    return map_id
-
-
-def _read_correlated_errors(facts: Mapping[str, str], key: str) -> CorrelatedErrors | None:
-    if key not in facts:
-        return None
-    found = parse_settings(CorrelatedErrors, _decode_object(facts[key], key), key)
-    if not 0.0 <= found.rho < math.inf:
-        raise CorruptDataError("shared errors that are no share")
-    return found
+def _read_layer(file: MapFile, kind: str, first: str):
+    """Return the layer of a feature type, given the map's first type, whose numbers of points are
+    those of the summaries."""
+    suffix = layer_suffix(kind, first)
+    key, errors = f"shared_errors{suffix}", None
+    if key in file.facts:
+        errors = parse_settings(CorrelatedErrors, _decode_fact(file.facts, key, dict, {}), key)
+        if not 0.0 <= errors.rho < math.inf:
+            raise CorruptDataError("shared errors that are no share")
+    return Layer(
+        _lazy_rows(file, "nodes", _read_node, kind, "", kind == first),
+        _LazyMapping(file, "coarse_models", _model_from_row, suffix),
+        errors,
+    )
 
 
 def _read_edits(file: MapFile) -> list[Edit]:
-    changes = decode_json(
-        file.facts.get("changes", "{}"), dict[str, dict[str, Any]], CorruptDataError, "changes"
-    )
+    changes = _decode_fact(file.facts, "changes", dict[str, dict[str, Any]], {})
     return [Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")]
 
 
@@ -209,187 +178,108 @@ def _read_session(file: MapFile, session_id: int) -> Session:
     return sessions[session_id]
 
 
-def _session_from_row(row: Mapping[str, Any]) -> Session:
-    facts = _decode_object(row["json"], "session")
+def _session_from_row(row: dict[str, Any]) -> Session:
+    facts = decode_json(row.pop("json"), dict[str, Any], CorruptDataError, "session")
     camera = facts.pop("camera", None)
-    session = parse_settings(
-        Session, facts | {"session_id": row["session_id"], "name": row["name"]}, "session"
-    )
+    session = parse_settings(Session, facts | row, "session")
     return session if camera is None else replace(session, camera=Camera.from_json(camera))
 
 
-class _LazySequence(Sequence[T]):
-    """Show rows of the map, numbered from 0, and read each when accessed."""
-
-    def __init__(self, length: Callable[[], int], read: Callable[[Row], T]) -> None:
-        self._length, self._read = length, read
-
-    def __len__(self) -> int:
-        return self._length()
-
-    def __getitem__(self, index):  # type: ignore[override]
-        if isinstance(index, slice):
-            return [self._read(row) for row in as_rows(range(*index.indices(len(self))))]
-        position = index + len(self) if index < 0 else index
-        if not 0 <= position < len(self):
-            raise IndexError(index)
-        return self._read(Row(int(position)))
-
-
-# No return types: a type check at run time would read an entry.
-def _lazy_summaries(file: MapFile, prefix: str = ""):
-    """Return the summaries of all nodes. They are read together at the first access, a few dozen
-    bytes per node."""
-    return _LazySequence(
-        partial(file.count, f"{prefix}nodes"), partial(_read_summary, file, prefix)
-    )
-
-
-def _lazy_nodes(file: MapFile, kind: str, prefix: str = "", is_default: bool = True):
-    """Return nodes with their points of one feature type. For the first type (`is_default`), the
-    number of points is checked against the summary."""
-    return _LazySequence(
-        partial(file.count, f"{prefix}nodes"), partial(_read_node, file, kind, prefix, is_default)
-    )
+def _lazy_rows(file: MapFile, table: str, read: Callable[..., T], *given: Any) -> LazySequence[T]:
+    """Return the entries that `read(file, *given, row)` makes of the rows of a table."""
+    return LazySequence(partial(file.count, table), partial(read, file, *given))
 
 
 def _read_summary(file: MapFile, prefix: str, row: Row) -> NodeSummary:
-    return _read_summaries(file, prefix)[row]
+    return _read_summaries(file, prefix)[row][0]
 
 
-def _read_summaries(file: MapFile, prefix: str) -> list[NodeSummary]:
-    def read() -> list[NodeSummary]:
+def _read_summaries(file: MapFile, prefix: str) -> list[tuple[NodeSummary, int]]:
+    """Return the summaries of all nodes with the ids of their cameras. They are read together at
+    the first access, a few dozen bytes per node."""
+
+    def read() -> list[tuple[NodeSummary, int]]:
         with file.read_connection():
+            known = _read_summaries(file, "") if prefix else []
+            of_id = {summary.node_id: summary for summary, _ in known}
             rows = file.rows(f"{prefix}nodes")
-            of_id = (
-                {summary.node_id: summary for summary in _read_summaries(file, "")}
-                if prefix
-                else {}
-            )
-            return [_summary_from_row(row, file, of_id if prefix else None) for row in rows]
+            return [(_summary_from_row(row, file, of_id), row["camera_id"]) for row in rows]
 
     return file.cached(f"{prefix}summaries", read)
 
 
 def _summary_from_row(
-    row: Mapping[str, Any], file: MapFile, nodes: Mapping[NodeId, NodeSummary] | None
+    row: Mapping[str, Any], file: MapFile, nodes: Mapping[NodeId, NodeSummary]
 ) -> NodeSummary:
-    """Return the summary of a node. With `nodes` it is a virtual node, whose session is that of its
-    node."""
+    """Return the summary of a node. The session of a virtual node is that of its node."""
     node_id = NodeId(check_count(row["node_id"], 0, MAX_ID, "a node's id"))
-    num_points = check_count(
-        row["num_points"], 0, MAX_POINTS, f"the number of points of node {node_id}"
-    )
-    if nodes is not None and row["of_node"] not in nodes:
-        raise CorruptDataError(f"side node {node_id} is of node {row['of_node']}, which is missing")
-    session_id = row["session_id"] if nodes is None else nodes[row["of_node"]].session_id
+    what = f"the number of points of node {node_id}"
+    num_points = check_count(row["num_points"], 0, MAX_POINTS, what)
+    of_node = row.get("of_node")
+    if of_node is not None and of_node not in nodes:
+        raise CorruptDataError(f"side node {node_id} is of node {of_node}, which is missing")
+    session_id = row["session_id"] if of_node is None else nodes[of_node].session_id
     recording, pose = _read_session(file, session_id).name, pose_from_bytes(row["world_from_cam"])
-    return NodeSummary(
-        node_id,
-        recording,
-        row["name"],
-        row["t_ns"],
-        pose,
-        num_points,
-        session_id,
-        row.get("of_node"),
-    )
+    name, t_ns = row["name"], row["t_ns"]
+    return NodeSummary(node_id, recording, name, t_ns, pose, num_points, session_id, of_node)
 
 
 def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: Row) -> TopoNode:
     """Read the node of a row with its points of a feature type. With the prefix `VIRTUAL_PREFIX` it
-    is a virtual node, which has no template. Raises MapError."""
+    is a virtual node, which has no template. For the first type (`is_default`), the number of
+    points is checked against the summary. Raises MapError."""
     with file.read_connection():
-        summary = _read_summaries(file, prefix)[row]
+        summary, camera_id = _read_summaries(file, prefix)[row]
         node_id, what = summary.node_id, f"{prefix}node {summary.node_id}"
-        points = _require_row(
-            file.row(f"{prefix}node_points", node_id=node_id, kind=kind), f"the points of {what}"
+        points = file.row(
+            f"{prefix}node_points", f"the points of {what}", node_id=node_id, kind=kind
         )
-        template = (
-            b""
-            if prefix
-            else _require_row(
-                file.row("node_templates", node_id=node_id), f"the template of {what}"
-            )["jpeg"]
-        )
+        template, statistics = b"", ()
+        if not prefix:
+            found = file.row("node_templates", f"the template of {what}", node_id=node_id)
+            template = found["jpeg"]
+            statistics = _LazyStatistics(file, node_id, kind, points["num_points"])
         features, points_cam, sqrt_covs, stored = points_from_row(points, kind, file.version, what)
         n = len(features)
         if is_default and summary.num_points != n:
             raise CorruptDataError(f"node {node_id} has {n} points")
         summary = summary if summary.num_points == n else replace(summary, num_points=n)
-        session_statistics = () if prefix else _LazyStatistics(file, node_id, kind, n)
+        camera = file.cached(f"camera {camera_id}", partial(_read_camera, file, camera_id))
         return TopoNode(
-            summary,
-            _read_camera(file, prefix, node_id),
-            features,
-            points_cam,
-            sqrt_covs,
-            template,
-            session_statistics,
-            stored,
+            summary, camera, features, points_cam, sqrt_covs, template, statistics, stored
         )
 
 
-def _read_camera(file: MapFile, prefix: str, node_id: NodeId) -> Camera:
-    rows = partial(file.rows, f"{prefix}nodes", ("node_id", "camera_id"))
-    camera_id = file.cached(
-        f"{prefix}camera_ids", lambda: {row["node_id"]: row["camera_id"] for row in rows()}
-    )[node_id]
-
-    def read() -> Camera:
-        return camera_from_text(
-            _require_row(file.row("cameras", camera_id=camera_id), f"camera {camera_id}")["json"]
-        )
-
-    return file.cached(f"camera {camera_id}", read)
+def _read_camera(file: MapFile, camera_id: int) -> Camera:
+    return camera_from_text(file.row("cameras", f"camera {camera_id}", camera_id=camera_id)["json"])
 
 
+@dataclass(frozen=True, eq=False)
 class _LazyStatistics:
     """Show each session's statistics of a node's points. Localization does not need them, so they
     are read when accessed."""
 
-    def __init__(self, file: MapFile, node_id: NodeId, kind: str, num_points: int) -> None:
-        self._file, self._node_id, self._kind, self._num_points = file, node_id, kind, num_points
-
-    def _list_session_ids(self) -> list[int]:
-        with self._file.read_connection() as database:
-            query = (
-                "SELECT session_id FROM landmark_sums WHERE node_id = ? AND kind = ? ORDER BY"
-                " session_id LIMIT 100000"
-            )
-            return [
-                decode_json(row[0], int, CorruptDataError, "landmark_sums.session_id")
-                for row in database.execute(query, (self._node_id, self._kind))
-            ]
+    file: MapFile
+    node_id: NodeId
+    kind: str
+    num_points: int
 
     def __iter__(self) -> Iterator[LandmarkStatistics]:
-        with self._file.read_connection():
-            found = [self._read_statistics(session_id) for session_id in self._list_session_ids()]
+        n, what = self.num_points, f"the sums of node {self.node_id}"
+        with self.file.read_connection():
+            found = [
+                decode_statistics(
+                    row["session_id"], row["sums"], check_count(row["num_rows"], 0, n, what), n
+                )
+                for row in self.file.find("landmark_sums", node_id=self.node_id, kind=self.kind)
+            ]
         return iter(found)
-
-    def _read_statistics(self, session_id: int) -> LandmarkStatistics:
-        what = f"the sums of node {self._node_id}"
-        row = _require_row(
-            self._file.row(
-                "landmark_sums", node_id=self._node_id, kind=self._kind, session_id=session_id
-            ),
-            what,
-        )
-        return decode_statistics(
-            session_id,
-            row["sums"],
-            check_count(row["num_rows"], 0, self._num_points, what),
-            self._num_points,
-        )
 
 
 def _read_place_image(file: MapFile, row: int) -> PlaceImage:
     with file.read_connection():
-        image_id = file.cached(
-            "image_ids",
-            lambda: [row["image_id"] for row in file.rows("place_images", ("image_id",))],
-        )[row]
-        found = _require_row(file.row("place_images", image_id=image_id), f"place image {image_id}")
+        image_id = file.cached("image_ids", partial(file.rows, "place_images", ("image_id",)))[row]
+        found = file.row("place_images", f"place image {image_id['image_id']}", **image_id)
         session = _read_session(file, found["session_id"])
         pose = pose_from_bytes(found["world_from_cam"])
         return PlaceImage(
@@ -399,7 +289,7 @@ def _read_place_image(file: MapFile, row: int) -> PlaceImage:
             pose,
             found["jpeg"],
             session.session_id,
-            image_id,
+            found["image_id"],
         )
 
 
@@ -419,10 +309,8 @@ class _LazyMapping(Mapping[K, V]):
 
     def _keys(self) -> dict[Any, Any]:
         """Return the stored key of each key."""
-        stored = self._file.cached(
-            self._table,
-            lambda: [row[self._key] for row in self._file.rows(self._table, (self._key,))],
-        )
+        read = partial(self._file.rows, self._table, (self._key,))
+        stored = [row[self._key] for row in self._file.cached(self._table, read)]
         if self._suffix is None:
             return {key: key for key in stored}
         named = ((*split_layer_name(key), key) for key in stored)
@@ -437,31 +325,20 @@ class _LazyMapping(Mapping[K, V]):
     def __getitem__(self, key: K) -> V:
         stored = self._keys()[key]
         with self._file.read_connection():
-            row = self._file.row(self._table, **{self._key: stored})
-            return self._read(_require_row(row, f"{self._table} {stored}"))
+            what = f"{self._table} {stored}"
+            return self._read(self._file.row(self._table, what, **{self._key: stored}))
 
 
 def _model_from_row(row: dict[str, Any]) -> CoarseModel:
-    name, what = row["name"], f"coarse localizer {row['name']}"
-    settings = _decode_object(row["settings"], what)
-    arrays = arrays_from_npz(row["arrays"], what)
-    return CoarseModel(split_layer_name(name)[0], settings, arrays)
+    what = f"coarse localizer {row['name']}"
+    settings = decode_json(row["settings"], dict[str, Any], CorruptDataError, what)
+    name = split_layer_name(row["name"])[0]
+    return CoarseModel(name, settings, arrays_from_npz(row["arrays"], what))
 
 
 def _moves_from_row(row: dict[str, Any]) -> np.ndarray:
-    num_moves = check_count(
-        row["num_moves"], 1, _MAX_MOVES, f"the repetitions of node {row['node_id']}"
-    )
-    size = len(row["moves"]) // num_moves
-    return np.array(
-        [
-            pose_from_bytes(row["moves"][k * size : (k + 1) * size]).matrix()
-            for k in range(num_moves)
-        ]
-    )
-
-
-def _require_row(row: dict[str, Any] | None, what: str) -> dict[str, Any]:
-    if row is None:
-        raise CorruptDataError(f"{what} is missing")
-    return row
+    what = f"the repetitions of node {row['node_id']}"
+    count, data = check_count(row["num_moves"], 1, _MAX_MOVES, what), row["moves"]
+    size = len(data) // count
+    poses = [pose_from_bytes(data[k * size : (k + 1) * size]) for k in range(count)]
+    return np.array([pose.matrix() for pose in poses])

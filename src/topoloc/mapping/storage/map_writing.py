@@ -11,7 +11,7 @@ import io
 import json
 import os
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from hashlib import blake2b
@@ -38,7 +38,7 @@ from topoloc.mapping.storage.schema import (
     create_table_statement,
     layer_suffix,
 )
-from topoloc.mapping.topomap import NextIds, TopoMetricMap
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.coarse import CoarseModel
 
@@ -60,9 +60,8 @@ def save_map(topomap: TopoMetricMap, path: Path) -> None:
         with atomic_write(path) as temporary:
             write_map(topomap, temporary)
     except (OSError, ValueError) as error:
-        if isinstance(error, ValueError) and "null" not in str(
-            error
-        ):  # a null character in the name; any other ValueError is a bug
+        # a null character in the name; any other ValueError is a bug
+        if isinstance(error, ValueError) and "null" not in str(error):
             raise
         raise MapError(f"cannot write map {path}: {error}") from error
 
@@ -78,10 +77,6 @@ def write_map(topomap: TopoMetricMap, path: Path) -> None:
         raise MapError(f"cannot write map {path}: {error}") from error
 
 
-_PointBlobs = tuple[list[bytes], list[bytes]]
-"""Encoded points of a node, and encoded statistics of each session."""
-
-
 class _Writer:
     """Insert rows with checksums and count them. The table `map` is written last, with the counts
     and the digest."""
@@ -92,67 +87,70 @@ class _Writer:
             table: [] for table in TABLES
         }
         self._camera_ids: dict[str, int] = {}
+        self._session_ids: dict[str, int] = {}
 
     def write(self, topomap: TopoMetricMap) -> None:
-        """Write all tables of the map in one transaction."""
+        """Write all tables of the map in one transaction. The sessions of a map without sessions
+        are those that its entries name."""
         self._database.execute("PRAGMA journal_mode = OFF")
         self._database.execute("BEGIN")
         for table in TABLES:
             self._database.execute(create_table_statement(table))
-        sessions = topomap.sessions or sessions_from_names(
-            [entry.recording for entry in (*topomap.summaries, *topomap.place_images)]
-        )
-        ids = (
-            {session.name: session.session_id for session in sessions}
-            if not topomap.sessions
-            else {}
-        )
-        for session in sessions:
+        if not topomap.sessions:
+            names = [entry.recording for entry in (*topomap.summaries, *topomap.place_images)]
+            topomap = replace(topomap, sessions=sessions_from_names(names))
+            self._session_ids = {one.name: one.session_id for one in topomap.sessions}
+        for session in topomap.sessions:
             self._insert("sessions", session.session_id, session.name, _session_to_json(session))
         for edit in topomap.edits:
             self._insert("edits", edit.edit_id, edit.name, edit.date, edit.schema)
-        self._write_nodes(topomap, ids)
-        for edge in sorted(topomap.edges, key=lambda edge: (edge.source_id, edge.target_id)):
-            self._insert("edges", edge.source_id, edge.target_id)
-        next_image = self._write_images(topomap, ids)
-        for kind, layer in topomap.layers.items():
-            for model in layer.coarse_models.values():
-                suffix = layer_suffix(kind, topomap.kind)
-                self._insert_model(replace(model, name=model.name + suffix))
-        if topomap.sides is not None:
-            virtual_view_type = topomap.sides.kind
-            for (of_side,) in parallel_map(
-                _encode_nodes, ([(node, virtual_view_type)] for node in topomap.sides.nodes)
-            ):
-                self._insert_node(*of_side, {}, VIRTUAL_PREFIX)
-            for model in topomap.sides.coarse_models.values():
-                self._insert_model(model, VIRTUAL_PREFIX)
-        if topomap.repetitions is not None:
-            for node_id, moves in sorted(topomap.repetitions.moves.items()):
-                self._insert(
-                    "repetitions", node_id, len(moves), moves[:, :3].astype("<f8").tobytes()
-                )
-        self._write_metadata(topomap, sessions, next_image)
-        self._database.execute("COMMIT")
-
-    def _write_nodes(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> None:
-        read = (
+        self._write_nodes(
             [(topomap.layers[kind].nodes[row], kind) for kind in topomap.kinds]
             for row in range(len(topomap.nodes))
         )
-        for (node, kind, blobs), *of_others in parallel_map(_encode_nodes, read):
-            self._insert_node(node, kind, blobs, session_ids)
-            self._insert("node_templates", node.summary.node_id, node.template_jpeg)
-            for of_other in of_others:
-                self._insert_points(*of_other)
+        for edge in sorted(topomap.edges):
+            self._insert("edges", edge.source_id, edge.target_id)
+        next_image = self._write_images(topomap)
+        for kind, layer in topomap.layers.items():
+            self._write_models(layer.coarse_models, "", layer_suffix(kind, topomap.kind))
+        if topomap.sides is not None:
+            kind = topomap.sides.kind
+            self._write_nodes(([(node, kind)] for node in topomap.sides.nodes), VIRTUAL_PREFIX)
+            self._write_models(topomap.sides.coarse_models, VIRTUAL_PREFIX)
+        for text, camera_id in self._camera_ids.items():
+            self._insert("cameras", camera_id, text)
+        if topomap.repetitions is not None:
+            for node_id, moves in sorted(topomap.repetitions.moves.items()):
+                blob = moves[:, :3].astype("<f8").tobytes()
+                self._insert("repetitions", node_id, len(moves), blob)
+        self._write_metadata(topomap, next_image)
+        self._database.execute("COMMIT")
 
-    def _write_images(self, topomap: TopoMetricMap, session_ids: Mapping[str, int]) -> int:
+    def _write_nodes(
+        self, nodes: Iterable[Sequence[tuple[TopoNode, str]]], prefix: str = ""
+    ) -> None:
+        """Write nodes, each given with its points of all feature types, the first type first."""
+        for node, rows in parallel_map(_encode_node, nodes):
+            s = node.summary
+            camera = json.dumps(node.camera.to_json(), sort_keys=True)
+            camera_id = self._camera_ids.setdefault(camera, len(self._camera_ids) + 1)
+            owner = s.of_node if prefix else self._session_ids.get(s.recording, s.session_id)
+            pose, num_points = _pose_to_bytes(s.world_from_cam), len(node.features)
+            self._insert(
+                f"{prefix}nodes", s.node_id, owner, s.name, s.t_ns, camera_id, pose, num_points
+            )
+            if not prefix:
+                self._insert("node_templates", s.node_id, node.template_jpeg)
+            for table, *row in rows:
+                self._insert(f"{prefix}{table}", *row)
+
+    def _write_images(self, topomap: TopoMetricMap) -> int:
         """Write the images. Images without an id receive the next ones. Return the id after the
         last."""
         next_id = max(topomap.next_ids.place_image, 1)
         for image in topomap.place_images:
             image_id = next_id if image.image_id is None else image.image_id
-            session_id = session_ids.get(image.recording, image.session_id)
+            session_id = self._session_ids.get(image.recording, image.session_id)
             self._insert(
                 "place_images",
                 image_id,
@@ -165,34 +163,20 @@ class _Writer:
             next_id = max(next_id, image_id + 1)
         return next_id
 
-    def _write_metadata(
-        self, topomap: TopoMetricMap, sessions: Sequence[Session], next_image: int
-    ) -> None:
-        used = NextIds(
-            session=max((session.session_id + 1 for session in sessions), default=0),
-            node=max((summary.node_id + 1 for summary in topomap.summaries), default=0),
-            place_image=next_image,
-            side_node=max((summary.node_id + 1 for summary in topomap.sides.summaries), default=0)
-            if topomap.sides
-            else 0,
-            edit=max((edit.edit_id + 1 for edit in topomap.edits), default=1),
-        )
+    def _write_metadata(self, topomap: TopoMetricMap, next_image: int) -> None:
+        of_sides = topomap.sides.summaries if topomap.sides else ()
+        side_node = max([topomap.next_ids.side_node, *(side.node_id + 1 for side in of_sides)])
+        next_ids = replace(topomap.free_ids, place_image=next_image, side_node=side_node)
+        counts = {table: len(rows) for table, rows in self._checksums.items() if table != "map"}
         facts = {
             "config": config_to_text(topomap.config),
             "kinds": json.dumps(topomap.kinds),
             "length_m": json.dumps(topomap.length_m),
             "default_coarse": json.dumps(topomap.default_coarse),
-            "next_ids": json.dumps(
-                {
-                    name: max(value, getattr(used, name))
-                    for name, value in asdict(topomap.next_ids).items()
-                }
-            ),
-            "counts": json.dumps(
-                {table: len(rows) for table, rows in self._checksums.items() if table != "map"}
-            ),
+            "next_ids": json.dumps(asdict(next_ids)),
+            "counts": json.dumps(counts),
+            "map_id": topomap.id,
         }
-        facts["map_id"] = topomap.id
         if changes := {
             str(edit.edit_id): dict(edit.changes) for edit in topomap.edits if edit.changes
         }:
@@ -209,94 +193,44 @@ class _Writer:
             facts["repetitions"] = topomap.repetitions.digest
         for key, value in sorted(facts.items()):
             self._insert("map", key, value)
-        self._insert(
-            "map",
-            "digest",
-            compute_map_digest(
-                {table: [c for _, c in sorted(rows)] for table, rows in self._checksums.items()}
-            ),
-        )
+        checksums = {table: [c for _, c in sorted(rows)] for table, rows in self._checksums.items()}
+        self._insert("map", "digest", compute_map_digest(checksums))
 
-    def _insert_node(
-        self,
-        node: TopoNode,
-        kind: str,
-        blobs: _PointBlobs,
-        session_ids: Mapping[str, int],
-        prefix: str = "",
+    def _write_models(
+        self, models: Mapping[str, CoarseModel], prefix: str, suffix: str = ""
     ) -> None:
-        camera_json = json.dumps(node.camera.to_json(), sort_keys=True)
-        if camera_json not in self._camera_ids:
-            self._camera_ids[camera_json] = len(self._camera_ids) + 1
-            self._insert("cameras", self._camera_ids[camera_json], camera_json)
-        s = node.summary
-        owner = s.of_node if prefix else session_ids.get(s.recording, s.session_id)
-        row = (
-            s.node_id,
-            owner,
-            s.name,
-            s.t_ns,
-            self._camera_ids[camera_json],
-            _pose_to_bytes(s.world_from_cam),
-            len(node.features),
-        )
-        self._insert(f"{prefix}nodes", *row)
-        self._insert_points(node, kind, blobs, prefix)
-
-    def _insert_points(
-        self, node: TopoNode, kind: str, blobs: _PointBlobs, prefix: str = ""
-    ) -> None:
-        (of_points, of_sums), f, node_id = blobs, node.features, node.summary.node_id
-        self._insert(
-            f"{prefix}node_points", node_id, kind, len(f), f.descriptors.shape[1], *of_points
-        )
-        if not prefix:
-            for session_statistics, blob in zip(node.session_statistics, of_sums, strict=True):
-                self._insert(
-                    "landmark_sums",
-                    node_id,
-                    kind,
-                    session_statistics.session_id,
-                    len(session_statistics.rows),
-                    blob,
-                )
-
-    def _insert_model(self, model: CoarseModel, prefix: str = "") -> None:
-        self._insert(
-            f"{prefix}coarse_models",
-            model.name,
-            json.dumps(model.settings, sort_keys=True),
-            _arrays_bytes(model.arrays),
-        )
+        for model in models.values():
+            buffer, arrays = io.BytesIO(), dict[str, Any](model.arrays)
+            np.savez(buffer, **arrays)
+            settings = json.dumps(model.settings, sort_keys=True)
+            self._insert(f"{prefix}coarse_models", model.name + suffix, settings, buffer.getvalue())
 
     def _insert(self, table: str, *row: Any) -> None:
         checksum = compute_checksum(table, row)
         self._database.execute(
             f"INSERT INTO {table} VALUES ({', '.join('?' * (len(row) + 1))})", (*row, checksum)
         )
-        names = list(TABLES[table])
-        self._checksums[table].append(
-            (tuple(row[names.index(name)] for name in SORT_COLUMNS[table].split(", ")), checksum)
-        )
+        named = dict(zip(TABLES[table], row, strict=True))
+        key = tuple(named[name] for name in SORT_COLUMNS[table].split(", "))
+        self._checksums[table].append((key, checksum))
 
 
-def _encode_nodes(nodes: Sequence[tuple[TopoNode, str]]) -> list[tuple[TopoNode, str, _PointBlobs]]:
-    """Encode points and statistics of nodes by feature type. Several threads may do so in
-    parallel."""
-    return [
-        (
-            node,
-            kind,
-            (
-                [compress_array(a) for a in node_to_arrays(node, kind)],
-                [
-                    encode_statistics(session_statistics)
-                    for session_statistics in node.session_statistics
-                ],
-            ),
-        )
-        for node, kind in nodes
-    ]
+def _encode_node(
+    of_types: Sequence[tuple[TopoNode, str]],
+) -> tuple[TopoNode, list[tuple[Any, ...]]]:
+    """Return a node with its points of the first feature type, and the rows of its points and
+    statistics of all types, each with its table first. Several threads may encode nodes."""
+    rows = list[tuple[Any, ...]]()
+    for node, kind in of_types:
+        node_id, num_points = node.summary.node_id, len(node.features)
+        blobs = [compress_array(array) for array in node_to_arrays(node, kind)]
+        size = node.features.descriptors.shape[1]
+        rows.append(("node_points", node_id, kind, num_points, size, *blobs))
+        rows += [
+            ("landmark_sums", node_id, kind, one.session_id, len(one.rows), encode_statistics(one))
+            for one in node.session_statistics
+        ]
+    return of_types[0][0], rows
 
 
 def copy_sorted_tables(database: sqlite3.Connection, path: Path) -> None:
@@ -312,9 +246,9 @@ def copy_sorted_tables(database: sqlite3.Connection, path: Path) -> None:
         "journal_mode = OFF",
         "synchronous = OFF",
         f"application_id = {APPLICATION_ID}",
+        f"user_version = {SCHEMA_VERSION}",
     ):
         database.execute(f"PRAGMA file.{pragma}")
-    database.execute(f"PRAGMA file.user_version = {SCHEMA_VERSION}")
     database.execute("BEGIN")
     for table in TABLES:
         database.execute(
@@ -349,9 +283,3 @@ def _session_to_json(session: Session) -> str:
 
 def _pose_to_bytes(world_from_cam: Rigid3) -> bytes:
     return world_from_cam.matrix()[:3].astype("<f8").tobytes()
-
-
-def _arrays_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **dict(arrays))  # pyright: ignore[reportArgumentType]
-    return buffer.getvalue()

@@ -108,36 +108,23 @@ SORT_COLUMNS = {table: next(iter(columns)) for table, columns in TABLES.items()}
 
 # the tables of schema 1; those of virtual nodes are optional
 SCHEMA_1 = {
-    "map": "CREATE TABLE map (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
-    "cameras": "CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, json TEXT NOT NULL UNIQUE)",
-    "node_templates": (
-        "CREATE TABLE node_templates (node_id INTEGER PRIMARY KEY REFERENCES nodes, jpeg BLOB NOT"
-        " NULL)"
-    ),
-    "edges": (
-        "CREATE TABLE edges (source_id INTEGER NOT NULL REFERENCES nodes, target_id INTEGER NOT"
-        " NULL REFERENCES nodes)"
-    ),
-    "place_images": (
-        """CREATE TABLE place_images (image_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL,
-    node_id INTEGER NOT NULL REFERENCES nodes, world_from_cam BLOB NOT NULL, jpeg BLOB NOT NULL)"""  # noqa: E501
-    ),
+    "map": "(key TEXT PRIMARY KEY, value TEXT NOT NULL)",
+    "cameras": "(camera_id INTEGER PRIMARY KEY, json TEXT NOT NULL UNIQUE)",
+    "node_templates": "(node_id INTEGER PRIMARY KEY REFERENCES nodes, jpeg BLOB NOT NULL)",
+    "edges": "(source_id INTEGER NOT NULL REFERENCES nodes,"
+    " target_id INTEGER NOT NULL REFERENCES nodes)",
+    "place_images": """(image_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL,
+    node_id INTEGER NOT NULL REFERENCES nodes, world_from_cam BLOB NOT NULL, jpeg BLOB NOT NULL)""",
 }
 for _prefix in ("", VIRTUAL_PREFIX):
-    SCHEMA_1[f"{_prefix}nodes"] = (
-        f"CREATE TABLE {_prefix}nodes (node_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name"
-        " TEXT NOT NULL, t_ns INTEGER NOT NULL,\n    camera_id INTEGER NOT NULL REFERENCES"
-        " cameras, world_from_cam BLOB NOT NULL, num_points INTEGER NOT NULL)"
-    )
-    SCHEMA_1[f"{_prefix}node_points"] = (
-        f"CREATE TABLE {_prefix}node_points (node_id INTEGER PRIMARY KEY REFERENCES {_prefix}nodes,"
-        " descriptor_size INTEGER NOT NULL,\n    points_img BLOB NOT NULL, shapes BLOB NOT NULL,"
-        " descriptors BLOB NOT NULL, points_cam BLOB NOT NULL, sqrt_covs BLOB NOT NULL)"
-    )
-    SCHEMA_1[f"{_prefix}coarse_models"] = (
-        f"CREATE TABLE {_prefix}coarse_models (name TEXT PRIMARY KEY, settings TEXT NOT NULL,"
-        " arrays BLOB NOT NULL)"
-    )
+    SCHEMA_1 |= {
+        f"{_prefix}nodes": """(node_id INTEGER PRIMARY KEY, recording TEXT NOT NULL, name TEXT NOT NULL, t_ns INTEGER NOT NULL,
+    camera_id INTEGER NOT NULL REFERENCES cameras, world_from_cam BLOB NOT NULL, num_points INTEGER NOT NULL)""",  # noqa: E501
+        f"{_prefix}node_points": f"""(node_id INTEGER PRIMARY KEY REFERENCES {_prefix}nodes, descriptor_size INTEGER NOT NULL,
+    points_img BLOB NOT NULL, shapes BLOB NOT NULL, descriptors BLOB NOT NULL, points_cam BLOB NOT NULL, sqrt_covs BLOB NOT NULL)""",  # noqa: E501
+        f"{_prefix}coarse_models": "(name TEXT PRIMARY KEY, settings TEXT NOT NULL, arrays BLOB NOT NULL)",  # noqa: E501
+    }
+SCHEMA_1 = {table: f"CREATE TABLE {table} {columns}" for table, columns in SCHEMA_1.items()}
 
 
 def create_table_statement(table: str) -> str:
@@ -162,56 +149,50 @@ def compute_checksum(table: str, row: Sequence[Any]) -> bytes:
 # Maps of schema 1 are shown to the reader as schema 2. Temporary views of the connection hide the
 # file's tables. Nothing is written, and saving the map writes the current schema. Sessions follow
 # from the recordings' names, so two recordings of one name are one session. The node of a virtual
-# node follows from recording and image name. There are no checksums, counts or landmark sums.
+# node follows from recording and image name. There are no checksums, counts or landmark sums. The
+# one feature type is named in the configuration.
 _COMMON_VIEWS = """
+CREATE TEMP TABLE kinds (kind TEXT);
+INSERT INTO kinds SELECT json_extract(value, '$.features.kind') FROM main.map WHERE key = 'config' AND json_valid(value);
 CREATE TEMP TABLE sessions (session_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, json TEXT NOT NULL, checksum BLOB);
 INSERT INTO sessions (session_id, name, json)
     SELECT row_number() OVER (ORDER BY first) - 1, name, '{}' FROM (
         SELECT min(place) AS first, name FROM (
             SELECT node_id AS place, recording AS name FROM main.nodes
             UNION ALL SELECT 1000000000 + image_id, recording FROM main.place_images) GROUP BY name);
-CREATE TEMP VIEW map AS SELECT key, value, NULL AS checksum FROM main.map;
 CREATE TEMP VIEW edits AS SELECT 1 AS edit_id, 'build' AS name, '' AS date, 1 AS schema, NULL AS checksum;
-CREATE TEMP VIEW cameras AS SELECT camera_id, json, NULL AS checksum FROM main.cameras;
-CREATE TEMP VIEW nodes AS SELECT node_id, session_id, n.name AS name, t_ns, camera_id, world_from_cam, num_points, NULL AS checksum
-    FROM main.nodes AS n LEFT JOIN sessions AS s ON s.name = n.recording;
-CREATE TEMP VIEW node_templates AS SELECT node_id, jpeg, NULL AS checksum FROM main.node_templates;
-CREATE TEMP VIEW edges AS SELECT source_id, target_id, NULL AS checksum FROM main.edges;
-CREATE TEMP VIEW place_images AS SELECT image_id, session_id, i.name AS name, node_id, world_from_cam, jpeg, NULL AS checksum
+CREATE TEMP VIEW nodes AS SELECT n.*, session_id, NULL AS checksum FROM main.nodes AS n LEFT JOIN sessions AS s ON s.name = n.recording;
+CREATE TEMP VIEW place_images AS SELECT i.*, session_id, NULL AS checksum
     FROM main.place_images AS i LEFT JOIN sessions AS s ON s.name = i.recording;
-CREATE TEMP VIEW landmark_sums AS SELECT 0 AS node_id, '' AS kind, 0 AS session_id, 0 AS num_rows, x'' AS sums, NULL AS checksum WHERE 0;
-CREATE TEMP VIEW repetitions AS SELECT 0 AS node_id, 0 AS num_moves, x'' AS moves, NULL AS checksum WHERE 0;
-"""  # noqa: E501
-# views of nodes and virtual nodes. Maps of schema 1 have one feature type, named in their
-# configuration.
-_POINT_VIEWS = """
-CREATE TEMP VIEW {0}node_points AS SELECT node_id, k.kind AS kind, num_points, descriptor_size, points_img, shapes, descriptors, points_cam,
-    sqrt_covs, NULL AS checksum FROM main.{0}node_points JOIN main.{0}nodes USING (node_id) JOIN kinds AS k;
-CREATE TEMP VIEW {0}coarse_models AS SELECT name, settings, arrays, NULL AS checksum FROM main.{0}coarse_models;
-"""  # noqa: E501
-_FEATURE_TYPE_TABLE = """
-CREATE TEMP TABLE kinds (kind TEXT);
-INSERT INTO kinds SELECT json_extract(value, '$.features.kind') FROM main.map WHERE key = 'config' AND json_valid(value);
 """  # noqa: E501
 _VIRTUAL_NODE_VIEWS = """
 CREATE TEMP TABLE pictures (recording TEXT, name TEXT, node_id INTEGER, PRIMARY KEY (recording, name));
 INSERT OR REPLACE INTO pictures SELECT recording, name, node_id FROM main.nodes ORDER BY node_id;
-CREATE TEMP VIEW side_nodes AS SELECT s.node_id AS node_id, p.node_id AS of_node, s.name AS name, t_ns, camera_id, world_from_cam,
-    num_points, NULL AS checksum FROM main.side_nodes AS s LEFT JOIN pictures AS p ON p.recording = s.recording AND p.name = s.name;
-"""  # noqa: E501
-_EMPTY_VIRTUAL_NODE_VIEW = """
-CREATE TEMP VIEW side_nodes AS SELECT 0 AS node_id, 0 AS of_node, '' AS name, 0 AS t_ns, 0 AS camera_id, x'' AS world_from_cam,
-    0 AS num_points, NULL AS checksum WHERE 0;
+CREATE TEMP VIEW side_nodes AS SELECT s.*, p.node_id AS of_node, NULL AS checksum
+    FROM main.side_nodes AS s LEFT JOIN pictures AS p ON p.recording = s.recording AND p.name = s.name;
 """  # noqa: E501
 
-SCHEMA_2_VIEWS = {
-    False: _FEATURE_TYPE_TABLE + _COMMON_VIEWS + _POINT_VIEWS.format("") + _EMPTY_VIRTUAL_NODE_VIEW,
-    True: _FEATURE_TYPE_TABLE
-    + _COMMON_VIEWS
-    + _POINT_VIEWS.format("")
-    + _VIRTUAL_NODE_VIEWS
-    + _POINT_VIEWS.format("side_"),
-}
+
+_POINT_VIEW = """
+CREATE TEMP VIEW {0}node_points AS SELECT p.*, num_points, k.kind AS kind, NULL AS checksum
+    FROM main.{0}node_points AS p JOIN main.{0}nodes USING (node_id) JOIN kinds AS k;
+"""
+_SAME_VIEW = "CREATE TEMP VIEW {0} AS SELECT *, NULL AS checksum FROM main.{0};\n"
+
+
+def schema_2_views(has_virtual_nodes: bool) -> str:
+    """Return the SQL that shows a map of schema 1, with or without virtual nodes, as schema 2."""
+    same = ["map", "cameras", "node_templates", "edges", "coarse_models"]
+    empty, views = ["landmark_sums", "repetitions"], _COMMON_VIEWS + _POINT_VIEW.format("")
+    if has_virtual_nodes:
+        views += _VIRTUAL_NODE_VIEWS + _POINT_VIEW.format(VIRTUAL_PREFIX)
+        same.append("side_coarse_models")
+    else:
+        empty += ["side_nodes", "side_node_points", "side_coarse_models"]
+    for table in empty:
+        columns = ", ".join(f"NULL AS {name}" for name in (*TABLES[table], "checksum"))
+        views += f"CREATE TEMP VIEW {table} AS SELECT {columns} WHERE 0;\n"
+    return views + "".join(map(_SAME_VIEW.format, same))
 
 
 def layer_suffix(kind: str, first: str) -> str:

@@ -1,8 +1,11 @@
-"""Localize nodes of a map in the rest of the map (leave-one-out).
+"""Localize nodes of a map, with their stored features as queries: in another map, in the rest of
+the map (leave-one-out), or in an edited version of the map.
 
 A map always finds a node by the node itself. So the node is hidden from the map, and optionally its
 neighbours of the same session. Hidden nodes take no part in retrieval, matching or guided search.
-The query consists of the node's stored local features, which all have a 3-D position.
+The query consists of the node's stored local features, which all have a 3-D position. The small
+images stored for the coarse localizers cannot serve as queries: at 160 pixels per side, even their
+own map does not localize most of them.
 """
 
 from __future__ import annotations
@@ -14,14 +17,12 @@ from typing import TypeVar
 import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.localizer import Localizer
+from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import Row, as_rows
-
-T = TypeVar("T")
 
 T = TypeVar("T")
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
@@ -88,19 +89,12 @@ def localize_left_out(
         features = {kind: layer.nodes[row].features for kind, layer in stored.layers.items()}
         near = [stored.summaries[k].node_id for k in beside(stored, row, num_d_thresh)]
         hidden = [node_id for node_id in near if node_id in known]
-        is_all = len(hidden) == len(localizer.topomap.summaries)
-        result = (
-            None
-            if is_all
-            else localizer.without(hidden).localize_query(
-                QueryImage.of_features(features, node.camera)
-            )[0]
-        )
-        answers[row] = (
-            _evaluate_result(result, node.summary.world_from_cam)
-            if isinstance(result, Localization)
-            else LeaveOneOutResult(False, False, 0)
-        )
+        answers[row] = LeaveOneOutResult(False, False, 0)
+        if len(hidden) < len(localizer.topomap.summaries):
+            query = QueryImage.of_features(features, node.camera)
+            result, *_ = localizer.without(hidden).localize_query(query)
+            if isinstance(result, Localization):
+                answers[row] = _evaluate_result(result, node.summary.world_from_cam)
         if progress is not None:
             progress(done + 1, len(rows))
     return answers
@@ -111,3 +105,50 @@ def _evaluate_result(result: Localization, world_from_cam: Rigid3) -> LeaveOneOu
         result.world_from_cam, MAX_TRANSLATION, np.radians(MAX_ROTATION_DEG)
     )
     return LeaveOneOutResult(not is_wrong, is_wrong, 0 if is_wrong else result.num_inliers)
+
+
+def localize_nodes(
+    localizer: Localizer,
+    source_map: TopoMetricMap,
+    rows: Sequence[Row],
+    on_localized: Callable[[int], None] = lambda done: None,
+) -> dict[Row, Localization | None]:
+    """Localize nodes of another map, which has all feature types of the localizer's map.
+
+    `rows` are those of the nodes in `source_map`. `on_localized` is called with the number of nodes
+    done so far. Return the localizations by row, None if a node is not localized.
+    """
+    answers: dict[Row, Localization | None] = {}
+    for row in rows:
+        features = {
+            kind: source_map.layers[kind].nodes[row].features for kind in localizer.topomap.kinds
+        }
+        query = QueryImage.of_features(features, source_map.nodes[row].camera)
+        result, *_ = localizer.localize_query(query)
+        answers[row] = result if isinstance(result, Localization) else None
+        on_localized(len(answers))
+    return answers
+
+
+def measure_recall_change(
+    before: TopoMetricMap,
+    after: TopoMetricMap,
+    localizer_config: LocalizerConfig | None = None,
+    max_queries: int = 24,
+) -> dict[str, int]:
+    """Count how many nodes of `before` the map localizes before and after an edit, each with the
+    node itself hidden.
+
+    At most `max_queries` nodes, evenly spaced, are localized. Return the counts by the names used
+    in the map's history, none if `max_queries` is 0. Raises MapError and errors as of `Localizer`.
+    """
+    rows = sample_evenly(before.rows, max_queries)
+    if not rows:
+        return {}
+    counts = {"earlier_asked": len(rows)}
+    for name, topomap in (("before", before), ("after", after)):
+        answers = localize_left_out(Localizer(topomap, localizer_config), before, rows, 0.0)
+        counts[f"earlier_localized_{name}"] = sum(
+            answer.is_localized for answer in answers.values()
+        )
+    return counts

@@ -11,11 +11,11 @@ import pytest
 
 from topoloc import TopoMetricMap
 from topoloc.features.features import Features
-from topoloc.mapping.coarse_models import open_map_coarse_localizer
-from topoloc.mapping.session_illumination import (
+from topoloc.mapping.coarse_models import (
     compute_illumination_distance,
     find_node_illumination_groups,
     group_by_illumination,
+    open_map_coarse_localizer,
 )
 from topoloc.mapping.sessions import Illumination, Session
 from topoloc.retrieval.coarse import VladConfig

@@ -1,0 +1,151 @@
+"""Make a node smaller: select its landmarks, and quantize their descriptors in larger steps.
+
+Landmarks with a high observation probability are kept. They are spread over the image, because a
+landmark beside others adds less. The objective is a submodular coverage: a cell of the image counts
+as the square root of the sum of its probabilities (Krause & Golovin 2014, greedy choice).
+
+Descriptors take half of a landmark's bytes. A file stores their numbers as signed bytes and
+compresses them, so fewer different values take fewer bits. A map reads them as usual, because the
+length of a descriptor does not matter. The default step is 0.64 times a number's root mean square
+(16 times the file's step for 64 numbers). With it, the scalar product of two descriptors changes by
+0.02. `benchmarks/descriptor_size.py` compares this with product quantization and with signs alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int8
+
+from topoloc.lifelong.lazy_sequences import transform_nodes
+from topoloc.mapping.landmark_statistics import LandmarkStatistics
+from topoloc.mapping.storage.point_encoding import dequantize_descriptors
+from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+
+# A node counts as quantized if the median norm of its stored descriptors is at most this many times
+# the norm expected for the step.
+_MAX_NORM_RATIO = 1.5
+
+
+def quantize_map_descriptors(topomap: TopoMetricMap, step: float) -> TopoMetricMap:
+    """Return the map with quantized descriptors, or the same map if all nodes are quantized
+    already.
+
+    A node is quantized each time it is read. Virtual nodes keep their descriptors. `step` is in
+    root mean squares of a descriptor's numbers. Raises MapError if a node cannot be read.
+    """
+    return transform_nodes(topomap, partial(quantize_node_descriptors, step=step))
+
+
+def quantize_node_descriptors(node: TopoNode, step: float) -> TopoNode:
+    """Return the node with its descriptors quantized, or the same node if they are quantized
+    already. `step` is in root mean squares of a descriptor's numbers."""
+    stored = node.stored_descriptors
+    if len(node.features) == 0 or (
+        stored is not None
+        and _median_norm(stored) <= _MAX_NORM_RATIO * np.sqrt(stored.shape[1]) / step
+    ):
+        return node
+    rounded = _quantize(node.features.descriptors, step)
+    return replace(
+        node,
+        features=replace(node.features, descriptors=dequantize_descriptors(rounded)),
+        stored_descriptors=rounded,
+    )
+
+
+def _quantize(descriptors: Float32[np.ndarray, "n d"], step: float) -> Int8[np.ndarray, "n d"]:
+    """Quantize descriptors of length 1 to signed bytes."""
+    steps = np.rint(descriptors * (np.sqrt(descriptors.shape[1]) / step))
+    return np.clip(steps, -127, 127).astype(np.int8)
+
+
+def _median_norm(stored: Int8[np.ndarray, "n d"]) -> float:
+    return float(np.median(np.linalg.norm(stored.astype(np.float32), axis=1)))
+
+
+def select_landmarks(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:
+    """Return the node with the landmarks `kept` (rows in increasing order) and their session
+    statistics."""
+    new_row = np.full(len(node.features), -1)
+    new_row[kept] = np.arange(len(kept))
+    session_statistics = []
+    for of_session in node.session_statistics:
+        stays = new_row[of_session.rows] >= 0
+        if stays.any():
+            names, rows = ("roots", "pulls", "expected", "seen"), new_row[of_session.rows[stays]]
+            parts = (getattr(of_session, name)[stays] for name in names)
+            session_statistics.append(LandmarkStatistics(of_session.session_id, rows, *parts))
+    stored = node.stored_descriptors
+    return replace(
+        node,
+        summary=replace(node.summary, num_points=len(kept)),
+        features=node.features.select(kept),
+        points_cam=node.points_cam[kept],
+        point_sqrt_covs=node.point_sqrt_covs[kept],
+        session_statistics=session_statistics,
+        stored_descriptors=None if stored is None else stored[kept],
+    )
+
+
+def find_vanished(node: TopoNode) -> Bool[np.ndarray, " n"]:
+    """Return the mask of landmarks that later sessions never saw although they saw the rest of the
+    node.
+
+    The number of missed images must be large enough: a session that finds a third of the landmarks
+    misses an existing one in four images with a probability of one in five.
+    """
+    # Minimum number of images of later sessions that should have shown a landmark, before it
+    # can count as vanished.
+    min_expected = 4
+    # A landmark counts as vanished if an existing landmark would stay unseen in all these
+    # images with at most this probability. The probability follows from the shares that the
+    # sessions saw of the node.
+    max_chance = 0.02
+    # If more than this share of a node's landmarks would count as vanished, none of them
+    # does.
+    max_gone_share = 0.7
+    num = len(node.features)
+    expected, seen, log_missed = np.zeros(num, np.int64), np.zeros(num, np.int64), np.zeros(num)
+    for session_statistics in node.session_statistics:
+        later = session_statistics.session_id != node.summary.session_id
+        if later and session_statistics.is_reobserved():
+            rows, own = session_statistics.rows, session_statistics.expected
+            num_seen = session_statistics.seen.sum(dtype=np.int64)
+            share = num_seen / max(int(own.sum(dtype=np.int64)), 1)
+            expected[rows] += own
+            seen[rows] += session_statistics.seen
+            log_missed[rows] += own * np.log1p(-min(share, 0.99))
+    vanished = (expected >= min_expected) & (seen == 0) & (log_missed <= np.log(max_chance))
+    return vanished if vanished.sum() <= max_gone_share * num else np.zeros(num, bool)
+
+
+def _observation_probability(node: TopoNode) -> Float[np.ndarray, " n"]:
+    """Return each landmark's probability of being seen if it should be visible, over all sessions
+    (Laplace's rule)."""
+    expected, seen = np.ones(len(node.features)) * 2.0, np.ones(len(node.features))
+    for session_statistics in node.session_statistics:
+        expected[session_statistics.rows] += session_statistics.expected
+        seen[session_statistics.rows] += session_statistics.seen
+    return seen / expected
+
+
+def choose_landmarks(
+    node: TopoNode, rows: Int[np.ndarray, " m"], most: int
+) -> Int[np.ndarray, " k"]:
+    """Select the rows that a node keeps. Greedy choice: each next landmark adds most to the
+    coverage of its cell."""
+    cells = 8  # number of cell columns in the image. The kept landmarks are spread over the cells
+    size = node.camera.width / cells
+    cell = (node.features.points_img[rows] / size).astype(np.int64)
+    key = cell[:, 1] * (cells + 1) + cell[:, 0]
+    chances, gains = _observation_probability(node)[rows], np.empty(len(rows))
+    for one in np.unique(key):
+        of_cell = np.flatnonzero(key == one)
+        best_first = of_cell[np.argsort(-chances[of_cell], kind="stable")]
+        total = np.cumsum(chances[best_first])
+        # gains decrease within a cell, so sorting is the greedy choice
+        gains[best_first] = np.sqrt(total) - np.sqrt(total - chances[best_first])
+    return np.sort(np.argsort(-gains, kind="stable")[:most])
