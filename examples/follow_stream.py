@@ -17,8 +17,8 @@ import numpy as np
 import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import translation_error
+from topoloc.tracking.config import HypothesesConfig
 from topoloc.tracking.motion import MotionConfig
-from topoloc.tracking.pose_hypotheses import HypothesesConfig
 
 COVERED, MISPLACED = range(8, 10), 20
 

@@ -29,8 +29,8 @@ from topoloc.bounds import (
 )
 from topoloc.errors import ConfigError
 from topoloc.mapping.nodes import NodeConfig
+from topoloc.tracking.config import HypothesesConfig
 from topoloc.tracking.motion import MotionConfig
-from topoloc.tracking.pose_hypotheses import HypothesesConfig
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,7 @@ def _rms(
             np.mean(
                 [
                     np.sum(np.square(pose.translation - TRUTH[k].translation))
-                    for k, pose in enumerate(held)
-                    if pose is not None
+                    for k, pose in held.items()
                 ]
             )
         )

@@ -23,8 +23,11 @@ from topoloc.atlas.manifest import Manifest
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.tiles.shared_images import estimate_by_shared_images
-from topoloc.lifelong.tiles.tile_comparison import NotJoined, compare_tiles
+from topoloc.lifelong.tiles.tile_comparison import (
+    NotJoined,
+    compare_tiles,
+    estimate_by_shared_images,
+)
 from topoloc.lifelong.tiles.tile_joining import TileJoiningResult, find_candidate_pairs, join_tiles
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import SkippedChecks, build_map

@@ -21,21 +21,19 @@ def _localized(pose: Rigid3, sigma_m: float = 0.03, sigma_deg: float = 1.0) -> L
     return Localization(pose, adjoint @ of_camera @ adjoint.T, 0.99, 0, [], 100, 80)
 
 
-def _bent(by_m: float, by_deg: float) -> list[Rigid3 | None]:
+def _bent(by_m: float, by_deg: float) -> dict[int, Rigid3]:
     """Off by so much at both ends, and right in the middle."""
     bend = np.cos(np.linspace(0.0, 2.0 * np.pi, len(TRUTH)))
     turns = [exp_so3(np.array([0.0, 0.0, np.radians(by_deg) * share])) for share in bend]
-    return [
-        Rigid3(turn @ pose.rotation, pose.translation + np.array([by_m * share, 0.0, 0.0]))
-        for pose, turn, share in zip(TRUTH, turns, bend, strict=True)
-    ]
+    return {
+        k: Rigid3(turn @ TRUTH[k].rotation, TRUTH[k].translation + np.array([by_m * share, 0, 0]))
+        for k, (turn, share) in enumerate(zip(turns, bend, strict=True))
+    }
 
 
-def _off(poses: list[Rigid3 | None]) -> np.ndarray:
+def _off(poses: dict[int, Rigid3]) -> np.ndarray:
     """Metres and degrees from the truth, a row a frame."""
-    apart = [
-        pose.inverse() @ true for pose, true in zip(poses, TRUTH, strict=True) if pose is not None
-    ]
+    apart = [poses[k].inverse() @ true for k, true in enumerate(TRUTH)]
     return np.array([(np.linalg.norm(one.translation), np.degrees(one.angle())) for one in apart])
 
 
@@ -54,7 +52,7 @@ def test_far_beyond_the_answers_it_keeps_its_own_shape():
 
 
 def test_single_answers_and_ones_that_are_not_sure_hardly_move_it():
-    walk: list[Rigid3 | None] = [*TRUTH]
+    walk = dict(enumerate(TRUTH))
     beside = Rigid3(np.eye(3), TRUTH[30].translation + np.array([0.08, 0.0, 0.0]))
     answers = {k: _localized(TRUTH[k]) for k in ANSWERED} | {30: _localized(beside)}
     assert _off(correct_trajectory(walk, answers, D_THRESH))[:, 0].max() < 0.012
@@ -66,7 +64,7 @@ def test_single_answers_and_ones_that_are_not_sure_hardly_move_it():
 
 
 def test_what_the_map_is_sure_of_and_contradicts_is_no_bend():
-    walk: list[Rigid3 | None] = [*TRUTH]
+    walk = dict(enumerate(TRUTH))
     elsewhere = {
         k: _localized(Rigid3(np.eye(3), TRUTH[k].translation + np.array([0.2, 0.0, 0.0])))
         for k in range(50, 60)
@@ -76,7 +74,5 @@ def test_what_the_map_is_sure_of_and_contradicts_is_no_bend():
 
 @pytest.mark.parametrize("answers", [{}, {3: _localized(TRUTH[3])}])
 def test_frames_without_a_pose_stay_without(answers: dict[int, Localization]):
-    walk: list[Rigid3 | None] = [*TRUTH[:3], None, *TRUTH[4:], None]
-    assert [
-        k for k, pose in enumerate(correct_trajectory(walk, answers, D_THRESH)) if pose is None
-    ] == [3, 100]
+    walk = {k: pose for k, pose in enumerate(TRUTH) if k != 3}
+    assert correct_trajectory(walk, answers, D_THRESH).keys() == walk.keys()

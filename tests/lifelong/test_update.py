@@ -30,7 +30,8 @@ from topoloc.apps.cli import main
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.session_content import is_well_localized, update_map
+from topoloc.lifelong.session_content import is_well_localized
+from topoloc.lifelong.update import update_map
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig

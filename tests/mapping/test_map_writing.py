@@ -152,7 +152,7 @@ def test_a_disk_that_is_full_is_a_map_error(
 def test_an_interrupted_write_leaves_nothing(
     tiny_map: TopoMetricMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(map_writing, "_arrays_bytes", stop(KeyboardInterrupt()))
+    monkeypatch.setattr(map_writing, "compute_map_digest", stop(KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):
         tiny_map.save(tmp_path / "room.topo")
     assert list(tmp_path.iterdir()) == []

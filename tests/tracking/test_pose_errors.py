@@ -8,7 +8,7 @@ import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.result import Localization
-from topoloc.tracking.pose_errors import compute_correlated_change, compute_pose_errors
+from topoloc.tracking.tracker_state import compute_correlated_change, compute_pose_errors
 
 WORLD_FROM_CAM = Rigid3(exp_so3(np.array([0.3, -1.0, 0.2])), np.array([40.0, -7.0, 2.0]))
 IN_CAMERA = np.diag([1e-4, 2e-4, 4e-4, 1e-5, 2e-5, 3e-5])

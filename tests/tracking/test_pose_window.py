@@ -6,7 +6,7 @@ import numpy as np
 
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.tracking.pose_window import PoseWindow
+from topoloc.tracking.tracker_state import PoseWindow
 
 FIRST = Rigid3(exp_so3(np.array([0.2, -0.4, 0.1])), np.array([3.0, -1.0, 5.0]))
 STEP = Rigid3(exp_so3(np.array([0.0, 0.05, 0.0])), np.array([0.1, 0.0, 0.02]))

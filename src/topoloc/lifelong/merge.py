@@ -88,7 +88,7 @@ def merge_maps(
         for row, answer in aligned.answers.items()
         if not is_well_localized(answer, first.config.d_thresh)
     )
-    poses = {Row(row): pose for row, pose in enumerate(aligned.world_from_cams) if pose is not None}
+    poses = {Row(row): pose for row, pose in aligned.world_from_cams.items()}
     merged, not_updated = _add_nodes(first, second, added, poses)
     changes = {
         "nodes_of_second": len(second.summaries),

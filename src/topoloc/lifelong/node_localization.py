@@ -49,18 +49,12 @@ def sample_evenly(rows: Sequence[T], max_count: int) -> list[T]:
     ]
 
 
-def beside(topomap: TopoMetricMap, row: Row, num_d_thresh: float) -> list[Row]:
-    """Return the rows of a node and of the near nodes of its session.
-
-    A node is near if its distance by Eq. 1 is at most `num_d_thresh` times D_thresh.
-    """
-    summary = topomap.summaries[row]
-    near = np.flatnonzero(
-        node_distances(summary.world_from_cam, topomap.node_poses, topomap.config.lambda_rot)
-        <= num_d_thresh * topomap.config.d_thresh
-    )
-    same = (k for k in as_rows(near) if topomap.summaries[k].session_id == summary.session_id)
-    return sorted({row, *same})
+def find_near_nodes(topomap: TopoMetricMap, row: Row, num_d_thresh: float) -> list[Row]:
+    """Return the rows of nodes whose distance to a node by Eq. 1 is at most `num_d_thresh` times
+    D_thresh."""
+    pose, config = topomap.summaries[row].world_from_cam, topomap.config
+    distances = node_distances(pose, topomap.node_poses, config.lambda_rot)
+    return as_rows(np.flatnonzero(distances <= num_d_thresh * config.d_thresh))
 
 
 def localize_left_out(
@@ -87,8 +81,10 @@ def localize_left_out(
     for done, row in enumerate(rows):
         node = stored.nodes[row]
         features = {kind: layer.nodes[row].features for kind, layer in stored.layers.items()}
-        near = [stored.summaries[k].node_id for k in beside(stored, row, num_d_thresh)]
-        hidden = [node_id for node_id in near if node_id in known]
+        session_id = stored.summaries[row].session_id
+        near = (stored.summaries[k] for k in find_near_nodes(stored, row, num_d_thresh))
+        beside = {one.node_id for one in near if one.session_id == session_id}
+        hidden = sorted(known & (beside | {node.summary.node_id}))
         answers[row] = LeaveOneOutResult(False, False, 0)
         if len(hidden) < len(localizer.topomap.summaries):
             query = QueryImage.of_features(features, node.camera)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from topoloc.geometry.rigid import inverse_covariance, position_covariance
+from topoloc.geometry.rigid import position_covariance
 from topoloc.lifelong.coarse_model_update import DescribedPlace
 from topoloc.lifelong.session_poses import Progress, SessionPoses
 from topoloc.localization.result import Localization
@@ -145,6 +145,6 @@ def is_well_localized(answer: Localization | None, d_thresh: float, min_inliers:
     max_sigma = 0.3
     if answer is None or answer.num_inliers < min_inliers:
         return False
-    of_inverse = answer.noise_share * inverse_covariance(answer.world_from_cam, answer.covariance)
-    at_camera = position_covariance(answer.world_from_cam.inverse(), of_inverse)
+    noise = answer.noise_share * answer.camera_covariance
+    at_camera = position_covariance(answer.world_from_cam.inverse(), noise)
     return float(np.sqrt(np.linalg.eigvalsh(at_camera)[-1])) <= max_sigma * d_thresh

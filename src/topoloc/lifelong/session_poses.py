@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
-from topoloc.geometry.rigid import Rigid3, inverse_covariance
+from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.noise_scale import LocalizedStep, NoiseScale, estimate_noise_scale
 from topoloc.lifelong.scale_estimation import WIDENED, MotionTolerance, find_motion_consensus
 from topoloc.lifelong.session_checks import check_calibration, check_focal_length
@@ -42,12 +42,12 @@ SLACK, SLACK_DEG = 0.3, 2.0
 class SessionPoses:
     """Hold the poses of a session in the world of the map.
 
-    `world_from_cams` holds the poses of the frames up to the last one with a pose, None if unknown.
+    `world_from_cams` holds the known poses by frame.
     `answers` holds the localizations of the queried frames, None if a frame is not localized.
     `inlier_idx` lists the frames whose localizations anchor the session.
     """
 
-    world_from_cams: list[Rigid3 | None]
+    world_from_cams: dict[int, Rigid3]
     answers: Mapping[int, Localization | None]
     inlier_idx: list[int]
     propagated_idx: Sequence[int] = ()
@@ -68,12 +68,19 @@ def estimate_poses_by_motion(
         UnreadableImageError, QueryError: an image cannot be read or localized.
     """
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
-    motions = [odom for poses in stretches if (odom := _known_poses(poses))]
+    numbered = [
+        {index: pose for index, pose in enumerate(poses) if pose is not None} for poses in stretches
+    ]
+    motions = [odom for odom in numbered if odom]
     if not motions:
         raise TrajectoryError(
             f"{sequence.name}: none of its frames has a pose; the map stays as it is"
         )
-    queried = [_select_node_frames(odom, map_config) for odom in motions]
+    queried = list[list[int]]()
+    for odom in motions:
+        frames, poses = list(odom), list(odom.values())
+        rows = select_node_frames(poses, map_config.d_thresh, map_config.lambda_rot)
+        queried.append([frames[row] for row in rows])
     indices = sorted({index for of_motion in queried for index in of_motion})
     results = list[Localization | NotLocalized]()
     for done, index in enumerate(indices):
@@ -87,49 +94,18 @@ def estimate_poses_by_motion(
         index: result if isinstance(result, Localization) else None
         for index, result in zip(indices, results, strict=True)
     }
-    return _align_stretches(
-        sequence.name,
-        motions,
-        [{index: answers[index] for index in of_motion} for of_motion in queried],
-        map_config.d_thresh,
-    )
-
-
-def _known_poses(poses: Sequence[Rigid3 | None]) -> dict[int, Rigid3]:
-    return {index: pose for index, pose in enumerate(poses) if pose is not None}
-
-
-def _select_node_frames(odom: Mapping[int, Rigid3], map_config: MapConfig) -> list[int]:
-    """Return frames of a motion that are about as far apart as nodes of the map."""
-    indices = list(odom)
-    poses, spacing = list(odom.values()), (map_config.d_thresh, map_config.lambda_rot)
-    return [indices[k] for k in select_node_frames(poses, *spacing)]
-
-
-def _align_stretches(
-    name: str,
-    motions: Sequence[Mapping[int, Rigid3]],
-    answers: Sequence[Mapping[int, Localization | None]],
-    d_thresh: float,
-) -> SessionPoses:
-    """Align each stretch by the localizations of its own images. Stretches that cannot be aligned
-    have no poses. Raises the TrajectoryError of the first stretch if none can be aligned."""
     aligned, refused = list[SessionPoses](), list[TrajectoryError]()
-    for odom, of_motion in zip(motions, answers, strict=True):
+    for odom, frames in zip(motions, queried, strict=True):
+        own = {index: answers[index] for index in frames}
         try:
-            aligned.append(align_motion_to_map(name, odom, of_motion, d_thresh))
+            aligned.append(align_motion_to_map(sequence.name, odom, own, map_config.d_thresh))
         except TrajectoryError as error:
             refused.append(error)
     if not aligned:
         raise refused[0]
-    world_from_cams: list[Rigid3 | None] = [None] * max(len(one.world_from_cams) for one in aligned)
-    for one in aligned:
-        for index, pose in _known_poses(one.world_from_cams).items():
-            world_from_cams[index] = pose
-    every = {index: answer for of_motion in answers for index, answer in of_motion.items()}
-    return SessionPoses(
-        world_from_cams, every, sorted(index for one in aligned for index in one.inlier_idx)
-    )
+    poses = {index: pose for one in aligned for index, pose in one.world_from_cams.items()}
+    inlier_idx = sorted(index for one in aligned for index in one.inlier_idx)
+    return SessionPoses(poses, answers, inlier_idx)
 
 
 def align_motion_to_map(
@@ -141,24 +117,16 @@ def align_motion_to_map(
 ) -> SessionPoses:
     """Align a motion in its own world with the map, by localizations of some of its frames.
 
-    Args:
-        name: the session's name, for error messages.
-        odom: the poses of the motion, by frame.
-        answers: the localizations of the queried frames, None if not localized.
-        d_thresh: D_thresh of the map, in metres.
-        noise_scale: the noise scales of motion and localizations. Estimated if None.
-
-    Raises:
-        TrajectoryError: the map recognises too little of it, or contradicts the motion.
+    `odom` holds the poses of the motion, and `answers` the localizations of the queried frames, by
+    frame. `d_thresh` is that of the map, in metres. The noise scales of motion and localizations
+    are estimated if `noise_scale` is None. Raises TrajectoryError if the map recognises too little
+    of the session `name`, or contradicts the motion.
     """
     localized = {index: result for index, result in answers.items() if result is not None}
     inlier_idx = _find_consensus(name, odom, localized, len(answers), d_thresh)
     anchors = {k: localized[k] for k in inlier_idx}
-    return SessionPoses(
-        _optimize_motion(odom, anchors, noise_scale or _estimate_noise(odom, anchors)),
-        answers,
-        inlier_idx,
-    )
+    poses = _optimize_motion(odom, anchors, noise_scale or _estimate_noise(odom, anchors))
+    return SessionPoses(poses, answers, inlier_idx)
 
 
 def _find_consensus(
@@ -175,7 +143,12 @@ def _find_consensus(
     min_share = 0.5
     indices = list(localized)
     if num_queried < MIN_AGREEING:
-        raise TrajectoryError(f"{name}: {_too_few_message(num_queried)}; the map stays as it is")
+        many = f"{num_queried} of its pictures are"
+        some = many if num_queried > 1 else "one of its pictures is"
+        raise TrajectoryError(
+            f"{name}: {some} as far apart as nodes of the map, too few to join: it takes"
+            f" {MIN_AGREEING}; the map stays as it is"
+        )
     if len(indices) < MIN_AGREEING:
         raise TrajectoryError(
             f"{name}: the map recognises {len(indices)} of {num_queried} pictures asked: another"
@@ -194,11 +167,6 @@ def _find_consensus(
     return inlier_idx
 
 
-def _too_few_message(num_queried: int) -> str:
-    found = f"{num_queried} of its pictures are" if num_queried > 1 else "one of its pictures is"
-    return f"{found} as far apart as nodes of the map, too few to join: it takes {MIN_AGREEING}"
-
-
 def _check_scale(
     name: str, odom: Mapping[int, Rigid3], localized: Mapping[int, Localization]
 ) -> None:
@@ -211,10 +179,7 @@ def _check_scale(
     a = np.array([odom[k].translation for k in localized])
     b = np.array([answer.world_from_cam.translation for answer in localized.values()])
     rows, columns = np.triu_indices(len(a), 1)
-    odom_lengths, lengths = (
-        np.linalg.norm(a[rows] - a[columns], axis=1),
-        np.linalg.norm(b[rows] - b[columns], axis=1),
-    )
+    odom_lengths, lengths = (np.linalg.norm(p[rows] - p[columns], axis=1) for p in (a, b))
     far = lengths > 0.5 * lengths.max()
     if (odom_lengths[far] == 0.0).any():
         return
@@ -233,7 +198,7 @@ def _check_scale(
 
 def _optimize_motion(
     odom: Mapping[int, Rigid3], anchors: Mapping[int, Localization], noise_scale: NoiseScale
-) -> list[Rigid3 | None]:
+) -> dict[int, Rigid3]:
     """Optimize the motion with its anchors as a pose graph. The first node is the world of the map
     and is fixed."""
     indices = list(odom)
@@ -247,17 +212,11 @@ def _optimize_motion(
     ]
     row_of = {index: row for row, index in enumerate(indices, 1)}
     for index, answer in anchors.items():
-        covariance = (noise_scale.answers * WIDENED) ** 2 * inverse_covariance(
-            answer.world_from_cam, answer.covariance
-        )
-        edges.append(
-            Edge(0, row_of[index], answer.world_from_cam.inverse(), covariance, is_loop=True)
-        )
+        covariance = (noise_scale.answers * WIDENED) ** 2 * answer.camera_covariance
+        cam_from_world = answer.world_from_cam.inverse()
+        edges.append(Edge(0, row_of[index], cam_from_world, covariance, is_loop=True))
     optimised = optimize_pose_graph(cam_from_worlds, edges)[1:]
-    poses: list[Rigid3 | None] = [None] * (max(odom) + 1)
-    for index, cam_from_world in zip(indices, optimised, strict=True):
-        poses[index] = cam_from_world.inverse()
-    return poses
+    return {index: pose.inverse() for index, pose in zip(indices, optimised, strict=True)}
 
 
 def _estimate_noise(odom: Mapping[int, Rigid3], anchors: Mapping[int, Localization]) -> NoiseScale:
@@ -278,8 +237,8 @@ def _estimate_noise(odom: Mapping[int, Rigid3], anchors: Mapping[int, Localizati
         before = pose
         if index in anchors:
             answer = anchors[index]
-            of_answer = inverse_covariance(answer.world_from_cam, answer.covariance)
-            seen.append(LocalizedStep(moved, spread, answer.world_from_cam.inverse(), of_answer))
+            cam_from_world, of_answer = answer.world_from_cam.inverse(), answer.camera_covariance
+            seen.append(LocalizedStep(moved, spread, cam_from_world, of_answer))
             moved, spread = Rigid3.identity(), np.zeros((6, 6))
     return estimate_noise_scale(seen, motion_factors, answer_factors)
 
@@ -295,8 +254,6 @@ def _relative_motion(
     turn_drift = 0.002
     b_from_a = odom_from_b.inverse() @ odom_from_a
     path_length = float(np.linalg.norm(b_from_a.translation))
-    sigma_m, sigma_rad = (
-        0.001 + drift * path_length,
-        0.0005 + turn_drift * (path_length + b_from_a.angle()),
-    )
+    sigma_m = 0.001 + drift * path_length
+    sigma_rad = 0.0005 + turn_drift * (path_length + b_from_a.angle())
     return b_from_a, np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)

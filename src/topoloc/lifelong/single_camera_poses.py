@@ -60,11 +60,8 @@ def estimate_poses_by_map(
     # A frame without odometry takes the map's pose if its position sigma is at most this many
     # D_thresh.
     max_sigma = 0.1
-    by_map, localized, results = (
-        dict[int, Rigid3](),
-        dict[int, Localization](),
-        list[Localization | NotLocalized](),
-    )
+    by_map, localized = dict[int, Rigid3](), dict[int, Localization]()
+    results = list[Localization | NotLocalized]()
     odometry = MonocularOdometry()
     for index, t_ns in enumerate(sequence.t_ns):
         frame = sequence[index]
@@ -76,11 +73,7 @@ def estimate_poses_by_map(
         odometry.process(index, frame)
         found = tracker.process(frame.image, frame.camera, t_ns)
         results.append(found.result)
-        if (
-            found.state in ("localized", "tracked")
-            and found.smoothed is not None
-            and isinstance(found.result, Localization)
-        ):
+        if found.smoothed is not None and isinstance(found.result, Localization):
             by_map[index], localized[index] = found.smoothed, found.result
         progress(f"localizing {sequence.name}", index + 1, len(sequence))
     check_calibration(sequence.name, results)
@@ -91,14 +84,11 @@ def estimate_poses_by_map(
             " too few to join"
         )
     d_thresh = map_config.d_thresh
-    clear = {
-        index
+    poses = {
+        index: by_map[index]
         for index, answer in localized.items()
         if answer.position_sigma_m <= max_sigma * d_thresh
     }
-    poses: list[Rigid3 | None] = [
-        by_map[index] if index in clear else None for index in range(len(sequence))
-    ]
     for stretch in odometry.submaps:
         odom = stretch.submap_from_cams()
         aligned, inlier_idx = align_stretch_to_map(sequence.name, odom, localized, d_thresh)
@@ -108,14 +98,15 @@ def estimate_poses_by_map(
             corrected = correct_trajectory(adjusted, anchors, d_thresh)
             aligned, inlier_idx = _reject_contradicted(corrected, localized, inlier_idx, d_thresh)
         for index in odom:
-            answer = localized[index] if index in inlier_idx else localized.pop(index, None)
+            is_inlier, pose = index in inlier_idx, poses.pop(index, None)
+            answer = localized[index] if is_inlier else localized.pop(index, None)
             if aligned is None:
-                poses[index] = by_map[index] if index in inlier_idx and index in clear else None
+                pose = pose if is_inlier else None
             else:
-                poses[index] = _pose_if_consistent(
-                    aligned[index] if index < len(aligned) else None, answer, d_thresh
-                )
-    known = [(index, pose) for index, pose in enumerate(poses) if pose is not None]
+                pose = _pose_if_consistent(aligned.get(index), answer, d_thresh)
+            if pose is not None:
+                poses[index] = pose
+    known = sorted(poses.items(), key=lambda pair: pair[0])
     if not known:
         raise TrajectoryError(
             f"{sequence.name}: {_failure_reason(localized)}; the map stays as it is"
@@ -144,14 +135,10 @@ def _failure_reason(localized: Mapping[int, Localization]) -> str:
 
 def align_stretch_to_map(
     name: str, odom: Mapping[int, Rigid3], localized: Mapping[int, Localization], d_thresh: float
-) -> tuple[list[Rigid3 | None] | None, list[int]]:
-    """Align a stretch of odometry with the map.
-
-    Returns:
-        world_from_cam by frame, and the frames of the localizations that agree with it. The poses
-        are None if too few localizations support the stretch. A single pose is None if map and
-        motion contradict each other there.
-    """
+) -> tuple[dict[int, Rigid3] | None, list[int]]:
+    """Align a stretch of odometry with the map. Return world_from_cam by frame, without frames at
+    which map and motion contradict each other, and the frames of the localizations that agree with
+    it. The poses are None if too few localizations support the stretch."""
     within_stretch = {index: answer for index, answer in localized.items() if index in odom}
     inlier_idx = _find_consensus(odom, within_stretch, d_thresh)
     num_refits = 3  # each with another scale
@@ -166,9 +153,8 @@ def align_stretch_to_map(
         if len(within) < MIN_AGREEING:
             return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh)
         try:
-            aligned = align_motion_to_map(
-                name, metric, within, d_thresh, NoiseScale()
-            )  # fixed noise scales: the drift of the scale is not a random walk
+            # fixed noise scales: the drift of the scale is not a random walk
+            aligned = align_motion_to_map(name, metric, within, d_thresh, NoiseScale())
         except TrajectoryError:
             return None, _reject_ambiguous(odom, within_stretch, inlier_idx, d_thresh)
         inlier_idx = aligned.inlier_idx
@@ -204,33 +190,24 @@ def _reject_ambiguous(
 
 
 def _reject_contradicted(
-    poses: Sequence[Rigid3 | None],
+    poses: Mapping[int, Rigid3],
     localized: Mapping[int, Localization],
     inlier_idx: Sequence[int],
     d_thresh: float,
-) -> tuple[list[Rigid3 | None] | None, list[int]]:
+) -> tuple[dict[int, Rigid3] | None, list[int]]:
     """Remove poses and localizations of frames for which map and motion contradict each other.
     Return None for the poses if too few localizations are left."""
     # A frame has no pose if map and motion differ by more than this many D_thresh. Three sigmas of
     # the localization, multiplied by `WIDENED`, are added.
     contradiction = 0.1
-    within_stretch = {
-        index: answer
-        for index, answer in localized.items()
-        if index < len(poses) and poses[index] is not None
-    }
-    apart = {
-        index
-        for index, answer in within_stretch.items()
-        if (pose := poses[index]) is not None
-        and not pose.is_same(
-            answer.world_from_cam,
-            contradiction * d_thresh + 3.0 * WIDENED * answer.position_sigma_m,
-            math.inf,
-        )
-    }
+    within_stretch = {index: answer for index, answer in localized.items() if index in poses}
+    apart = set[int]()
+    for index, answer in within_stretch.items():
+        tolerance = contradiction * d_thresh + 3.0 * WIDENED * answer.position_sigma_m
+        if not poses[index].is_same(answer.world_from_cam, tolerance, math.inf):
+            apart.add(index)
     contradicted = _find_contradicted_frames(list(within_stretch), apart)
-    left = [None if index in contradicted else pose for index, pose in enumerate(poses)]
+    left = {index: pose for index, pose in poses.items() if index not in contradicted}
     consistent = [index for index in inlier_idx if index not in apart]
     return (left, consistent) if len(consistent) >= MIN_AGREEING else (None, [])
 

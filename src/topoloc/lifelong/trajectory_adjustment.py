@@ -17,13 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.alignment import compute_path_lengths
-from topoloc.geometry.rigid import Rigid3, exp_so3, inverse_covariance, log_so3
+from topoloc.geometry.rigid import Rigid3, exp_so3, log_so3
 from topoloc.localization.result import Localization
 from topoloc.slam.bundle.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import FramePose, KeyFrame
@@ -34,18 +33,14 @@ _NUM_ITERATIONS, _MAX_SIGMAS = 4, 3.0
 
 def adjust_trajectory(
     stretch: MonocularSubmap,
-    world_from_cams: Sequence[Rigid3 | None],
+    world_from_cams: Mapping[int, Rigid3],
     anchors: Mapping[int, Localization],
-) -> list[Rigid3 | None]:
-    """Return the adjusted world_from_cam of each frame. None stays None.
+) -> dict[int, Rigid3]:
+    """Return the adjusted poses of the frames, given the initial poses in the map's world (metres)
+    and the trusted localizations.
 
-    The stretch's key frames and landmarks change, too. Afterwards they are in the map's world, in
-    metres.
-
-    Args:
-        stretch: the odometry of the trajectory.
-        world_from_cams: the initial poses of the frames, in the map's world and metres.
-        anchors: the trusted localizations, by frame.
+    The key frames and landmarks of the stretch change, too. Afterwards they are in the map's world,
+    in metres.
     """
     # Factor of the sigmas of tracked points. A sliding point does so in all of its key frames.
     points_widened = 8.0
@@ -54,9 +49,14 @@ def adjust_trajectory(
     frames = {
         f.frame_idx: f
         for f in stretch.frames
-        if id(f.keyframe) in moved and _has_pose(world_from_cams, f.frame_idx)
+        if id(f.keyframe) in moved and f.frame_idx in world_from_cams
     }
-    relative = {index: _relative_pose(frame, world_from_cams) for index, frame in frames.items()}
+    relative = {
+        index: f.view_from_cam
+        @ world_from_cams[index].inverse()
+        @ f.keyframe.cam_from_world.inverse()
+        for index, f in frames.items()
+    }
     for keyframe in keyframes:
         keyframe.observations.weights /= points_widened
     map_anchors = [
@@ -64,32 +64,13 @@ def adjust_trajectory(
         for index, frame in frames.items()
         if index in anchors
     ]
-    adjust_bundle(
-        keyframes,
-        [],
-        stretch.landmarks,
-        map_anchors,
-        max_steps=30,
-        min_decrease=1e-5,
-        cauchy_scale=0.5,
-    )
-    adjusted = list(world_from_cams)
+    limits = {"max_steps": 30, "min_decrease": 1e-5, "cauchy_scale": 0.5}
+    adjust_bundle(keyframes, [], stretch.landmarks, map_anchors, **limits)
+    adjusted = dict(world_from_cams)
     for index, frame in frames.items():
-        adjusted[index] = (
-            relative[index] @ frame.keyframe.cam_from_world
-        ).inverse() @ frame.view_from_cam
+        view_from_world = relative[index] @ frame.keyframe.cam_from_world
+        adjusted[index] = view_from_world.inverse() @ frame.view_from_cam
     return adjusted
-
-
-def _has_pose(world_from_cams: Sequence[Rigid3 | None], index: int) -> bool:
-    return index < len(world_from_cams) and world_from_cams[index] is not None
-
-
-def _relative_pose(frame: FramePose, world_from_cams: Sequence[Rigid3 | None]) -> Rigid3:
-    """Return cam_from_keyframe of a frame, in metres."""
-    pose = world_from_cams[frame.frame_idx]
-    assert pose is not None
-    return frame.view_from_cam @ pose.inverse() @ frame.keyframe.cam_from_world.inverse()
 
 
 def _keyframe_anchor(
@@ -97,32 +78,22 @@ def _keyframe_anchor(
 ) -> PosePrior:
     """Return the pose prior on a frame's key frame that follows from the frame's localization."""
     keyframe_from_cam = cam_from_keyframe.inverse() @ frame.view_from_cam
-    information = np.linalg.inv(inverse_covariance(answer.world_from_cam, answer.covariance))
     turned = keyframe_from_cam.inverse().adjoint()
-    return PosePrior(
-        frame.keyframe,
-        keyframe_from_cam @ answer.world_from_cam.inverse(),
-        turned.T @ information @ turned,
-    )
+    information = turned.T @ np.linalg.inv(answer.camera_covariance) @ turned
+    keyframe_from_world = keyframe_from_cam @ answer.world_from_cam.inverse()
+    return PosePrior(frame.keyframe, keyframe_from_world, information)
 
 
 def _transform_to_map(
-    stretch: MonocularSubmap, world_from_cams: Sequence[Rigid3 | None]
+    stretch: MonocularSubmap, world_from_cams: Mapping[int, Rigid3]
 ) -> list[KeyFrame]:
     """Move the key frames with a known pose, and their landmarks, into the map's world and metres.
     Return these key frames."""
     views = {f.frame_idx: f.view_from_cam for f in stretch.frames}
-    keyframes = [
-        k
-        for k in stretch.keyframes
-        if _has_pose(world_from_cams, k.frame_idx) and k.frame_idx in views
-    ]
+    known = views.keys() & world_from_cams.keys()
+    keyframes = [k for k in stretch.keyframes if k.frame_idx in known]
     before = [k.cam_from_world for k in keyframes]
-    after = [
-        views[k.frame_idx] @ pose.inverse()
-        for k in keyframes
-        if (pose := world_from_cams[k.frame_idx]) is not None
-    ]
+    after = [views[k.frame_idx] @ world_from_cams[k.frame_idx].inverse() for k in keyframes]
     moved = np.zeros(stretch.landmarks.num, np.bool_)
     for keyframe, old, new, metres in zip(
         keyframes, before, after, _metres_per_unit(before, after), strict=True
@@ -153,71 +124,31 @@ def _metres_per_unit(before: Sequence[Rigid3], after: Sequence[Rigid3]) -> Float
     return metres / np.maximum(odom, 1e-12)
 
 
-@dataclass(frozen=True, eq=False)
-class _Corrections:
-    """Hold shifts (metres, world) and rotation vectors (radians, world) at path lengths
-    (metres)."""
-
-    path_lengths: Float[np.ndarray, " k"]
-    shifts: Float[np.ndarray, "k 3"]
-    rotation_vectors: Float[np.ndarray, "k 3"]
-
-    def at(
-        self, path_length: float, reach_m: float
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Interpolate the correction linearly. It decays beyond both ends."""
-        beyond = (
-            max(self.path_lengths[0] - path_length, path_length - self.path_lengths[-1], 0.0)
-            / reach_m
-        )
-        decay = float(np.exp(-0.5 * beyond**2))
-        shift, rotation_vector = (
-            np.array([np.interp(path_length, self.path_lengths, column) for column in rows.T])
-            for rows in (self.shifts, self.rotation_vectors)
-        )
-        return decay * shift, decay * rotation_vector
-
-
 def correct_trajectory(
-    world_from_cams: Sequence[Rigid3 | None], answers: Mapping[int, Localization], d_thresh: float
-) -> list[Rigid3 | None]:
-    """Return the corrected poses. None stays None.
-
-    Args:
-        world_from_cams: the poses by frame.
-        answers: the trusted localizations, by frame.
-        d_thresh: D_thresh of the map, in metres. The correction is smoothed over this distance.
-    """
-    poses = {index: pose for index, pose in enumerate(world_from_cams) if pose is not None}
-    answered = [
-        index
+    world_from_cams: Mapping[int, Rigid3], answers: Mapping[int, Localization], d_thresh: float
+) -> dict[int, Rigid3]:
+    """Return the poses, corrected by the trusted localizations (`answers`, by frame). The
+    correction is smoothed over `d_thresh`, D_thresh of the map in metres."""
+    poses = list(world_from_cams.values())
+    rows = {index: row for row, index in enumerate(world_from_cams)}
+    answered = {
+        rows[index]: answer
         for index, answer in answers.items()
-        if index in poses and _is_correctable(poses[index], answer)
-    ]
-    if not answered:
-        return list(world_from_cams)
-    path_lengths = dict(
-        zip(
-            poses,
-            compute_path_lengths(np.array([pose.translation for pose in poses.values()])),
-            strict=True,
-        )
-    )
-    at = np.array([path_lengths[index] for index in answered])
-    corrections = _estimate_corrections(
-        [poses[index] for index in answered], [answers[index] for index in answered], at, d_thresh
-    )
-    moved = {
-        index: _apply_correction(pose, *corrections.at(path_lengths[index], d_thresh))
-        for index, pose in poses.items()
+        if index in rows and _is_correctable(world_from_cams[index], answer)
     }
-    return [moved.get(index) for index in range(len(world_from_cams))]
-
-
-def _apply_correction(
-    pose: Rigid3, shift: Float[np.ndarray, "3"], rotation_vector: Float[np.ndarray, "3"]
-) -> Rigid3:
-    return Rigid3(exp_so3(rotation_vector) @ pose.rotation, pose.translation + shift)
+    if not answered:
+        return dict(world_from_cams)
+    lengths = compute_path_lengths(np.array([pose.translation for pose in poses]))
+    at = lengths[list(answered)]
+    errors = [_pose_error(poses[row], answer) for row, answer in answered.items()]
+    corrections = _estimate_corrections(errors, list(answered.values()), at, d_thresh)
+    beyond = np.maximum(np.maximum(at[0] - lengths, lengths - at[-1]), 0.0) / d_thresh
+    decay = np.exp(-0.5 * beyond**2)
+    moved = [decay * np.interp(lengths, at, column) for column in corrections.T]
+    return {
+        index: Rigid3(exp_so3(step[3:]) @ pose.rotation, pose.translation + step[:3])
+        for (index, pose), step in zip(world_from_cams.items(), np.transpose(moved), strict=True)
+    }
 
 
 def _is_correctable(pose: Rigid3, answer: Localization) -> bool:
@@ -230,42 +161,29 @@ def _is_correctable(pose: Rigid3, answer: Localization) -> bool:
     )
 
 
-def _pose_error(
-    pose: Rigid3, answer: Localization
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    return answer.world_from_cam.translation - pose.translation, log_so3(
-        answer.world_from_cam.rotation @ pose.rotation.T
-    )
+def _pose_error(pose: Rigid3, answer: Localization) -> Float[np.ndarray, "6"]:
+    """Return the shift (metres, world) and rotation vector (radians, world) to the localization."""
+    turn = log_so3(answer.world_from_cam.rotation @ pose.rotation.T)
+    return np.append(answer.world_from_cam.translation - pose.translation, turn)
 
 
 def _estimate_corrections(
-    poses: Sequence[Rigid3],
+    errors: Sequence[Float[np.ndarray, "6"]],
     answers: Sequence[Localization],
     path_lengths: Float[np.ndarray, " k"],
     d_thresh: float,
-) -> _Corrections:
+) -> Float[np.ndarray, "k 6"]:
     """Estimate the correction at each localization from the localizations around it."""
     # Prior sigma of the correction, in D_thresh. A localization this far from the local mean
     # has half the weight.
     stray = 0.1
     stray_deg = 0.5  # the same for the rotation, in degrees
-    errors = [_pose_error(pose, answer) for pose, answer in zip(poses, answers, strict=True)]
+    shifts, turns = np.split(np.array(errors), 2, axis=1)
     sigmas_m = np.array([answer.position_sigma_m for answer in answers])
     sigmas = np.radians([answer.rotation_sigma_deg for answer in answers])
-    near = np.exp(-0.5 * (np.subtract.outer(path_lengths, path_lengths) / (d_thresh)) ** 2)
-    shifts = _robust_mean(
-        near, np.array([shift for shift, _ in errors]), sigmas_m, stray * d_thresh
-    )
-    return _Corrections(
-        path_lengths,
-        shifts,
-        _robust_mean(
-            near,
-            np.array([rotation_vector for _, rotation_vector in errors]),
-            sigmas,
-            math.radians(stray_deg),
-        ),
-    )
+    near = np.exp(-0.5 * (np.subtract.outer(path_lengths, path_lengths) / d_thresh) ** 2)
+    shifts = _robust_mean(near, shifts, sigmas_m, stray * d_thresh)
+    return np.hstack([shifts, _robust_mean(near, turns, sigmas, math.radians(stray_deg))])
 
 
 def _robust_mean(

@@ -155,10 +155,9 @@ def update_map(
         session_poses = estimate_poses_by_map(sequence, tracker, topomap.config, progress)
     else:
         session_poses = estimate_poses_by_motion(sequence, localizer, topomap.config, progress)
-    without = [None] * (len(sequence) - len(session_poses.world_from_cams))
-    posed_sequence = SequenceView(
-        sequence, list(range(len(sequence))), [*session_poses.world_from_cams, *without]
-    )
+    indices = list(range(len(sequence)))
+    poses = [session_poses.world_from_cams.get(index) for index in indices]
+    posed_sequence = SequenceView(sequence, indices, poses)
     frames = select_posed_frames(posed_sequence, topomap.free_ids.session)
     content = create_session_content(topomap, frames, session_poses, progress)
     camera = sequence[frames[0].index].camera

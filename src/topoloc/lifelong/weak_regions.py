@@ -16,9 +16,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.node_localization import LeaveOneOutResult, localize_left_out, sample_evenly
+from topoloc.lifelong.node_localization import (
+    LeaveOneOutResult,
+    find_near_nodes,
+    localize_left_out,
+    sample_evenly,
+)
 from topoloc.localization.localizer import Localizer
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import NodePoses
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row
 
@@ -43,11 +48,7 @@ class NodeQuality:
 
     def to_json(self) -> dict[str, Any]:
         """Return the node's quality as JSON."""
-        queried_nodes = (
-            None
-            if self.answer is None
-            else {"localized": self.answer.is_localized, "inliers": self.answer.num_inliers}
-        )
+        answer = self.answer
         return {
             "node_id": self.node_id,
             "name": self.name,
@@ -55,7 +56,8 @@ class NodeQuality:
             "position": self.world_from_cam.translation.round(3).tolist(),
             "num_landmarks": self.num_landmarks,
             "seen_by_other_sessions": round(self.seen_share, 3),
-            "without_itself": queried_nodes,
+            "without_itself": answer
+            and {"localized": answer.is_localized, "inliers": answer.num_inliers},
             "weak": list(self.reasons),
         }
 
@@ -99,8 +101,7 @@ class WeakRegions:
     def weakest(self) -> list[NodeQuality]:
         """Return the queried nodes, the fewest inliers first."""
         return sorted(
-            self.queried_nodes,
-            key=lambda node: node.answer.num_inliers if node.answer is not None else 0,
+            self.queried_nodes, key=lambda node: node.answer.num_inliers if node.answer else 0
         )
 
     @property
@@ -115,7 +116,7 @@ class WeakRegions:
             "num_sessions": len(self.session_names),
             "num_asked": len(self.queried_nodes),
             "num_localized": sum(
-                node.answer is not None and node.answer.is_localized for node in self.nodes
+                bool(node.answer and node.answer.is_localized) for node in self.nodes
             ),
             "weak": {reason: self.count(reason) for reason in REASONS},
             "where_next": self.suggest_next_recording(),
@@ -125,54 +126,38 @@ class WeakRegions:
 
     def suggest_next_recording(self) -> str:
         """Suggest in one or two sentences the places of the next recording."""
-        sentences = list[str]()
-        of_reason = {
-            reason: [part for part in self.parts if part.reason == reason] for reason in REASONS
-        }
-        poor = sorted(
-            of_reason["not_held"] + of_reason["few_landmarks"], key=lambda part: -len(part.nodes)
-        )
+        sentences, largest = list[str](), dict[Reason, WeakRegion]()
+        for part in sorted(self.parts, key=lambda part: -len(part.nodes)):
+            largest.setdefault(part.reason, part)
+        poor = [largest[reason] for reason in ("not_held", "few_landmarks") if reason in largest]
         if poor:
-            is_one, is_not_held = len(poor[0].nodes) == 1, poor[0].reason == "not_held"
-            why = (
-                f"the rest of the map does not hold {'it' if is_one else 'them'}"
-                if is_not_held
-                else "few landmarks are known there"
-            )
-            sentences.append(f"Walk again past {self._describe_region(poor[0])}: {why}.")
-        if one_way := of_reason["one_direction"]:
+            part = max(poor, key=lambda part: len(part.nodes))
+            held = f"the rest of the map does not hold {'it' if len(part.nodes) == 1 else 'them'}"
+            why = held if part.reason == "not_held" else "few landmarks are known there"
+            sentences.append(f"Walk again past {self._describe_region(part)}: {why}.")
+        if one_way := largest.get("one_direction"):
             num, of = self.count("one_direction"), len(self.nodes)
-            where = (
-                "all of it the other way"
-                if num == of
-                else f"the other way past {self._describe_region(one_way[0])}"
-            )
+            past = f"the other way past {self._describe_region(one_way)}"
+            where = "all of it the other way" if num == of else past
             sentences.append(f"Walk {where}: {num} of {of} nodes look where nobody looks back.")
-        if len(sentences) < 2 and len(self.session_names) < 2:
+        if len(self.session_names) < 2:
             sentences.append(
                 "All of it is of one session: a walk on another day, or in another light, tells"
                 " what lasts."
             )
-        elif len(sentences) < 2 and of_reason["single_session"]:
-            sentences.append(
-                f"Walk again past {self._describe_region(of_reason['single_session'][0])}: seen by"
-                " one session alone."
-            )
+        elif once := largest.get("single_session"):
+            place = self._describe_region(once)
+            sentences.append(f"Walk again past {place}: seen by one session alone.")
         return " ".join(sentences[:2]) or "No part is weak."
 
     def _describe_region(self, part: WeakRegion) -> str:
         first, last = part.nodes[0], part.nodes[-1]
         place = "({:.1f}, {:.1f}, {:.1f}) m".format(*(part.centre.round(1) + 0.0))  # no -0.0
+        sessions = ", ".join(sorted({self.session_names[node.session_id] for node in part.nodes}))
         if first is last:
-            return (
-                f"{place}, node {first.node_id} ({first.name} of"
-                f" {self.session_names.get(first.session_id, '?')})"
-            )
-        sessions = sorted({self.session_names.get(node.session_id, "?") for node in part.nodes})
-        return (
-            f"{place}, {len(part.nodes)} nodes ({first.name} to {last.name} of"
-            f" {', '.join(sessions)})"
-        )
+            return f"{place}, node {first.node_id} ({first.name} of {sessions})"
+        names = f"{first.name} to {last.name}"
+        return f"{place}, {len(part.nodes)} nodes ({names} of {sessions})"
 
 
 def find_weak_regions(
@@ -200,27 +185,23 @@ def find_weak_regions(
     """
     min_turn_deg = 120.0  # minimum angle between opposite views, in degrees
     apart = 3.0  # weak nodes within this many D_thresh of each other form one region
-    topomap, rows = (localizer.topomap, sample_evenly(localizer.topomap.rows, max_queries))
+    topomap = localizer.topomap
+    rows = sample_evenly(topomap.rows, max_queries)
 
     def report_progress(done: int, total: int) -> None:
         if progress is not None:
             progress("asking the map without the node", done, total)
 
     answers = localize_left_out(localizer, topomap, rows, beside, report_progress)
-    has_opposite_view = _has_opposite_view(
-        topomap.node_poses, reach * topomap.config.d_thresh, min_turn_deg
-    )
+    d_thresh = topomap.config.d_thresh
+    has_opposite_view = _has_opposite_view(topomap.node_poses, reach * d_thresh, min_turn_deg)
     nodes = [
         _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), stood_by)
         for row in topomap.rows
     ]
-    names = {session.session_id: session.name for session in topomap.sessions}
-    names |= {
-        summary.session_id: summary.recording
-        for summary in topomap.summaries
-        if summary.session_id not in names
-    }
-    return WeakRegions(nodes, _group_regions(nodes, apart * topomap.config.d_thresh), names)
+    names = {summary.session_id: summary.recording for summary in topomap.summaries}
+    names |= {session.session_id: session.name for session in topomap.sessions}
+    return WeakRegions(nodes, _group_regions(nodes, apart * d_thresh), names)
 
 
 def _assess_node(
@@ -262,20 +243,17 @@ def _assess_node(
 def _seen_share(node: TopoNode) -> float:
     """Return the share of a node's landmarks that other sessions saw."""
     seen = np.zeros(len(node.features), bool)
-    for session_statistics in node.session_statistics:
-        if session_statistics.session_id != node.summary.session_id:
-            seen[session_statistics.rows[session_statistics.seen > 0]] = True
+    for one in node.session_statistics:
+        if one.session_id != node.summary.session_id:
+            seen[one.rows[one.seen > 0]] = True
     return float(seen.mean()) if len(seen) else 0.0
 
 
 def _has_other_session(topomap: TopoMetricMap, row: Row, num_d_thresh: float) -> bool:
     """Return whether a node of another session is within `num_d_thresh` times D_thresh."""
-    summary = topomap.summaries[row]
-    near = np.flatnonzero(
-        node_distances(summary.world_from_cam, topomap.node_poses, topomap.config.lambda_rot)
-        <= num_d_thresh * topomap.config.d_thresh
-    )
-    return any(topomap.summaries[int(other)].session_id != summary.session_id for other in near)
+    session_id = topomap.summaries[row].session_id
+    near = find_near_nodes(topomap, row, num_d_thresh)
+    return any(topomap.summaries[other].session_id != session_id for other in near)
 
 
 def _has_opposite_view(
@@ -283,13 +261,10 @@ def _has_opposite_view(
 ) -> Bool[np.ndarray, " nodes"]:
     """Return for each node whether another one within reach looks in the opposite direction."""
     axes, found = poses.rotations[:, :, 2], np.zeros(len(poses.centres), bool)
-    batch_size = 512  # nodes compared with all others in one step
-    for start in range(0, len(axes), batch_size):
-        some = slice(start, start + batch_size)
-        away = np.linalg.norm(poses.centres[some, None] - poses.centres[None], axis=2)
-        found[some] = (
-            (away <= reach_m) & (axes[some] @ axes.T <= np.cos(np.deg2rad(min_turn_deg)))
-        ).any(axis=1)
+    max_cos = np.cos(np.deg2rad(min_turn_deg))
+    for row, (centre, axis) in enumerate(zip(poses.centres, axes, strict=True)):
+        is_near = np.linalg.norm(poses.centres - centre, axis=1) <= reach_m
+        found[row] = (is_near & (axes @ axis <= max_cos)).any()
     return found
 
 

@@ -32,7 +32,8 @@ def array_from_bytes(data: bytes, dtype: str, shape: tuple[int, ...], what: str)
             f"{what}: {len(data)} bytes are not {' x '.join(map(str, shape))} {dtype}"
         )
     array = np.frombuffer(data, dtype).reshape(shape)
-    if array.dtype.kind == "f" and not (np.abs(array) <= _MAX_MAGNITUDE).all():  # also if NaN
+    largest = float(np.abs(array).max(initial=0)) if array.dtype.kind == "f" else 0.0
+    if not largest <= _MAX_MAGNITUDE:  # NaN compares as false
         raise CorruptDataError(f"{what}: a number that is not finite or beyond {_MAX_MAGNITUDE:g}")
     return array
 

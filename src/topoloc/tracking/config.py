@@ -6,7 +6,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from topoloc.bounds import Above
-from topoloc.tracking.pose_hypotheses import HypothesesConfig
+from topoloc.tracking.motion import MotionConfig
+
+
+@dataclass(frozen=True)
+class HypothesesConfig:
+    """Configure the gating, the weights and the extent of predictions."""
+
+    motion: MotionConfig = field(default_factory=MotionConfig)
 
 
 @dataclass(frozen=True)

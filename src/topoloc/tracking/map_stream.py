@@ -21,7 +21,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
@@ -32,10 +31,8 @@ from topoloc.recordings.image_io import to_grey
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.motion import MotionState, update_motion
-from topoloc.tracking.point_tracker import PointTracker, TrackedMotion
-from topoloc.tracking.pose_errors import compute_correlated_change, noise_floor
+from topoloc.tracking.point_tracker import PointTracker
 from topoloc.tracking.pose_hypotheses import PoseHypotheses
-from topoloc.tracking.pose_window import PoseWindow
 from topoloc.tracking.stream_localizer import (
     ExpectedPose,
     LocalizedPose,
@@ -44,12 +41,16 @@ from topoloc.tracking.stream_localizer import (
 )
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker_state import (
+    PoseWindow,
     ReferenceImage,
     StreamFrame,
+    TrackedImage,
+    compute_correlated_change,
     compute_direction_uncertainty,
     compute_motion_covariance,
     compute_smoothed_covariance,
     downscale_image,
+    noise_floor,
 )
 
 
@@ -62,12 +63,9 @@ class MapStream:
 
     def __init__(self, localizer: Localizer, config: TrackerConfig) -> None:
         self.localizer, self.config = localizer, config
-        self._hypotheses, self._window = (
-            PoseHypotheses(self.config.hypotheses.motion),
-            PoseWindow(),
-        )
+        self._hypotheses, self._window = PoseHypotheses(config.hypotheses.motion), PoseWindow()
         self._stream_localizer = StreamLocalizer(localizer, self._hypotheses)
-        self._answer: StreamedPose | None = None
+        self._last_smoothed: Rigid3 | None = None
         self._reference: ReferenceImage | None = None
         self._last_attempt_ns = 0
 
@@ -80,11 +78,10 @@ class MapStream:
             answer = self._process_paper_mode(image, camera, t_ns)
         else:
             grey = downscale_image(to_grey(image), camera, max_side_px)
-            answer = self._process_motion_mode(
-                StreamFrame(image, camera, t_ns, odom_from_cam, *grey)
-            )
-        self._answer = self._complete_result(answer, camera)
-        return self._answer
+            frame = StreamFrame(image, camera, t_ns, odom_from_cam, *grey)
+            answer = self._process_motion_mode(frame)
+        self._last_smoothed = answer.smoothed
+        return self._complete_result(answer, camera)
 
     def process_missing(
         self, t_ns: int, result: NotLocalized, odom_from_cam: Rigid3 | None
@@ -94,14 +91,11 @@ class MapStream:
             return self._complete_result(self._copy_previous_pose(result, t_ns))
         self._hypotheses.predict(t_ns, odom_from_cam)
         self._drop_stale_reference()
-        return self._complete_result(
-            self._mark_if_ambiguous(self._make_predicted_pose(result, t_ns))
-        )
+        return self._complete_result(self._make_predicted_pose(result, t_ns))
 
     def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
-        return replace(
-            answer, result=self.localizer.with_provenance(answer.result, camera, answer.t_ns)
-        )
+        result = self.localizer.with_provenance(answer.result, camera, answer.t_ns)
+        return replace(answer, result=result)
 
     def _process_paper_mode(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
         """Localize one image by section III-B: "when such a jump is found, we copy the previous
@@ -109,17 +103,15 @@ class MapStream:
         result = self.localizer.localize(image, camera)
         if not isinstance(result, Localization):
             return self._copy_previous_pose(result, t_ns)
-        previous = self._answer.smoothed if self._answer is not None else None
-        if (
-            previous is not None
-            and np.linalg.norm(result.world_from_cam.translation - previous.translation)
-            > self.config.max_jump
-        ):
-            return self._copy_previous_pose(reject_jump(result), t_ns)
-        return StreamedPose(t_ns, "localized", result, result.world_from_cam, result.covariance)
+        pose, previous = result.world_from_cam, self._last_smoothed
+        if previous is not None:
+            way = np.linalg.norm(pose.translation - previous.translation)
+            if way > self.config.max_jump:
+                return self._copy_previous_pose(reject_jump(result), t_ns)
+        return StreamedPose(t_ns, "localized", result, pose, result.covariance)
 
     def _copy_previous_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
-        previous = self._answer.smoothed if self._answer is not None else None
+        previous = self._last_smoothed
         return StreamedPose(t_ns, "lost" if previous is None else "predicted", result, previous)
 
     def _process_motion_mode(self, frame: StreamFrame) -> StreamedPose:
@@ -128,26 +120,21 @@ class MapStream:
         predicted = self._hypotheses.predict(frame.t_ns, frame.odom_from_cam)
         self._drop_stale_reference()
         with clock.stage("tracking"):
-            tracked_motion = self._track_points(frame, predicted)
-        if tracked_motion is not None:
-            self._hypotheses.apply_motion(
-                self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse(),
-                tracked_motion.covariance,
-                frame.odom_from_cam,
-            )
-        if tracked_motion is None or self._is_localization_due(tracked_motion, frame):
+            tracked = self._track_points(frame, predicted)
+        if tracked is not None:
+            pose, covariance = tracked.smoothed.inverse(), tracked.motion.covariance
+            self._hypotheses.apply_motion(pose, covariance, frame.odom_from_cam)
+        if tracked is None or self._is_localization_due(tracked, frame):
             self._last_attempt_ns = frame.t_ns
-            found = self._stream_localizer.localize(
-                frame, self._predict_pose(predicted, tracked_motion)
-            )
+            expected = self._predict_pose(predicted, tracked)
+            found = self._stream_localizer.localize(frame, expected)
             self._drop_stale_reference()
             if isinstance(found, LocalizedPose):
-                return self._mark_if_ambiguous(
-                    self._update_with_localization(frame, found, predicted, tracked_motion, seconds)
-                )
-            if tracked_motion is None or self._reference is None:
-                return self._mark_if_ambiguous(self._make_predicted_pose(found, frame.t_ns))
-        return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked_motion, clock))
+                answer = self._update_with_localization(frame, found, predicted, tracked, seconds)
+                return self._mark_if_ambiguous(answer)
+            if tracked is None or self._reference is None:
+                return self._make_predicted_pose(found, frame.t_ns)
+        return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked, clock))
 
     def _drop_stale_reference(self) -> None:
         """Drop the reference image unless its hypothesis is still the best."""
@@ -160,26 +147,16 @@ class MapStream:
         if self._hypotheses.is_unambiguous:
             return answer
         alternatives = self._hypotheses.alternatives()
-        detail = (
-            "the pictures so far leave open which of these"
-            if len(alternatives) > 1
-            else "too little speaks for this pose so far"
-        )
-        result = NotLocalized(
-            "ambiguous",
-            [],
-            0,
-            0,
-            answer.result.times_ms,
-            detail,
-            alternatives,
-            answer.result.provenance,
-        )
+        detail = "too little speaks for this pose so far"
+        if len(alternatives) > 1:
+            detail = "the pictures so far leave open which of these"
+        times_ms, provenance = answer.result.times_ms, answer.result.provenance
+        result = NotLocalized("ambiguous", [], 0, 0, times_ms, detail, alternatives, provenance)
         return StreamedPose(answer.t_ns, "ambiguous", result)
 
     def _track_points(
         self, frame: StreamFrame, predicted: MotionState | None
-    ) -> TrackedMotion | None:
+    ) -> TrackedImage | None:
         """Track the points into this image.
 
         None if they are lost or give a pose that the motion does not allow.
@@ -187,22 +164,18 @@ class MapStream:
         reference = self._reference
         if reference is None or predicted is None or reference.follower.camera != frame.grey_camera:
             return None
-        tracked_motion = reference.follower.track_points(
-            frame.grey, predicted.world_from_cam.inverse()
-        )
-        if tracked_motion is None:
+        near = predicted.world_from_cam.inverse()
+        motion = reference.follower.track_points(frame.grey, near)
+        if motion is None:
             return None
-        world_from_cam = self._compute_smoothed_pose(tracked_motion, frame.t_ns).inverse()
-        floor = noise_floor(reference.errors.depth)
-        return (
-            tracked_motion
-            if self._hypotheses.is_consistent(
-                predicted, world_from_cam, tracked_motion.covariance + floor
-            )
-            else None
-        )
+        offset = _fade_offset(reference.offset, (frame.t_ns - reference.t_ns) / 1e9)
+        smoothed = offset @ motion.cam_from_ref @ reference.smoothed
+        covariance = motion.covariance + noise_floor(reference.errors.depth)
+        if not self._hypotheses.is_consistent(predicted, smoothed.inverse(), covariance):
+            return None
+        return TrackedImage(reference, motion, smoothed)
 
-    def _is_localization_due(self, tracked_motion: TrackedMotion, frame: StreamFrame) -> bool:
+    def _is_localization_due(self, tracked: TrackedImage, frame: StreamFrame) -> bool:
         """Return whether the image must be localized in full."""
         # Minimum seconds between two full localizations while the points are tracked.
         retry_interval = 0.1
@@ -213,21 +186,18 @@ class MapStream:
         # An image is also localized in full if the points moved by more than this share
         # of the image width.
         max_shift = 0.04
-        reference = self._reference
-        assert reference is not None
         if not self._hypotheses.is_unambiguous:
             return True
         if frame.t_ns - self._last_attempt_ns < retry_interval * 1e9:
             return False
-        is_old = frame.t_ns - reference.t_ns >= interval * 1e9
         return (
-            is_old
-            or tracked_motion.tracked_ratio < min_share_left
-            or tracked_motion.shift_px > max_shift * frame.grey_camera.width
+            frame.t_ns - tracked.reference.t_ns >= interval * 1e9
+            or tracked.motion.tracked_ratio < min_share_left
+            or tracked.motion.shift_px > max_shift * frame.grey_camera.width
         )
 
     def _predict_pose(
-        self, predicted: MotionState | None, tracked_motion: TrackedMotion | None
+        self, predicted: MotionState | None, tracked: TrackedImage | None
     ) -> ExpectedPose | None:
         """Return the expected pose of the image, None if there is no prediction.
 
@@ -239,21 +209,13 @@ class MapStream:
         reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
         if reference is None or predicted is None:
             return None
-        if tracked_motion is None:
+        if tracked is None:
             is_known = compute_direction_uncertainty(predicted, reference.errors.depth) <= max_doubt
             return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
-        motion, scale = (
-            tracked_motion.cam_from_ref.adjoint(),
-            self._hypotheses.prediction_scale**2,
-        )
-        pose_covariance = (
-            motion @ reference.errors.total @ motion.T
-            + scale * compute_motion_covariance(tracked_motion)
-        )
-        near = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
+        scale = self._hypotheses.prediction_scale**2
         return ExpectedPose(
-            near,
-            pose_covariance,
+            tracked.cam_from_world.inverse(),
+            tracked.moved_errors + scale * compute_motion_covariance(tracked.motion),
             is_alone,
             is_tracked=True,
             is_from_virtual_views=reference.found.is_from_virtual_views,
@@ -264,38 +226,36 @@ class MapStream:
         frame: StreamFrame,
         found: LocalizedPose,
         predicted: MotionState | None,
-        tracked_motion: TrackedMotion | None,
+        tracked: TrackedImage | None,
         seconds: float,
     ) -> StreamedPose:
         """Return the result of a full localization, `seconds` after the last measured pose."""
         cam_from_world, errors = found.result.world_from_cam.inverse(), found.errors
-        t_ns, offset = frame.t_ns, Rigid3.identity()
-        if predicted is None or self._reference is None:
+        offset, before = Rigid3.identity(), self._reference
+        if predicted is None or before is None:
             smoothed, pose_covariance = self._window.add(
                 cam_from_world, errors.noise, Rigid3.identity(), errors.noise
             )
         else:
-            motion, motion_covariance = self._compute_motion(predicted, tracked_motion)
+            if tracked is not None:
+                motion = tracked.motion.cam_from_ref
+                motion_covariance = compute_motion_covariance(tracked.motion)
+            else:
+                motion = predicted.world_from_cam.inverse() @ before.smoothed.inverse()
+                motion_covariance = predicted.pose_covariance
             motion_covariance = motion_covariance + compute_correlated_change(errors, motion)
-            before = (
-                self._compute_smoothed_pose(tracked_motion, t_ns)
-                if tracked_motion is not None
-                else None
-            )
-            if tracked_motion is None and np.trace(motion_covariance) >= np.trace(errors.noise):
+            if tracked is None and np.trace(motion_covariance) >= np.trace(errors.noise):
                 self._window.clear()  # the prediction adds no information
             smoothed, pose_covariance = self._window.add(
                 cam_from_world, errors.noise, motion, motion_covariance
             )
-            if before is not None:
-                offset = self._fade_offset(before @ smoothed.inverse(), seconds)
-            measured = errors.noise if tracked_motion is None else tracked_motion.covariance
-            self._hypotheses.set_best_state(
-                update_motion(predicted, (offset @ smoothed).inverse(), measured),
-                frame.odom_from_cam,
-            )
+            if tracked is not None:
+                offset = _fade_offset(tracked.smoothed @ smoothed.inverse(), seconds)
+            measured = errors.noise if tracked is None else tracked.motion.covariance
+            state = update_motion(predicted, (offset @ smoothed).inverse(), measured)
+            self._hypotheses.set_best_state(state, frame.odom_from_cam)
         self._reference = ReferenceImage(
-            t_ns,
+            frame.t_ns,
             found.result,
             cam_from_world,
             errors,
@@ -304,90 +264,45 @@ class MapStream:
             offset,
             _follow_points(frame, found),
         )
-        best = self._hypotheses.best
-        assert best is not None
-        return StreamedPose(
-            t_ns,
-            "localized",
-            found.result,
-            best.world_from_cam,
-            compute_smoothed_covariance(self._reference),
-        )
-
-    def _compute_smoothed_pose(self, tracked_motion: TrackedMotion, t_ns: int) -> Rigid3:
-        """Return the smoothed cam_from_world of a tracked image."""
-        reference = self._reference
-        assert reference is not None
-        return (
-            self._fade_offset(reference.offset, (t_ns - reference.t_ns) / 1e9)
-            @ tracked_motion.cam_from_ref
-            @ reference.smoothed
-        )
-
-    def _fade_offset(self, offset: Rigid3, seconds: float) -> Rigid3:
-        # Time constant (to 1/e, seconds) of the correction of the smoothed pose by a new
-        # localization. It prevents jumps.
-        blend_time = 0.2
-        return Rigid3.exp(np.exp(-seconds / blend_time) * offset.log())
-
-    def _compute_motion(
-        self, predicted: MotionState, tracked_motion: TrackedMotion | None
-    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-        """Return cam_from_before since the last localized image, with the covariance of its left
-        perturbation."""
-        assert self._reference is not None
-        if tracked_motion is not None:
-            return tracked_motion.cam_from_ref, compute_motion_covariance(tracked_motion)
-        return (
-            predicted.world_from_cam.inverse() @ self._reference.smoothed.inverse(),
-            predicted.pose_covariance,
-        )
+        covariance = compute_smoothed_covariance(self._reference)
+        pose = self._hypotheses.leader.world_from_cam
+        return StreamedPose(frame.t_ns, "localized", found.result, pose, covariance)
 
     def _make_tracked_pose(
-        self, frame: StreamFrame, tracked_motion: TrackedMotion, clock: StageClock
+        self, frame: StreamFrame, tracked: TrackedImage, clock: StageClock
     ) -> StreamedPose:
-        reference, state = self._reference, self._hypotheses.best
-        assert reference is not None
-        assert state is not None
-        world_from_cam = (tracked_motion.cam_from_ref @ reference.cam_from_world).inverse()
-        adjoint, motion = world_from_cam.adjoint(), tracked_motion.cam_from_ref.adjoint()
-        covariance = (
-            adjoint
-            @ (motion @ reference.errors.total @ motion.T + tracked_motion.covariance)
-            @ adjoint.T
-        )
-        found = reference.found
+        world_from_cam, state = tracked.cam_from_world.inverse(), self._hypotheses.leader
+        adjoint, found = world_from_cam.adjoint(), tracked.reference.found
         result = Localization(
             world_from_cam=world_from_cam,
-            covariance=covariance,
+            covariance=adjoint @ (tracked.moved_errors + tracked.motion.covariance) @ adjoint.T,
             probability=min(found.probability, self._hypotheses.alternatives()[0].probability),
             node_id=found.node_id,
             candidates=[],
-            num_matches=tracked_motion.num_tracked,
-            num_inliers=tracked_motion.num_inliers,
+            num_matches=tracked.motion.num_tracked,
+            num_inliers=tracked.motion.num_inliers,
             times_ms=clock.times_ms(),
             provenance=found.provenance,
         )
-        return StreamedPose(
-            frame.t_ns,
-            "tracked",
-            result,
-            state.world_from_cam,
-            compute_smoothed_covariance(reference, state),
-        )
+        covariance = compute_smoothed_covariance(tracked.reference, state)
+        return StreamedPose(frame.t_ns, "tracked", result, state.world_from_cam, covariance)
 
     def _make_predicted_pose(self, result: NotLocalized, t_ns: int) -> StreamedPose:
-        """Return the predicted pose, or "lost" if there is no hypothesis."""
+        """Return the predicted pose, "lost" if there is no hypothesis, or an ambiguous result."""
         predicted = self._hypotheses.best
         if predicted is None:
             return StreamedPose(t_ns, "lost", result)
-        return StreamedPose(
-            t_ns,
-            "predicted",
-            result,
-            predicted.world_from_cam,
-            compute_smoothed_covariance(self._reference, predicted),
+        covariance = compute_smoothed_covariance(self._reference, predicted)
+        return self._mark_if_ambiguous(
+            StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, covariance)
         )
+
+
+def _fade_offset(offset: Rigid3, seconds: float) -> Rigid3:
+    # Time constant (to 1/e, seconds) of the correction of the smoothed pose by a new
+    # localization. It prevents jumps.
+    blend_time = 0.2
+    return Rigid3.exp(np.exp(-seconds / blend_time) * offset.log())
 
 
 def _follow_points(frame: StreamFrame, found: LocalizedPose) -> PointTracker:

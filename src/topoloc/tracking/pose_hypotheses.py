@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -32,13 +33,6 @@ from topoloc.tracking.motion import (
     start_motion,
     update_motion,
 )
-
-
-@dataclass(frozen=True)
-class HypothesesConfig:
-    """Configure the gating, the weights and the extent of predictions."""
-
-    motion: MotionConfig = field(default_factory=MotionConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +66,12 @@ class _Hypothesis:
     from_best: Rigid3
     candidate_idx: int | None
 
+    def measured(
+        self, state: MotionState, odom_from_cam: Rigid3 | None, **changes: Any
+    ) -> _Hypothesis:
+        """Return the hypothesis with the state measured in the current image."""
+        return replace(self, state=state, current=state, odom_from_cam=odom_from_cam, **changes)
+
 
 class PoseHypotheses:
     """Hold the hypotheses, highest weight first, and the weight of "elsewhere". All weights sum to
@@ -81,29 +81,13 @@ class PoseHypotheses:
     from it.
     """
 
-    def __init__(
-        self,
-        motion: MotionConfig,
-        *,
-        max_number: int = 24,
-        miss: float = 0.01,
-        prediction_scale: float = 2.5,
-    ) -> None:
-        """Start without a hypothesis.
+    miss: ClassVar[float] = 0.01
+    """Probability that a localization is wrong."""
+    prediction_scale: ClassVar[float] = 2.5
+    """Factor on the sigma of the prediction, because hands jerk and wheels hit kerbs."""
 
-        Args:
-            motion: the motion model.
-            max_number: maximum number of hypotheses, those with the highest weights.
-            miss: probability that a localization is wrong.
-            prediction_scale: factor on the sigma of the prediction, because hands jerk and wheels
-                hit kerbs.
-        """
-        self.motion, self.miss, self.prediction_scale = motion, miss, prediction_scale
-        self._max_number = max_number
-        self.clear()
-
-    def clear(self) -> None:
-        """Remove all hypotheses."""
+    def __init__(self, motion: MotionConfig) -> None:
+        self.motion = motion
         self._ranked: list[_Hypothesis] = []
         self._null_weight, self.is_track_continued = 1.0, False
 
@@ -111,6 +95,11 @@ class PoseHypotheses:
     def best(self) -> MotionState | None:
         """Return the best hypothesis at the current image, None if the camera is lost."""
         return self._ranked[0].current if self._ranked else None
+
+    @property
+    def leader(self) -> MotionState:
+        """Return the best hypothesis at the current image. Raises IndexError if there is none."""
+        return self._ranked[0].current
 
     @property
     def candidate_idx(self) -> int | None:
@@ -130,19 +119,16 @@ class PoseHypotheses:
 
         Hypotheses with the same pose and different velocities are merged.
         """
-        found: list[Alternative] = []
+        found = list[Alternative]()
         for one in self._ranked:
             pose = one.current.world_from_cam
-            known = next(
-                (k for k, other in enumerate(found) if is_same_place(other.world_from_cam, pose)),
-                None,
-            )
-            if known is None:
-                found.append(Alternative(pose, one.weight, one.node_id))
+            for k, other in enumerate(found):
+                if is_same_place(other.world_from_cam, pose):
+                    weight = other.probability + one.weight
+                    found[k] = structs.replace(other, probability=weight)
+                    break
             else:
-                found[known] = structs.replace(
-                    found[known], probability=found[known].probability + one.weight
-                )
+                found.append(Alternative(pose, one.weight, one.node_id))
         return tuple(sorted(found, key=lambda one: -one.probability))
 
     def seconds_since(self, t_ns: int) -> float:
@@ -158,21 +144,17 @@ class PoseHypotheses:
         max_seconds_with_odometry = 20.0  # the same with external odometry
         before, alive = self._ranked, list[_Hypothesis]()
         for one in before:
-            before_from_cam = _relative_odometry(one.odom_from_cam, odom_from_cam)
-            limit = max_seconds if before_from_cam is None else max_seconds_with_odometry
+            motion, limit = None, max_seconds
+            if one.odom_from_cam is not None and odom_from_cam is not None:
+                motion = one.odom_from_cam.inverse() @ odom_from_cam
+                limit = max_seconds_with_odometry
             if t_ns - one.state.t_ns <= limit * 1e9:
-                alive.append(
-                    replace(
-                        one,
-                        current=predict_motion(one.state, t_ns, self.motion, before_from_cam),
-                        candidate_idx=None,
-                    )
-                )
+                current = predict_motion(one.state, t_ns, self.motion, motion)
+                alive.append(replace(one, current=current, candidate_idx=None))
         self.is_track_continued = bool(alive) and alive[0].state is before[0].state
         left = sum(one.weight for one in alive)
-        self._prune(
-            alive if self.is_track_continued or left > 0.5 else [], 1.0 - left
-        )  # dropped weight counts as "elsewhere"
+        # dropped weight counts as "elsewhere"
+        self._prune(alive if self.is_track_continued or left > 0.5 else [], 1.0 - left)
         return self.best
 
     def is_consistent(
@@ -182,10 +164,9 @@ class PoseHypotheses:
         # Maximum squared Mahalanobis distance of a consistent pose from the prediction
         # (chi^2 with 6 degrees of freedom: 1 in 100,000).
         max_surprise = 33.0
+        gate = self._gate_covariance(predicted, covariance)
         return predicted.world_from_cam.is_same(
-            world_from_cam,
-            covariance=self._gate_covariance(predicted, covariance),
-            max_square=max_surprise,
+            world_from_cam, covariance=gate, max_square=max_surprise
         )
 
     def _gate_covariance(
@@ -203,11 +184,13 @@ class PoseHypotheses:
 
         The points measure the best hypothesis at this pose. The others move by the same motion.
         """
-        for k, one in enumerate(self._ranked):
-            current = update_motion(one.current, one.from_best @ world_from_cam, covariance)
-            self._ranked[k] = replace(
-                one, state=current, current=current, odom_from_cam=odom_from_cam
+        self._ranked = [
+            one.measured(
+                update_motion(one.current, one.from_best @ world_from_cam, covariance),
+                odom_from_cam,
             )
+            for one in self._ranked
+        ]
 
     def update_weights(
         self,
@@ -229,58 +212,39 @@ class PoseHypotheses:
         kept_share = 0.6
         miss_ambiguous = 0.1  # minimum probability that the true pose is not among the alternatives
         if not candidates:
-            self._prune(
-                [replace(one, weight=kept_share * one.weight) for one in self._ranked],
-                self._null_weight,
-            )
+            kept = [replace(one, weight=kept_share * one.weight) for one in self._ranked]
+            self._prune(kept, self._null_weight)
             return
-        before, miss = (self.best, self.miss if len(candidates) == 1 else miss_ambiguous)
-        none = max(miss, 1.0 - sum(one.probability for one in candidates))
-        new = (
-            self._merge_consistent(candidates[0], odom_from_cam, new_evidence_ratio)
-            if len(candidates) == 1
-            else []
+        before, is_single = self.best, len(candidates) == 1
+        none = max(
+            self.miss if is_single else miss_ambiguous,
+            1.0 - sum(one.probability for one in candidates),
         )
-        for one in self._ranked:
-            if new and self.is_consistent(
-                one.current, candidates[0].world_from_cam, candidates[0].covariance
-            ):
-                continue  # already merged
-            updated = [
+        new, others = list[_Hypothesis](), self._ranked
+        if is_single:
+            new, others = self._merge_consistent(candidates[0], odom_from_cam, new_evidence_ratio)
+        for one in others:
+            updated = (
                 self._update_with_candidate(one, number, candidate, odom_from_cam)
                 for number, candidate in enumerate(candidates)
-            ]
+            )
             children = [child for child in updated if child is not None]
             children.append(replace(one, weight=one.weight * none))
             gain = sum(child.weight for child in children) / one.weight
-            new += [
-                replace(child, weight=child.weight * gain ** (new_evidence_ratio - 1.0))
-                for child in children
-            ]
+            factor = gain ** (new_evidence_ratio - 1.0)
+            new += [replace(child, weight=child.weight * factor) for child in children]
         for number, candidate in enumerate(candidates):
             weight = self._null_weight * candidate.probability * new_evidence_ratio
-            heaviest = max(
-                (one for one in new if one.candidate_idx == number),
-                key=lambda one: one.weight,
-                default=None,
-            )
-            if heaviest is not None and heaviest.weight >= weight:
-                new[new.index(heaviest)] = replace(heaviest, weight=heaviest.weight + weight)
+            own = [k for k, one in enumerate(new) if one.candidate_idx == number]
+            heaviest = max(own, key=lambda k: new[k].weight, default=None)
+            if heaviest is not None and new[heaviest].weight >= weight:
+                new[heaviest] = replace(new[heaviest], weight=new[heaviest].weight + weight)
             else:
                 state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance)
-                new.append(
-                    _Hypothesis(
-                        state,
-                        odom_from_cam,
-                        state,
-                        weight,
-                        candidate.node_id,
-                        Rigid3.identity(),
-                        number,
-                    )
-                )
+                pose, node_id = Rigid3.identity(), candidate.node_id
+                new.append(_Hypothesis(state, odom_from_cam, state, weight, node_id, pose, number))
         self._prune(_merge_duplicates(new), self._null_weight * none**new_evidence_ratio)
-        best = self._ranked[0].current
+        best = self.leader
         self.is_track_continued = before is not None and self.is_consistent(
             before, best.world_from_cam, best.pose_covariance
         )
@@ -289,35 +253,35 @@ class PoseHypotheses:
     def set_best_state(self, state: MotionState, odom_from_cam: Rigid3 | None) -> None:
         """Replace the state of the best hypothesis by a more accurate one than its candidate
         gives."""
-        self._ranked[0] = replace(
-            self._ranked[0], state=state, current=state, odom_from_cam=odom_from_cam
-        )
+        self._ranked[0] = self._ranked[0].measured(state, odom_from_cam)
         self._update_relative_poses()
 
     def _merge_consistent(
         self, candidate: Candidate, odom_from_cam: Rigid3 | None, new_evidence_ratio: float
-    ) -> list[_Hypothesis]:
-        """Merge the hypotheses consistent with a single pose into one.
+    ) -> tuple[list[_Hypothesis], list[_Hypothesis]]:
+        """Merge the hypotheses consistent with a single pose into one. Return it, and the others.
 
         The motion is that of the likeliest of them.
         """
         pose, covariance = candidate.world_from_cam, candidate.covariance
-        weight, likeliest = 0.0, (-math.inf, None)
+        weight, likeliest, others = 0.0, list[tuple[float, _Hypothesis]](), list[_Hypothesis]()
         for one in self._ranked:
-            if (
-                updated := self._update_with_candidate(one, 0, candidate, odom_from_cam)
-            ) is not None:
-                predicted = one.current.world_from_cam
-                both = one.current.pose_covariance + covariance
-                gate = self._gate_covariance(one.current, covariance)
-                surprised = math.exp(-0.5 * predicted.squared_distance(pose, gate))
-                weight += one.weight * (candidate.probability * surprised) ** new_evidence_ratio
-                spread = float(np.linalg.slogdet(both)[1])
-                density = math.log(one.weight) - 0.5 * (
-                    predicted.squared_distance(pose, both) + spread
-                )
-                likeliest = max(likeliest, (density, updated), key=lambda pair: pair[0])
-        return [] if likeliest[1] is None else [replace(likeliest[1], weight=weight)]
+            updated = self._update_with_candidate(one, 0, candidate, odom_from_cam)
+            if updated is None:
+                others.append(one)
+                continue
+            predicted = one.current.world_from_cam
+            gate = self._gate_covariance(one.current, covariance)
+            surprised = math.exp(-0.5 * predicted.squared_distance(pose, gate))
+            weight += one.weight * (candidate.probability * surprised) ** new_evidence_ratio
+            both = one.current.pose_covariance + covariance
+            spread = float(np.linalg.slogdet(both)[1])
+            square = predicted.squared_distance(pose, both)
+            likeliest.append((math.log(one.weight) - 0.5 * (square + spread), updated))
+        if not likeliest:
+            return [], others
+        _, best = max(likeliest, key=lambda pair: pair[0])
+        return [replace(best, weight=weight)], others
 
     def _update_with_candidate(
         self, one: _Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
@@ -326,32 +290,23 @@ class PoseHypotheses:
 
         None if the candidate is not consistent with it.
         """
-        pose, covariance = candidate.world_from_cam, candidate.covariance
-        if not self.is_consistent(one.current, pose, covariance):
+        pose, covariance, now = candidate.world_from_cam, candidate.covariance, one.current
+        if not self.is_consistent(now, pose, covariance):
             return None
-        state = update_motion(one.current, pose, covariance)
-        square = one.current.world_from_cam.squared_distance(
-            pose, one.current.pose_covariance + covariance
-        )
-        likelihood = max(math.exp(-0.5 * square), 1e-100)
-        return _Hypothesis(
-            state,
-            odom_from_cam,
-            state,
-            one.weight * candidate.probability * likelihood,
-            candidate.node_id,
-            one.from_best,
-            number,
-        )
+        square = now.world_from_cam.squared_distance(pose, now.pose_covariance + covariance)
+        weight = one.weight * candidate.probability * max(math.exp(-0.5 * square), 1e-100)
+        state, changes = update_motion(now, pose, covariance), {"node_id": candidate.node_id}
+        return one.measured(state, odom_from_cam, weight=weight, candidate_idx=number, **changes)
 
     def _prune(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:
         """Keep the hypotheses with the highest weights and normalise the weights."""
+        max_number = 24  # maximum number of hypotheses, those with the highest weights
         min_weight = 0.002  # minimum weight of a hypothesis
         # Minimum probability that the camera is at none of the hypotheses, because it was
         # carried or all are wrong.
         min_elsewhere = 0.0005
         whole = sum(one.weight for one in hypotheses) + elsewhere
-        heaviest = sorted(hypotheses, key=lambda one: -one.weight)[: self._max_number]
+        heaviest = sorted(hypotheses, key=lambda one: -one.weight)[:max_number]
         kept = [one for one in heaviest if one.weight >= min_weight * whole] or heaviest[:1]
         self._null_weight = max(elsewhere / whole, min_elsewhere) if kept else 1.0
         share = (1.0 - self._null_weight) / max(sum(one.weight for one in kept), 1e-300)
@@ -370,17 +325,14 @@ def _merge_duplicates(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
     """Merge hypotheses with the same pose and velocity, and prefer those measured now."""
     kept: list[_Hypothesis] = []
     least = 1e-4 * max(one.weight for one in hypotheses)
-    for one in sorted(
-        (one for one in hypotheses if one.weight > least),
-        key=lambda one: (one.candidate_idx is None, -one.weight),
-    ):
-        same = next(
-            (k for k, other in enumerate(kept) if _is_same_motion(one.current, other.current)), None
-        )
-        if same is None:
-            kept.append(one)
+    heavy = [one for one in hypotheses if one.weight > least]
+    for one in sorted(heavy, key=lambda one: (one.candidate_idx is None, -one.weight)):
+        for k, other in enumerate(kept):
+            if _is_same_motion(one.current, other.current):
+                kept[k] = replace(other, weight=other.weight + one.weight)
+                break
         else:
-            kept[same] = replace(kept[same], weight=kept[same].weight + one.weight)
+            kept.append(one)
     return kept
 
 
@@ -398,12 +350,3 @@ def _is_same_motion(a: MotionState, b: MotionState) -> bool:
 def is_same_place(a: Rigid3, b: Rigid3) -> bool:
     """Return whether two poses are within 0.25 m and 5 degrees."""
     return a.is_same(b, 0.25, math.radians(5.0))
-
-
-def _relative_odometry(
-    odom_from_before: Rigid3 | None, odom_from_cam: Rigid3 | None
-) -> Rigid3 | None:
-    """Return the motion of external odometry, None if it is missing at one of the two times."""
-    if odom_from_before is None or odom_from_cam is None:
-        return None
-    return odom_from_before.inverse() @ odom_from_cam

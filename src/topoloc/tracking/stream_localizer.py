@@ -13,9 +13,8 @@ from topoloc.localization.evidence import compute_precision_probability
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.tracking.pose_errors import PoseErrors, compute_pose_errors
 from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses, is_same_place
-from topoloc.tracking.tracker_state import StreamFrame
+from topoloc.tracking.tracker_state import PoseErrors, StreamFrame, compute_pose_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +69,14 @@ class StreamLocalizer:
                 return refusal
         if len(found) != 1 or not self._is_consistent(found[0], pose_covariance):
             refusal, found = self._localize_globally(frame)
-        candidates = [
-            Candidate(
-                one.result.world_from_cam,
-                one.errors.total + pose_covariance,
-                one.probability,
-                one.result.node_id,
-            )
-            for one in found
-        ]
+        candidates = list[Candidate]()
+        for one in found:
+            pose, node_id = one.result.world_from_cam, one.result.node_id
+            covariance = one.errors.total + pose_covariance
+            candidates.append(Candidate(pose, covariance, one.probability, node_id))
+        new_evidence_ratio = self._compute_new_evidence(found)
         self._hypotheses.update_weights(
-            frame.t_ns, candidates, frame.odom_from_cam, self._compute_new_evidence(found)
+            frame.t_ns, candidates, frame.odom_from_cam, new_evidence_ratio
         )
         if self._hypotheses.candidate_idx is not None:
             return found[self._hypotheses.candidate_idx]
@@ -120,19 +116,17 @@ class StreamLocalizer:
         refusal, found = self._query_localizer(frame, None)
         if refusal is None:
             return refusal, found
-        missed: list[LocalizedPose] = []
+        known = list(found)
         for hypothesis in self._hypotheses.alternatives()[:max_queries]:
-            if not _is_known_pose(hypothesis.world_from_cam, [*found, *missed]):
+            if not _is_known_pose(hypothesis.world_from_cam, known):
                 around = self._query_localizer(frame, hypothesis.world_from_cam)[1]
-                missed += [
-                    one
-                    for one in around
-                    if not _is_known_pose(one.result.world_from_cam, [*found, *missed])
+                known += [
+                    one for one in around if not _is_known_pose(one.result.world_from_cam, known)
                 ]
-        total = len(found) + len(missed)
-        found = [replace(one, probability=one.probability * len(found) / total) for one in found]
-        return refusal, found + [
-            replace(one, probability=one.probability / total) for one in missed
+        shares = [len(found) if k < len(found) else 1 for k in range(len(known))]
+        return refusal, [
+            replace(one, probability=one.probability * share / len(known))
+            for one, share in zip(known, shares, strict=True)
         ]
 
     def _is_consistent(
@@ -149,25 +143,15 @@ class StreamLocalizer:
         """Return the possible poses of the image: one, the alternatives, or none with the
         reason."""
         result, named = self._localizer.localize_with_inliers(frame.image, frame.camera, near)
-        if isinstance(result, NotLocalized):
-            return result, [
-                self._to_localized_pose(one, inlier_points, one.probability)
-                for one, inlier_points in named
-            ]
-        return None, [
-            self._to_localized_pose(
-                one, inlier_points, min(_place_probability(one), 1.0 - self._hypotheses.miss)
-            )
-            for one, inlier_points in named
-        ]
-
-    def _to_localized_pose(
-        self, result: Localization, inlier_points: PointObservations, probability: float
-    ) -> LocalizedPose:
-        depth = float(
-            np.median(result.world_from_cam.inverse().apply(inlier_points.points_world)[:, 2])
-        )
-        return LocalizedPose(result, inlier_points, compute_pose_errors(result, depth), probability)
+        refusal, found = result if isinstance(result, NotLocalized) else None, list[LocalizedPose]()
+        for one, points in named:
+            probability = one.probability
+            if refusal is None:
+                probability = min(_place_probability(one), 1.0 - self._hypotheses.miss)
+            depths = one.world_from_cam.inverse().apply(points.points_world)[:, 2]
+            errors = compute_pose_errors(one, float(np.median(depths)))
+            found.append(LocalizedPose(one, points, errors, probability))
+        return refusal, found
 
 
 def _place_probability(found: Localization) -> float:
@@ -175,11 +159,9 @@ def _place_probability(found: Localization) -> float:
 
     The result's probability also includes the precision, which does not affect other places.
     """
-    return (
-        found.probability
-        if found.evidence is None
-        else min(found.probability / compute_precision_probability(found.evidence), 1.0)
-    )
+    if found.evidence is None:
+        return found.probability
+    return min(found.probability / compute_precision_probability(found.evidence), 1.0)
 
 
 def _is_known_pose(world_from_cam: Rigid3, found: list[LocalizedPose]) -> bool:

@@ -1,7 +1,17 @@
-"""Hold the state of the tracker: the current image and the last localized one."""
+"""Hold the state of the tracker: the current image, the last localized ones and their errors.
+
+The error of a localization has two parts. The noise of the matches is independent from image to
+image. The common error of the map's points (`correlated_errors.py`) is not. An image taken nearby
+uses the same points and has the same error, so averaging over images does not reduce it. When the
+camera moves on, other points take over and this part changes slowly, faster for nearer points. It
+is modelled as a first-order Gauss-Markov process (Gelb, *Applied Optimal Estimation*, 1974, section
+3.8) in s = distance / depth + rotation. Two images have the share exp(-s / reach) of it in common.
+They differ by 2 (1 - exp(-s / reach)) of its covariance.
+"""
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -12,9 +22,9 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 from topoloc.retrieval.coarse import Image
+from topoloc.slam.pose_graph import Edge, optimize_pose_graph
 from topoloc.tracking.motion import MotionState
 from topoloc.tracking.point_tracker import PointTracker, TrackedMotion
-from topoloc.tracking.pose_errors import PoseErrors
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +40,56 @@ class StreamFrame:
     odom_from_cam: Rigid3 | None
     grey: UInt8[np.ndarray, "a b"]
     grey_camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Hold both covariances of the left perturbation of cam_from_world, in camera axes (m, rad).
+
+    `depth` is the median depth of the points, metres.
+    """
+
+    noise: Float[np.ndarray, "6 6"]
+    correlated: Float[np.ndarray, "6 6"]
+    depth: float
+
+    @property
+    def total(self) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of the whole error."""
+        return self.noise + self.correlated
+
+
+def compute_pose_errors(
+    found: Localization, depth: float, floor_share: float = 0.001
+) -> PoseErrors:
+    """Return both parts for points at this depth (metres). `noise_floor` is added to the noise."""
+    noise = found.noise_share * found.camera_covariance
+    return PoseErrors(
+        noise + noise_floor(depth, floor_share), found.camera_covariance - noise, depth
+    )
+
+
+def noise_floor(depth: float, share: float = 0.001) -> Float[np.ndarray, "6 6"]:
+    """Return the noise that remains with any number of points.
+
+    Its sigma is `share` of their depth (metres), and `share` radians.
+    """
+    return np.diag(np.repeat([(share * depth) ** 2, share**2], 3))
+
+
+def compute_correlated_change(
+    errors: PoseErrors, cam_from_before: Rigid3
+) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance of the change of the correlated part between two images.
+
+    `cam_from_before` is the motion between them.
+    """
+    # Motion over which map errors are correlated (to 1/e): the distance in depths of the points,
+    # plus the rotation in radians.
+    reach = 2.0
+    way = float(np.linalg.norm(cam_from_before.translation))
+    moved = way / errors.depth + cam_from_before.angle()
+    return 2.0 * (1.0 - np.exp(-moved / reach)) * errors.correlated
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +111,27 @@ class ReferenceImage:
     follower: PointTracker
 
 
+@dataclass(frozen=True, eq=False)
+class TrackedImage:
+    """Hold the current image, tracked from the last localized one (`reference`): its motion since,
+    and its smoothed cam_from_world."""
+
+    reference: ReferenceImage
+    motion: TrackedMotion
+    smoothed: Rigid3
+
+    @property
+    def cam_from_world(self) -> Rigid3:
+        """Return the raw pose."""
+        return self.motion.cam_from_ref @ self.reference.cam_from_world
+
+    @property
+    def moved_errors(self) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of the error of the reference image, moved to this image."""
+        adjoint = self.motion.cam_from_ref.adjoint()
+        return adjoint @ self.reference.errors.total @ adjoint.T
+
+
 def compute_direction_uncertainty(predicted: MotionState, depth: float) -> float:
     """Return three sigma (radians) of the direction to points at this depth (metres)."""
     sigmas = np.sqrt(np.diag(predicted.pose_covariance))
@@ -62,10 +143,8 @@ def compute_motion_covariance(
 ) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of a tracked motion: the noise of the points, and `share` of the motion
     for wrong depths."""
-    way, turn = (
-        float(np.linalg.norm(tracked_motion.cam_from_ref.translation)),
-        tracked_motion.cam_from_ref.angle(),
-    )
+    motion = tracked_motion.cam_from_ref
+    way, turn = float(np.linalg.norm(motion.translation)), motion.angle()
     return tracked_motion.covariance + np.diag(np.repeat([way**2, turn**2], 3)) * share**2
 
 
@@ -93,7 +172,61 @@ def downscale_image(
     scale = max_side_px / max(grey.shape)
     if scale >= 1.0:
         return grey, camera
-    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), camera.rescaled(
-        width, height
-    )
+    size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA), camera.rescaled(*size)
+
+
+_Estimate = tuple[Rigid3, Float[np.ndarray, "6 6"]]
+"""A transform and the covariance of its left perturbation."""
+
+
+class PoseWindow:
+    """Hold the last `size` localized images, which are adjusted together.
+
+    Localization has about a centimetre of noise, point tracking a tenth of that. A pose graph over
+    the images (`slam/pose_graph.py`) combines the two. Its node 0 is the world. A robust loss
+    limits the influence of a wrong localization.
+    """
+
+    def __init__(self, size: int = 10) -> None:
+        # poses and motions since the image before; that of the first image is not used
+        self._measured: deque[tuple[_Estimate, _Estimate]] = deque(maxlen=size)
+        self._smoothed: deque[Rigid3] = deque(maxlen=size)
+        self._covariance = np.zeros((6, 6))  # of the last one of these
+
+    def clear(self) -> None:
+        """Remove all images."""
+        self._measured.clear()
+        self._smoothed.clear()
+
+    def add(
+        self,
+        cam_from_world: Rigid3,
+        covariance: Float[np.ndarray, "6 6"],
+        cam_from_before: Rigid3,
+        motion_covariance: Float[np.ndarray, "6 6"],
+    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
+        """Add an image, localized at `cam_from_world` after the motion `cam_from_before` since the
+        last added image. Return its smoothed cam_from_world. All covariances are those of left
+        perturbations."""
+        if self._smoothed:
+            adjoint = cam_from_before.adjoint()
+            before = adjoint @ self._covariance @ adjoint.T + motion_covariance
+            both = before @ np.linalg.solve(before + covariance, covariance)
+            self._covariance = (both + both.T) / 2.0  # symmetric up to rounding
+        else:
+            self._covariance = covariance
+        before = self._smoothed[-1] if self._smoothed else None
+        self._smoothed.append(cam_from_world if before is None else cam_from_before @ before)
+        motion = cam_from_before, motion_covariance
+        self._measured.append(((cam_from_world, covariance), motion))
+        edges = list[Edge]()
+        for k, (pose, motion) in enumerate(self._measured, start=1):
+            edges.append(Edge(0, k, *pose, is_loop=True))
+            if k > 1:
+                edges.append(Edge(k - 1, k, *motion, is_loop=True))
+        poses = optimize_pose_graph(
+            [Rigid3.identity(), *self._smoothed], edges, max_steps=5, min_step=1e-4
+        )
+        self._smoothed = deque(poses[1:], maxlen=self._smoothed.maxlen)
+        return self._smoothed[-1], self._covariance

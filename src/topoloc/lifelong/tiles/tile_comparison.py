@@ -1,7 +1,7 @@
 """Determine if two maps overlap, and the transform between them. Start reading at `compare_tiles`.
 
-Maps of overlapping parts of one recording share images, which give the transform at once
-(`shared_images.py`). Otherwise nodes of each map are localized in the other one, the most similar
+Maps of overlapping parts of one recording share images, which give the transform at once.
+Otherwise nodes of each map are localized in the other one, the most similar
 ones first. Each localization gives an estimate of the transform. A consensus needs enough agreeing
 estimates from independent images (`transform_consensus.py`). It must then pass a test on nodes that
 would stand near a node of the other map. Nearly all of them must be localized at their expected
@@ -13,22 +13,21 @@ something else.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from topoloc.atlas.global_descriptors import GlobalDescriptors
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.transform_consensus import (
-    TransformConsensus,
     diagonal_covariance,
     find_consensus,
     propagate_estimate,
 )
 from topoloc.lifelong.node_localization import localize_nodes, sample_evenly
-from topoloc.lifelong.tiles.shared_images import estimate_by_shared_images
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import node_distances
@@ -80,16 +79,6 @@ class NotJoined:
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    """Hold the localization of node `queried` of one map in the other map, whose nearest match is
-    node `matched_row`."""
-
-    queried: Row
-    matched_row: Row
-    result: Localization
-
-
 def compare_tiles(
     first: OpenTile,
     second: OpenTile,
@@ -115,210 +104,196 @@ def compare_tiles(
     shared = estimate_by_shared_images(first.topomap, second.topomap)
     if shared is not None:
         return TileTransform(*shared, is_from_shared_images=True)
-    is_of_kinds = any(
-        set(one.topomap.kinds) <= set(other.topomap.kinds)
-        for one, other in ((first, second), (second, first))
-    )
-    if not is_of_kinds or not first.vectors.keys() & second.vectors.keys():
+    queries = _NodeQueries(first, second), _NodeQueries(second, first)
+    common = [kind for kind in first.vectors if kind in second.vectors]
+    if not common or not any(one.is_possible for one in queries):
         return NotJoined("their features are not of the same kinds")
-    return _Comparison(first, second).verdict(num_probed, max_queries, min_near)
-
-
-class _Comparison:
-    """Hold two tiles and the localizations so far of each tile's nodes in the other, by row. None
-    if a node is not localized."""
-
-    def __init__(self, first: OpenTile, second: OpenTile) -> None:
-        self._tiles = first, second
-        self._answers: tuple[dict[Row, Localization | None], ...] = (
-            {},
-            {},
-        )  # nodes of the second tile in the first, and nodes of the first in the second
-
-    def verdict(
-        self, num_probed: int, max_queries: int, min_near: int
-    ) -> TileTransform | NotJoined:
-        """Compare the tiles and return the transform, or the reason for no join."""
-        orders = self._rank_nodes_by_similarity()
-        self._localize_nodes([order[:num_probed] for order in orders])
-        if not self._localized_nodes():
+    alike = first.vectors[common[-1]] @ second.vectors[common[-1]].T
+    for num_queries in (num_probed, max_queries):
+        for side, one in enumerate(queries):  # the most similar nodes first
+            order = np.argsort(-alike.max(axis=side), kind="stable")
+            one.localize(as_rows(order[:num_queries]))
+        if not any(answer is not None for one in queries for answer in one.answers.values()):
             return NotJoined("no node of either is recognised in the other")
-        self._localize_nodes([order[:max_queries] for order in orders])
-        found = self._find_consensus()
-        if isinstance(found, NotJoined):
-            return found
-        consensus, ends = found
-        first_from_second, covariance = consensus.between(
-            self._tiles[0].world_from_node(ends[0]),
-            self._tiles[1].world_from_node(ends[1]).inverse(),
-        )
-        near = self._find_nearby_nodes(first_from_second, max_queries)
-        self._localize_nodes(near)
-        tested = self._verify(first_from_second, near)
-        joint = TileTransform(
-            first_from_second, covariance, int(np.count_nonzero(consensus.is_inlier)), *tested
-        )
-        return self._decide(joint, min_near)
-
-    def _decide(self, found: TileTransform, min_near: int) -> TileTransform | NotJoined:
-        # Minimum share of these nodes that are localized at their expected pose.
-        min_recognised = 0.9
-        # Minimum share of unguided matches that agree with the pose, in three quarters of
-        # these nodes. Another place of the same plan may match as often, but its
-        # different parts match something else.
-        min_agreeing = 0.75
-        if found.num_near < min_near:
-            return NotJoined(
-                f"{found.num_agreeing} answers agree, but only {found.num_near} nodes stand near"
-                " one of the other tile"
-            )
-        if found.num_recognised < min_recognised * found.num_near:
-            return NotJoined(
-                f"{found.num_agreeing} answers agree, but {found.num_near - found.num_recognised}"
-                f" of {found.num_near} nodes that should be recognised are not"
-            )
-        if found.agreeing < min_agreeing:
-            return NotJoined(
-                f"{found.num_agreeing} answers agree, but {1.0 - found.agreeing:.0%} of what is"
-                " matched there does not"
-            )
+    found = _find_consensus(*queries)
+    if isinstance(found, NotJoined):
         return found
+    shares = list[float | None]()
+    for one, pose in zip(queries, (found[0], found[0].inverse()), strict=True):
+        near = one.find_nearby_nodes(pose, max_queries)
+        one.localize(near)
+        shares += one.verify(pose, near)
+    return _decide(found, shares, min_near)
 
-    def _rank_nodes_by_similarity(self) -> list[list[Row]]:
-        """Return the rows of the second tile's nodes, and of the first's, by similarity to the
-        other tile's most similar node."""
-        first, second = (tile.vectors for tile in self._tiles)
-        kind = [kind for kind in first if kind in second][-1]
-        alike = first[kind] @ second[kind].T
-        return [as_rows(np.argsort(-alike.max(axis=side), kind="stable")) for side in (0, 1)]
 
-    def _localize_nodes(self, rows: Sequence[Sequence[Row]]) -> None:
-        """Localize nodes of the second tile in the first, and nodes of the first in the second, if
-        not done before."""
-        for queried, of, known, wanted in zip(
-            self._tiles, self._tiles[::-1], self._answers, rows, strict=True
-        ):
-            if set(queried.topomap.kinds) <= set(of.topomap.kinds):
-                known.update(
-                    localize_nodes(
-                        queried.localizer, of.topomap, [row for row in wanted if row not in known]
-                    )
-                )
+def _decide(
+    found: _FoundTransform, shares: Sequence[float | None], min_near: int
+) -> TileTransform | NotJoined:
+    """Return the transform if the nodes that should be localized pass the test. `shares` are their
+    shares of agreeing matches, None if a node is not localized at its expected pose."""
+    # Minimum share of these nodes that are localized at their expected pose.
+    min_recognised = 0.9
+    # Minimum share of unguided matches that agree with the pose, in three quarters of these nodes.
+    # Another place of the same plan may match as often, but its different parts match something
+    # else.
+    min_agreeing = 0.75
+    num_agreeing, num_near, num_missed = found[2], len(shares), shares.count(None)
+    agreeing = float(np.quantile([share or 0.0 for share in shares], 0.25)) if shares else 0.0
+    if num_near < min_near:
+        fault = f"only {num_near} nodes stand near one of the other tile"
+    elif num_near - num_missed < min_recognised * num_near:
+        fault = f"{num_missed} of {num_near} nodes that should be recognised are not"
+    elif agreeing < min_agreeing:
+        fault = f"{1.0 - agreeing:.0%} of what is matched there does not"
+    else:
+        return TileTransform(*found, num_near, num_near - num_missed, agreeing)
+    return NotJoined(f"{num_agreeing} answers agree, but {fault}")
 
-    def _localized_nodes(self) -> list[list[_Answer]]:
-        """Return the successful localizations in the first tile and in the second. Return an empty
-        list if there is none."""
-        found = [
-            [
-                _Answer(row, queried.topomap.row_of(result.node_id), result)
-                for row, result in known.items()
-                if result is not None
-            ]
-            for queried, known in zip(self._tiles, self._answers, strict=True)
-        ]
-        return found if any(found) else []
 
-    def _find_consensus(self) -> tuple[TransformConsensus, tuple[Row, Row]] | NotJoined:
-        """Return the transform between two nodes, one of each tile, and the rows of these nodes."""
-        by_first, by_second = self._localized_nodes()
-        answers = [*by_first, *by_second]
-        pairs = [(one.matched_row, one.queried) for one in by_first] + [
-            (one.queried, one.matched_row) for one in by_second
-        ]
-        ends = pairs[int(np.argmax([one.result.num_inliers for one in answers]))]
-        estimates, covariances = [], []
-        for number, one in enumerate(answers):
-            estimate, covariance = self._estimate_transform(
-                one, ends, is_from_second=number >= len(by_first)
-            )
-            estimates.append(estimate)
-            covariances.append(covariance)
-        consensus = find_consensus(
-            estimates, np.stack(covariances), np.array(pairs), rival_share=0.34
-        )
-        return (
-            NotJoined(f"{len(answers)} nodes are recognised, but do not agree")
-            if consensus is None
-            else (consensus, ends)
-        )
+@dataclass(frozen=True, eq=False)
+class _NodeQueries:
+    """Localize nodes of the tile `source` in the tile `target`. `answers` holds the localizations
+    so far by row, None if a node is not localized."""
 
-    def _estimate_transform(
-        self, one: _Answer, ends: tuple[Row, Row], is_from_second: bool
-    ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
-        """Return the transform between the nodes `ends` according to one localization:
-        first_from_second."""
+    target: OpenTile
+    source: OpenTile
+    answers: dict[Row, Localization | None] = field(default_factory=dict)
+
+    @property
+    def is_possible(self) -> bool:
+        """Return whether the source has all feature types of the target."""
+        return set(self.target.topomap.kinds) <= set(self.source.topomap.kinds)
+
+    def localize(self, rows: Sequence[Row]) -> None:
+        """Localize nodes, if that is possible and not done before."""
+        if self.is_possible:
+            new = [row for row in rows if row not in self.answers]
+            self.answers.update(localize_nodes(self.target.localizer, self.source.topomap, new))
+
+    def estimate_node_transforms(self) -> Iterator[tuple[Row, Row, Rigid3, np.ndarray, int]]:
+        """Yield for each localized node its row, the row of the node of the target that it matches
+        best, the transform to that node with its covariance, and the number of inliers."""
         # Factor applied to the sigmas of the localizations, because neighbours share
         # errors of the map.
         widened = 3.0
         sigma = 0.01  # additional position sigma of a localization, in metres
         sigma_deg = 0.2  # additional rotation sigma of a localization, in degrees
-        first, second = self._tiles
-        matched_row = second if is_from_second else first
-        node_from_world = matched_row.world_from_node(one.matched_row).inverse()
-        adjoint = node_from_world.adjoint()
-        by_from_asked = node_from_world @ one.result.world_from_cam
-        covariance = widened**2 * adjoint @ one.result.covariance @ adjoint.T + diagonal_covariance(
-            sigma, sigma_deg
-        )
-        a, b = one.matched_row, one.queried
-        if is_from_second:
-            covariance, by_from_asked = (
-                inverse_covariance(by_from_asked, covariance),
-                by_from_asked.inverse(),
-            )
-            a, b = b, a
-        to_first = first.world_from_node(ends[0]).inverse() @ first.world_from_node(a)
-        from_second = second.world_from_node(b).inverse() @ second.world_from_node(ends[1])
-        return propagate_estimate(
-            to_first, by_from_asked, covariance, from_second, drift=0.01, drift_deg=0.1
-        )
+        for row, result in self.answers.items():
+            if result is not None:
+                matched = self.target.topomap.row_of(result.node_id)
+                node_from_world = self.target.world_from_node(matched).inverse()
+                adjoint = node_from_world.adjoint()
+                covariance = widened**2 * adjoint @ result.covariance @ adjoint.T
+                covariance = covariance + diagonal_covariance(sigma, sigma_deg)
+                pose = node_from_world @ result.world_from_cam
+                yield row, matched, pose, covariance, result.num_inliers
 
-    def _find_nearby_nodes(self, first_from_second: Rigid3, max_queries: int) -> list[list[Row]]:
-        """Return nodes of the second tile, and of the first, that the transform puts near a node of
-        the other. At most `max_queries` of each tile are chosen, evenly spaced."""
+    def find_nearby_nodes(self, target_from_source: Rigid3, max_queries: int) -> list[Row]:
+        """Return nodes that the transform puts near a node of the target. At most `max_queries` are
+        chosen, evenly spaced."""
         # A node must be localized if it is within this many D_thresh (distance of Eq. 1)
         # of a node of the other tile.
         max_distance = 3.0
-        rows = []
-        for queried, of, pose in zip(
-            self._tiles,
-            self._tiles[::-1],
-            (first_from_second, first_from_second.inverse()),
-            strict=True,
-        ):
-            config, node_poses = queried.topomap.config, queried.topomap.node_poses
-            apart = [
-                node_distances(pose @ summary.world_from_cam, node_poses, config.lambda_rot).min()
-                for summary in of.topomap.summaries
-            ]
-            near = np.flatnonzero(np.array(apart) <= max_distance * config.d_thresh)
-            rows.append(sample_evenly(as_rows(near), max_queries))
-        return rows
+        config, poses = self.target.topomap.config, self.target.topomap.node_poses
+        moved = (target_from_source @ one.world_from_cam for one in self.source.topomap.summaries)
+        apart = [node_distances(pose, poses, config.lambda_rot).min() for pose in moved]
+        near = np.flatnonzero(np.array(apart) <= max_distance * config.d_thresh)
+        return sample_evenly(as_rows(near), max_queries)
 
-    def _verify(
-        self, first_from_second: Rigid3, near: Sequence[Sequence[Row]]
-    ) -> tuple[int, int, float]:
-        """Return the number of tested nodes, the number localized at their expected pose, and the
-        lower quartile of the share of agreeing matches."""
-        num_at_pose, shares = 0, list[float]()
-        poses = (first_from_second, first_from_second.inverse())
-        for queried, of, known, rows, pose in zip(
-            self._tiles, self._tiles[::-1], self._answers, near, poses, strict=True
-        ):
-            d_thresh = queried.topomap.config.d_thresh
-            for row in rows:
-                if row not in known:
-                    continue
-                result, share = known[row], 0.0
-                if result is not None and result.world_from_cam.is_same(
-                    pose @ of.world_from_node(row), 0.3 * d_thresh, math.radians(2.0)
-                ):
-                    num_at_pose, share = num_at_pose + 1, _unguided_inlier_ratio(result)
+    def verify(self, target_from_source: Rigid3, rows: Sequence[Row]) -> list[float | None]:
+        """Return the share of unguided matches that agree with the pose, for each node that was
+        queried. It is None if the node is not localized at its expected pose."""
+        max_m, shares = 0.3 * self.target.topomap.config.d_thresh, list[float | None]()
+        for row in rows:
+            if row in self.answers:
+                result, expected = self.answers[row], self.source.world_from_node(row)
+                limits = target_from_source @ expected, max_m, math.radians(2.0)
+                share = None
+                if result is not None and result.world_from_cam.is_same(*limits):
+                    evidence = result.evidence
+                    share = evidence.num_inliers / max(evidence.num_matches, 1) if evidence else 0.0
                 shares.append(share)
-        return len(shares), num_at_pose, float(np.quantile(shares, 0.25)) if shares else 0.0
+        return shares
 
 
-def _unguided_inlier_ratio(result: Localization) -> float:
-    """Return the share of unguided matches that agree with the pose."""
-    evidence = result.evidence
-    return 0.0 if evidence is None else evidence.num_inliers / max(evidence.num_matches, 1)
+_FoundTransform = tuple[Rigid3, Float[np.ndarray, "6 6"], int]
+"""first_from_second, the covariance of its left perturbation (m, rad), and the number of
+observations that agree."""
+
+
+def _find_consensus(in_first: _NodeQueries, in_second: _NodeQueries) -> _FoundTransform | NotJoined:
+    """Return the transform between the tiles that most localizations agree on."""
+    steps = [
+        (matched, row, pose, covariance, num_inliers)
+        for row, matched, pose, covariance, num_inliers in in_first.estimate_node_transforms()
+    ]
+    steps += [
+        (row, matched, pose.inverse(), inverse_covariance(pose, covariance), num_inliers)
+        for row, matched, pose, covariance, num_inliers in in_second.estimate_node_transforms()
+    ]
+    first, second = in_first.target, in_second.target
+    found = _find_common_transform(
+        [
+            (first.world_from_node(a), second.world_from_node(b), pose, covariance)
+            for a, b, pose, covariance, _ in steps
+        ],
+        int(np.argmax([num_inliers for *_, num_inliers in steps])),
+        np.array([(a, b) for a, b, *_ in steps]),
+    )
+    if found is None:
+        return NotJoined(f"{len(steps)} nodes are recognised, but do not agree")
+    return found
+
+
+def _find_common_transform(
+    observations: Sequence[tuple[Rigid3, Rigid3, Rigid3, np.ndarray]],
+    reference: int,
+    pairs: Int[np.ndarray, "n 2"] | None = None,
+) -> _FoundTransform | None:
+    """Return the transform between two maps that most observations agree on.
+
+    An observation holds the poses of a camera in the first map and of one in the second, and the
+    transform between these cameras with its covariance. All are moved to the cameras of the
+    observation `reference`. `pairs` are the nodes of each observation, if they may repeat.
+    """
+    one, other, *_ = observations[reference]
+    estimates = [
+        propagate_estimate(
+            one.inverse() @ a, pose, covariance, b.inverse() @ other, drift=0.01, drift_deg=0.1
+        )
+        for a, b, pose, covariance in observations
+    ]
+    poses, covariances = zip(*estimates, strict=True)
+    consensus = find_consensus(list(poses), np.stack(covariances), pairs, rival_share=0.34)
+    if consensus is None:
+        return None
+    return *consensus.between(one, other.inverse()), int(np.count_nonzero(consensus.is_inlier))
+
+
+def estimate_by_shared_images(
+    first: TopoMetricMap, second: TopoMetricMap
+) -> _FoundTransform | None:
+    """Estimate first_from_second (metres) from the images that both maps contain.
+
+    Because of noise, two images of a camera are never identical. So maps with identical images show
+    the same place, even if other places look similar. Return first_from_second, the covariance of
+    its left perturbation (m, rad), and the number of images that agree. Return None if the maps
+    share too few images or the images do not agree.
+    """
+    max_images = 200  # evenly spaced
+    sigma_m, sigma_deg = 0.01, 0.1  # of the transform between the maps as one image gives it
+    here, there = _image_poses(first), _image_poses(second)
+    shared = sample_evenly(sorted(here.keys() & there.keys()), max_images)
+    if not shared:
+        return None
+    covariance = diagonal_covariance(sigma_m, sigma_deg)
+    observations = [(here[one], there[one], Rigid3.identity(), covariance) for one in shared]
+    return _find_common_transform(observations, len(shared) // 2)
+
+
+def _image_poses(topomap: TopoMetricMap) -> dict[tuple[str, bytes], Rigid3]:
+    """Return world_from_cam of each mapping image by its name and bytes. Images that occur several
+    times are left out, such as images of a covered camera."""
+    images = [(image.name, image.jpeg, image.world_from_cam) for image in topomap.place_images]
+    times = Counter(jpeg for _, jpeg, _ in images)
+    return {(name, jpeg): pose for name, jpeg, pose in images if times[jpeg] == 1}

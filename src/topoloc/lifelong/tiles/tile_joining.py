@@ -7,7 +7,8 @@ continue. The manifest adjusts all joins together (`atlas/joint_worlds.py`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,7 @@ from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError, MapError
+from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.lifelong.tiles.tile_comparison import NotJoined, OpenTile, TileTransform, compare_tiles
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.build import Progress
@@ -106,22 +108,24 @@ def join_tiles(
             this machine.
     """
     atlas = Atlas.open(where)
-    selected = _select_pairs(atlas, tile_ids, pairs)
+    wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
+    if pairs is None:
+        selected = find_candidate_pairs(atlas, wanted)
+    else:
+        known = {join.pair for join in atlas.manifest.joins}
+        ordered = [(min(pair), max(pair)) for pair in pairs]
+        selected = [(atlas.tile(a), atlas.tile(b)) for a, b in ordered if (a, b) not in known]
+    pair_results = list[PairResult]()
     if run_jobs is not None:
-        jobs = [
-            PairJob(absolute_address(where), first.tile_id, second.tile_id)
-            for first, second in selected
-        ]
-        done = run_jobs(jobs) if jobs else []
-        return TileJoiningResult(Atlas.open(where).manifest, done)
-    maps, pair_results = MapCache([], Localizer, _MAX_BYTES), list[PairResult]()
-    try:
-        for first, second in selected:
-            pair_results.append(_join_pair(atlas, maps, (first, second)))
-            if on_compared is not None:
-                on_compared(pair_results[-1])
-    finally:
-        maps.close()
+        address = absolute_address(where)
+        jobs = [PairJob(address, first.tile_id, second.tile_id) for first, second in selected]
+        pair_results = run_jobs(jobs) if jobs else []
+    else:
+        with closing(MapCache([], Localizer, _MAX_BYTES)) as maps:
+            for first, second in selected:
+                pair_results.append(_join_pair(atlas, maps, first, second))
+                if on_compared is not None:
+                    on_compared(pair_results[-1])
     return TileJoiningResult(Atlas.open(where).manifest, pair_results)
 
 
@@ -142,66 +146,32 @@ class PairJob:
     def run(self, progress: Progress) -> PairResult:
         """Compare and join the tiles. Raises as `join_tiles`, and AtlasError if a tile does not
         exist any more."""
-        maps = MapCache([], Localizer, _MAX_BYTES)
-        try:
-            atlas = Atlas.open(self.where)
-            return _join_pair(atlas, maps, (atlas.tile(self.first), atlas.tile(self.second)))
-        finally:
-            maps.close()
+        atlas = Atlas.open(self.where)
+        with closing(MapCache([], Localizer, _MAX_BYTES)) as maps:
+            return _join_pair(atlas, maps, atlas.tile(self.first), atlas.tile(self.second))
 
     def failure_outcome(self, reason: str) -> PairResult:
         """Return the result of a job that did not finish."""
         return PairResult(self.first, self.second, NotCompared(reason))
 
 
-def _select_pairs(
-    atlas: Atlas, tile_ids: Sequence[str], pairs: Sequence[tuple[str, str]] | None
-) -> list[tuple[Tile, Tile]]:
-    wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)
-    return (
-        find_candidate_pairs(atlas, wanted) if pairs is None else _find_unjoined_pairs(atlas, pairs)
-    )
-
-
-def _join_pair(atlas: Atlas, maps: MapCache[Localizer], pair: tuple[Tile, Tile]) -> PairResult:
+def _join_pair(atlas: Atlas, maps: MapCache[Localizer], first: Tile, second: Tile) -> PairResult:
     """Compare a pair of tiles and return the result. A join is added to the manifest."""
-    first, second = pair
+    ids = first.tile_id, second.tile_id
     try:
-        found = _compare_pair(atlas, maps, first, second)
+        vectors = [atlas.places_of(tile) for tile in (first, second)]
+        with (
+            maps.use_map(ids[0], atlas.map_path(first)) as one,
+            maps.use_map(ids[1], atlas.map_path(second)) as other,
+        ):
+            tiles = OpenTile(one.content, vectors[0]), OpenTile(other.content, vectors[1])
+            found = compare_tiles(*tiles)
     except (MapError, AtlasError) as error:
         found = NotJoined(str(error))
     if isinstance(found, TileTransform):
-        join = Join(
-            first.tile_id,
-            second.tile_id,
-            found.first_from_second,
-            found.covariance,
-            found.num_agreeing,
-        )
-        add_joins(atlas.store.where, [join], {first.tile_id: first, second.tile_id: second})
-    return PairResult(first.tile_id, second.tile_id, found)
-
-
-def _compare_pair(
-    atlas: Atlas, maps: MapCache[Localizer], first: Tile, second: Tile
-) -> TileTransform | NotJoined:
-    places = [atlas.places_of(tile) for tile in (first, second)]
-    with (
-        maps.use_map(first.tile_id, atlas.map_path(first)) as one,
-        maps.use_map(second.tile_id, atlas.map_path(second)) as other,
-    ):
-        return compare_tiles(OpenTile(one.content, places[0]), OpenTile(other.content, places[1]))
-
-
-def _find_unjoined_pairs(atlas: Atlas, pairs: Sequence[tuple[str, str]]) -> list[tuple[Tile, Tile]]:
-    """Return the given pairs that are not joined yet, each in the order of its ids."""
-    ordered = [(min(pair), max(pair)) for pair in pairs]
-    known = {join.pair for join in atlas.manifest.joins}
-    return [
-        (atlas.tile(first), atlas.tile(second))
-        for first, second in ordered
-        if (first, second) not in known
-    ]
+        join = Join(*ids, found.first_from_second, found.covariance, found.num_agreeing)
+        add_joins(atlas.store.where, [join], dict(zip(ids, (first, second), strict=True)))
+    return PairResult(*ids, found)
 
 
 def find_candidate_pairs(atlas: Atlas, wanted: Collection[str]) -> list[tuple[Tile, Tile]]:
@@ -222,9 +192,9 @@ def find_candidate_pairs(atlas: Atlas, wanted: Collection[str]) -> list[tuple[Ti
         if tile.tile_id not in wanted or tile.tile_id in atlas.problems:
             continue
         candidate_ids = [other.tile_id for other in manifest.tiles if _may_overlap(tile, other)]
-        for other_id, score in (
-            _find_similar_tiles(atlas, tile, candidate_ids) if candidate_ids and index.kinds else ()
-        ):
+        if not candidate_ids or not index.kinds:
+            continue
+        for other_id, score in _find_similar_tiles(atlas, tile, candidate_ids):
             pair = (min(tile.tile_id, other_id), max(tile.tile_id, other_id))
             if pair not in known and score >= min_likeness:
                 scores[pair] = max(score, scores.get(pair, -1.0))
@@ -234,27 +204,21 @@ def find_candidate_pairs(atlas: Atlas, wanted: Collection[str]) -> list[tuple[Ti
 
 def _find_similar_tiles(
     atlas: Atlas, tile: Tile, candidate_ids: Sequence[str]
-) -> Iterator[tuple[str, float]]:
-    """Yield the most similar tiles with their similarity: the median over the most similar
+) -> list[tuple[str, float]]:
+    """Return the most similar tiles with their similarity: the median over the most similar
     places."""
     num_neighbours = 6  # number of most similar other tiles that each tile is compared with
     places, found = atlas.places_of(tile), dict[str, list[float]]()
     kind = next((kind for kind in tile.kinds if kind in places), next(iter(places)))
-    rows = np.unique(
-        np.linspace(0, len(places[kind]) - 1, min(len(places[kind]), _NUM_RETRIEVED))
-        .round()
-        .astype(int)
-    )
-    for row in rows:
-        for other_id, likeness in atlas.index.rank(
-            {kind: places[kind][row]}, num_neighbours, candidate_ids
-        ):
+    for row in sample_evenly(range(len(places[kind])), _NUM_RETRIEVED):
+        query = {kind: places[kind][row]}
+        for other_id, likeness in atlas.index.rank(query, num_neighbours, candidate_ids):
             found.setdefault(other_id, []).append(likeness)
     scores = {
         other_id: float(np.median(sorted(values)[-_NUM_BEST:]))
         for other_id, values in found.items()
     }
-    yield from sorted(scores.items(), key=lambda pair: -pair[1])[:num_neighbours]
+    return sorted(scores.items(), key=lambda pair: -pair[1])[:num_neighbours]
 
 
 def _may_overlap(tile: Tile, other: Tile) -> bool:
@@ -264,9 +228,8 @@ def _may_overlap(tile: Tile, other: Tile) -> bool:
     world_from_other = tile.from_world_of(other)
     if world_from_other is None:
         return True
-    reaches = [float(np.linalg.norm(np.diff(one.box_world, axis=0))) / 2.0 for one in (tile, other)]
-    centres = [one.box_world.mean(axis=0) for one in (tile, other)]
-    return (
-        float(np.linalg.norm(world_from_other.apply(centres[1]) - centres[0]))
-        <= sum(reaches) + MAX_WORLD_OFFSET_M
-    )
+    boxes = tile.box_world, other.box_world
+    reach = sum(float(np.linalg.norm(np.diff(box, axis=0))) / 2.0 for box in boxes)
+    centres = [box.mean(axis=0) for box in boxes]
+    apart = float(np.linalg.norm(world_from_other.apply(centres[1]) - centres[0]))
+    return apart <= reach + MAX_WORLD_OFFSET_M

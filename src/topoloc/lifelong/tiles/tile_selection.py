@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
 from topoloc.errors import TrajectoryError
+from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.lifelong.session_poses import Progress
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
@@ -27,11 +26,7 @@ def find_tile_of_recording(
     """
     # Number of images of the recording, evenly spaced, that are localized in the atlas.
     num_queries = 12
-    rows = np.unique(
-        np.linspace(0, max(len(sequence) - 1, 0), min(num_queries, len(sequence)))
-        .round()
-        .astype(int)
-    ).tolist()
+    rows = sample_evenly(range(len(sequence)), num_queries)
     answers = list[Localization]()
     for done, row in enumerate(rows):
         frame = sequence[row]
@@ -45,24 +40,15 @@ def find_tile_of_recording(
 def select_tile(
     name: str, num_asked: int, answers: Sequence[Localization], tiles: Mapping[str, Tile]
 ) -> Tile:
-    """Return the tile with the most localizations.
-
-    Args:
-        name: the recording's name, for error messages.
-        num_asked: the number of sampled images.
-        answers: the localizations of the sampled images.
-        tiles: the tiles by id.
-
-    Raises:
-        TrajectoryError: no tile has enough localizations, or they are in tiles of several worlds.
-    """
+    """Return the tile (of `tiles`, by id) with the most localizations (`answers`) of the
+    `num_asked` sampled images of the recording `name`. Raises TrajectoryError if no tile has
+    enough, or they are in tiles of several worlds."""
     min_answers = 3  # minimum number of images localized in the tile
     # Minimum share of the localized images that are in the tile or in tiles of the same
     # world.
     min_share = 0.67
-    counts = Counter(
-        answer.provenance.tile for answer in answers if answer.provenance.tile is not None
-    )
+    found = (answer.provenance.tile for answer in answers)
+    counts = Counter(tile_id for tile_id in found if tile_id is not None)
     if not counts or max(counts.values()) < min_answers:
         raise TrajectoryError(
             f"{name}: no tile recognises it: {_format_counts(counts)} of {num_asked} pictures"
