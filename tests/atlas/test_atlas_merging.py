@@ -14,7 +14,7 @@ from topoloc.apps.cli import main
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import add_joins, create_atlas, new_tiles
 from topoloc.atlas.joins import Join
-from topoloc.atlas.merging import merge_atlases
+from topoloc.atlas.place import merge_atlases
 from topoloc.errors import AtlasError
 from topoloc.geometry.rigid import Rigid3
 

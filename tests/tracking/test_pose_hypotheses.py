@@ -198,8 +198,8 @@ def test_followed_points_move_all_hypotheses():
 
 
 def test_the_number_is_bounded():
-    hypotheses = PoseHypotheses(MotionConfig(), max_number=5)
-    seen(hypotheses, 0, *(at(float(x)) for x in range(20)))
-    assert len(hypotheses.alternatives()) == 5
-    seen(hypotheses, STEP_NS, *(at(float(x)) for x in range(20)))
-    assert len(hypotheses.alternatives()) <= 5
+    hypotheses = PoseHypotheses(MotionConfig())
+    seen(hypotheses, 0, *(at(float(x)) for x in range(40)))
+    assert len(hypotheses.alternatives()) == 24
+    seen(hypotheses, STEP_NS, *(at(float(x)) for x in range(40)))
+    assert len(hypotheses.alternatives()) <= 24

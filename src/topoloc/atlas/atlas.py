@@ -36,6 +36,23 @@ def store_at(where: str) -> Store:
     return FolderStore(Path(where))
 
 
+def read_manifest(store: Store, creates: bool = False) -> tuple[bytes | None, Manifest]:
+    """Return the manifest of a store, as bytes and parsed. If there is none and `creates` is set,
+    it is an empty one.
+
+    Raises:
+        AtlasError: there is no atlas, or it is damaged.
+    """
+    data = store.manifest()
+    if data is not None:
+        return data, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
+    if creates:
+        return None, Manifest()
+    raise AtlasError(
+        f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one"
+    )
+
+
 def absolute_address(where: str) -> str:
     """Return the address of an atlas as an absolute path, or unchanged for an object store."""
     return where if "://" in where else os.path.abspath(where)
@@ -59,12 +76,7 @@ class Atlas:
             AtlasError: there is no atlas, or it is damaged.
         """
         store = store_at(where)
-        data = store.manifest()
-        if data is None:
-            raise AtlasError(
-                f"{where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one"
-            )
-        return Atlas(store, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}"))
+        return Atlas(store, read_manifest(store)[1])
 
     @staticmethod
     def from_manifest(where: str, data: bytes) -> Atlas:
@@ -134,8 +146,7 @@ class Atlas:
             AtlasError: the manifest is damaged, or the store does not answer.
             MissingExtraError: the store needs an extra that is not installed.
         """
-        data = store_at(where).manifest()
-        return Manifest() if data is None else Manifest.from_bytes(data, f"{where}/{MANIFEST}")
+        return read_manifest(store_at(where), creates=True)[1]
 
     @staticmethod
     def remove(where: str, tile_ids: Sequence[str]) -> Atlas:
@@ -148,7 +159,7 @@ class Atlas:
     def merge(sources: Sequence[str], where: str) -> Atlas:
         """Create an atlas of the tiles of all sources, atlases or map files, with their joins.
         Raises AtlasError, MapError."""
-        from topoloc.atlas.merging import merge_atlases
+        from topoloc.atlas.place import merge_atlases
 
         return Atlas(store_at(where), merge_atlases(sources, where))
 

@@ -18,13 +18,14 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
-import faiss
+import faiss as faiss_module
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int
 
 from topoloc.errors import AtlasError
 from topoloc.recordings.atomic import atomic_write
 
+faiss: Any = faiss_module  # its type stubs lack overloads
 NUM_COMPARED, MAX_COMPARED = 1024, 16_384
 """Number of candidates compared by full vectors. If they belong to too few tiles, it grows by eight
 times, up to the second number."""
@@ -33,6 +34,8 @@ MAX_ROWS_COMPARED = 8_192
 _MIN_PROBES, _CELLS_PER_PROBE, _MAX_CELLS = 96, 8, 4096
 _NUM_TRAINING_VECTORS, _CHUNK = 65_536, 65_536
 _MAGIC, _ALIGNMENT = b"topoloc-places-1\n", 4096
+_DAMAGE = (OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError)
+"""Errors of a damaged file. RecursionError is a RuntimeError."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +67,8 @@ class DescriptorShard:
         vectors: Float16[np.ndarray, "n d"],
         codes: Any = None,
     ) -> None:
-        self.kind, self.vocabulary, self.tiles, self.vectors = (
-            kind,
-            vocabulary,
-            list(tiles),
-            vectors,
-        )
+        self.kind, self.vocabulary = kind, vocabulary
+        self.tiles, self.vectors = list(tiles), vectors
         self.bounds: Int[np.ndarray, " _"] = np.cumsum([0, *(tile.num_rows for tile in tiles)])
         self._codes = _build_codes(vectors) if codes is None else codes
         self._num_probes = min(
@@ -122,12 +121,10 @@ class DescriptorShard:
             rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
         else:
             chosen = None if len(asked) == len(is_selected) else self._select_tile_rows(is_selected)
-            parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)  # pyright: ignore[reportCallIssue]
+            parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)
             with _single_threaded():
-                found = self._codes.search(vector[None], min(count, num_rows), params=parameters)[
-                    1
-                ][0]
-            rows = found[found >= 0]
+                found = self._codes.search(vector[None], min(count, num_rows), params=parameters)
+            rows = found[1][0][found[1][0] >= 0]
         similarities = self.vectors[rows].astype(np.float32) @ vector
         order = np.argsort(-similarities, kind="stable")
         return rows[order], similarities[order]
@@ -140,7 +137,7 @@ class DescriptorShard:
         key, known = is_selected.tobytes(), self._chosen
         if known is None or known[0] != key:
             bits = np.packbits(np.repeat(is_selected, np.diff(self.bounds)), bitorder="little")
-            self._chosen = known = key, faiss.IDSelectorBitmap(bits)  # pyright: ignore[reportCallIssue]
+            self._chosen = known = key, faiss.IDSelectorBitmap(bits)
         return known[1]
 
     def save(self, folder: Path) -> Path:
@@ -154,10 +151,10 @@ class DescriptorShard:
             "kind": self.kind,
             "vocabulary": self.vocabulary,
             "tiles": [astuple(tile) for tile in self.tiles],
+            "shape": self.vectors.shape,
+            "num_bytes_of_codes": len(codes),
         }
-        header = json.dumps(
-            facts | {"shape": self.vectors.shape, "num_bytes_of_codes": len(codes)}
-        ).encode()
+        header = json.dumps(facts).encode()
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / self.name
         with atomic_write(path) as temporary, temporary.open("wb") as file:
@@ -186,18 +183,9 @@ class DescriptorShard:
         """
         try:
             return _opened(path)
-        except (
-            OSError,
-            ValueError,
-            TypeError,
-            KeyError,
-            RuntimeError,
-            RecursionError,
-            OverflowError,
-        ) as error:
-            raise AtlasError(
-                f"{path} is missing or damaged: {' '.join(str(error).split())[:120]}"
-            ) from None
+        except _DAMAGE as error:
+            fault = " ".join(str(error).split())[:120]
+            raise AtlasError(f"{path} is missing or damaged: {fault}") from None
 
 
 def _opened(path: Path) -> DescriptorShard:
@@ -211,17 +199,16 @@ def _opened(path: Path) -> DescriptorShard:
             raise ValueError("its checksum is another")
         file.seek(len(_MAGIC) + 32)
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-        codes = faiss.deserialize_index(
-            np.frombuffer(file.read(header["num_bytes_of_codes"]), np.uint8)
-        )
+        data = np.frombuffer(file.read(header["num_bytes_of_codes"]), np.uint8)
+        codes = faiss.deserialize_index(data)
         start = file.tell() + -file.tell() % _ALIGNMENT
     num_rows, dimension = header["shape"]
     mapped = np.memmap(path, np.float16, "r", start, (num_rows, dimension))
     tiles = [ShardTile(*tile) for tile in header["tiles"]]
-    if (
-        codes.ntotal != num_rows
-        or codes.d != dimension
-        or sum(tile.num_rows for tile in tiles) != num_rows
+    if (codes.ntotal, codes.d, sum(tile.num_rows for tile in tiles)) != (
+        num_rows,
+        dimension,
+        num_rows,
     ):
         raise ValueError("its parts do not belong together")
     return DescriptorShard(header["kind"], header["vocabulary"], tiles, np.asarray(mapped), codes)
@@ -232,23 +219,15 @@ def _build_codes(vectors: Float16[np.ndarray, "n d"]) -> Any:
     num_rows, dimension = vectors.shape
     num_cells = max(1, min(round(math.sqrt(num_rows)), _MAX_CELLS))
     num_parts = dimension // 2 if dimension % 2 == 0 else dimension
-    index = faiss.IndexIVFPQFastScan(
-        faiss.IndexFlatIP(dimension),
-        dimension,
-        num_cells,
-        num_parts,
-        4,
-        faiss.METRIC_INNER_PRODUCT,
-        32,
-        True,
-    )
+    cells, metric = faiss.IndexFlatIP(dimension), faiss.METRIC_INNER_PRODUCT
+    index = faiss.IndexIVFPQFastScan(cells, dimension, num_cells, num_parts, 4, metric, 32, True)
     index.cp.niter, index.cp.seed, index.cp.min_points_per_centroid = 8, 1, 1
     index.pq.cp.min_points_per_centroid = 1
     sample = np.sort(np.random.default_rng(1).permutation(num_rows)[:_NUM_TRAINING_VECTORS])
     with _single_threaded():
-        index.train(vectors[sample].astype(np.float32))  # pyright: ignore[reportCallIssue]
+        index.train(vectors[sample].astype(np.float32))
         for start in range(0, num_rows, _CHUNK):
-            index.add(vectors[start : start + _CHUNK].astype(np.float32))  # pyright: ignore[reportCallIssue]
+            index.add(vectors[start : start + _CHUNK].astype(np.float32))
     return index
 
 

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from msgspec import structs
 
-from topoloc.atlas.atlas import store_at
+from topoloc.atlas.atlas import read_manifest, store_at
 from topoloc.atlas.global_descriptors import compute_global_descriptors, save_global_descriptors
 from topoloc.atlas.joins import Join
+from topoloc.atlas.joint_worlds import geo_box
 from topoloc.atlas.manifest import TILES, Manifest, PlacesFile, StoredFile, Tile, check_tile_id
-from topoloc.atlas.store import MANIFEST, Store, sha256_of
+from topoloc.atlas.store import Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
-from topoloc.geometry.geodesy import Georeference
 from topoloc.mapping.storage.kept_files import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import temporary_file
@@ -55,16 +55,9 @@ class NewTile:
 def new_tiles(
     paths: Sequence[str], tile_id: str | None = None, world: str | None = None
 ) -> list[NewTile]:
-    """Return the map files as new tiles.
-
-    Args:
-        tile_id: id of the tile, for a single file. None: the file name without `.topo`.
-        world: name of a world that all of them share, possibly with existing tiles. None: each has
-            its own.
-
-    Raises:
-        AtlasError: two tiles have the same id, or an id is invalid.
-    """
+    """Return the map files as new tiles. `tile_id` is the id of a single file's tile, by default
+    the file name without `.topo`. `world` names the world that all of them share, by default each
+    has its own. Raises AtlasError if two tiles have the same id, or an id is invalid."""
     ids = [tile_id or Path(path).name.removesuffix(".topo") for path in paths]
     tiles = [
         NewTile(name, Path(path), world or name) for name, path in zip(ids, paths, strict=True)
@@ -79,19 +72,14 @@ def new_tiles(
 
 
 def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
-    """Create an atlas of these tiles and return its manifest.
-
-    Raises:
-        AtlasError: there is an atlas already, or it cannot be written.
-        MapError: a map is missing, damaged or empty.
-    """
+    """Create an atlas of these tiles and return its manifest. Raises AtlasError if there is an
+    atlas already or it cannot be written, MapError if a map is missing, damaged or empty."""
     store = store_at(where)
     exists = AtlasError(f"{where} is an atlas already; `topoloc atlas add` adds to it")
     if store.manifest() is not None:
         raise exists
-    after = Manifest().with_tiles(
-        {tile.tile_id: tile for tile in _store_tiles(store, new)}, time.time()
-    )
+    tiles = {tile.tile_id: store_tile(tile, store) for tile in new}
+    after = Manifest().with_tiles(tiles, time.time())
     if not store.commit(None, after.to_bytes()):
         raise exists
     return after
@@ -106,21 +94,15 @@ def add_tiles(
 ) -> Manifest:
     """Add tiles and return the new manifest.
 
-    Args:
-        replaces: replace tiles of the same ids. Otherwise they are an error, unless they have the
-            same recipe.
-        grace_s: seconds for which unreferenced files are kept.
-        creates: create the atlas if there is none.
-
-    Raises:
-        AtlasError: there is no atlas, it has a tile of the same id, or it cannot be written.
-        MapError: a map is missing, damaged or empty.
+    Tiles of the same ids are replaced (`replaces`). Otherwise they are an error, unless they have
+    the same recipe. Unreferenced files are kept for `grace_s` seconds. If there is no atlas, it is
+    created (`creates`) or AtlasError is raised. Raises MapError if a map is missing, damaged or
+    empty.
     """
     store = store_at(where)
-    _check_ids_free(
-        _read(store, creates)[1], new, replaces
-    )  # before the work, and again with each try
-    added = {tile.tile_id: tile for tile in _store_tiles(store, new)}
+    # before the work, and again with each try
+    _check_ids_free(read_manifest(store, creates)[1], new, replaces)
+    added = {tile.tile_id: store_tile(tile, store) for tile in new}
 
     def with_added(manifest: Manifest, now: float) -> Manifest:
         _check_ids_free(manifest, new, replaces)
@@ -131,9 +113,7 @@ def add_tiles(
     return after
 
 
-def replace_tile(
-    where: str, new: NewTile, before: Tile, grace_s: float = GRACE_S
-) -> Manifest | None:
+def replace_tile(where: str, new: NewTile, before: Tile) -> Manifest | None:
     """Replace a tile by a new version of its map in the same world, and return the manifest.
 
     The joins of the tile are kept in their current state. If the tile was removed or changed since
@@ -147,21 +127,21 @@ def replace_tile(
     tile = store_tile(new, store)
 
     def with_replaced(manifest: Manifest, now: float) -> Manifest:
-        there = manifest.by_id.get(before.tile_id)
-        if there is None or (there.map.sha256, there.world) != (before.map.sha256, before.world):
+        is_same = _is_same_map(manifest, before)
+        if not is_same or manifest.by_id[before.tile_id].world != before.world:
             raise _TileChangedError
         joins = [join for join in manifest.joins if before.tile_id in join.pair]
         return manifest.with_tiles(manifest.by_id | {tile.tile_id: tile}, now, joins)
 
     try:
-        after = _commit_change(store, with_replaced, grace_s)
+        after = _commit_change(store, with_replaced)
     except _TileChangedError:
         return None
     _restore_files(store, [new], [tile])
     return after
 
 
-def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) -> Manifest:
+def remove_tiles(where: str, tile_ids: Sequence[str]) -> Manifest:
     """Remove tiles and return the new manifest.
 
     Raises:
@@ -173,17 +153,13 @@ def remove_tiles(where: str, tile_ids: Sequence[str], grace_s: float = GRACE_S) 
         missing = [tile_id for tile_id in tile_ids if tile_id not in manifest.by_id]
         if missing:
             raise AtlasError(f"the atlas {where} has no tile {missing[0][:80]!r}")
-        return manifest.with_tiles(
-            {tile_id: tile for tile_id, tile in manifest.by_id.items() if tile_id not in tile_ids},
-            now,
-        )
+        left = {key: tile for key, tile in manifest.by_id.items() if key not in tile_ids}
+        return manifest.with_tiles(left, now)
 
-    return _commit_change(store, without, grace_s)
+    return _commit_change(store, without)
 
 
-def add_joins(
-    where: str, joins: Sequence[Join], between: Mapping[str, Tile], grace_s: float = GRACE_S
-) -> Manifest:
+def add_joins(where: str, joins: Sequence[Join], between: Mapping[str, Tile]) -> Manifest:
     """Add joins and return the new manifest.
 
     `between` holds the tiles that the joins were computed from. Joins of tiles that were removed or
@@ -194,16 +170,16 @@ def add_joins(
     """
 
     def with_joins(manifest: Manifest, now: float) -> Manifest:
-        there = {
-            name
-            for name, tile in manifest.by_id.items()
-            if name in between and between[name].map.sha256 == tile.map.sha256
-        }
-        return manifest.with_tiles(
-            manifest.by_id, now, [join for join in joins if there.issuperset(join.pair)]
-        )
+        there = {name for name in between if _is_same_map(manifest, between[name])}
+        kept = [join for join in joins if there.issuperset(join.pair)]
+        return manifest.with_tiles(manifest.by_id, now, kept)
 
-    return _commit_change(store_at(where), with_joins, grace_s)
+    return _commit_change(store_at(where), with_joins)
+
+
+def _is_same_map(manifest: Manifest, tile: Tile) -> bool:
+    there = manifest.by_id.get(tile.tile_id)
+    return there is not None and there.map.sha256 == tile.map.sha256
 
 
 def store_tile(new: NewTile, store: Store) -> Tile:
@@ -213,28 +189,21 @@ def store_tile(new: NewTile, store: Store) -> Tile:
         MapError, AtlasError: the map cannot be read or is empty, or the store cannot be written.
     """
     scratch = temporary_file(Path(tempfile.gettempdir()) / "topoloc-tile.places")
-    with TopoMetricMap.load(new.path) as topomap, scratch as places:
+    with TopoMetricMap.load(new.path) as topomap, scratch as path:
         if len(topomap.summaries) == 0:
             raise EmptyMapError(f"map {new.path} has no nodes")
         vectors = compute_global_descriptors(topomap)
-        versions = {
-            kind: vocabulary.version
-            for kind in vectors
-            if (vocabulary := shared_vocabulary(kind)) is not None
-        }
-        save_global_descriptors(places, vectors)
-        stored = _store_file(store, f"{new.tile_id}.places", places)
-        tile = _describe_tile(
-            new, topomap, PlacesFile(**structs.asdict(stored), vocabularies=versions)
-        )
-    kept = [_store_file(store, f"{new.tile_id}.topo", one) for one in find_kept_files(new.path)]
-    previous = [*kept, *new.older]
-    return structs.replace(
-        tile,
-        map=_store_file(store, f"{new.tile_id}.topo", new.path),
-        recipe=new.recipe,
-        previous=tuple(select_kept(previous, [stored.num_bytes for stored in previous])),
-    )
+        found = {kind: shared_vocabulary(kind) for kind in vectors}
+        versions = {kind: one.version for kind, one in found.items() if one is not None}
+        save_global_descriptors(path, vectors)
+        places = structs.asdict(_store_file(store, f"{new.tile_id}.places", path))
+        newest, *older = [new.path, *find_kept_files(new.path)]
+        stored = _store_file(store, f"{new.tile_id}.topo", newest)
+        kept = [_store_file(store, f"{new.tile_id}.topo", one) for one in older]
+        previous = [*kept, *new.older]
+        previous = select_kept(previous, [one.num_bytes for one in previous])
+        placed = PlacesFile(**places, vocabularies=versions)
+        return _describe_tile(new, topomap, stored, placed, tuple(previous))
 
 
 def _store_file(store: Store, name: str, path: Path) -> StoredFile:
@@ -244,10 +213,6 @@ def _store_file(store: Store, name: str, path: Path) -> StoredFile:
     stored = StoredFile(f"{TILES}/{stem}-{sha256[:12]}.{suffix}", sha256, path.stat().st_size)
     store.put(stored.name, path)
     return stored
-
-
-def _store_tiles(store: Store, new: Sequence[NewTile]) -> list[Tile]:
-    return [store_tile(one, store) for one in new]
 
 
 def _restore_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) -> None:
@@ -262,59 +227,44 @@ class _TileChangedError(Exception):
     """Signal that another writer changed the tile first."""
 
 
-_UNKNOWN = StoredFile("", "", 0)
-
-
-def _describe_tile(new: NewTile, topomap: TopoMetricMap, places: PlacesFile) -> Tile:
-    """Return the manifest entry of a map with a placeholder of its file."""
+def _describe_tile(
+    new: NewTile,
+    topomap: TopoMetricMap,
+    stored: StoredFile,
+    places: PlacesFile,
+    previous: tuple[StoredFile, ...],
+) -> Tile:
+    """Return the manifest entry of a map and its stored files."""
     centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
-    first_rows = {
-        summary.session_id: row for row, summary in reversed(list(enumerate(topomap.summaries)))
-    }
+    session_ids = [summary.session_id for summary in topomap.summaries]
+    _, first_rows = np.unique(session_ids, return_index=True)
     known = topomap.georeference
     return Tile(
         new.tile_id,
-        map=_UNKNOWN,
+        map=stored,
         places=places,
         map_id=topomap.id,
         map_version=topomap.version,
         kinds=tuple(topomap.kinds),
         num_nodes=len(topomap.summaries),
         sessions=tuple(sorted({summary.recording for summary in topomap.summaries})),
-        focal_px=max(float(topomap.nodes[row].camera.fx) for row in first_rows.values()),
+        focal_px=max(float(topomap.nodes[row].camera.fx) for row in first_rows),
         box_world=np.array([centres.min(axis=0), centres.max(axis=0)]),
         world=new.world,
         georeference=known,
-        geo_box=None if known is None else _geo_box(known, centres),
+        geo_box=None if known is None else geo_box([*map(known.geopoint, centres)]),
         atlas_from_world=None,
+        recipe=new.recipe,
+        previous=previous,
     )
 
 
-def _geo_box(known: Georeference, centres: np.ndarray) -> tuple[float, float, float, float]:
-    places = [known.geopoint(centre) for centre in centres]
-    lats, lons = [place.lat for place in places], [place.lon for place in places]
-    return min(lats), min(lons), max(lats), max(lons)
-
-
-def _read(store: Store, creates: bool = False) -> tuple[bytes | None, Manifest]:
-    """Read the manifest, as bytes and parsed. It is empty if there is none and `creates` is set."""
-    data = store.manifest()
-    if data is None and creates:
-        return None, Manifest()
-    if data is None:
-        raise AtlasError(
-            f"{store.where} is no atlas: it has no {MANIFEST}; `topoloc atlas create` makes one"
-        )
-    return data, Manifest.from_bytes(data, f"{store.where}/{MANIFEST}")
-
-
 def _check_ids_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> None:
-    there = manifest.by_id
     taken = [
         tile.tile_id
         for tile in new
-        if tile.tile_id in there
-        and (tile.recipe is None or there[tile.tile_id].recipe != tile.recipe)
+        if (there := manifest.by_id.get(tile.tile_id)) is not None
+        and (tile.recipe is None or there.recipe != tile.recipe)
     ]
     if taken and not replaces:
         raise AtlasError(
@@ -324,31 +274,26 @@ def _check_ids_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) 
 
 
 def _commit_change(
-    store: Store, change: ManifestEdit, grace_s: float, creates: bool = False
+    store: Store, change: ManifestEdit, grace_s: float = GRACE_S, creates: bool = False
 ) -> Manifest:
     """Read, change and commit the manifest until no other writer interferes.
 
     Unreferenced files older than `grace_s` are removed afterwards.
     """
     for _ in range(_MAX_TRIES):
-        before, manifest = _read(store, creates)
+        before, manifest = read_manifest(store, creates)
         now, ages = time.time(), store.ages(TILES)
         after = change(manifest, now)
-        gone = [
-            name
+        retired = {
+            name: when
             for name, when in after.retired.items()
-            if name not in ages or min(now - when, ages[name]) > grace_s
-        ]
-        after = replace(
-            after, retired={name: when for name, when in after.retired.items() if name not in gone}
-        )
+            if name in ages and min(now - when, ages[name]) <= grace_s
+        }
+        after = replace(after, retired=retired)
         if store.commit(before, after.to_bytes()):
-            known = after.files | set(after.retired)
-            for name in (
-                name
-                for name, age in store.ages(TILES).items()
-                if name not in known and age > grace_s
-            ):
-                store.remove(name)
+            known = after.files | retired.keys()
+            for name, age in store.ages(TILES).items():
+                if name not in known and age > grace_s:
+                    store.remove(name)
             return after
     raise AtlasError(f"{store.where}: other writers came in between {_MAX_TRIES} times")

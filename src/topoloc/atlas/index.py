@@ -5,8 +5,8 @@ One index for each feature type holds the global descriptors of all tiles.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int
@@ -15,16 +15,10 @@ from topoloc.atlas.descriptor_shard import DescriptorShard
 from topoloc.atlas.global_descriptors import GlobalDescriptors
 from topoloc.retrieval.descriptor_kernels import multiply_rows
 
-
-class _TileRanker(Protocol):
-    def rank(
-        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_selected: Bool[np.ndarray, " t"]
-    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        """Return the numbers of the tiles with the most similar nodes, and the similarities.
-
-        `is_selected` masks the tiles that may be returned.
-        """
-        ...
+_Ranking = tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]
+_Rank = Callable[[Float32[np.ndarray, " d"], int, Bool[np.ndarray, " t"]], _Ranking]
+"""Return the numbers of the tiles with the most similar nodes to a vector, up to a number of tiles
+and of those of a mask, and their similarities."""
 
 
 class AtlasIndex:
@@ -45,21 +39,18 @@ class AtlasIndex:
         vectors: Sequence[GlobalDescriptors],
         shards: Sequence[tuple[DescriptorShard, Sequence[int]]] = (),
     ) -> None:
-        self._tile_ids, self._all = list(tile_ids), np.ones(len(tile_ids), bool)
-        self._by_kind: dict[str, list[_TileRanker]] = {}
+        self._tile_ids = list(tile_ids)
+        self._by_kind: dict[str, list[_Rank]] = {}
         for kind in {kind for one in vectors for kind in one}:
-            rows = [
-                number for number, one in enumerate(vectors) if kind in one and len(one[kind]) > 0
-            ]
-            of_tile = np.repeat(rows, [len(vectors[row][kind]) for row in rows])
-            if len(rows) > 0:
-                self._by_kind.setdefault(kind, []).append(
-                    _ExactTiles(np.concatenate([vectors[row][kind] for row in rows]), of_tile)
-                )
+            rows = [row for row, one in enumerate(vectors) if len(one.get(kind, ())) > 0]
+            if rows:
+                stacked = np.ascontiguousarray(np.concatenate([vectors[row][kind] for row in rows]))
+                firsts = np.cumsum([0, *(len(vectors[row][kind]) for row in rows[:-1])])
+                exact = partial(_rank_exactly, stacked, np.array(rows), firsts)
+                self._by_kind.setdefault(kind, []).append(exact)
         for shard, numbers in shards:
-            self._by_kind.setdefault(shard.kind, []).append(
-                _NumberedShard(shard, np.array(numbers))
-            )
+            in_shard = partial(_rank_in_shard, shard, np.array(numbers))
+            self._by_kind.setdefault(shard.kind, []).append(in_shard)
 
     @property
     def kinds(self) -> list[str]:
@@ -83,75 +74,51 @@ class AtlasIndex:
             num_tiles: maximum number of returned tiles.
             among: ids of the tiles that may be returned. None: all.
         """
-        is_selected = (
-            self._all
-            if among is None
-            else np.array([tile_id in among for tile_id in self._tile_ids], bool)
-        )
+        is_selected = np.ones(len(self._tile_ids), bool)
+        if among is not None:
+            is_selected = np.array([tile_id in among for tile_id in self._tile_ids], bool)
         similarity: dict[int, float] = {}
         for kind, vector in by_kind.items():
-            found = self._found(
-                kind, np.ascontiguousarray(vector, np.float32), num_tiles, is_selected
-            )
-            if not found:
-                continue
-            best = max(found.values())
-            shift = best - max(similarity.values(), default=best)
-            similarity = {row: before + shift for row, before in similarity.items()} | found
+            query = np.ascontiguousarray(vector, np.float32)
+            pairs = [
+                (float(value), -int(row))
+                for rank in self._by_kind.get(kind, ())  # each tile is in exactly one part
+                for row, value in zip(*rank(query, num_tiles, is_selected), strict=True)
+            ]
+            if pairs:
+                found = {-row: value for value, row in sorted(pairs, reverse=True)[:num_tiles]}
+                best = max(found.values())
+                shift = best - max(similarity.values(), default=best)
+                similarity = {row: before + shift for row, before in similarity.items()} | found
         ranked = sorted(((value, -row) for row, value in similarity.items()), reverse=True)
         return [(self._tile_ids[-row], value) for value, row in ranked[:num_tiles]]
 
-    def _found(
-        self,
-        kind: str,
-        vector: Float32[np.ndarray, " d"],
-        num_tiles: int,
-        is_selected: Bool[np.ndarray, " t"],
-    ) -> dict[int, float]:
-        """Return the similarity of the likeliest tiles by one feature type.
 
-        Each tile is in exactly one part of the index.
-        """
-        pairs = [part.rank(vector, num_tiles, is_selected) for part in self._by_kind.get(kind, ())]
-        found = sorted(
-            (
-                (float(value), -int(row))
-                for rows, values in pairs
-                for row, value in zip(rows, values, strict=True)
-            ),
-            reverse=True,
-        )
-        return {-row: value for value, row in found[:num_tiles]}
+def _rank_exactly(
+    vectors: Float32[np.ndarray, "n d"],
+    tiles: Int[np.ndarray, " s"],
+    firsts: Int[np.ndarray, " s"],
+    vector: Float32[np.ndarray, " d"],
+    num_tiles: int,
+    is_selected: Bool[np.ndarray, " t"],
+) -> _Ranking:
+    """Compare all nodes of some tiles. The nodes of a tile are consecutive from its `firsts`."""
+    similarities = np.empty(len(vectors), np.float32)
+    multiply_rows(vectors, vector, similarities)
+    best = np.maximum.reduceat(similarities, firsts)
+    order = np.argsort(-best, kind="stable")
+    order = order[is_selected[tiles[order]]][:num_tiles]
+    return tiles[order], best[order]
 
 
-class _ExactTiles:
-    """Compare all nodes of some tiles exactly. The nodes of a tile are consecutive."""
-
-    def __init__(self, vectors: Float32[np.ndarray, "n d"], of_tile: Int[np.ndarray, " n"]) -> None:
-        self._vectors = np.ascontiguousarray(vectors)
-        self._tiles, self._firsts = np.unique(of_tile, return_index=True)
-
-    def rank(
-        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_selected: Bool[np.ndarray, " t"]
-    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        similarities = np.empty(len(self._vectors), np.float32)
-        multiply_rows(self._vectors, vector, similarities)
-        best = np.maximum.reduceat(similarities, self._firsts)
-        order = np.argsort(-best, kind="stable")
-        order = order[is_selected[self._tiles[order]]][:num_tiles]
-        return self._tiles[order], best[order]
-
-
-class _NumberedShard:
-    """Wrap a shard to use the tile numbers of the index. Tiles numbered -1 are never returned."""
-
-    def __init__(self, shard: DescriptorShard, numbers: Int[np.ndarray, " s"]) -> None:
-        self._shard, self._numbers = shard, numbers
-
-    def rank(
-        self, vector: Float32[np.ndarray, " d"], num_tiles: int, is_selected: Bool[np.ndarray, " t"]
-    ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        tiles, similarities = self._shard.rank(
-            vector, num_tiles, (self._numbers >= 0) & is_selected[self._numbers]
-        )
-        return self._numbers[tiles], similarities
+def _rank_in_shard(
+    shard: DescriptorShard,
+    numbers: Int[np.ndarray, " s"],
+    vector: Float32[np.ndarray, " d"],
+    num_tiles: int,
+    is_selected: Bool[np.ndarray, " t"],
+) -> _Ranking:
+    """Rank the tiles of a shard by their numbers in the index. Those numbered -1 are left out."""
+    is_live = (numbers >= 0) & is_selected[numbers]
+    tiles, similarities = shard.rank(vector, num_tiles, is_live)
+    return numbers[tiles], similarities

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +56,7 @@ class _LiveShard:
 
     @property
     def live(self) -> list[ShardTile]:
-        return [
-            tile for tile, is_live in zip(self.shard.tiles, self.is_live, strict=True) if is_live
-        ]
+        return [tile for tile, _ in self.rows()]
 
     @property
     def num_live(self) -> int:
@@ -65,12 +64,9 @@ class _LiveShard:
 
     def rows(self) -> list[_Rows]:
         """Return the current tiles with their vectors."""
-        bounds, tiles = self.shard.bounds, enumerate(self.shard.tiles)
-        return [
-            (tile, self.shard.vectors[bounds[k] : bounds[k + 1]])
-            for k, tile in tiles
-            if self.is_live[k]
-        ]
+        bounds, vectors = self.shard.bounds, self.shard.vectors
+        tiles = [(k, tile) for k, tile in enumerate(self.shard.tiles) if self.is_live[k]]
+        return [(tile, vectors[bounds[k] : bounds[k + 1]]) for k, tile in tiles]
 
 
 def index_folder(where: str) -> Path:
@@ -104,22 +100,12 @@ def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> Op
         for tile, rows in vectors:
             exact.setdefault(tile.tile_id, {})[kind] = rows.astype(np.float32)
     numbers = {tile_id: number for number, tile_id in enumerate(ids)}
-    shards = [
-        (
-            one.shard,
-            [
-                numbers[tile.tile_id] if live else -1
-                for tile, live in zip(one.shard.tiles, one.is_live, strict=True)
-            ],
-        )
-        for of_kind in live_shards.values()
-        for one in of_kind
-    ]
-    return OpenedIndex(
-        AtlasIndex(ids, [exact.get(tile_id, {}) for tile_id in ids], shards),
-        work.problems,
-        work.notes,
-    )
+    shards = list[tuple[DescriptorShard, list[int]]]()
+    for one in chain.from_iterable(live_shards.values()):
+        live = zip(one.shard.tiles, one.is_live, strict=True)
+        shards.append((one.shard, [numbers[tile.tile_id] if is_ else -1 for tile, is_ in live]))
+    index = AtlasIndex(ids, [exact.get(tile_id, {}) for tile_id in ids], shards)
+    return OpenedIndex(index, work.problems, work.notes)
 
 
 @dataclass(eq=False)
@@ -133,16 +119,9 @@ class _IndexBuilder:
 
     def __post_init__(self) -> None:
         self._checksums = {tile.tile_id: tile.places.sha256 for tile in self.tiles}
-        vocabularies = {
-            kind: shared_vocabulary(kind)
-            for tile in self.tiles
-            for kind in tile.places.vocabularies
-        }
-        self.versions = {
-            kind: vocabulary.version
-            for kind, vocabulary in sorted(vocabularies.items())
-            if vocabulary is not None
-        }
+        kinds = sorted({kind for tile in self.tiles for kind in tile.places.vocabularies})
+        found = {kind: shared_vocabulary(kind) for kind in kinds}
+        self.versions = {kind: one.version for kind, one in found.items() if one is not None}
 
     @cached_property
     def stored(self) -> list[DescriptorShard]:
@@ -187,16 +166,11 @@ class _IndexBuilder:
             kind: {tile.tile_id for one in of_kind for tile in one.live}
             for kind, of_kind in live_shards.items()
         }
-        rest, num_rows = (
-            {kind: list[_Rows]() for kind in live_shards},
-            dict.fromkeys(live_shards, 0),
-        )
+        rest = {kind: list[_Rows]() for kind in live_shards}
+        num_rows = dict.fromkeys(live_shards, 0)
         for tile in self.tiles:
-            ours = [
-                kind
-                for kind, version in tile.places.vocabularies.items()
-                if self.versions.get(kind) == version
-            ]
+            versions = tile.places.vocabularies.items()
+            ours = [kind for kind, version in versions if self.versions.get(kind) == version]
             lacking = [kind for kind in ours if tile.tile_id not in known[kind]]
             if ours and not lacking:
                 continue
@@ -209,12 +183,8 @@ class _IndexBuilder:
                 continue
             for kind in lacking:
                 if len(rows := vectors.get(kind, np.zeros((0, 1)))) > 0:
-                    rest[kind].append(
-                        (
-                            ShardTile(tile.tile_id, tile.places.sha256, len(rows)),
-                            rows.astype(np.float16),
-                        )
-                    )
+                    entry = ShardTile(tile.tile_id, tile.places.sha256, len(rows))
+                    rest[kind].append((entry, rows.astype(np.float16)))
                     num_rows[kind] += len(rows)
                 if num_rows[kind] >= SHARD_DESCRIPTORS:
                     live_shards[kind].append(self._new_shard(kind, rest[kind]))

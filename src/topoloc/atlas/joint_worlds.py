@@ -78,10 +78,12 @@ def _geo_box(
 ) -> tuple[float, float, float, float]:
     """Return the minimum and maximum latitude and longitude (degrees) of a box's corners."""
     corners = np.array(list(product(*box_world.T)))
-    places = [
-        GeoPoint.from_ecef(corner)
-        for corner in (origin.ecef_from_enu() @ atlas_from_world).apply(corners)
-    ]
+    in_ecef = (origin.ecef_from_enu() @ atlas_from_world).apply(corners)
+    return geo_box([GeoPoint.from_ecef(corner) for corner in in_ecef])
+
+
+def geo_box(places: Sequence[GeoPoint]) -> tuple[float, float, float, float]:
+    """Return the minimum latitude and longitude of places, then the maximum ones, in degrees."""
     lats, lons = [place.lat for place in places], [place.lon for place in places]
     return min(lats), min(lons), max(lats), max(lons)
 
@@ -166,14 +168,9 @@ def _is_inconsistent(
     return False
 
 
-@dataclass(frozen=True, eq=False)
-class _WorldLink:
-    """Link a world to the world `to`. `pose` transforms the latter into the former."""
-
-    to: str
-    pose: Rigid3
-    covariance: Float[np.ndarray, "6 6"]
-    num_agreeing: int
+_WorldLink = tuple[int, str, Rigid3, Float[np.ndarray, "6 6"]]
+"""A link from one world to another: the number of agreeing images, the other world, and the
+transform from it with its covariance."""
 
 
 def _groups(
@@ -186,14 +183,9 @@ def _groups(
     links: dict[str, list[_WorldLink]] = {}
     for join in joins:
         one, other, pose = worlds[join.first], worlds[join.second], join.first_from_second
-        links.setdefault(one, []).append(
-            _WorldLink(other, pose, join.covariance, join.num_agreeing)
-        )
-        links.setdefault(other, []).append(
-            _WorldLink(
-                one, pose.inverse(), inverse_covariance(pose, join.covariance), join.num_agreeing
-            )
-        )
+        back = pose.inverse(), inverse_covariance(pose, join.covariance)
+        links.setdefault(one, []).append((join.num_agreeing, other, pose, join.covariance))
+        links.setdefault(other, []).append((join.num_agreeing, one, *back))
     groups, seen = dict[str, dict[str, JointPose]](), set[str]()
     for anchor in sorted(links, key=lambda name: (name not in anchored, name)):
         if anchor not in seen:
@@ -218,19 +210,12 @@ def _reachable_worlds(
             continue
         places[name] = place
         adjoint = place.joint_from_world.adjoint()
-        for link in links[name]:
-            if link.to not in places:
-                covariance = place.covariance + adjoint @ link.covariance @ adjoint.T
+        for num_agreeing, to, pose, of_link in links[name]:
+            if to not in places:
+                covariance = place.covariance + adjoint @ of_link @ adjoint.T
+                reached = JointPose(anchor, place.joint_from_world @ pose, covariance)
                 count += 1
-                heapq.heappush(
-                    queue,
-                    (
-                        -link.num_agreeing,
-                        count,
-                        link.to,
-                        JointPose(anchor, place.joint_from_world @ link.pose, covariance),
-                    ),
-                )
+                heapq.heappush(queue, (-num_agreeing, count, to, reached))
     return places
 
 
@@ -266,11 +251,7 @@ def _edge(join: Join, worlds: Mapping[str, str], rows: Mapping[str, int]) -> Edg
 def _residuals(
     joins: Sequence[Join], worlds: Mapping[str, str], places: Mapping[str, JointPose]
 ) -> list[float]:
-    names = list(places)
-    rows, poses = (
-        {name: row for row, name in enumerate(names)},
-        [places[name].joint_from_world.inverse() for name in names],
-    )
-    return compute_normalized_residuals(
-        poses, [_edge(join, worlds, rows) for join in joins]
-    ).tolist()
+    rows = {name: row for row, name in enumerate(places)}
+    poses = [place.joint_from_world.inverse() for place in places.values()]
+    edges = [_edge(join, worlds, rows) for join in joins]
+    return compute_normalized_residuals(poses, edges).tolist()

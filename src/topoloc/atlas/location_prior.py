@@ -1,17 +1,49 @@
-"""Restrict the search in an atlas by an approximate position. Tiles out of reach are skipped."""
+"""Configure the search in an atlas, and restrict it by an approximate position. Tiles out of reach
+are skipped."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.atlas.manifest import Manifest
+from topoloc.bounds import Between
 from topoloc.errors import AtlasError, GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint
 from topoloc.geometry.rigid import Rigid3
+
+
+@dataclass(frozen=True)
+class AtlasConfig:
+    """Configure how many tiles are searched."""
+
+    num_glanced: Annotated[int, Between(1, 100_000)] = 8
+    """Maximum number of tiles searched coarse only, by retrieval. The search stops at a clear
+    pose."""
+    num_asked: Annotated[int, Between(1, 10_000)] = 3
+    """Maximum number of tiles searched exhaustively, until one localizes the image."""
+
+    num_ranked: ClassVar[int] = 64
+    """Number of tiles ranked by the index. No others are searched."""
+    min_ranking_margin: ClassVar[float] = 0.15
+    """Minimum similarity margin of the best tile for an immediate exhaustive search. If no tile has
+    it, the next feature type ranks them."""
+    num_coarse_first: ClassVar[int] = 2
+    """Maximum number of tiles searched coarse only before the next feature type ranks them."""
+    max_similarity_gap: ClassVar[float] = 0.25
+    """Tiles whose similarity is lower than the best tile's by more than this are not searched."""
+    min_similarity: ClassVar[float] = 0.33
+    """Similarity that any place reaches. After the first tile, less similar ones are searched
+    exhaustively only if the coarse search found a pose."""
+    max_rival_gap: ClassVar[float] = 0.1
+    """Tiles whose similarity is within this of the tile that localized the image are checked for a
+    rival pose."""
+    num_rivals: ClassVar[int] = 2
+    """Maximum number of these similar tiles that are checked."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +145,8 @@ def distances_to_boxes(
     distance to a NaN box is 0.
     """
     lat = np.clip(near.lat, boxes[:, 0], boxes[:, 2])
-    turned = near.lon + np.array(
-        [[-360.0], [0.0], [360.0]]
-    )  # handles boxes on either side of 180 degrees
+    # boxes on either side of 180 degrees
+    turned = near.lon + np.array([[-360.0], [0.0], [360.0]])
     lon = np.abs(np.clip(turned, boxes[:, 1], boxes[:, 3]) - turned).min(axis=0)
     up, across = np.sin(np.radians(lat - near.lat) / 2.0), np.sin(np.radians(lon) / 2.0)
     along = up**2 + np.cos(np.radians(lat)) * math.cos(math.radians(near.lat)) * across**2
@@ -138,17 +169,13 @@ def _tiles_near_pose(
     reached: dict[str, Rigid3 | None] = {
         manifest.tiles[number].tile_id: near.world_from_cam for number in in_reach
     }
-    one = manifest.tiles[int(np.flatnonzero(of_world)[0])]
-    is_known = np.array(
-        [tile.atlas_from_world is not None or tile.joint is not None for tile in manifest.tiles],
-        bool,
-    )
-    for number in np.flatnonzero(is_candidate & ~of_world & is_known):
+    one = manifest.tiles[int(of_world.argmax())]
+    for number in np.flatnonzero(is_candidate & ~of_world):
         tile = manifest.tiles[number]
         world_from_one = tile.from_world_of(one)
         if world_from_one is not None:
             pose = world_from_one @ near.world_from_cam
-            nearest = np.clip(pose.translation, tile.box_world[0], tile.box_world[1])
+            nearest = np.clip(pose.translation, *tile.box_world)
             if np.linalg.norm(nearest - pose.translation) <= near.radius_m:
                 reached[tile.tile_id] = pose
     return reached

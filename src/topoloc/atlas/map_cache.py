@@ -23,7 +23,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.place import open_place
-from topoloc.atlas.watched_atlas import WatchedAtlas
+from topoloc.atlas.tile_fetcher import WatchedAtlas
 from topoloc.errors import MapError, MapNotFoundError
 from topoloc.mapping.node_cache import set_node_cache_size
 from topoloc.mapping.topomap import TopoMetricMap
@@ -150,25 +150,25 @@ class MapCache(Generic[M]):
         for source in self._files:
             for path in sorted(source.glob(f"*{SUFFIX}")) if source.is_dir() else [source]:
                 yield path.name.removesuffix(SUFFIX), _MapSource(str(path))
-        for watched in self.atlases:
-            atlas = watched.now()
+        for atlas in [watched.now() for watched in self.atlases]:
             for tile in atlas.manifest.tiles:
-                yield (
-                    tile.tile_id,
-                    _MapSource(f"{atlas.store.where}/{tile.map.name}", (atlas, tile)),
-                )
+                where = f"{atlas.store.where}/{tile.map.name}"
+                yield tile.tile_id, _MapSource(where, (atlas, tile))
 
     @property
     def num_bytes(self) -> int:
         """Return the total bytes of the open maps."""
         with self._lock:
-            return sum(entry.opened.num_bytes for entry in self._entries.values() if entry.opened)
+            return sum(opened.num_bytes for opened in self._opened_maps())
 
     @property
     def num_open(self) -> int:
         """Return the number of open maps."""
         with self._lock:
-            return sum(entry.opened is not None for entry in self._entries.values())
+            return len(self._opened_maps())
+
+    def _opened_maps(self) -> list[CachedMap[M]]:
+        return [entry.opened for entry in self._entries.values() if entry.opened is not None]
 
     @contextmanager
     def use_map(self, name: str, path: Path | None = None) -> Iterator[CachedMap[M]]:
@@ -194,7 +194,8 @@ class MapCache(Generic[M]):
             stamp = _file_stamp(path)
             if entry.opened is None or (entry.opened.path, entry.opened.stamp) != (path, stamp):
                 before, entry.opened = entry.opened, None
-                self._close_when_unused(before)
+                if before is not None:
+                    self._close_when_unused(before)
                 entry.opened = CachedMap(name, path, stamp, self._opened(path))
             opened = entry.opened
             with self._lock:
@@ -213,7 +214,7 @@ class MapCache(Generic[M]):
     def close(self) -> None:
         """Close all maps. Maps in use are closed when they are released."""
         with self._lock:
-            opened = [entry.opened for entry in self._entries.values()]
+            opened = self._opened_maps()
             self._entries.clear()
         for one in opened:
             self._close_when_unused(one)
@@ -236,7 +237,7 @@ class MapCache(Generic[M]):
 
     def _close_oldest(self) -> None:
         with self._lock:
-            total = sum(entry.opened.num_bytes for entry in self._entries.values() if entry.opened)
+            total = sum(opened.num_bytes for opened in self._opened_maps())
             closed = list[CachedMap[M]]()
             for entry in self._entries.values():
                 if total <= self._max_bytes:
@@ -251,9 +252,7 @@ class MapCache(Generic[M]):
         for opened in closed:
             self._close_when_unused(opened)
 
-    def _close_when_unused(self, opened: CachedMap[M] | None) -> None:
-        if opened is None:
-            return
+    def _close_when_unused(self, opened: CachedMap[M]) -> None:
         with self._lock:
             opened.is_retired = True
             is_unused = opened.num_users == 0

@@ -39,7 +39,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         (*_QUERY_COMMANDS, "update", "merge"),
     ),
     "atlas": (
-        "topoloc.atlas.config",
+        "topoloc.atlas.location_prior",
         "AtlasConfig",
         ("localize", "evaluate", "explain", "serve", "follow", "update"),
     ),
