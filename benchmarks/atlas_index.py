@@ -27,8 +27,7 @@ from jaxtyping import Float16, Float32
 
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.descriptor_shard import DescriptorShard
-from topoloc.atlas.global_descriptors import GlobalDescriptors, load_global_descriptors
-from topoloc.atlas.index import AtlasIndex
+from topoloc.atlas.index import AtlasIndex, GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index_files import open_index
 from topoloc.atlas.manifest import PlacesFile, StoredFile, Tile
 from topoloc.retrieval.descriptor_kernels import multiply_rows

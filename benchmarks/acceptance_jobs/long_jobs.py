@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from topoloc.mapping.storage.kept_files import kept_path
+from topoloc.mapping.edit import kept_path
 
 from .edits import digest
 from .figures import Figure

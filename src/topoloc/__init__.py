@@ -44,9 +44,10 @@ if TYPE_CHECKING:
         UnreadableImageError,
         WeightsError,
     )
-    from topoloc.evaluation.evaluate import Evaluation, evaluate
     from topoloc.evaluation.metrics import EvaluatedQuery
     from topoloc.evaluation.query_localization import (
+        Evaluation,
+        evaluate,
         find_frames_with_truth,
         localize_out_of_map,
         localize_queries,
@@ -60,8 +61,7 @@ if TYPE_CHECKING:
     from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
     from topoloc.lifelong.merge import merge
     from topoloc.lifelong.prune import prune
-    from topoloc.lifelong.tiles.tile_joining import PairResult, join_tiles
-    from topoloc.lifelong.tiles.tile_selection import find_tile_of_recording
+    from topoloc.lifelong.tiles.tile_joining import PairResult, find_tile_of_recording, join_tiles
     from topoloc.lifelong.update import MapUpdate, update
     from topoloc.lifelong.weak_regions import (
         NodeQuality,
@@ -223,7 +223,7 @@ _MODULES = {
     "DepthImage": "topoloc.recordings.frame",
     "DuplicateSessionError": "topoloc.errors",
     "EvaluatedQuery": "topoloc.evaluation.metrics",
-    "Evaluation": "topoloc.evaluation.evaluate",
+    "Evaluation": "topoloc.evaluation.query_localization",
     "FeatureTypeError": "topoloc.errors",
     "GeoPoint": "topoloc.geometry.geodesy",
     "GeoPose": "topoloc.geometry.geodesy",
@@ -282,11 +282,11 @@ _MODULES = {
     "build_map": "topoloc.localization.map_facts.map_building",
     "check_camera_calibrations": "topoloc.localization.image_calibration_check",
     "check_map": "topoloc.localization.map_facts.contradictions",
-    "evaluate": "topoloc.evaluation.evaluate",
+    "evaluate": "topoloc.evaluation.query_localization",
     "explain": "topoloc.apps.report.explanation",
     "export": "topoloc.apps.export.formats",
     "find_frames_with_truth": "topoloc.evaluation.query_localization",
-    "find_tile_of_recording": "topoloc.lifelong.tiles.tile_selection",
+    "find_tile_of_recording": "topoloc.lifelong.tiles.tile_joining",
     "find_weak_regions": "topoloc.lifelong.weak_regions",
     "georeference": "topoloc.mapping.georeference",
     "join_tiles": "topoloc.lifelong.tiles.tile_joining",

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.global_descriptors import (
+from topoloc.atlas.index import (
+    AtlasIndex,
     compute_global_descriptors,
     load_global_descriptors,
     save_global_descriptors,
 )
-from topoloc.atlas.index import AtlasIndex
 from topoloc.errors import AtlasError
 from topoloc.mapping.topomap import TopoMetricMap
 

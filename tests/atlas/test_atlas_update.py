@@ -22,7 +22,7 @@ from topoloc.atlas.manifest import Tile
 from topoloc.atlas.place import edit_tile
 from topoloc.errors import AtlasError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.tiles.tile_selection import select_tile
+from topoloc.lifelong.tiles.tile_joining import select_tile
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Localization
 from topoloc.mapping.edit import edit_map

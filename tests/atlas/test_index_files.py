@@ -13,7 +13,7 @@ import pytest
 
 from topoloc.atlas import descriptor_shard, index_files
 from topoloc.atlas.descriptor_shard import DescriptorShard
-from topoloc.atlas.global_descriptors import GlobalDescriptors
+from topoloc.atlas.index import GlobalDescriptors
 from topoloc.atlas.index_files import OpenedIndex, open_index
 from topoloc.atlas.manifest import PlacesFile, StoredFile, Tile
 from topoloc.errors import AtlasError

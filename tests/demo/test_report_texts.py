@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from topoloc.demo.report_texts import describe_night, describe_out_of_map
+from topoloc.demo.recordings import describe_night, describe_out_of_map
 
 
 def _row(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.lifelong.noise_scale import LocalizedStep, NoiseScale, estimate_noise_scale
+from topoloc.lifelong.scale_estimation import LocalizedStep, NoiseScale, estimate_noise_scale
 from topoloc.lifelong.session_poses import align_motion_to_map
 from topoloc.localization.result import Localization
 

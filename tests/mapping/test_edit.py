@@ -17,9 +17,8 @@ from schema_1 import write_schema_1
 
 from topoloc import TopoMetricMap
 from topoloc.errors import MapError
-from topoloc.mapping.edit import edit_map, read_history, undo_edit
+from topoloc.mapping.edit import edit_map, find_kept_files, read_history, undo_edit
 from topoloc.mapping.storage.integrity_check import find_map_damage
-from topoloc.mapping.storage.kept_files import find_kept_files
 
 
 @pytest.fixture
@@ -94,7 +93,7 @@ def test_without_hard_links_the_file_is_copied(map_file: Path, monkeypatch: pyte
 
 def test_the_oldest_files_go_beyond_the_limit(map_file: Path, monkeypatch: pytest.MonkeyPatch):
     for limit, num_kept in ((2.5 * map_file.stat().st_size, 2), (1, 1)):
-        monkeypatch.setattr("topoloc.mapping.storage.kept_files._MAX_BYTES", limit)
+        monkeypatch.setattr("topoloc.mapping.edit._MAX_BYTES", limit)
         for k in range(3):
             with edit_map(map_file) as edit:
                 edit.commit(edit.topomap, f"edit {k}")

@@ -14,7 +14,7 @@ from test_place_vectors import NO_FEATURES, silent
 from built_room import built_room
 from topoloc.apps.cli import main
 from topoloc.errors import TrainingError
-from topoloc.lifelong.coarse_model_update import update_coarse_models
+from topoloc.lifelong.session_content import update_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel, open_coarse_localizer
 from topoloc.retrieval.network_config import NetworkInputConfig

@@ -10,8 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-from topoloc.atlas.global_descriptors import GlobalDescriptors, load_global_descriptors
-from topoloc.atlas.index import AtlasIndex
+from topoloc.atlas.index import AtlasIndex, GlobalDescriptors, load_global_descriptors
 from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of

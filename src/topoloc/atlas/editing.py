@@ -17,13 +17,13 @@ import numpy as np
 from msgspec import structs
 
 from topoloc.atlas.atlas import read_manifest, store_at
-from topoloc.atlas.global_descriptors import compute_global_descriptors, save_global_descriptors
+from topoloc.atlas.index import compute_global_descriptors, save_global_descriptors
 from topoloc.atlas.joins import Join
 from topoloc.atlas.joint_worlds import geo_box
 from topoloc.atlas.manifest import TILES, Manifest, PlacesFile, StoredFile, Tile, check_tile_id
 from topoloc.atlas.store import Store, sha256_of
 from topoloc.errors import AtlasError, EmptyMapError
-from topoloc.mapping.storage.kept_files import find_kept_files, select_kept
+from topoloc.mapping.edit import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import temporary_file
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary

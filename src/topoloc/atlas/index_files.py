@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Float16
 
 from topoloc.atlas.descriptor_shard import DescriptorShard, ShardTile
-from topoloc.atlas.global_descriptors import GlobalDescriptors
-from topoloc.atlas.index import AtlasIndex
+from topoloc.atlas.index import AtlasIndex, GlobalDescriptors
 from topoloc.atlas.manifest import Tile
 from topoloc.errors import AtlasError, ObjectStoreError
 from topoloc.features.network_files import cache_folder

@@ -41,7 +41,7 @@ class StoredFile(Struct, frozen=True, rename={"name": "file", "num_bytes": "byte
 
 
 class PlacesFile(StoredFile, frozen=True):
-    """Describe a file of global descriptors (`global_descriptors.py`), with the versions of their
+    """Describe a file of global descriptors (`index.py`), with the versions of their
     vocabularies by feature type."""
 
     vocabularies: dict[str, str]

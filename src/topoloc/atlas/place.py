@@ -19,8 +19,7 @@ from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
 from topoloc.atlas.store import MANIFEST, Store, sha256_of
 from topoloc.errors import AtlasError, TopolocError
-from topoloc.mapping.edit import read_history
-from topoloc.mapping.storage.kept_files import kept_path
+from topoloc.mapping.edit import kept_path, read_history
 from topoloc.recordings.atomic import temporary_folder
 
 _MAX_TRIES = 5

@@ -1,16 +1,26 @@
-"""Estimate the metric scale of monocular motion from localizations of some of its images.
+"""Estimate the metric scale of monocular motion from localizations of some of its images, and the
+noise scales of a session's motion and of the map's localizations from each other.
 
 The scale drifts along the trajectory. Its logarithm is modelled as a random walk. Least squares
 over knots along the trajectory fit it to the distances between localizations and give its
 uncertainty. The inlier localizations are selected first: the largest set that one similarity
 transform explains.
+
+Assumed sigmas are wrong by a different factor in each recording. SLAM of a rendered loop drifts by
+about a thousandth of the distance. A hand-held camera with a nominal calibration drifts by some
+hundredths. The localizations' sigmas describe the worst parts of a map. The scatter between
+consecutive localizations and its growth with distance separate the two (variance components,
+Harville, JASA 72, 1977). A Kalman filter predicts the motion from localization to localization and
+corrects it by each. The factors with the highest likelihood are selected. Student's t distribution
+limits the effect of wrong localizations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import permutations, product
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,6 +30,73 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import select_hypothesis
 from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.localization.result import Localization
+
+_DEGREES_OF_FREEDOM = 4.0  # of Student's t distribution: fewer give an outlier less weight
+_NUM_DIMENSIONS = 6
+
+
+@dataclass(frozen=True)
+class NoiseScale:
+    """Hold the factors by which the sigmas of the motion and of the localizations differ from the
+    assumed ones."""
+
+    motion: float = 1.0
+    answers: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedStep:
+    """Hold a localized image and the motion to it from the previous localized image.
+
+    The first step's `cam_from_before` and `motion_covariance` (6, 6) have no meaning. Covariances
+    belong to left perturbations (translation, rotation, in metres and radians) of `cam_from_before`
+    and of the localization `cam_from_world`.
+    """
+
+    cam_from_before: Rigid3
+    motion_covariance: Float[np.ndarray, "6 6"]
+    cam_from_world: Rigid3
+    covariance: Float[np.ndarray, "6 6"]
+
+
+def estimate_noise_scale(
+    steps: Sequence[LocalizedStep], motion_scales: Sequence[float], answer_scales: Sequence[float]
+) -> NoiseScale:
+    """Return the pair of factors with the highest likelihood, or 1 and 1 if there are fewer than
+    two steps."""
+    if len(steps) < 2:
+        return NoiseScale()
+    adjoints = [step.cam_from_before.adjoint() for step in steps]
+    return min(
+        (NoiseScale(*pair) for pair in product(motion_scales, answer_scales)),
+        key=lambda scale: _negative_log_likelihood(steps, adjoints, scale),
+    )
+
+
+def _negative_log_likelihood(
+    steps: Sequence[LocalizedStep], adjoints: Sequence[Float[np.ndarray, "6 6"]], scale: NoiseScale
+) -> float:
+    """Compute -2 times the log-likelihood of the localizations after the first, without
+    constants."""
+    pose, covariance = steps[0].cam_from_world, scale.answers**2 * steps[0].covariance
+    cost, total = 0.0, _DEGREES_OF_FREEDOM + _NUM_DIMENSIONS
+    for step, adjoint in zip(steps[1:], adjoints[1:], strict=True):
+        pose = step.cam_from_before @ pose
+        covariance = adjoint @ covariance @ adjoint.T + scale.motion**2 * step.motion_covariance
+        of_answer = scale.answers**2 * step.covariance
+        off = (step.cam_from_world @ pose.inverse()).log()
+        both = covariance + of_answer
+        square = float(off @ np.linalg.solve(both, off))
+        outlier = math.log1p(square / _DEGREES_OF_FREEDOM)
+        cost += float(np.linalg.slogdet(both)[1]) + total * outlier
+        # an outlier corrects the pose less
+        inflation = max((_DEGREES_OF_FREEDOM + square) / total, 1.0)
+        gain = np.linalg.solve(covariance + inflation * of_answer, covariance).T
+        pose = Rigid3.exp(gain @ off) @ pose
+        covariance = covariance - gain @ covariance
+        covariance = (covariance + covariance.T) / 2.0
+    return cost
+
 
 # Factor applied to the sigmas of localizations, because neighbours share errors of the map.
 WIDENED = 3.0
@@ -62,15 +139,8 @@ def find_motion_consensus(
     is_metric: bool,
 ) -> list[int]:
     """Return the frames of the largest set of localizations that one transform of the motion
-    explains.
-
-    Args:
-        odom: the motion, as poses by frame.
-        localized: the localizations by frame.
-        tolerance: the tolerance of agreeing localizations.
-        is_metric: whether the motion has metric scale. The transform is rigid then. Otherwise it is
-            a similarity transform.
-    """
+    (`odom`, poses by frame) explains. It is rigid if the motion has metric scale (`is_metric`),
+    otherwise a similarity transform."""
     answers = _collect_localized_frames(odom, localized)
     hypotheses = (
         [(row, 1.0) for row in range(len(answers.rows))]
@@ -122,14 +192,10 @@ def scale_to_metres(
     max_sigma: float = 0.1,
 ) -> dict[int, Rigid3]:
     """Return the motion with its steps in metres, according to localizations that agree with each
-    other.
+    other. The world of the motion stays at its first frame.
 
-    The world of the motion stays at its first frame.
-
-    Args:
-        drift: sigma of the logarithm of the scale after one metre. It grows with the square root of
-            the distance.
-        max_sigma: frames whose scale has a larger relative sigma are left out.
+    `drift` is the sigma of the logarithm of the scale after one metre. It grows with the square
+    root of the distance. Frames whose scale has a relative sigma above `max_sigma` are left out.
     """
     answers = _collect_localized_frames(odom, localized)
     positions = np.array([pose.translation for pose in odom.values()])
@@ -156,34 +222,25 @@ def _estimate_scale_profile(
     """Return the logarithm of the scale at each frame and its sigma."""
     max_knots = 200  # maximum number of knots along the trajectory at which the scale is estimated
     a, b = answers.select(pairs[:, 0]), answers.select(pairs[:, 1])
-    apart, own_apart = (
-        np.linalg.norm(a.world - b.world, axis=1),
-        np.linalg.norm(a.odom - b.odom, axis=1),
-    )
+    apart = np.linalg.norm(a.world - b.world, axis=1)
+    own_apart = np.linalg.norm(a.odom - b.odom, axis=1)
     measured = np.log(apart / own_apart)
     sigmas = WIDENED * np.hypot(a.sigmas, b.sigmas) / apart
-    knots = np.unique(
-        path_lengths[
-            np.linspace(0, len(path_lengths) - 1, min(len(path_lengths), max_knots)).astype(int)
-        ]
-    )
+    num = len(path_lengths)
+    rows = np.linspace(0, num - 1, min(num, max_knots)).astype(int)
+    knots = np.unique(path_lengths[rows])
     metre = float(np.exp(np.median(measured)))
-    mean = np.stack(
-        [
-            _interpolation_weights(np.linspace(u, v, 9), knots).mean(axis=0)
-            for u, v in zip(a.path_lengths, b.path_lengths, strict=True)
-        ]
-    )
-    difference = (
-        np.diff(np.eye(len(knots)), axis=0)
-        / (drift * np.sqrt(np.maximum(np.diff(knots) * metre, 1e-9)))[:, None]
-    )
+    spans = zip(a.path_lengths, b.path_lengths, strict=True)
+    weights = [_interpolation_weights(np.linspace(u, v, 9), knots) for u, v in spans]
+    mean = np.stack([one.mean(axis=0) for one in weights])
+    steps = drift * np.sqrt(np.maximum(np.diff(knots) * metre, 1e-9))
+    difference = np.diff(np.eye(len(knots)), axis=0) / steps[:, None]
     matrix = np.concatenate([mean / sigmas[:, None], difference])
     covariance = np.linalg.inv(matrix.T @ matrix + 1e-12 * np.eye(len(knots)))
     logs = covariance @ (matrix[: len(mean)].T @ (measured / sigmas))
-    return np.interp(path_lengths, knots, logs), np.interp(
-        path_lengths, knots, np.sqrt(np.diag(covariance))
-    )
+    of_knots = logs, np.sqrt(np.diag(covariance))
+    at_logs, at_sigmas = (np.interp(path_lengths, knots, values) for values in of_knots)
+    return at_logs, at_sigmas
 
 
 def _select_pairs(answers: _LocalizedFrames) -> Int[np.ndarray, "p 2"]:

@@ -1,18 +1,24 @@
 """Create the content that a session adds to a map: new nodes, mapping images, and observations of
-the existing nodes."""
+the existing nodes. Add the images to the map's coarse localizers.
+
+k-NN localizers receive new vectors. Their vocabulary or network stays the same.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from topoloc.errors import MissingExtraError
+from topoloc.features.features import Features
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import position_covariance
-from topoloc.lifelong.coarse_model_update import DescribedPlace
-from topoloc.lifelong.session_poses import Progress, SessionPoses
+from topoloc.lifelong.session_poses import SessionPoses
 from topoloc.localization.result import Localization
+from topoloc.mapping.build import Progress
 from topoloc.mapping.landmarks import NODES_PER_IMAGE, Observations
 from topoloc.mapping.mapping_frames import (
     MappingFrame,
@@ -31,9 +37,66 @@ from topoloc.mapping.node_drafts import (
 )
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.sessions import Illumination
-from topoloc.mapping.topomap import PlaceImage, TopoMetricMap, TopoNode
+from topoloc.mapping.topomap import Layer, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.virtual_nodes import find_new_virtual_views
 from topoloc.node_ids import NodeId, Row, as_rows
+from topoloc.retrieval.coarse import CoarseModel, ExtendableLocalizer, open_coarse_localizer
+from topoloc.retrieval.network_images import decode_stored_image
+from topoloc.retrieval.vlad import SurfVlad
+
+DescribedPlace = tuple[Features, Camera, NodeId]
+"""The local features of a mapping image, its camera model, and the id of its node."""
+
+
+def update_coarse_models(
+    topomap: TopoMetricMap,
+    views: Mapping[str, Sequence[DescribedPlace]],
+    images: Sequence[PlaceImage],
+) -> tuple[TopoMetricMap, list[str]]:
+    """Return the map with new places added to its coarse localizers, and the names of those that
+    were not updated.
+
+    Localizers that use local features are extended with `views`. Localizers that compare network
+    descriptors are extended with `images`. A localizer with one output per node (cnn-fc) cannot be
+    extended, because it would need training. No network localizer is extended if PyTorch is
+    missing.
+
+    Raises:
+        MapError: a coarse localizer of the map, or an image, is damaged.
+    """
+    layers, not_updated = dict[str, Layer](), list[str]()
+    for kind, layer in topomap.layers.items():
+        models = dict(layer.coarse_models)
+        for name, model in models.items():
+            if name == SurfVlad.name:
+                models[name] = _add_features(model, views.get(kind, []))
+            elif images:
+                extended = _add_images(model, images)
+                models[name] = extended or model
+                not_updated += [] if extended else [name]
+        layers[kind] = replace(layer, coarse_models=models)
+    return replace(topomap, layers=layers), sorted(not_updated)
+
+
+def _add_features(model: CoarseModel, views: Sequence[DescribedPlace]) -> CoarseModel:
+    if not views:
+        return model
+    described = [(features, camera.width, camera.height) for features, camera, _ in views]
+    node_ids = np.array([node_id for *_, node_id in views])
+    return SurfVlad.from_model(model).extend_with_features(described, node_ids).to_model()
+
+
+def _add_images(model: CoarseModel, images: Sequence[PlaceImage]) -> CoarseModel | None:
+    try:
+        localizer = open_coarse_localizer(model)
+    except MissingExtraError:
+        return None
+    if not isinstance(localizer, ExtendableLocalizer):
+        return None
+    return localizer.extend_with_images(
+        [decode_stored_image(image.jpeg) for image in images],
+        np.array([image.node_id for image in images]),
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,12 +4,12 @@ Localizations of some images anchor the session's own motion. The motion comes f
 (given, or from SLAM) in any world. `single_camera_poses.py` handles a single camera without poses.
 One rigid transform, up to drift, must explain most localizations. A pose graph with a fixed map
 then combines the motion and the localizations. Their weights follow from the session itself
-(`noise_scale.py`).
+(`scale_estimation.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,20 +18,23 @@ from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.noise_scale import LocalizedStep, NoiseScale, estimate_noise_scale
-from topoloc.lifelong.scale_estimation import WIDENED, MotionTolerance, find_motion_consensus
+from topoloc.lifelong.scale_estimation import (
+    WIDENED,
+    LocalizedStep,
+    MotionTolerance,
+    NoiseScale,
+    estimate_noise_scale,
+    find_motion_consensus,
+)
 from topoloc.lifelong.session_checks import check_calibration, check_focal_length
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping.build import Progress
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import select_node_frames
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.recording import SequenceView
 from topoloc.slam.pose_graph import Edge, optimize_pose_graph
-
-Progress = Callable[[str, int, int], None]
-"""Called with a stage's name, the number of steps done and the number of all steps."""
-
 
 MIN_AGREEING = 5  # localized images that agree with the motion
 # Constant part of the tolerance of two agreeing localizations: position, in D_thresh, and rotation.

@@ -18,10 +18,10 @@ import numpy as np
 
 from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.noise_scale import NoiseScale
 from topoloc.lifelong.scale_estimation import (
     WIDENED,
     MotionTolerance,
+    NoiseScale,
     find_motion_consensus,
     scale_to_metres,
 )
@@ -30,12 +30,12 @@ from topoloc.lifelong.session_poses import (
     MIN_AGREEING,
     SLACK,
     SLACK_DEG,
-    Progress,
     SessionPoses,
     align_motion_to_map,
 )
 from topoloc.lifelong.trajectory_adjustment import adjust_trajectory, correct_trajectory
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.mapping.build import Progress
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import select_node_frames
 from topoloc.recordings.frame import StereoSequence

@@ -14,11 +14,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from topoloc.lifelong.coarse_model_update import update_coarse_models
 from topoloc.lifelong.lazy_sequences import overlay
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.session_checks import check_session_is_new
-from topoloc.lifelong.session_content import SessionContent, create_session_content
+from topoloc.lifelong.session_content import (
+    SessionContent,
+    create_session_content,
+    update_coarse_models,
+)
 from topoloc.lifelong.session_poses import estimate_poses_by_motion
 from topoloc.lifelong.single_camera_poses import estimate_poses_by_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig

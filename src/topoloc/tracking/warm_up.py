@@ -25,12 +25,12 @@ from topoloc.localization.guided_kernels import match_projections
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.walls.upright_pose import estimate_upright_pose
+from topoloc.mapping.build import Progress
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import DepthImage, StereoFrame
 from topoloc.slam.bundle.block_kernels import solve_factored
 from topoloc.tracking.tracker import Tracker
 
-Progress = Callable[[str, int, int], None]
 STAGE = "compiling"
 
 _CAMERA = Camera.pinhole(320, 240, 260.0, 260.0, 159.5, 119.5)

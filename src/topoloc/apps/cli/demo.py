@@ -35,8 +35,15 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.demo.recordings import ROLES, SHIPPED, Role, find_missing_recordings
-from topoloc.demo.report_texts import PAPER_LAB, create_report_texts, describe_night
+from topoloc.demo.recordings import (
+    PAPER_LAB,
+    ROLES,
+    SHIPPED,
+    Role,
+    create_report_texts,
+    describe_night,
+    find_missing_recordings,
+)
 from topoloc.plugin import write_text
 
 Progress = Callable[[str, int, int], None]

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.atlas.global_descriptors import GlobalDescriptors
+from topoloc.atlas.index import GlobalDescriptors
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.transform_consensus import (
     diagonal_covariance,
