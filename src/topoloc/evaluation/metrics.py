@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -52,25 +53,19 @@ class EvaluatedQuery:
     def translation_m(self) -> float:
         """Return the distance from the ground truth in metres. NaN without a pose or ground truth
         in the same world."""
-        if (
-            isinstance(self.result, NotLocalized)
-            or self.world_from_cam is None
-            or self.is_in_other_world
-        ):
-            return float("nan")
-        return translation_error(self.result.world_from_cam, self.world_from_cam)
+        return self._measure(translation_error)
 
     @property
     def rotation_deg(self) -> float:
         """Return the angle from the ground truth in degrees. NaN without a pose or ground truth in
         the same world."""
-        if (
-            isinstance(self.result, NotLocalized)
-            or self.world_from_cam is None
-            or self.is_in_other_world
-        ):
-            return float("nan")
-        return float(np.rad2deg(rotation_error(self.result.world_from_cam, self.world_from_cam)))
+        return math.degrees(self._measure(rotation_error))
+
+    def _measure(self, error: Callable[[Rigid3, Rigid3], float]) -> float:
+        truth = None if self.is_in_other_world else self.world_from_cam
+        if isinstance(self.result, NotLocalized) or truth is None:
+            return math.nan
+        return error(self.result.world_from_cam, truth)
 
     @property
     def is_false_accept(self) -> bool:

@@ -16,12 +16,11 @@ from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.build import Progress
 from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
-from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
+from topoloc.recordings.frame import Image, StereoSequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,19 +126,16 @@ def localize_queries(
     label = label or sequence.name
     answers = []
     for done, i in enumerate(frames):
-        frame = sequence[i]
-        assert frame.world_from_cam is not None
-        world_from_cam = (map_from_truth or Rigid3.identity()) @ frame.world_from_cam
+        answer, pose = _localize(localizer, sequence, i, label), sequence.poses[i]
+        if pose is None:
+            raise TrajectoryError(f"{answer.query}: no known pose to judge against")
+        world_from_cam = pose if map_from_truth is None else map_from_truth @ pose
         distances = node_distances(world_from_cam, nodes, topomap.config.lambda_rot)
-        answer = EvaluatedQuery(
-            frame.name,
-            _localize(localizer, frame),
-            world_from_cam,
-            topomap.summaries[int(np.argmin(distances))].node_id,
-            label,
-            create_image_reader(sequence, i),
-            frame.camera,
-            find_neighbour_ids(topomap, distances),
+        answer = replace(
+            answer,
+            world_from_cam=world_from_cam,
+            nearest_node_id=topomap.summaries[int(np.argmin(distances))].node_id,
+            neighbour_ids=find_neighbour_ids(topomap, distances),
         )
         answers.append(_to_answered_world(localizer, answer, tile_id))
         if progress:
@@ -169,19 +165,7 @@ def localize_out_of_map(
     label, frames = label or sequence.name, range(len(sequence)) if frames is None else frames
     answers = []
     for done, i in enumerate(frames):
-        frame = sequence[i]
-        result = _localize(localizer, frame)
-        answers.append(
-            EvaluatedQuery(
-                sequence.names[i],
-                result,
-                None,
-                None,
-                label,
-                create_image_reader(sequence, i),
-                frame.camera,
-            )
-        )
+        answers.append(_localize(localizer, sequence, i, label))
         if progress:
             progress(f"{label} (out of map)", done + 1, len(frames))
     return answers
@@ -230,9 +214,17 @@ def _to_answered_world(
     )
 
 
-def _localize(localizer: Localizer, frame: StereoFrame) -> Localization | NotLocalized:
+def _localize(
+    localizer: Localizer, sequence: StereoSequence, index: int, label: str
+) -> EvaluatedQuery:
+    """Localize a frame. Return the result without ground truth."""
+    frame = sequence[index]
     if frame.camera is None:
         raise CalibrationError(
             f"{frame.name}: no calibration; put a camera.json into the recording's folder"
         )
-    return localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns)
+    result = localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns)
+    reader = create_image_reader(sequence, index)
+    return EvaluatedQuery(
+        frame.name, result, None, recording=label, read_image=reader, camera=frame.camera
+    )

@@ -1,19 +1,22 @@
-"""Validate the data of a map file: shapes, types and bounds. Invalid data raises `CorruptDataError`
-before any kernel uses it."""
+"""Validate the header of a map file and its data: shapes, types and bounds. Invalid data raises
+`CorruptDataError` before any kernel uses it."""
 
 from __future__ import annotations
 
 import io
 import math
+import os
 import zipfile
 import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from topoloc.errors import CalibrationError
+from topoloc.errors import CalibrationError, MapError, MapVersionError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.storage.schema import APPLICATION_ID, SCHEMA_VERSION
 
 MAX_POINTS = 100_000
 MAX_SIDE_PX = 32_768
@@ -22,6 +25,41 @@ _MAX_MAGNITUDE = 1e7  # metres and pixels; larger than any measurement
 
 class CorruptDataError(Exception):
     """Invalid data in a map file. The message describes it."""
+
+
+def check_header(path: Path) -> int:
+    """Check the 100-byte header of a map file and return its schema version. Raises MapError,
+    MapVersionError."""
+    if os.path.exists(path) and not os.path.isfile(path):
+        hint = "a folder" if os.path.isdir(path) else "a pipe or a device"
+        hint = "an atlas" if os.path.isfile(path / "atlas.json") else hint
+        raise MapError(f"{path} is no map but {hint}")
+    try:
+        with path.open("rb") as file:
+            header = file.read(100)
+            num_bytes = file.seek(0, os.SEEK_END)
+    except (OSError, ValueError) as error:  # ValueError: the name contains a null character
+        raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from error
+    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
+        raise MapError(
+            f"{path} is not a topoloc map" + (" (the file is empty)" if num_bytes == 0 else "")
+        )
+    if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
+        raise MapError(f"{path} is an SQLite database but not a topoloc map")
+    version = int.from_bytes(header[60:64], "big")
+    if not 1 <= version <= SCHEMA_VERSION:
+        newer = (
+            "a newer topoloc" if version > SCHEMA_VERSION else "an older topoloc; build it again"
+        )
+        raise MapVersionError(
+            f"map {path} has schema {version}, this topoloc reads schemas 1 to {SCHEMA_VERSION}:"
+            f" written by {newer}"
+        )
+    page_size = int.from_bytes(header[16:18], "big")
+    expected = int.from_bytes(header[28:32], "big") * (65536 if page_size == 1 else page_size)
+    if num_bytes < expected:
+        raise MapError(f"map {path} is truncated: {num_bytes} of {expected} bytes")
+    return version
 
 
 def array_from_bytes(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> np.ndarray:

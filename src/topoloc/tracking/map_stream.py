@@ -50,16 +50,13 @@ from topoloc.tracking.tracker_state import (
     compute_motion_covariance,
     compute_smoothed_covariance,
     downscale_image,
+    fade_offset,
     noise_floor,
 )
 
 
 class MapStream:
-    """Hold the state of one stream in one map.
-
-    Args:
-        localizer: localizes in this map alone.
-    """
+    """Hold the state of one stream in one map, to which `localizer` is restricted."""
 
     def __init__(self, localizer: Localizer, config: TrackerConfig) -> None:
         self.localizer, self.config = localizer, config
@@ -168,7 +165,7 @@ class MapStream:
         motion = reference.follower.track_points(frame.grey, near)
         if motion is None:
             return None
-        offset = _fade_offset(reference.offset, (frame.t_ns - reference.t_ns) / 1e9)
+        offset = fade_offset(reference.offset, (frame.t_ns - reference.t_ns) / 1e9)
         smoothed = offset @ motion.cam_from_ref @ reference.smoothed
         covariance = motion.covariance + noise_floor(reference.errors.depth)
         if not self._hypotheses.is_consistent(predicted, smoothed.inverse(), covariance):
@@ -180,11 +177,9 @@ class MapStream:
         # Minimum seconds between two full localizations while the points are tracked.
         retry_interval = 0.1
         interval = 0.25  # interval of full localizations, seconds
-        # An image is also localized in full if the share of points still tracked is below
-        # this.
+        # or if the share of points still tracked is below this
         min_share_left = 0.6
-        # An image is also localized in full if the points moved by more than this share
-        # of the image width.
+        # or if the points moved by more than this share of the image width
         max_shift = 0.04
         if not self._hypotheses.is_unambiguous:
             return True
@@ -203,8 +198,7 @@ class MapStream:
 
         The error of a tracked pose includes those of its reference image and of wrong depths.
         """
-        # Maximum direction uncertainty of the prediction (three sigma, radians). Above
-        # it, coarse retrieval is used.
+        # Maximum direction uncertainty (three sigma, radians). Above it, retrieval is used.
         max_doubt = 0.3
         reference, is_alone = self._reference, len(self._hypotheses.alternatives()) == 1
         if reference is None or predicted is None:
@@ -250,7 +244,7 @@ class MapStream:
                 cam_from_world, errors.noise, motion, motion_covariance
             )
             if tracked is not None:
-                offset = _fade_offset(tracked.smoothed @ smoothed.inverse(), seconds)
+                offset = fade_offset(tracked.smoothed @ smoothed.inverse(), seconds)
             measured = errors.noise if tracked is None else tracked.motion.covariance
             state = update_motion(predicted, (offset @ smoothed).inverse(), measured)
             self._hypotheses.set_best_state(state, frame.odom_from_cam)
@@ -296,13 +290,6 @@ class MapStream:
         return self._mark_if_ambiguous(
             StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, covariance)
         )
-
-
-def _fade_offset(offset: Rigid3, seconds: float) -> Rigid3:
-    # Time constant (to 1/e, seconds) of the correction of the smoothed pose by a new
-    # localization. It prevents jumps.
-    blend_time = 0.2
-    return Rigid3.exp(np.exp(-seconds / blend_time) * offset.log())
 
 
 def _follow_points(frame: StreamFrame, found: LocalizedPose) -> PointTracker:

@@ -1,4 +1,5 @@
 """Filter the camera's pose and velocity on SE(3), predict the next pose and test measured poses.
+Define the hypotheses about them.
 
 It is an extended Kalman filter. Its error state is the right perturbation of `world_from_cam` and
 the velocity, both in the camera's axes. In these axes position and rotation are hardly correlated.
@@ -8,14 +9,16 @@ except for an unknown acceleration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from topoloc.bounds import Above
 from topoloc.geometry.rigid import Rigid3
+from topoloc.node_ids import NodeId
 
 
 @dataclass(frozen=True)
@@ -125,3 +128,59 @@ def update_motion(
         predicted.velocity + correction[6:],
         (posterior + posterior.T) / 2.0,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Hold one hypothesis.
+
+    `state` and `odom_from_cam` belong to the last measured pose, `current` to the current image.
+    `from_best` transforms poses of the best hypothesis into those of this one, and stays valid
+    under common motion. `candidate_idx` is the index of the candidate used for this image, None if
+    none was.
+    """
+
+    state: MotionState
+    odom_from_cam: Rigid3 | None
+    current: MotionState
+    weight: float
+    node_id: NodeId
+    from_best: Rigid3
+    candidate_idx: int | None
+
+    def measured(
+        self, state: MotionState, odom_from_cam: Rigid3 | None, **changes: Any
+    ) -> Hypothesis:
+        """Return the hypothesis with the state measured in the current image."""
+        return replace(self, state=state, current=state, odom_from_cam=odom_from_cam, **changes)
+
+
+def merge_duplicates(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    """Merge hypotheses with the same pose and velocity, and prefer those measured now."""
+    kept: list[Hypothesis] = []
+    least = 1e-4 * max(one.weight for one in hypotheses)
+    heavy = [one for one in hypotheses if one.weight > least]
+    for one in sorted(heavy, key=lambda one: (one.candidate_idx is None, -one.weight)):
+        for k, other in enumerate(kept):
+            if _is_same_motion(one.current, other.current):
+                kept[k] = replace(other, weight=other.weight + one.weight)
+                break
+        else:
+            kept.append(one)
+    return kept
+
+
+def _is_same_motion(a: MotionState, b: MotionState) -> bool:
+    """Return whether two states differ by less than their covariances allow.
+
+    The limit on the squared Mahalanobis distance (12 degrees of freedom) is 6.
+    """
+    error = np.concatenate(
+        [(a.world_from_cam.inverse() @ b.world_from_cam).log(), b.velocity - a.velocity]
+    )
+    return float(error @ np.linalg.solve(a.covariance + b.covariance, error)) < 6.0
+
+
+def is_same_place(a: Rigid3, b: Rigid3) -> bool:
+    """Return whether two poses are within 0.25 m and 5 degrees."""
+    return a.is_same(b, 0.25, math.radians(5.0))

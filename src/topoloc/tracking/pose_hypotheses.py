@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -27,8 +27,11 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Alternative
 from topoloc.node_ids import NodeId
 from topoloc.tracking.motion import (
+    Hypothesis,
     MotionConfig,
     MotionState,
+    is_same_place,
+    merge_duplicates,
     predict_motion,
     start_motion,
     update_motion,
@@ -48,31 +51,6 @@ class Candidate:
     node_id: NodeId
 
 
-@dataclass(frozen=True, eq=False)
-class _Hypothesis:
-    """Hold one hypothesis.
-
-    `state` and `odom_from_cam` belong to the last measured pose, `current` to the current image.
-    `from_best` transforms poses of the best hypothesis into those of this one, and stays valid
-    under common motion. `candidate_idx` is the index of the candidate used for this image, None if
-    none was.
-    """
-
-    state: MotionState
-    odom_from_cam: Rigid3 | None
-    current: MotionState
-    weight: float
-    node_id: NodeId
-    from_best: Rigid3
-    candidate_idx: int | None
-
-    def measured(
-        self, state: MotionState, odom_from_cam: Rigid3 | None, **changes: Any
-    ) -> _Hypothesis:
-        """Return the hypothesis with the state measured in the current image."""
-        return replace(self, state=state, current=state, odom_from_cam=odom_from_cam, **changes)
-
-
 class PoseHypotheses:
     """Hold the hypotheses, highest weight first, and the weight of "elsewhere". All weights sum to
     one.
@@ -88,7 +66,7 @@ class PoseHypotheses:
 
     def __init__(self, motion: MotionConfig) -> None:
         self.motion = motion
-        self._ranked: list[_Hypothesis] = []
+        self._ranked: list[Hypothesis] = []
         self._null_weight, self.is_track_continued = 1.0, False
 
     @property
@@ -142,7 +120,7 @@ class PoseHypotheses:
         """
         max_seconds = 1.0  # seconds without a measured pose after which a hypothesis is dropped
         max_seconds_with_odometry = 20.0  # the same with external odometry
-        before, alive = self._ranked, list[_Hypothesis]()
+        before, alive = self._ranked, list[Hypothesis]()
         for one in before:
             motion, limit = None, max_seconds
             if one.odom_from_cam is not None and odom_from_cam is not None:
@@ -220,7 +198,7 @@ class PoseHypotheses:
             self.miss if is_single else miss_ambiguous,
             1.0 - sum(one.probability for one in candidates),
         )
-        new, others = list[_Hypothesis](), self._ranked
+        new, others = list[Hypothesis](), self._ranked
         if is_single:
             new, others = self._merge_consistent(candidates[0], odom_from_cam, new_evidence_ratio)
         for one in others:
@@ -242,8 +220,8 @@ class PoseHypotheses:
             else:
                 state = start_motion(t_ns, candidate.world_from_cam, candidate.covariance)
                 pose, node_id = Rigid3.identity(), candidate.node_id
-                new.append(_Hypothesis(state, odom_from_cam, state, weight, node_id, pose, number))
-        self._prune(_merge_duplicates(new), self._null_weight * none**new_evidence_ratio)
+                new.append(Hypothesis(state, odom_from_cam, state, weight, node_id, pose, number))
+        self._prune(merge_duplicates(new), self._null_weight * none**new_evidence_ratio)
         best = self.leader
         self.is_track_continued = before is not None and self.is_consistent(
             before, best.world_from_cam, best.pose_covariance
@@ -258,13 +236,13 @@ class PoseHypotheses:
 
     def _merge_consistent(
         self, candidate: Candidate, odom_from_cam: Rigid3 | None, new_evidence_ratio: float
-    ) -> tuple[list[_Hypothesis], list[_Hypothesis]]:
+    ) -> tuple[list[Hypothesis], list[Hypothesis]]:
         """Merge the hypotheses consistent with a single pose into one. Return it, and the others.
 
         The motion is that of the likeliest of them.
         """
         pose, covariance = candidate.world_from_cam, candidate.covariance
-        weight, likeliest, others = 0.0, list[tuple[float, _Hypothesis]](), list[_Hypothesis]()
+        weight, likeliest, others = 0.0, list[tuple[float, Hypothesis]](), list[Hypothesis]()
         for one in self._ranked:
             updated = self._update_with_candidate(one, 0, candidate, odom_from_cam)
             if updated is None:
@@ -284,8 +262,8 @@ class PoseHypotheses:
         return [replace(best, weight=weight)], others
 
     def _update_with_candidate(
-        self, one: _Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
-    ) -> _Hypothesis | None:
+        self, one: Hypothesis, number: int, candidate: Candidate, odom_from_cam: Rigid3 | None
+    ) -> Hypothesis | None:
         """Return the hypothesis updated by a candidate, weighted by its likelihood.
 
         None if the candidate is not consistent with it.
@@ -298,7 +276,7 @@ class PoseHypotheses:
         state, changes = update_motion(now, pose, covariance), {"node_id": candidate.node_id}
         return one.measured(state, odom_from_cam, weight=weight, candidate_idx=number, **changes)
 
-    def _prune(self, hypotheses: list[_Hypothesis], elsewhere: float) -> None:
+    def _prune(self, hypotheses: list[Hypothesis], elsewhere: float) -> None:
         """Keep the hypotheses with the highest weights and normalise the weights."""
         max_number = 24  # maximum number of hypotheses, those with the highest weights
         min_weight = 0.002  # minimum weight of a hypothesis
@@ -319,34 +297,3 @@ class PoseHypotheses:
             replace(one, from_best=one.current.world_from_cam @ best_from_world)
             for one in self._ranked
         ]
-
-
-def _merge_duplicates(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
-    """Merge hypotheses with the same pose and velocity, and prefer those measured now."""
-    kept: list[_Hypothesis] = []
-    least = 1e-4 * max(one.weight for one in hypotheses)
-    heavy = [one for one in hypotheses if one.weight > least]
-    for one in sorted(heavy, key=lambda one: (one.candidate_idx is None, -one.weight)):
-        for k, other in enumerate(kept):
-            if _is_same_motion(one.current, other.current):
-                kept[k] = replace(other, weight=other.weight + one.weight)
-                break
-        else:
-            kept.append(one)
-    return kept
-
-
-def _is_same_motion(a: MotionState, b: MotionState) -> bool:
-    """Return whether two states differ by less than their covariances allow.
-
-    The limit on the squared Mahalanobis distance (12 degrees of freedom) is 6.
-    """
-    error = np.concatenate(
-        [(a.world_from_cam.inverse() @ b.world_from_cam).log(), b.velocity - a.velocity]
-    )
-    return float(error @ np.linalg.solve(a.covariance + b.covariance, error)) < 6.0
-
-
-def is_same_place(a: Rigid3, b: Rigid3) -> bool:
-    """Return whether two poses are within 0.25 m and 5 degrees."""
-    return a.is_same(b, 0.25, math.radians(5.0))

@@ -13,7 +13,8 @@ from topoloc.localization.evidence import compute_precision_probability
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses, is_same_place
+from topoloc.tracking.motion import is_same_place
+from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses
 from topoloc.tracking.tracker_state import PoseErrors, StreamFrame, compute_pose_errors
 
 

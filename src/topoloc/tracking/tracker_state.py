@@ -165,6 +165,14 @@ def compute_smoothed_covariance(
     return covariance + adjoint @ since.pose_covariance @ adjoint.T
 
 
+def fade_offset(offset: Rigid3, seconds: float) -> Rigid3:
+    """Return the rest of a correction of the smoothed pose after a time."""
+    # Time constant (to 1/e, seconds) of the correction of the smoothed pose by a new
+    # localization. It prevents jumps.
+    blend_time = 0.2
+    return Rigid3.exp(np.exp(-seconds / blend_time) * offset.log())
+
+
 def downscale_image(
     grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int
 ) -> tuple[UInt8[np.ndarray, "a b"], Camera]:

@@ -3,7 +3,7 @@ nodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar, no_type_check
 
@@ -18,6 +18,7 @@ from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseModel
 
+K = TypeVar("K")
 T = TypeVar("T")
 
 
@@ -36,6 +37,22 @@ class LazySequence(Sequence[T]):
         return (
             [*map(self._read, as_rows(rows))] if isinstance(rows, range) else self._read(Row(rows))
         )
+
+
+class LazyMapping(Mapping[K, T]):
+    """Show a mapping whose values are read at every access: `read` of the entries of `keys()`."""
+
+    def __init__(self, keys: Callable[[], Mapping[K, Any]], read: Callable[[Any], T]) -> None:
+        self._keys, self._read = keys, read
+
+    def __len__(self) -> int:
+        return len(self._keys())
+
+    def __iter__(self) -> Iterator[K]:
+        return iter(self._keys())
+
+    def __getitem__(self, key: K) -> T:
+        return self._read(self._keys()[key])
 
 
 @dataclass(frozen=True, eq=False)

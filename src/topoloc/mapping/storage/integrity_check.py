@@ -4,6 +4,7 @@ Also describe its contents in numbers and words."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -30,9 +31,7 @@ def find_map_damage(path: Path) -> list[str]:
     Raises:
         MapError: the file cannot be opened.
     """
-    with TopoMetricMap.load(path) as topomap:
-        file = topomap.file
-        assert file is not None, "a map that was just opened"
+    with TopoMetricMap.load(path) as topomap, closing(MapFile(path)) as file:
         found = [*_check_rows(file), *_check_entries(topomap)]
     return list(dict.fromkeys(text.removeprefix(f"map {path} is damaged: ") for text in found))
 
@@ -82,15 +81,9 @@ def _session_facts(session: Session) -> dict[str, Any]:
 def list_coarse_models(path: Path) -> list[dict[str, Any]]:
     """Return the name, bytes, backbone and weights of each coarse localizer of a map file. Raises
     MapError."""
-    file = MapFile(path)
-    try:
-        with file.read_connection() as database:
-            query = (
-                "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
-            )
-            return [_model_facts(*row) for row in database.execute(query)]
-    finally:
-        file.close()
+    query = "SELECT name, settings, length(arrays) FROM coarse_models ORDER BY name LIMIT 1000"
+    with closing(MapFile(path)) as file, file.read_connection() as database:
+        return [_model_facts(*row) for row in database.execute(query)]
 
 
 def _check_rows(file: MapFile) -> Iterator[str]:

@@ -7,7 +7,6 @@ checked after. SQLite runs with limits of time and size.
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import threading
 import time
@@ -24,13 +23,10 @@ from topoloc.errors import (
     FeatureTypeError,
     GeoreferenceError,
     MapError,
-    MapVersionError,
 )
 from topoloc.json_data import Count, decode_json
 from topoloc.mapping.storage.schema import (
-    APPLICATION_ID,
     SCHEMA_1,
-    SCHEMA_VERSION,
     SORT_COLUMNS,
     TABLES,
     VIRTUAL_PREFIX,
@@ -38,7 +34,7 @@ from topoloc.mapping.storage.schema import (
     create_table_statement,
     schema_2_views,
 )
-from topoloc.mapping.validation import CorruptDataError
+from topoloc.mapping.validation import CorruptDataError, check_header
 
 MAX_SECONDS = 5.0
 """Time limit of one read. The slowest valid read (all node summaries of a large map) takes a tenth
@@ -268,41 +264,6 @@ class MapFile:
         if missing := wanted.keys() - found - optional:
             raise CorruptDataError(f"table {min(missing)} is missing")
         return found
-
-
-def check_header(path: Path) -> int:
-    """Check the 100-byte header of a map file and return its schema version. Raises MapError,
-    MapVersionError."""
-    if os.path.exists(path) and not os.path.isfile(path):
-        hint = "a folder" if os.path.isdir(path) else "a pipe or a device"
-        hint = "an atlas" if os.path.isfile(path / "atlas.json") else hint
-        raise MapError(f"{path} is no map but {hint}")
-    try:
-        with path.open("rb") as file:
-            header = file.read(100)
-            num_bytes = file.seek(0, os.SEEK_END)
-    except (OSError, ValueError) as error:  # ValueError: the name contains a null character
-        raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from error
-    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
-        raise MapError(
-            f"{path} is not a topoloc map" + (" (the file is empty)" if num_bytes == 0 else "")
-        )
-    if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
-        raise MapError(f"{path} is an SQLite database but not a topoloc map")
-    version = int.from_bytes(header[60:64], "big")
-    if not 1 <= version <= SCHEMA_VERSION:
-        newer = (
-            "a newer topoloc" if version > SCHEMA_VERSION else "an older topoloc; build it again"
-        )
-        raise MapVersionError(
-            f"map {path} has schema {version}, this topoloc reads schemas 1 to {SCHEMA_VERSION}:"
-            f" written by {newer}"
-        )
-    page_size = int.from_bytes(header[16:18], "big")
-    expected = int.from_bytes(header[28:32], "big") * (65536 if page_size == 1 else page_size)
-    if num_bytes < expected:
-        raise MapError(f"map {path} is truncated: {num_bytes} of {expected} bytes")
-    return version
 
 
 def _check_types(table: str, names: Iterable[str], row: Sequence[Any]) -> dict[str, Any]:

@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from topoloc.bounds import parse_settings
 from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.camera import Camera
@@ -23,6 +21,7 @@ from topoloc.mapping.sessions import Edit, Session
 from topoloc.mapping.storage.entries import (
     CorrelatedErrors,
     Edge,
+    LazyMapping,
     LazySequence,
     NodeSummary,
     PlaceImage,
@@ -31,7 +30,7 @@ from topoloc.mapping.storage.entries import (
     VirtualNodes,
 )
 from topoloc.mapping.storage.map_file import MapFile
-from topoloc.mapping.storage.point_encoding import points_from_row
+from topoloc.mapping.storage.point_encoding import model_from_row, moves_from_row, points_from_row
 from topoloc.mapping.storage.schema import (
     SORT_COLUMNS,
     VIRTUAL_PREFIX,
@@ -42,32 +41,19 @@ from topoloc.mapping.topomap import Layer, NextIds, TopoMetricMap
 from topoloc.mapping.validation import (
     MAX_POINTS,
     CorruptDataError,
-    arrays_from_npz,
     camera_from_text,
     check_count,
     pose_from_bytes,
 )
 from topoloc.node_ids import NodeId, Row
-from topoloc.retrieval.coarse import CoarseModel
 
 T = TypeVar("T")
-K = TypeVar("K", int, str)
-V = TypeVar("V")
 MAX_ID = 2**53
-_MAX_MOVES = 1000
 
 
 def open_map(path: Path, digest: str | None = None) -> TopoMetricMap:
-    """Open a map file without reading its nodes. It stays open.
-
-    Args:
-        path: the map file.
-        digest: the expected digest. Another one is an error.
-
-    Raises:
-        MapError: the file is missing, not a topoloc map, truncated, damaged, or has another digest.
-        MapVersionError: the schema is unknown to this version.
-    """
+    """Open a map file without reading its nodes. It stays open. Raises MapError and
+    MapVersionError as `MapFile`."""
     file = MapFile(path, digest)
     try:
         with file.read_connection():
@@ -89,8 +75,9 @@ def _read_contents(file: MapFile) -> TopoMetricMap:
     map_id = facts.get("map_id")
     if map_id is not None and not re.fullmatch("[0-9a-f]{16}", map_id):
         raise CorruptDataError("map_id: 16 hexadecimal digits are expected")
-    moves = _LazyMapping(file, "repetitions", _moves_from_row)
+    moves = _lazy_entries(file, "repetitions", moves_from_row)
     of_earth = facts.get("georeference")
+    changes = _decode_fact(facts, "changes", dict[str, dict[str, Any]], {})
     return TopoMetricMap(
         summaries=_lazy_rows(file, "nodes", _read_summary, ""),
         layers={kind: _read_layer(file, kind, config.features.kind) for kind in kinds},
@@ -102,7 +89,7 @@ def _read_contents(file: MapFile) -> TopoMetricMap:
         repetitions=Repetitions(facts["repetitions"], moves) if "repetitions" in facts else None,
         sides=_read_virtual_nodes(file, kinds),
         sessions=list(_read_sessions(file).values()),
-        edits=_read_edits(file),
+        edits=[Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")],
         next_ids=parse_settings(NextIds, _decode_fact(facts, "next_ids", dict, {}), "next_ids"),
         map_id=map_id,
         georeference=None if of_earth is None else Georeference.from_json(of_earth),
@@ -138,7 +125,7 @@ def _read_virtual_nodes(file: MapFile, kinds: Sequence[str]):
     return VirtualNodes(
         _lazy_rows(file, table, _read_summary, VIRTUAL_PREFIX),
         _lazy_rows(file, table, _read_node, kind, VIRTUAL_PREFIX, True),
-        _LazyMapping(file, f"{VIRTUAL_PREFIX}coarse_models", _model_from_row),
+        _lazy_entries(file, f"{VIRTUAL_PREFIX}coarse_models", model_from_row),
         kind,
     )
 
@@ -154,14 +141,9 @@ def _read_layer(file: MapFile, kind: str, first: str):
             raise CorruptDataError("shared errors that are no share")
     return Layer(
         _lazy_rows(file, "nodes", _read_node, kind, "", kind == first),
-        _LazyMapping(file, "coarse_models", _model_from_row, suffix),
+        _lazy_entries(file, "coarse_models", model_from_row, suffix),
         errors,
     )
-
-
-def _read_edits(file: MapFile) -> list[Edit]:
-    changes = _decode_fact(file.facts, "changes", dict[str, dict[str, Any]], {})
-    return [Edit(**row, changes=changes.get(str(row["edit_id"]))) for row in file.rows("edits")]
 
 
 def _read_sessions(file: MapFile) -> dict[int, Session]:
@@ -244,10 +226,9 @@ def _read_node(file: MapFile, kind: str, prefix: str, is_default: bool, row: Row
         if is_default and summary.num_points != n:
             raise CorruptDataError(f"node {node_id} has {n} points")
         summary = summary if summary.num_points == n else replace(summary, num_points=n)
-        camera = file.cached(f"camera {camera_id}", partial(_read_camera, file, camera_id))
-        return TopoNode(
-            summary, camera, features, points_cam, sqrt_covs, template, statistics, stored
-        )
+        camera = file.cached(f"camera {camera_id}", lambda: _read_camera(file, camera_id))
+        of_node = features, points_cam, sqrt_covs, template, statistics, stored
+        return TopoNode(summary, camera, *of_node)
 
 
 def _read_camera(file: MapFile, camera_id: int) -> Camera:
@@ -282,63 +263,31 @@ def _read_place_image(file: MapFile, row: int) -> PlaceImage:
         found = file.row("place_images", f"place image {image_id['image_id']}", **image_id)
         session = _read_session(file, found["session_id"])
         pose = pose_from_bytes(found["world_from_cam"])
-        return PlaceImage(
-            session.name,
-            found["name"],
-            found["node_id"],
-            pose,
-            found["jpeg"],
-            session.session_id,
-            found["image_id"],
-        )
+        entry = found["name"], found["node_id"], pose, found["jpeg"]
+        return PlaceImage(session.name, *entry, session.session_id, found["image_id"])
 
 
-class _LazyMapping(Mapping[K, V]):
-    """Show rows of a table by their key, or those of one layer by the names in it. Each is read
-    when accessed."""
-
-    def __init__(
-        self,
-        file: MapFile,
-        table: str,
-        read: Callable[[dict[str, Any]], V],
-        suffix: str | None = None,
-    ) -> None:
-        self._file, self._table, self._read, self._suffix = file, table, read, suffix
-        self._key = SORT_COLUMNS[table]
-
-    def _keys(self) -> dict[Any, Any]:
-        """Return the stored key of each key."""
-        read = partial(self._file.rows, self._table, (self._key,))
-        stored = [row[self._key] for row in self._file.cached(self._table, read)]
-        if self._suffix is None:
-            return {key: key for key in stored}
-        named = ((*split_layer_name(key), key) for key in stored)
-        return {name: key for name, suffix, key in named if suffix == self._suffix}
-
-    def __len__(self) -> int:
-        return len(self._keys())
-
-    def __iter__(self) -> Iterator[K]:
-        return iter(self._keys())
-
-    def __getitem__(self, key: K) -> V:
-        stored = self._keys()[key]
-        with self._file.read_connection():
-            what = f"{self._table} {stored}"
-            return self._read(self._file.row(self._table, what, **{self._key: stored}))
+def _lazy_entries(
+    file: MapFile, table: str, read: Callable[[dict[str, Any]], T], suffix: str | None = None
+) -> LazyMapping[Any, T]:
+    """Return the entries that `read` makes of the rows of a table by their key, or those of one
+    layer by the names in it."""
+    key = SORT_COLUMNS[table]
+    return LazyMapping(
+        partial(_stored_keys, file, table, key, suffix),
+        partial(_read_entry, file, table, key, read),
+    )
 
 
-def _model_from_row(row: dict[str, Any]) -> CoarseModel:
-    what = f"coarse localizer {row['name']}"
-    settings = decode_json(row["settings"], dict[str, Any], CorruptDataError, what)
-    name = split_layer_name(row["name"])[0]
-    return CoarseModel(name, settings, arrays_from_npz(row["arrays"], what))
+def _stored_keys(file: MapFile, table: str, key: str, suffix: str | None) -> dict[Any, Any]:
+    stored = [row[key] for row in file.cached(table, partial(file.rows, table, (key,)))]
+    if suffix is None:
+        return {one: one for one in stored}
+    return {name: one for one in stored for name, of in [split_layer_name(one)] if of == suffix}
 
 
-def _moves_from_row(row: dict[str, Any]) -> np.ndarray:
-    what = f"the repetitions of node {row['node_id']}"
-    count, data = check_count(row["num_moves"], 1, _MAX_MOVES, what), row["moves"]
-    size = len(data) // count
-    poses = [pose_from_bytes(data[k * size : (k + 1) * size]) for k in range(count)]
-    return np.array([pose.matrix() for pose in poses])
+def _read_entry(
+    file: MapFile, table: str, key: str, read: Callable[[dict[str, Any]], T], stored: int | str
+) -> T:
+    with file.read_connection():
+        return read(file.row(table, f"{table} {stored}", **{key: stored}))

@@ -14,18 +14,23 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int8
+from jaxtyping import Float, Float32, Int8
 
 from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
+from topoloc.json_data import decode_json
 from topoloc.mapping.storage.entries import TopoNode
+from topoloc.mapping.storage.schema import split_layer_name
 from topoloc.mapping.validation import (
     MAX_POINTS,
     CorruptDataError,
     array_from_bytes,
+    arrays_from_npz,
     check_count,
     decompress_bytes,
+    pose_from_bytes,
 )
+from topoloc.retrieval.coarse import CoarseModel
 
 FIRST_COMPRESSED_SCHEMA = 3
 """The first schema with compressed arrays. Older schemas store raw arrays."""
@@ -119,3 +124,21 @@ def _quantize_descriptors(node: TopoNode, scale: float) -> Int8[np.ndarray, "n d
     ):
         return stored
     return np.clip(np.rint(descriptors * scale), -127, 127).astype(np.int8)
+
+
+def model_from_row(row: Mapping[str, Any]) -> CoarseModel:
+    """Decode a row of `coarse_models`. Raises CorruptDataError."""
+    what = f"coarse localizer {row['name']}"
+    settings = decode_json(row["settings"], dict[str, Any], CorruptDataError, what)
+    name = split_layer_name(row["name"])[0]
+    return CoarseModel(name, settings, arrays_from_npz(row["arrays"], what))
+
+
+def moves_from_row(row: Mapping[str, Any]) -> Float[np.ndarray, "k 4 4"]:
+    """Decode a row of `repetitions`. Raises CorruptDataError."""
+    max_moves = 1000
+    what = f"the repetitions of node {row['node_id']}"
+    count, data = check_count(row["num_moves"], 1, max_moves, what), row["moves"]
+    size = len(data) // count
+    poses = [pose_from_bytes(data[k * size : (k + 1) * size]) for k in range(count)]
+    return np.array([pose.matrix() for pose in poses])
