@@ -13,20 +13,40 @@ length of a descriptor does not matter. The default step is 0.64 times a number'
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int8
 
-from topoloc.lifelong.lazy_sequences import transform_nodes
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
+from topoloc.mapping.storage.entries import LazySequence
 from topoloc.mapping.storage.point_encoding import dequantize_descriptors
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 
 # A node counts as quantized if the median norm of its stored descriptors is at most this many times
 # the norm expected for the step.
 _MAX_NORM_RATIO = 1.5
+
+
+def transform_nodes(
+    topomap: TopoMetricMap, transform: Callable[[TopoNode], TopoNode]
+) -> TopoMetricMap:
+    """Return the map with each node transformed at every access, or the same map if `transform`
+    returns all nodes unchanged."""
+    if all(transform(node) is node for layer in topomap.layers.values() for node in layer.nodes):
+        return topomap
+    layers = {
+        kind: replace(
+            layer,
+            nodes=LazySequence(
+                partial(len, layer.nodes), lambda row, layer=layer: transform(layer.nodes[row])
+            ),
+        )
+        for kind, layer in topomap.layers.items()
+    }
+    return replace(topomap, layers=layers)
 
 
 def quantize_map_descriptors(topomap: TopoMetricMap, step: float) -> TopoMetricMap:

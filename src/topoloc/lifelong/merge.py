@@ -16,7 +16,6 @@ from typing import Any
 
 from topoloc.errors import MapError, TrajectoryError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.lifelong.lazy_sequences import overlay
 from topoloc.lifelong.node_localization import localize_nodes, measure_recall_change
 from topoloc.lifelong.session_content import is_well_localized, update_coarse_models
 from topoloc.lifelong.session_poses import SessionPoses, align_motion_to_map
@@ -25,6 +24,7 @@ from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.build import Progress
 from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.storage.entries import overlay
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.virtual_nodes import add_virtual_nodes

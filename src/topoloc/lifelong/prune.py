@@ -25,13 +25,14 @@ from topoloc.lifelong.landmark_pruning import (
     find_vanished,
     quantize_map_descriptors,
     select_landmarks,
+    transform_nodes,
 )
-from topoloc.lifelong.lazy_sequences import overlay, transform_nodes
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.node_pruning import compute_node_support, remove_nodes, select_removed_nodes
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.landmark_statistics import merge_count_statistics
+from topoloc.mapping.storage.entries import overlay
 from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.recordings.atomic import temporary_file

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from topoloc.lifelong.lazy_sequences import overlay
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.session_checks import check_session_is_new
 from topoloc.lifelong.session_content import (
@@ -38,6 +37,7 @@ from topoloc.mapping.mapping_frames import (
 )
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.sessions import Session
+from topoloc.mapping.storage.entries import overlay
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.mapping.virtual_nodes import add_virtual_nodes
 from topoloc.recordings.frame import StereoSequence

@@ -4,10 +4,10 @@ between sessions of several illuminations, which have user-given names or are me
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from topoloc.errors import MapError
 from topoloc.mapping.sessions import Illumination, Session
@@ -42,27 +42,22 @@ def open_map_coarse_localizer(
     coarse = open_coarse_localizer(
         node_ids_to_rows(model, [summary.node_id for summary in topomap.summaries])
     )
-    lights = (
-        find_node_illumination_groups(topomap.summaries, topomap.sessions)
-        if len(topomap.sessions) > 1
-        else None
-    )
-    return (
-        coarse.suppress_group_differences(lights)
-        if isinstance(coarse, DescriptorLocalizer) and lights is not None and lights.any()
-        else coarse
-    )
+    if len(topomap.sessions) > 1 and isinstance(coarse, DescriptorLocalizer):
+        lights = find_node_illumination_groups(topomap.summaries, topomap.sessions)
+        return coarse.suppress_group_differences(lights) if lights.any() else coarse
+    return coarse
 
 
 def node_ids_to_rows(model: CoarseModel, ids: Sequence[NodeId]) -> CoarseModel:
     """Return a stored model with the ids of its nodes replaced by rows. Descriptors of other nodes
     are removed."""
-    known = model.arrays.get("node_ids", _output_node_ids(model))
+    known, num_nodes = model.arrays.get("node_ids"), model.settings.get("num_nodes")
+    if known is None and isinstance(num_nodes, int) and 0 <= num_nodes <= 1_000_000:
+        known = np.arange(num_nodes)  # one output per node, in the order of ids
     if known is None or known.ndim != 1 or known.dtype.kind not in "iu":
         return model  # opening the model reports the error
-    if list(ids) == list(range(len(ids))) and (
-        len(known) == 0 or 0 <= known.min() <= known.max() < len(ids)
-    ):
+    is_numbered = list(ids) == list(range(len(ids)))
+    if is_numbered and (len(known) == 0 or 0 <= known.min() <= known.max() < len(ids)):
         return model
     rows: dict[int, int] = {node_id: row for row, node_id in enumerate(ids)}
     of_known = np.array([rows.get(int(node_id), -1) for node_id in known], np.int64)
@@ -79,18 +74,11 @@ def node_ids_to_rows(model: CoarseModel, ids: Sequence[NodeId]) -> CoarseModel:
     return replace(model, arrays={**model.arrays, **per_vector, "node_ids": of_known[kept]})
 
 
-def _output_node_ids(model: CoarseModel) -> np.ndarray | None:
-    """Return the node ids of a model with one output per node, in the order of ids."""
-    num_nodes = model.settings.get("num_nodes")
-    return (
-        np.arange(num_nodes) if isinstance(num_nodes, int) and 0 <= num_nodes <= 1_000_000 else None
-    )
-
-
 def compute_illumination_distance(a: Illumination, b: Illumination) -> float:
     """Return the distance between two illuminations: grey level, contrast, shares of dark and
     bright pixels, and colours with half the weight."""
-    return float(np.linalg.norm(_to_vector(a) - _to_vector(b)))
+    weights = np.array([1.0, 1.0, 1.0, 1.0, 0.5, 0.5])
+    return float(np.linalg.norm(weights * np.subtract(astuple(a), astuple(b))))
 
 
 def group_by_illumination(
@@ -105,13 +93,11 @@ def group_by_illumination(
     """
     leaders, groups = list[Session](), dict[int, int]()
     for session in sorted(sessions, key=lambda one: -weights.get(one.session_id, 0)):
-        group = next(
-            (k for k, leader in enumerate(leaders) if _is_same_illumination(session, leader)), None
-        )
-        if group is None:
-            group = len(leaders) if _has_illumination(session) or not leaders else 0
-            if group == len(leaders):
-                leaders.append(session)
+        same = (k for k, leader in enumerate(leaders) if _is_same_illumination(session, leader))
+        is_known = session.light is not None or session.light_name is not None
+        group = next(same, len(leaders) if is_known or not leaders else 0)
+        if group == len(leaders):
+            leaders.append(session)
         groups[session.session_id] = group
     return groups
 
@@ -126,10 +112,6 @@ def find_node_illumination_groups(
     return np.array([groups.get(summary.session_id, 0) for summary in summaries], np.int64)
 
 
-def _has_illumination(session: Session) -> bool:
-    return session.light is not None or session.light_name is not None
-
-
 def _is_same_illumination(a: Session, b: Session) -> bool:
     if a.light_name is not None and b.light_name is not None:
         return a.light_name == b.light_name
@@ -141,10 +123,4 @@ def _is_same_illumination(a: Session, b: Session) -> bool:
         a.light is not None
         and b.light is not None
         and compute_illumination_distance(a.light, b.light) < max_distance
-    )
-
-
-def _to_vector(light: Illumination) -> Float[np.ndarray, "6"]:
-    return np.array(
-        [light.level, light.contrast, light.dark, light.bright, 0.5 * light.red, 0.5 * light.blue]
     )

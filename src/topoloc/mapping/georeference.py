@@ -12,11 +12,9 @@ from jaxtyping import Bool, Float
 
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
-from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.georeferencing import (
     GeoreferenceFit,
-    UpDirection,
     estimate_up_direction,
     fit_georeference,
     georeference_from_heading,
@@ -34,7 +32,13 @@ class ControlPoints:
 
     points_world: Float[np.ndarray, "n 3"]
     places: Sequence[GeoPoint]
-    names: list[str]
+    names: Sequence[str]
+
+    @staticmethod
+    def of(rows: Sequence[tuple[Sequence[float] | np.ndarray, GeoPoint, str]]) -> ControlPoints:
+        """Return the points of rows of point, place and name."""
+        points, places, names = zip(*rows, strict=True)
+        return ControlPoints(np.array(points), places, names)
 
 
 def read_control_points(path: Path) -> ControlPoints:
@@ -45,15 +49,11 @@ def read_control_points(path: Path) -> ControlPoints:
         GeoreferenceError: the file is missing or empty, columns or numbers are missing, or a place
             is not on earth. Names the line.
     """
-    rows = _read_table(path, 6, 0, "x, y, z, lat, lon, h")
-    numbers = [_parse_numbers(path, line, columns[:6]) for line, columns in rows]
-    places = [
-        _parse_geo_point(path, line, values[3:])
-        for (line, _), values in zip(rows, numbers, strict=True)
-    ]
-    return ControlPoints(
-        np.array([values[:3] for values in numbers]), places, [f"line {line}" for line, _ in rows]
-    )
+    found = []
+    for line, columns in _read_table(path, 6, 0, "x, y, z, lat, lon, h"):
+        numbers = _parse_numbers(path, line, columns[:6])
+        found.append((numbers[:3], _parse_geo_point(path, line, numbers[3:]), f"line {line}"))
+    return ControlPoints.of(found)
 
 
 def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
@@ -74,16 +74,12 @@ def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
     ]
     positions = _find_positions_by_name(topomap)
     named = [
-        (columns[0], place)
+        (positions[columns[0]], place, columns[0])
         for (_, columns), place in zip(rows, places, strict=True)
         if columns[0] in positions
     ]
     if named:
-        return ControlPoints(
-            np.array([positions[name] for name, _ in named]),
-            [place for _, place in named],
-            [name for name, _ in named],
-        )
+        return ControlPoints.of(named)
     if not all(_is_number(columns[0]) for _, columns in rows):
         example = next(iter(positions), "none")
         raise GeoreferenceError(
@@ -109,24 +105,15 @@ def _interpolate_at_times(
             point_enu = (1.0 - share) * points_enu[after - 1] + share * points_enu[after]
         else:
             continue
-        found.append(
-            (
-                summary.world_from_cam.translation,
-                GeoPoint.from_ecef(origin.apply(point_enu)),
-                summary.name,
-            )
-        )
+        place = GeoPoint.from_ecef(origin.apply(point_enu))
+        found.append((summary.world_from_cam.translation, place, summary.name))
     if not found:
         times = [summary.t_ns for summary in topomap.summaries]
         spans = " and ".join(
             f"{min(span) / 1e9:.3f} to {max(span) / 1e9:.3f} s" for span in (t_ns, times)
         )
         raise GeoreferenceError(f"{path}: no fix is of a time of the map ({spans})")
-    return ControlPoints(
-        np.array([point for point, _, _ in found]),
-        [place for _, place, _ in found],
-        [name for _, _, name in found],
-    )
+    return ControlPoints.of(found)
 
 
 def _find_positions_by_name(topomap: TopoMetricMap) -> dict[str, Float[np.ndarray, "3"]]:
@@ -183,9 +170,6 @@ def _parse_geo_point(path: Path, line: int, values: Sequence[float]) -> GeoPoint
         raise GeoreferenceError(f"{path}, line {line}: {error}") from None
 
 
-_Fitted = tuple[ControlPoints, GeoreferenceFit]
-
-
 @dataclass(frozen=True, eq=False)
 class GeoreferenceResult:
     """The georeference of a map, the heading of its first image (degrees clockwise from true
@@ -197,7 +181,7 @@ class GeoreferenceResult:
     georeference: Georeference
     heading_deg: float
     up: str | None
-    names: list[str]
+    names: Sequence[str]
     residuals_m: Float[np.ndarray, " n"]
     is_inlier: Bool[np.ndarray, " n"]
 
@@ -236,32 +220,21 @@ def georeference(
         ]
         if not posed:
             raise GeoreferenceError(f"map {path} has no mapping picture")
-        direction = estimate_up_direction(posed, up)
+        direction, names = estimate_up_direction(posed, up), ()
         if origin is not None:
-            found, fitted = georeference_from_heading(posed[0], *origin, direction), None
+            placed = georeference_from_heading(posed[0], *origin, direction)
+            fit = GeoreferenceFit(placed, np.zeros(0), np.zeros(0, dtype=bool))
         else:
-            fitted = _fit(topomap, gnss, points, direction)
-            found = fitted[1].georeference
+            source = "points" if points is not None else "gnss"
+            path_of_known = Path(points or gnss or "")
+            if points is not None:
+                known, direction = read_control_points(path_of_known), None
+            else:
+                known = read_gnss(path_of_known, topomap)
+            names = known.names
+            fit = fit_georeference(known.points_world, known.places, source, direction)
+        found = fit.georeference
         edit.commit(replace(topomap, georeference=found), f"georeference {found.source}")
-    axis = None if points is not None else direction.axis
-    return _create_result(found, posed[0], axis, fitted)
-
-
-def _fit(
-    topomap: TopoMetricMap, gnss: str | Path | None, points: str | Path | None, up: UpDirection
-) -> _Fitted:
-    if points is not None:
-        known = read_control_points(Path(points))
-        return known, fit_georeference(known.points_world, known.places, "points")
-    known = read_gnss(Path(gnss or ""), topomap)
-    return known, fit_georeference(known.points_world, known.places, "gnss", up)
-
-
-def _create_result(
-    found: Georeference, first: Rigid3, up: str | None, fitted: _Fitted | None
-) -> GeoreferenceResult:
-    heading_deg = found.heading_deg(first.rotation[:, 2])
-    if fitted is None:
-        return GeoreferenceResult(found, heading_deg, up, [], np.zeros(0), np.zeros(0, dtype=bool))
-    known, fit = fitted
-    return GeoreferenceResult(found, heading_deg, up, known.names, fit.residuals_m, fit.is_inlier)
+    heading_deg = found.heading_deg(posed[0].rotation[:, 2])
+    axis = None if direction is None else direction.axis
+    return GeoreferenceResult(found, heading_deg, axis, names, fit.residuals_m, fit.is_inlier)

@@ -223,25 +223,19 @@ def _check_fit(
     """Check that the points determine the transform. Raises GeoreferenceError."""
     is_inlier = weights > 0.0
     offsets = pairs.world[is_inlier] - pairs.world[is_inlier].mean(axis=0)
-    extent, left = (
-        float(np.linalg.norm(offsets, axis=1).max()),
-        f"residuals of {math.sqrt(3.0) * sigma:.2f} m",
-    )
+    extent = float(np.linalg.norm(offsets, axis=1).max())
+    left = f"residuals of {math.sqrt(3.0) * sigma:.2f} m"
     if 2 * int(is_inlier.sum()) < len(is_inlier):
         raise GeoreferenceError(
             f"only {int(is_inlier.sum())} of {len(is_inlier)} points agree with each other: these"
             " are not the map's places"
         )
-    _check_scale(
-        offsets,
-        (pairs.enu[is_inlier] - pairs.enu[is_inlier].mean(axis=0)) @ enu_from_world.rotation,
-    )
-    information = np.sum(offsets**2) * np.eye(3) - offsets.T @ offsets
-    information = information / sigma**2
+    enu = pairs.enu[is_inlier]
+    _check_scale(offsets, (enu - enu.mean(axis=0)) @ enu_from_world.rotation)
+    information = (np.sum(offsets**2) * np.eye(3) - offsets.T @ offsets) / sigma**2
     if pairs.up is not None:
-        information = (
-            information + (np.eye(3) - np.outer(pairs.up.world, pairs.up.world)) / pairs.up.sigma**2
-        )
+        across = np.eye(3) - np.outer(pairs.up.world, pairs.up.world)
+        information = information + across / pairs.up.sigma**2
     rotation_sigma = 1.0 / math.sqrt(max(float(np.linalg.eigvalsh(information)[0]), 1e-12))
     if rotation_sigma > _MAX_ROTATION_SIGMA:
         about = f"{math.degrees(min(rotation_sigma, math.pi)):.0f} degrees"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -37,19 +37,13 @@ class Illumination:
     def of_image(image: Image) -> Illumination:
         """Measure the illumination of an image (uint8) on every fourth pixel in each direction."""
         sample = image[::4, ::4].astype(np.float64) / 255.0
-        grey = sample if sample.ndim == 2 else sample @ np.array([0.299, 0.587, 0.114])
-        red, green, blue = (
-            (1.0, 1.0, 1.0) if sample.ndim == 2 else sample.reshape(-1, 3).mean(axis=0) + 1e-3
-        )
-        dark, bright = float((grey < 1 / 16).mean()), float((grey > 15 / 16).mean())
-        return Illumination(
-            float(grey.mean()),
-            float(grey.std()),
-            dark,
-            bright,
-            float(red / green),
-            float(blue / green),
-        )
+        grey, colours = sample, np.ones(3)
+        if sample.ndim == 3:
+            grey = sample @ np.array([0.299, 0.587, 0.114])
+            colours = sample.reshape(-1, 3).mean(axis=0) + 1e-3
+        red, blue = colours[0] / colours[1], colours[2] / colours[1]
+        parts = grey.mean(), grey.std(), (grey < 1 / 16).mean(), (grey > 15 / 16).mean(), red, blue
+        return Illumination(*map(float, parts))
 
 
 @dataclass(frozen=True)
@@ -112,12 +106,7 @@ def average_illumination(lights: Sequence[Illumination]) -> Illumination | None:
     """Return the mean illumination, rounded to four decimals, or None if `lights` is empty."""
     if not lights:
         return None
-    rows = np.array(
-        [
-            [light.level, light.contrast, light.dark, light.bright, light.red, light.blue]
-            for light in lights
-        ]
-    )
+    rows = np.array([astuple(light) for light in lights])
     return Illumination(*(round(float(value), 4) for value in rows.mean(axis=0)))
 
 

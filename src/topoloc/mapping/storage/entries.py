@@ -39,6 +39,18 @@ class LazySequence(Sequence[T]):
         )
 
 
+def overlay(base: Sequence[T], changed: Mapping[int, T], added: Sequence[T]) -> LazySequence[T]:
+    """Return `base` with the entries of `changed` (by row) replaced and those of `added`
+    appended."""
+
+    def read(row: int) -> T:
+        if row in changed:
+            return changed[row]
+        return base[row] if row < len(base) else added[row - len(base)]
+
+    return LazySequence(lambda: len(base) + len(added), read)
+
+
 class LazyMapping(Mapping[K, T]):
     """Show a mapping whose values are read at every access: `read` of the entries of `keys()`."""
 
