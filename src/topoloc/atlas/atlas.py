@@ -121,16 +121,12 @@ class Atlas:
     def add_map(
         where: str, tile_id: str, path: Path, world: str, recipe: str, replaces: bool = False
     ) -> Tile:
-        """Add a map file as a tile, and create the atlas if there is none.
+        """Add a map file as a tile, and create the atlas if there is none. `recipe` is the digest
+        of the map's inputs. A tile of the same id is replaced (`replaces`), or is an error, unless
+        it has the same recipe.
 
-        Args:
-            recipe: digest of the map's inputs.
-            replaces: replace a tile of the same id. Otherwise it is an error, unless it has the
-                same recipe.
-
-        Raises:
-            AtlasError: the atlas has a tile of the same id, or it cannot be written.
-            MapError: the map is damaged or empty.
+        Raises AtlasError if the atlas has a tile of the same id or cannot be written, MapError if
+        the map is damaged or empty.
         """
         from topoloc.atlas.editing import NewTile, add_tiles
 

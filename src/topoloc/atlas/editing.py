@@ -114,14 +114,11 @@ def add_tiles(
 
 
 def replace_tile(where: str, new: NewTile, before: Tile) -> Manifest | None:
-    """Replace a tile by a new version of its map in the same world, and return the manifest.
+    """Replace a tile by a new version of its map in the same world, and return the manifest. Its
+    joins are kept in their current state.
 
-    The joins of the tile are kept in their current state. If the tile was removed or changed since
-    `before`, nothing is changed and None is returned.
-
-    Raises:
-        AtlasError: there is no atlas, or it cannot be written.
-        MapError: the map is missing, damaged or empty.
+    If the tile was removed or changed since `before`, nothing is changed and None is returned.
+    Raises AtlasError and MapError as `add_tiles`.
     """
     store = store_at(where)
     tile = store_tile(new, store)
@@ -160,14 +157,9 @@ def remove_tiles(where: str, tile_ids: Sequence[str]) -> Manifest:
 
 
 def add_joins(where: str, joins: Sequence[Join], between: Mapping[str, Tile]) -> Manifest:
-    """Add joins and return the new manifest.
-
-    `between` holds the tiles that the joins were computed from. Joins of tiles that were removed or
-    changed since are dropped.
-
-    Raises:
-        AtlasError: there is no atlas, or it cannot be written.
-    """
+    """Add joins and return the new manifest. `between` holds the tiles that the joins were computed
+    from. Joins of tiles that were removed or changed since are dropped. Raises AtlasError if there
+    is no atlas, or it cannot be written."""
 
     def with_joins(manifest: Manifest, now: float) -> Manifest:
         there = {name for name in between if _is_same_map(manifest, between[name])}

@@ -65,14 +65,9 @@ def save_global_descriptors(path: Path, vectors: GlobalDescriptors) -> None:
 def load_global_descriptors(
     path: Path, versions: Mapping[str, str]
 ) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Read the output of `save_global_descriptors`.
-
-    `versions` holds the vocabulary versions of the vectors by feature type. Vectors of versions
-    other than the installed ones are skipped.
-
-    Raises:
-        AtlasError: the file is missing or damaged, or no version matches.
-    """
+    """Read the output of `save_global_descriptors`. Vectors of other vocabulary versions than the
+    installed ones are skipped (`versions`, by feature type). Raises AtlasError if the file is
+    missing or damaged, or no version matches."""
     vectors = {}
     try:
         with np.load(path, allow_pickle=False) as stored:

@@ -75,16 +75,11 @@ def index_folder(where: str) -> Path:
 
 
 def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> OpenedIndex:
-    """Open the index of these tiles from the shards in `folder`.
+    """Open the index of these tiles from the shards in `folder`. Missing shards are built, and
+    stored there if it is writable.
 
-    Missing shards are built, and stored there if it is writable.
-
-    Args:
-        read: loads the global descriptors of a tile. It raises AtlasError if they are not
-            available.
-
-    Raises:
-        ObjectStoreError: `read` raised it.
+    `read` loads the global descriptors of a tile. It raises AtlasError if they are not available,
+    and ObjectStoreError, which is passed on.
     """
     work = _IndexBuilder(tiles, folder)
     live_shards = {kind: work.live_shards(kind) for kind in work.versions}

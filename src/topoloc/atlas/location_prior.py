@@ -115,15 +115,11 @@ LocationPrior = GeoPositionPrior | WorldPositionPrior
 def tiles_in_reach(
     manifest: Manifest, near: LocationPrior | None, georeferenced_only: bool = False
 ) -> dict[str, Rigid3 | None]:
-    """Return the tiles in reach by id, with the prior pose in the tile's own world or None.
+    """Return the tiles in reach by id, with the prior pose in the tile's own world or None. A tile
+    is in reach if the box of its nodes is. With `georeferenced_only`, tiles without a known
+    position on earth are skipped.
 
-    A tile is in reach if the box of its nodes is.
-
-    Args:
-        georeferenced_only: skip tiles without a known position on earth.
-
-    Raises:
-        AtlasError: no tile belongs to the prior's world.
+    Raises AtlasError if no tile belongs to the prior's world.
     """
     is_placed = ~np.isnan(manifest.geo_boxes[:, 0])
     is_candidate = is_placed if georeferenced_only else np.ones_like(is_placed)

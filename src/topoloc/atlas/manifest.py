@@ -176,14 +176,9 @@ class Manifest:
     def with_tiles(
         self, tiles: Mapping[str, Tile], now: float, joins: Sequence[Join] = ()
     ) -> Manifest:
-        """Return the next manifest, with these tiles.
-
-        Files that it does not list any more are retired at `now`.
-
-        Args:
-            joins: further joins between these tiles. Existing joins stay, unless a tile was removed
-                or its map changed.
-        """
+        """Return the next manifest, with these tiles and further joins between them. Existing joins
+        stay, unless a tile was removed or its map changed. Files that it does not list any more are
+        retired at `now`."""
         origin = self.origin
         if origin is None:
             origin = next(

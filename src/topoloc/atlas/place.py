@@ -84,22 +84,15 @@ def open_place(where: str) -> SingleMap | Atlas:
 
 
 def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> T:
-    """Edit the map of a tile. The tile keeps its world and its joins.
+    """Edit the map of a tile and return the result of `edit`. The tile keeps its world and its
+    joins.
 
-    Args:
-        where: the atlas.
-        tile_id: the tile.
-        edit: a function that edits the map file at a path, as `mapping/edit.py` does. It receives a
-            copy, with the file before the last edit kept beside it. It is called again if another
-            writer replaced the tile in the meantime.
+    `edit` is a function that edits the map file at a path, as `mapping/edit.py` does. It receives a
+    copy, with the file before the last edit kept beside it. It is called again if another writer
+    replaced the tile in the meantime. Its errors leave the atlas unchanged.
 
-    Returns:
-        The result of `edit`.
-
-    Raises:
-        AtlasError: there is no such atlas or tile, it cannot be read or written, or other writers
-            replaced the tile in each of five tries.
-        TopolocError: raised by `edit`. The atlas stays unchanged.
+    Raises AtlasError if there is no such atlas or tile, it cannot be read or written, or other
+    writers replaced the tile in each of five tries.
     """
     for _ in range(_MAX_TRIES):
         atlas = Atlas.open(where)
@@ -146,15 +139,13 @@ def _copy_map(atlas: Atlas, stored: StoredFile, path: Path) -> None:
 
 
 def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
-    """Create an atlas at `where` from the tiles of all sources (atlases or map files).
+    """Create an atlas at `where` from the tiles of all sources (atlases or map files). A map with
+    the same id in two sources becomes one tile. Worlds of different sources stay distinct, even if
+    they have the same name.
 
-    A map with the same id in two sources becomes one tile. Worlds of different sources stay
-    distinct, even if they have the same name.
-
-    Raises:
-        AtlasError: there is an atlas already, two tiles of one id hold different maps, a tile's
-            file is missing or wrong, or the atlas cannot be written.
-        MapError: a map is missing, damaged or empty.
+    Raises AtlasError if there is an atlas already, two tiles of one id hold different maps, a
+    tile's file is missing or wrong, or the atlas cannot be written. Raises MapError if a map is
+    missing, damaged or empty.
     """
     store = store_at(where)
     if store.manifest() is not None:

@@ -68,13 +68,10 @@ class SharedWorld:
     def open_tiles(
         self, atlas: Atlas, warn: Callable[[str], None]
     ) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
-        """Iterate over tiles with their maps. Each map is open during its iteration.
+        """Iterate over tiles with their maps. Each map is open during its iteration. A tile that
+        cannot be read is skipped with a warning.
 
-        A tile that cannot be read is skipped with a warning.
-
-        Raises:
-            AtlasError: no tile can be read.
-            ObjectStoreError: the store does not respond.
+        Raises AtlasError if no tile can be read, ObjectStoreError if the store does not respond.
         """
         num_opened = 0
         for one in self.tiles:

@@ -56,13 +56,11 @@ class WatchedAtlas:
         return self._atlas
 
     def look(self) -> bool:
-        """Open the atlas again if its manifest changed, and return whether it did.
+        """Open the atlas again if its manifest changed, and return whether it did. Only one thread
+        may call it at a time.
 
-        Only one thread may call it at a time.
-
-        Raises:
-            AtlasError: the atlas is gone or damaged.
-            ObjectStoreError: the store does not respond.
+        Raises AtlasError if the atlas is gone or damaged, ObjectStoreError if the store does not
+        respond.
         """
         version = self._check_version()
         if version == self._version:

@@ -65,15 +65,7 @@ def merge_maps(
     progress: Progress | None = None,
 ) -> tuple[TopoMetricMap, dict[str, Any]]:
     """Merge the second map into the first. Return the result in the first map's world, and the
-    numbers of changes by name.
-
-    Raises:
-        ConfigError: a setting of the localizer is out of its bounds.
-        MapError: both are versions of one map, or the second lacks a feature type of the first.
-        TrajectoryError: the maps overlap too little, or their distances disagree.
-        FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
-            this machine.
-    """
+    numbers of changes by name. Raises as `merge`."""
     progress = progress or (lambda stage, done, total: None)
     if missing := set(first.kinds) - set(second.kinds):
         raise MapError(

@@ -64,17 +64,11 @@ def localize_left_out(
     num_d_thresh: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[Row, LeaveOneOutResult]:
-    """Localize nodes of `stored` in the localizer's map while the nodes themselves are hidden.
+    """Localize the nodes `rows` of `stored` in the localizer's map, which is `stored` or a version
+    of it, while the nodes themselves are hidden. Nodes of the same session within `num_d_thresh`
+    D_thresh are hidden, too. `progress` is called with the number of nodes done and of all nodes.
 
-    Args:
-        localizer: the localizer of the map. Its map is `stored` or a version of it.
-        stored: the map that holds the nodes used as queries.
-        rows: the rows of these nodes in `stored`.
-        num_d_thresh: also hide nodes of the same session within this many D_thresh.
-        progress: is called with the number of nodes done and the number of all nodes.
-
-    Returns:
-        The results by row. A node is not localized if all nodes of the map would be hidden.
+    Return the results by row. A node is not localized if all nodes of the map would be hidden.
     """
     known = {summary.node_id for summary in localizer.topomap.summaries}
     answers = dict[Row, LeaveOneOutResult]()

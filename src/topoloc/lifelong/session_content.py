@@ -56,13 +56,10 @@ def update_coarse_models(
     """Return the map with new places added to its coarse localizers, and the names of those that
     were not updated.
 
-    Localizers that use local features are extended with `views`. Localizers that compare network
-    descriptors are extended with `images`. A localizer with one output per node (cnn-fc) cannot be
-    extended, because it would need training. No network localizer is extended if PyTorch is
-    missing.
-
-    Raises:
-        MapError: a coarse localizer of the map, or an image, is damaged.
+    Localizers that use local features are extended with `views`, those that compare network
+    descriptors with `images`. A localizer with one output per node (cnn-fc) cannot be extended,
+    because it would need training. No network localizer is extended if PyTorch is missing. Raises
+    MapError if a coarse localizer of the map, or an image, is damaged.
     """
     layers, not_updated = dict[str, Layer](), list[str]()
     for kind, layer in topomap.layers.items():

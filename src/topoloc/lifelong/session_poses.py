@@ -60,15 +60,12 @@ class SessionPoses:
 def estimate_poses_by_motion(
     sequence: StereoSequence, localizer: Localizer, map_config: MapConfig, progress: Progress
 ) -> SessionPoses:
-    """Estimate the poses of a session that has its own poses.
+    """Estimate the poses of a session that has its own poses, in any metric world, or in several,
+    one per stretch. Frames are queried about as far apart as nodes.
 
-    Its poses are in any metric world, or in several, one per stretch. Frames are queried about as
-    far apart as nodes.
-
-    Raises:
-        TrajectoryError: the map recognises too little of it, or contradicts its poses.
-        CalibrationError: the images contradict their calibration.
-        UnreadableImageError, QueryError: an image cannot be read or localized.
+    Raises TrajectoryError if the map recognises too little of it or contradicts its poses,
+    CalibrationError if the images contradict their calibration, UnreadableImageError and
+    QueryError.
     """
     stretches = (sequence.poses, *(sequence.apart if isinstance(sequence, SequenceView) else ()))
     numbered = [

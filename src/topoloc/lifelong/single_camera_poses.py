@@ -48,14 +48,11 @@ _NUM_FRAMES_AROUND = 3
 def estimate_poses_by_map(
     sequence: StereoSequence, tracker: Tracker, map_config: MapConfig, progress: Progress
 ) -> SessionPoses:
-    """Estimate the poses of a session without poses by localizing each of its images.
+    """Estimate the poses of a session without poses by localizing each of its images. The result's
+    `answers` hold frames about as far apart as nodes.
 
-    The result's `answers` hold frames about as far apart as nodes.
-
-    Raises:
-        TrajectoryError: the map recognises too little of it.
-        CalibrationError: a frame has no calibration, or the images contradict it.
-        UnreadableImageError, QueryError: an image cannot be read or localized.
+    Raises TrajectoryError if the map recognises too little of it, CalibrationError if a frame has
+    no calibration or the images contradict it, UnreadableImageError and QueryError.
     """
     # A frame without odometry takes the map's pose if its position sigma is at most this many
     # D_thresh.

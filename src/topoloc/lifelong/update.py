@@ -131,24 +131,13 @@ def update_map(
     localizer_config: LocalizerConfig | None = None,
     progress: Progress | None = None,
 ) -> MapUpdate:
-    """Return the map with one more session.
+    """Return the map with one more session, which has poses in any metric world. `poses_from` is
+    their source, which the map records. If it is `map`, the images form a stream, each is localized
+    in the map, and they need no poses.
 
-    Args:
-        topomap: the map.
-        sequence: the session, with poses in any metric world. If `poses_from` is `map`, its images
-            form a stream and need no poses.
-        poses_from: the source of the poses, which the map records. `map` localizes every image in
-            the map.
-        localizer_config: the localizer's settings.
-        progress: is called with a stage's name, steps done and all steps.
-
-    Raises:
-        ConfigError: a setting of the localizer is out of its bounds.
-        DuplicateSessionError: the session is in the map already.
-        TrajectoryError: the map recognises too little of it, or contradicts its poses.
-        FeatureTypeError, MissingExtraError, WeightsError: the map's features cannot be extracted on
-            this machine.
-        RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
+    `progress` is called with a stage's name, steps done and all steps. Raises as `update`, and
+    FeatureTypeError, MissingExtraError or WeightsError if the map's features cannot be extracted on
+    this machine.
     """
     progress = progress or (lambda stage, done, total: None)
     check_session_is_new(topomap, sequence)

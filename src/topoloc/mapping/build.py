@@ -231,12 +231,10 @@ def _observe_image(
     config: BuildConfig,
 ) -> tuple[MappingImage, Row, dict[Row, dict[str, Observations]], dict[str, np.ndarray]]:
     """Process one mapping image. Changes no shared state, so several calls may run in parallel.
-
     `read` is None for a frame that is a node, whose features are known already.
 
-    Returns:
-        The image, the row of its nearest node, its observations of near nodes by row, and its VLADs
-        by feature type.
+    Return the image, the row of its nearest node, its observations of near nodes by row, and its
+    VLADs by feature type.
     """
     image = (
         drafts.image(frame)

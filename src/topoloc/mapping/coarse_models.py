@@ -26,13 +26,10 @@ def open_map_coarse_localizer(
     topomap: TopoMetricMap, name: str, kind: str | None = None
 ) -> CoarseLocalizer:
     """Open a map's coarse localizer for a feature type, by default the first. It identifies nodes
-    by row.
-
-    If the sessions have several illuminations, descriptor localizers reduce the weight of
+    by row. If the sessions have several illuminations, descriptor localizers reduce the weight of
     differences between these.
 
-    Raises:
-        MapError: the map has no localizer of this name, or it is damaged.
+    Raises MapError if the map has no localizer of this name, or it is damaged.
     """
     own, first = (topomap.layers[one].coarse_models for one in (kind or topomap.kind, topomap.kind))
     model = own.get(name) or first.get(name)

@@ -129,16 +129,11 @@ class MapEdit:
     def commit(
         self, changed: TopoMetricMap, name: str, changes: Mapping[str, Any] | None = None
     ) -> Edit:
-        """Replace the file by the changed map atomically, with an entry in its history.
+        """Replace the file by the changed map atomically, with an entry of this name in its
+        history. `changes` holds numbers and texts for the history, by name.
 
-        Args:
-            changed: the changed map.
-            name: the name of the edit.
-            changes: numbers and texts for the history, by name.
-
-        Raises:
-            MapError: the map cannot be written, the file before cannot be kept, or another process
-                replaced the map. The file at the path stays unchanged.
+        Raises MapError if the map cannot be written, the file before cannot be kept, or another
+        process replaced the map. The file at the path stays unchanged.
         """
         edits = self.topomap.edits
         edit = Edit(self.topomap.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
@@ -165,15 +160,11 @@ class MapEdit:
 
 @contextmanager
 def edit_map(path: str | Path, on_wait: WaitCallback | None = None) -> Iterator[MapEdit]:
-    """Open a map file for an edit. Waits while another process edits it.
+    """Open a map file for an edit. Waits while another process edits it, and calls `on_wait` once
+    before.
 
-    Args:
-        path: the map file.
-        on_wait: is called once before waiting.
-
-    Raises:
-        MapError: the file is missing, damaged, or read-only.
-        MapVersionError: the schema is unknown to this version.
+    Raises MapError if the file is missing, damaged or read-only, MapVersionError if the schema is
+    unknown to this version.
     """
     path = Path(os.path.realpath(path))
     with _lock_map_file(path, on_wait) as locked:

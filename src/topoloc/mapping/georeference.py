@@ -58,14 +58,11 @@ def read_control_points(path: Path) -> ControlPoints:
 
 def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
     """Read lines of ``name, lat, lon, h`` or ``time, lat, lon, h``: the places of mapping images by
-    name, or of the camera by time.
+    name, or of the camera by time. Times are in the recordings' clock, in seconds, or in
+    nanoseconds if they are large. Places between two fixes are interpolated.
 
-    Times are in the recordings' clock, in seconds, or in nanoseconds if they are large. Places
-    between two fixes are interpolated.
-
-    Raises:
-        GeoreferenceError: the file is missing or empty, columns or numbers are missing, a place is
-            not on earth, or no line matches the map. Names the line.
+    Raises GeoreferenceError if the file is missing or empty, columns or numbers are missing, a
+    place is not on earth, or no line matches the map. It names the line.
     """
     rows = _read_table(path, 4, 1, "time or name, lat, lon, h")
     places = [

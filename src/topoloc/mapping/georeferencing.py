@@ -84,17 +84,12 @@ def estimate_up_direction(
 def georeference_from_heading(
     world_from_cam: Rigid3, origin: GeoPoint, heading_deg: float, up: UpDirection
 ) -> Georeference:
-    """Return the georeference from the place and heading of one image.
+    """Return the georeference from the place (`origin`) and heading of one image. The heading is
+    that of its optical axis, in degrees clockwise from true north. `up` is the up direction of the
+    world.
 
-    Args:
-        world_from_cam: the pose of the image.
-        origin: the place of the image.
-        heading_deg: the heading of its optical axis, in degrees clockwise from true north.
-        up: the up direction of the world.
-
-    Raises:
-        GeoreferenceError: the image looks up or down, so it has no heading, or the height is
-            implausible.
+    Raises GeoreferenceError if the image looks up or down, so it has no heading, or the height is
+    implausible.
     """
     _check_heights([origin])
     view = world_from_cam.rotation[:, 2]
@@ -124,15 +119,13 @@ def fit_georeference(
     source: str,
     up: UpDirection | None = None,
 ) -> GeoreferenceFit:
-    """Fit the rigid transform from points of the world (metres) to their places on earth.
-
-    The origin is the first place. Least median of squares over triples is followed by least squares
+    """Fit the rigid transform from points of the world (metres) to their places on earth. The
+    origin is the first place. Least median of squares over triples is followed by least squares
     with Cauchy weights. Up to four points are all used as inliers. `up` is an additional
     measurement of the rotation.
 
-    Raises:
-        GeoreferenceError: there are fewer than three points, or they leave the rotation
-            undetermined, contradict each other, or have another scale.
+    Raises GeoreferenceError if there are fewer than three points, or they leave the rotation
+    undetermined, contradict each other, or have another scale.
     """
     if len(points_world) < 3:
         raise GeoreferenceError(
