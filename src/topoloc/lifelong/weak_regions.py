@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -187,12 +188,8 @@ def find_weak_regions(
     apart = 3.0  # weak nodes within this many D_thresh of each other form one region
     topomap = localizer.topomap
     rows = sample_evenly(topomap.rows, max_queries)
-
-    def report_progress(done: int, total: int) -> None:
-        if progress is not None:
-            progress("asking the map without the node", done, total)
-
-    answers = localize_left_out(localizer, topomap, rows, beside, report_progress)
+    report = None if progress is None else partial(progress, "asking the map without the node")
+    answers = localize_left_out(localizer, topomap, rows, beside, report)
     d_thresh = topomap.config.d_thresh
     has_opposite_view = _has_opposite_view(topomap.node_poses, reach * d_thresh, min_turn_deg)
     nodes = [

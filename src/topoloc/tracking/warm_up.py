@@ -28,6 +28,7 @@ from topoloc.localization.walls.upright_pose import estimate_upright_pose
 from topoloc.mapping.build import Progress
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import DepthImage, StereoFrame
+from topoloc.recordings.memory_sequence import MemorySequence
 from topoloc.slam.bundle.block_kernels import solve_factored
 from topoloc.tracking.tracker import Tracker
 
@@ -87,7 +88,7 @@ def warm_up(
 
         steps: tuple[Callable[[], object], ...] = (
             features,
-            lambda: build_map(_SyntheticRecording(wall)).save(map_file),
+            lambda: build_map(_record_wall(wall)).save(map_file),
             lambda: localize_image(pictures[1], _CAMERA),
             lambda: localize_image(pictures[1], None),
             lambda: localize_image(lost, _CAMERA),
@@ -102,32 +103,17 @@ def warm_up(
             progress(STAGE, len(steps), len(steps))
 
 
-class _SyntheticRecording:
-    """Provide an RGB-D recording of two frames along the wall."""
-
-    name = "wall"
-
-    def __init__(self, wall: Float32[np.ndarray, "h w"]) -> None:
-        self._wall, self._positions = wall, (0.0, 0.2)
-        self.names, self.t_ns = ["first", "second"], [0, 100_000_000]
-        self.poses: list[Rigid3 | None] = [
-            Rigid3(np.eye(3), np.array([place, 0.0, 0.0])) for place in self._positions
-        ]
-
-    def __len__(self) -> int:
-        return len(self.poses)
-
-    def __getitem__(self, index: int) -> StereoFrame:
-        image, depth = _render_wall(self._wall, self._positions[index])
+def _record_wall(wall: Float32[np.ndarray, "h w"]) -> MemorySequence:
+    """Return an RGB-D recording of two frames along the wall."""
+    frames = list[StereoFrame]()
+    for t_ns, place in ((0, 0.0), (100_000_000, 0.2)):
+        image, depth = _render_wall(wall, place)
         registered = DepthImage(depth, _CAMERA, Rigid3.identity())
-        return StereoFrame(
-            self.names[index],
-            self.t_ns[index],
-            image,
-            _CAMERA,
-            depth=registered,
-            world_from_cam=self.poses[index],
+        pose = Rigid3(np.eye(3), np.array([place, 0.0, 0.0]))
+        frames.append(
+            StereoFrame(f"{t_ns}", t_ns, image, _CAMERA, depth=registered, world_from_cam=pose)
         )
+    return MemorySequence(frames, "wall")
 
 
 def _make_texture(seed: int) -> Float32[np.ndarray, "h w"]:
