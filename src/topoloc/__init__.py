@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from topoloc.atlas.location_prior import AtlasConfig, GeoPositionPrior
     from topoloc.atlas.manifest import Tile
     from topoloc.atlas.map_cache import MapCache
-    from topoloc.atlas.place import SingleMap, open_place
-    from topoloc.atlas.shared_world import SharedWorld
+    from topoloc.atlas.place import SharedWorld, SingleMap, open_place
     from topoloc.atlas.tile_fetcher import TileFetcher
     from topoloc.compiled import set_num_threads
     from topoloc.errors import (
@@ -253,7 +252,7 @@ _MODULES = {
     "ResultError": "topoloc.errors",
     "Rigid3": "topoloc.geometry.rigid",
     "ServiceError": "topoloc.errors",
-    "SharedWorld": "topoloc.atlas.shared_world",
+    "SharedWorld": "topoloc.atlas.place",
     "SingleMap": "topoloc.atlas.place",
     "SkippedChecks": "topoloc.localization.map_facts.map_building",
     "SlamResult": "topoloc.slam.slam",

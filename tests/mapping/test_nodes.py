@@ -11,9 +11,9 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.mapping.nodes import (
     DEPTH_SHARE,
     RADIANS_PER_NODE,
-    NearestNodeSearch,
     NodeConfig,
     NodePoses,
+    find_nearest_nodes,
     node_distances,
     select_node_frames,
 )
@@ -97,9 +97,7 @@ def test_the_nearest_nodes_are_those_of_all(
         [moved(round(x, 1), round(yaw, 1)) for x, yaw in nodes]
     )  # equal ones among them
     right = np.argsort(node_distances(moved(*camera), poses, lambda_rot), kind="stable")[:count]
-    assert (
-        NearestNodeSearch(poses, lambda_rot).rows(moved(*camera), count).tolist() == right.tolist()
-    )
+    assert find_nearest_nodes(moved(*camera), poses, lambda_rot, count).tolist() == right.tolist()
 
 
 def test_unset_parameters_follow_from_the_scene():

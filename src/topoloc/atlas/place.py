@@ -1,12 +1,12 @@
 """Open a map file or an atlas. Both are places of tiles, with the same methods. Merge them into one
-atlas, with all tiles and joins unchanged."""
+atlas, with all tiles and joins unchanged. Group the tiles of an atlas by common world."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,9 +18,89 @@ from topoloc.atlas.editing import NewTile, new_tiles, replace_tile, store_tile
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
 from topoloc.atlas.store import MANIFEST, Store, sha256_of
-from topoloc.errors import AtlasError, TopolocError
+from topoloc.errors import AtlasError, MapError, ObjectStoreError, TopolocError
+from topoloc.geometry.geodesy import Georeference
+from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.edit import kept_path, read_history
+from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import temporary_folder
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedTile:
+    """Hold a tile and the transform from its map's world to the shared one."""
+
+    tile: Tile
+    world_from_map: Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class SharedWorld:
+    """Hold the tiles of one world, sorted by id.
+
+    For georeferenced tiles it is the atlas world (east-north-up). Otherwise it is a joint world, or
+    a world that several tiles share. `georeference` is None if it is unknown.
+    """
+
+    tiles: tuple[PlacedTile, ...]
+    georeference: Georeference | None
+
+    @staticmethod
+    def group(manifest: Manifest) -> list[SharedWorld]:
+        """Group all tiles by the worlds that they share, the world with most nodes first."""
+        groups: dict[str | None, list[PlacedTile]] = {}
+        for tile in manifest.tiles:
+            joint, pose = tile.in_joint_world, tile.atlas_from_world
+            key, pose = (joint.joint, joint.joint_from_world) if pose is None else (None, pose)
+            groups.setdefault(key, []).append(PlacedTile(tile, pose))
+        origin = manifest.origin
+        on_earth = None if origin is None else Georeference(origin, Rigid3.identity(), "atlas")
+        worlds = [
+            SharedWorld(tuple(group), on_earth if key is None else None)
+            for key, group in groups.items()
+        ]
+        return sorted(worlds, key=lambda world: -world.num_nodes)
+
+    @staticmethod
+    def of_tile(manifest: Manifest, tile: Tile) -> SharedWorld:
+        """Return a tile alone, in the world of its map."""
+        return SharedWorld((PlacedTile(tile, Rigid3.identity()),), manifest.georeference_of(tile))
+
+    @property
+    def num_nodes(self) -> int:
+        """Return the number of nodes of all tiles."""
+        return sum(placed.tile.num_nodes for placed in self.tiles)
+
+    def world_from_map_of(self, tile_id: str | None) -> Rigid3 | None:
+        """Return the transform from a tile's map to this world, None for a tile of another
+        world."""
+        return next(
+            (placed.world_from_map for placed in self.tiles if placed.tile.tile_id == tile_id), None
+        )
+
+    def open_tiles(
+        self, atlas: Atlas, warn: Callable[[str], None]
+    ) -> Iterator[tuple[PlacedTile, TopoMetricMap]]:
+        """Iterate over tiles with their maps. Each map is open during its iteration. A tile that
+        cannot be read is skipped with a warning.
+
+        Raises AtlasError if no tile can be read, ObjectStoreError if the store does not respond.
+        """
+        num_opened = 0
+        for one in self.tiles:
+            try:
+                topomap = TopoMetricMap.load(atlas.map_path(one.tile))
+            except ObjectStoreError:
+                raise
+            except MapError as error:
+                warn(f"tile {one.tile.tile_id} is left out: {error}")
+                continue
+            num_opened += 1
+            with topomap:
+                yield one, topomap
+        if num_opened == 0:
+            raise AtlasError(f"no tile of the atlas {atlas.store.where} can be read")
+
 
 _MAX_TRIES = 5
 T = TypeVar("T")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -103,10 +104,10 @@ def summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     It contains counts, medians over localized queries, and recall over all queries with ground
     truth.
     """
-    rows = [
-        {"name": name} | _summarize(group) for name, group in group_by_recording(answers).items()
-    ]
-    return _summarize(answers) | {"recordings": rows}
+    groups = group_by_recording(answers).items()
+    return _summarize(answers) | {
+        "recordings": [{"name": name} | _summarize(group) for name, group in groups]
+    }
 
 
 def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
@@ -115,12 +116,10 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     rotation = np.array([a.rotation_deg for a in with_truth])
     localized = np.isfinite(translation)
     ranked = [a for a in with_truth if a.nearest_node_id is not None]
-    first = [a.result.candidates[0].node_id if a.result.candidates else None for a in ranked]
-    hits = [node == a.nearest_node_id for node, a in zip(first, ranked, strict=True)]
-    near = [
-        node == a.nearest_node_id or node in a.neighbour_ids
-        for node, a in zip(first, ranked, strict=True)
-    ]
+    first = [(a, a.result.candidates[0].node_id if a.result.candidates else None) for a in ranked]
+    hits = [node == a.nearest_node_id for a, node in first]
+    near = [node == a.nearest_node_id or node in a.neighbour_ids for a, node in first]
+    reasons = [a.result.reason for a in answers if isinstance(a.result, NotLocalized)]
     stages = sorted({stage for a in answers for stage in a.result.times_ms})
     return {
         "num_queries": len(with_truth),
@@ -139,17 +138,12 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
         "neighbour_accuracy": float(np.mean(near)) if near else None,
         "num_elsewhere": len(answers) - len(with_truth),
         "false_accepts": sum(a.is_false_accept for a in answers),
-        "not_localized": _count_reasons(answers),
+        "not_localized": dict(sorted(Counter(reasons).items())),
         "median_times_ms": {
             stage: _median(np.array([a.result.times_ms.get(stage, 0.0) for a in answers]))
             for stage in stages
         },
     }
-
-
-def _count_reasons(answers: list[EvaluatedQuery]) -> dict[str, int]:
-    reasons = [a.result.reason for a in answers if isinstance(a.result, NotLocalized)]
-    return {reason: reasons.count(reason) for reason in sorted(set(reasons))}
 
 
 def _median(values: np.ndarray) -> float | None:

@@ -18,11 +18,11 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int8
+from jaxtyping import Bool, Float, Int
 
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.mapping.storage.entries import LazySequence
-from topoloc.mapping.storage.point_encoding import dequantize_descriptors
+from topoloc.mapping.storage.point_encoding import dequantize_descriptors, quantize_descriptors
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 
 # A node counts as quantized if the median norm of its stored descriptors is at most this many times
@@ -62,28 +62,20 @@ def quantize_map_descriptors(topomap: TopoMetricMap, step: float) -> TopoMetricM
 def quantize_node_descriptors(node: TopoNode, step: float) -> TopoNode:
     """Return the node with its descriptors quantized, or the same node if they are quantized
     already. `step` is in root mean squares of a descriptor's numbers."""
-    stored = node.stored_descriptors
-    if len(node.features) == 0 or (
-        stored is not None
-        and _median_norm(stored) <= _MAX_NORM_RATIO * np.sqrt(stored.shape[1]) / step
-    ):
+    stored, descriptors = node.stored_descriptors, node.features.descriptors
+    scale = np.sqrt(descriptors.shape[1]) / step
+    if stored is not None and len(stored) > 0:
+        norms = np.linalg.norm(stored.astype(np.float32), axis=1)
+        if np.median(norms) <= _MAX_NORM_RATIO * scale:
+            return node
+    if len(descriptors) == 0:
         return node
-    rounded = _quantize(node.features.descriptors, step)
+    rounded = quantize_descriptors(descriptors, scale)
     return replace(
         node,
         features=replace(node.features, descriptors=dequantize_descriptors(rounded)),
         stored_descriptors=rounded,
     )
-
-
-def _quantize(descriptors: Float32[np.ndarray, "n d"], step: float) -> Int8[np.ndarray, "n d"]:
-    """Quantize descriptors of length 1 to signed bytes."""
-    steps = np.rint(descriptors * (np.sqrt(descriptors.shape[1]) / step))
-    return np.clip(steps, -127, 127).astype(np.int8)
-
-
-def _median_norm(stored: Int8[np.ndarray, "n d"]) -> float:
-    return float(np.median(np.linalg.norm(stored.astype(np.float32), axis=1)))
 
 
 def select_landmarks(node: TopoNode, kept: Int[np.ndarray, " k"]) -> TopoNode:

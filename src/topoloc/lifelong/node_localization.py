@@ -16,7 +16,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
@@ -84,17 +83,14 @@ def localize_left_out(
             query = QueryImage.of_features(features, node.camera)
             result, *_ = localizer.without(hidden).localize_query(query)
             if isinstance(result, Localization):
-                answers[row] = _evaluate_result(result, node.summary.world_from_cam)
+                limits = MAX_TRANSLATION, np.radians(MAX_ROTATION_DEG)
+                pose = node.summary.world_from_cam
+                is_same = pose.is_same(result.world_from_cam, *limits)
+                num_inliers = result.num_inliers if is_same else 0
+                answers[row] = LeaveOneOutResult(is_same, not is_same, num_inliers)
         if progress is not None:
             progress(done + 1, len(rows))
     return answers
-
-
-def _evaluate_result(result: Localization, world_from_cam: Rigid3) -> LeaveOneOutResult:
-    is_wrong = not world_from_cam.is_same(
-        result.world_from_cam, MAX_TRANSLATION, np.radians(MAX_ROTATION_DEG)
-    )
-    return LeaveOneOutResult(not is_wrong, is_wrong, 0 if is_wrong else result.num_inliers)
 
 
 def localize_nodes(

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Int
 
 from topoloc.mapping.node_drafts import observe_node
-from topoloc.mapping.nodes import NearestNodeSearch
+from topoloc.mapping.nodes import find_nearest_nodes
 from topoloc.mapping.storage.entries import LazySequence
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes
@@ -49,11 +49,13 @@ def compute_node_support(topomap: TopoMetricMap, num_compared: int) -> NodeSuppo
     Raises:
         MapError: a node cannot be read.
     """
-    nearest = NearestNodeSearch(topomap.node_poses, topomap.config.lambda_rot)
+    poses, lambda_rot = topomap.node_poses, topomap.config.lambda_rot
     count = min(num_compared + 1, len(topomap.summaries))
-    supporters = np.array(
-        [nearest.rows(summary.world_from_cam, count) for summary in topomap.summaries], np.int64
-    )
+    nearest = [
+        find_nearest_nodes(summary.world_from_cam, poses, lambda_rot, count)
+        for summary in topomap.summaries
+    ]
+    supporters = np.array(nearest, np.int64)
     landmarks = np.zeros(supporters.shape, np.int64)
     for layer in topomap.layers.values():
         nodes = layer.nodes

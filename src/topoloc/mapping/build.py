@@ -40,7 +40,7 @@ from topoloc.mapping.node_drafts import (
     finish_node,
     observe_draft,
 )
-from topoloc.mapping.nodes import NearestNodeSearch, NodeConfig, NodePoses, select_node_frames
+from topoloc.mapping.nodes import NodeConfig, NodePoses, find_nearest_nodes, select_node_frames
 from topoloc.mapping.sessions import Edit, Illumination, Session, today
 from topoloc.mapping.storage.entries import PlaceImage, TopoNode
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
@@ -195,7 +195,7 @@ def _process_mapping_images(
         )
         for kind in config.kinds
     }
-    nodes = NearestNodeSearch(NodePoses.of(drafts.world_from_nodes), config.lambda_rot)
+    nodes = NodePoses.of(drafts.world_from_nodes)
     images, lights = list[PlaceImage](), list[Illumination]()
     vlads = {kind: DiskList[np.ndarray]() for kind in config.kinds}
     cells = {kind: [] for kind in config.kinds}
@@ -226,7 +226,7 @@ def _observe_image(
     frame: MappingFrame,
     read: StereoFrame | None,
     drafts: NodeDrafts,
-    nodes: NearestNodeSearch,
+    nodes: NodePoses,
     words: dict[str, Float32[np.ndarray, "k d"]],
     config: BuildConfig,
 ) -> tuple[MappingImage, Row, dict[Row, dict[str, Observations]], dict[str, np.ndarray]]:
@@ -241,7 +241,8 @@ def _observe_image(
         if read is None
         else extract_mapping_image(frame, prepare_view(read, with_depth=False), config)
     )
-    nearest = as_rows(nodes.rows(image.world_from_cam, NODES_PER_IMAGE))
+    pose, lambda_rot = image.world_from_cam, config.lambda_rot
+    nearest = as_rows(find_nearest_nodes(pose, nodes, lambda_rot, NODES_PER_IMAGE))
     around = {row: drafts.disk_list[row] for row in nearest}
     observed = {
         row: observe_draft(draft, image, frame.session_id)

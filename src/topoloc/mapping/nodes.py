@@ -99,30 +99,22 @@ def select_node_frames(
     return np.array(frame_idx)
 
 
-class NearestNodeSearch:
-    """Find the nodes nearest to a camera by Eq. 1. The distance in metres is a lower bound, so only
-    a few nodes are compared."""
-
-    def __init__(self, poses: NodePoses, lambda_rot: float) -> None:
-        self._poses, self._lambda_rot = poses, lambda_rot
-
-    def rows(self, world_from_cam: Rigid3, count: int) -> Int[np.ndarray, " nodes"]:
-        """Return the rows of up to `count` nodes, the nearest first. Ties keep the order of
-        rows."""
-        metres = np.linalg.norm(self._poses.centres - world_from_cam.translation, axis=1)
-        num_checked = 8 * count
-        while True:
-            is_all = num_checked >= len(metres)
-            rows = (
-                np.arange(len(metres))
-                if is_all
-                else np.sort(np.argpartition(metres, num_checked)[:num_checked])
-            )
-            distances = node_distances(world_from_cam, self._poses.rows(rows), self._lambda_rot)
-            order = np.argsort(distances, kind="stable")[:count]
-            if is_all or distances[order[-1]] < metres[rows].max():
-                return rows[order]
-            num_checked *= 4
+def find_nearest_nodes(
+    world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float, count: int
+) -> Int[np.ndarray, " nearest"]:
+    """Return the rows of up to `count` nodes nearest to a camera by Eq. 1, the nearest first. Ties
+    keep the order of rows. The distance in metres is a lower bound, so only a few are compared."""
+    metres = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
+    num_checked = 8 * count
+    while True:
+        is_all = num_checked >= len(metres)
+        near = slice(None) if is_all else np.argpartition(metres, num_checked)[:num_checked]
+        rows = np.sort(np.arange(len(metres))[near])
+        distances = node_distances(world_from_cam, nodes.rows(rows), lambda_rot)
+        order = np.argsort(distances, kind="stable")[:count]
+        if is_all or distances[order[-1]] < metres[rows].max():
+            return rows[order]
+        num_checked *= 4
 
 
 def compute_nodes_digest(summaries: Sequence[NodeSummary], method: bytes) -> str:

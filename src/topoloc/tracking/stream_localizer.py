@@ -45,6 +45,11 @@ class LocalizedPose:
     errors: PoseErrors
     probability: float
 
+    def as_candidate(self, more: Float[np.ndarray, "6 6"]) -> Candidate:
+        """Return the pose for the hypotheses, with more covariance."""
+        pose, node_id = self.result.world_from_cam, self.result.node_id
+        return Candidate(pose, self.errors.total + more, self.probability, node_id)
+
 
 class StreamLocalizer:
     """Run the localizer and update the hypotheses with its result."""
@@ -68,13 +73,19 @@ class StreamLocalizer:
                 if not expected.is_from_virtual_views:
                     self._hypotheses.update_weights(frame.t_ns, [])
                 return refusal
-        if len(found) != 1 or not self._is_consistent(found[0], pose_covariance):
+        candidates, best = (
+            [one.as_candidate(pose_covariance) for one in found],
+            self._hypotheses.best,
+        )
+        if (
+            len(candidates) != 1
+            or best is None
+            or not self._hypotheses.is_consistent(
+                best, candidates[0].world_from_cam, candidates[0].covariance
+            )
+        ):
             refusal, found = self._localize_globally(frame)
-        candidates = list[Candidate]()
-        for one in found:
-            pose, node_id = one.result.world_from_cam, one.result.node_id
-            covariance = one.errors.total + pose_covariance
-            candidates.append(Candidate(pose, covariance, one.probability, node_id))
+            candidates = [one.as_candidate(pose_covariance) for one in found]
         new_evidence_ratio = self._compute_new_evidence(found)
         self._hypotheses.update_weights(
             frame.t_ns, candidates, frame.odom_from_cam, new_evidence_ratio
@@ -129,14 +140,6 @@ class StreamLocalizer:
             replace(one, probability=one.probability * share / len(known))
             for one, share in zip(known, shares, strict=True)
         ]
-
-    def _is_consistent(
-        self, found: LocalizedPose, pose_covariance: Float[np.ndarray, "6 6"]
-    ) -> bool:
-        best = self._hypotheses.best
-        return best is not None and self._hypotheses.is_consistent(
-            best, found.result.world_from_cam, found.errors.total + pose_covariance
-        )
 
     def _query_localizer(
         self, frame: StreamFrame, near: Rigid3 | None

@@ -18,7 +18,7 @@ from topoloc.apps.viewer.world_document import create_world_document, transform_
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, create_atlas
 from topoloc.atlas.joins import Join
-from topoloc.atlas.shared_world import SharedWorld
+from topoloc.atlas.place import SharedWorld
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization

@@ -46,7 +46,7 @@ def node_to_arrays(node: TopoNode, kind: str) -> list[np.ndarray]:
     """Return the node's arrays for the file, in the order of the table's columns."""
     f = node.features
     shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
-    descriptors = _quantize_descriptors(node, find_feature_type(kind).descriptor_scale)
+    descriptors = _stored_or_quantized(node, find_feature_type(kind).descriptor_scale)
     return [
         f.points_img.astype("<f4"),
         shapes,
@@ -113,7 +113,14 @@ def dequantize_descriptors(stored: Int8[np.ndarray, "n d"]) -> Float32[np.ndarra
     return descriptors
 
 
-def _quantize_descriptors(node: TopoNode, scale: float) -> Int8[np.ndarray, "n d"]:
+def quantize_descriptors(
+    descriptors: Float32[np.ndarray, "n d"], scale: float
+) -> Int8[np.ndarray, "n d"]:
+    """Return descriptors of length 1, times `scale`, as signed bytes."""
+    return np.clip(np.rint(descriptors * scale), -127, 127).astype(np.int8)
+
+
+def _stored_or_quantized(node: TopoNode, scale: float) -> Int8[np.ndarray, "n d"]:
     """Return the descriptors as signed bytes. A node read from a file keeps the bytes of the
     file."""
     descriptors, stored = node.features.descriptors, node.stored_descriptors
@@ -123,7 +130,7 @@ def _quantize_descriptors(node: TopoNode, scale: float) -> Int8[np.ndarray, "n d
         and np.array_equal(dequantize_descriptors(stored), descriptors)
     ):
         return stored
-    return np.clip(np.rint(descriptors * scale), -127, 127).astype(np.int8)
+    return quantize_descriptors(descriptors, scale)
 
 
 def model_from_row(row: Mapping[str, Any]) -> CoarseModel:
