@@ -34,22 +34,22 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 # The figures of `python tools/house.py .` (`--help` has the rule of each). A ceiling only goes
 # down, unless an issue grants an allowance. The goals stand behind the ceilings.
 CEILINGS = {
-    "lines.core": 41135,  # goal 30000
-    "lines.apps": 16899,  # goal 15500
-    "statements.core": 18057,  # goal 13500
-    "statements.apps": 8362,  # goal 7500
-    "files_over_300": 32,  # goal 20
-    "functions_over_45": 14,  # goal 15
+    "lines.core": 39295,  # goal 30000
+    "lines.apps": 16890,  # goal 15500
+    "statements.core": 17966,  # goal 13500
+    "statements.apps": 8359,  # goal 7500
+    "files_over_300": 20,  # goal 20
+    "functions_over_45": 10,  # goal 15
     "folders_over_20": 0,  # goal 0
-    "one_importer": 97,  # goal 50
+    "one_importer": 86,  # goal 50
     "apps.deep_names": 0,  # goal 0
     "apps.public_names": 146,  # goal: at most 120
-    "asserts.sum": 69,  # goal 40
+    "asserts.sum": 42,  # goal 40
     "branches.map_or_atlas": 0,
-    "branches.walls": 23,  # goal 0
-    "constants.all": 453,  # goal 474, localization 25
+    "branches.walls": 22,  # goal 0
+    "constants.all": 450,  # goal 474, localization 25
     "constants.core/localization": 50,
-    "user_docs_bytes": 142629,  # goal 150000
+    "user_docs_bytes": 142625,  # goal 150000
     "readme_lines": 150,  # goal 150
     "architecture_lines": 110,  # goal 110
 }

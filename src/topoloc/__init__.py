@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from topoloc.apps.service.client import AsyncClient, Client
     from topoloc.apps.viewer.page import view
     from topoloc.atlas.atlas import Atlas
-    from topoloc.atlas.location_prior import AtlasConfig, GeoPositionPrior
+    from topoloc.atlas.config import AtlasConfig
+    from topoloc.atlas.location_prior import GeoPositionPrior
     from topoloc.atlas.manifest import Tile
     from topoloc.atlas.map_cache import MapCache
     from topoloc.atlas.place import SharedWorld, SingleMap, open_place
@@ -211,7 +212,7 @@ _MODULES = {
     "Alternative": "topoloc.localization.result",
     "AsyncClient": "topoloc.apps.service.client",
     "Atlas": "topoloc.atlas.atlas",
-    "AtlasConfig": "topoloc.atlas.location_prior",
+    "AtlasConfig": "topoloc.atlas.config",
     "AtlasError": "topoloc.errors",
     "BuildConfig": "topoloc.mapping.build",
     "CalibrationError": "topoloc.errors",

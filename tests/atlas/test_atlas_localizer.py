@@ -12,8 +12,8 @@ import pytest
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.editing import add_tiles, new_tiles
-from topoloc.atlas.location_prior import AtlasConfig
 from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference

@@ -10,7 +10,7 @@ import pytest
 from msgspec import structs
 
 from topoloc.atlas.atlas import Atlas
-from topoloc.atlas.location_prior import AtlasConfig
+from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.manifest import Manifest, PlacesFile, StoredFile, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.store import FolderStore

@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from topoloc.atlas.location_prior import AtlasConfig
+from topoloc.atlas.config import AtlasConfig
 from topoloc.bounds import check_bounds
 from topoloc.errors import AtlasError
 from topoloc.geometry.camera import Camera

@@ -93,10 +93,8 @@ class PoseHypotheses:
         return not self._ranked or self.alternatives()[0].probability >= min_probability
 
     def alternatives(self) -> tuple[Alternative, ...]:
-        """Return the poses at the current image, likeliest first.
-
-        Hypotheses with the same pose and different velocities are merged.
-        """
+        """Return the poses at the current image, likeliest first. Hypotheses with the same pose
+        and different velocities are merged."""
         found = list[Alternative]()
         for one in self._ranked:
             pose = one.current.world_from_cam
@@ -147,6 +145,11 @@ class PoseHypotheses:
             world_from_cam, covariance=gate, max_square=max_surprise
         )
 
+    def is_expected(self, candidate: Candidate) -> bool:
+        """Return whether a pose is consistent with the best hypothesis."""
+        best, pose = self.best, candidate.world_from_cam
+        return best is not None and self.is_consistent(best, pose, candidate.covariance)
+
     def _gate_covariance(
         self, predicted: MotionState, covariance: Float[np.ndarray, "6 6"]
     ) -> Float[np.ndarray, "6 6"]:
@@ -158,10 +161,8 @@ class PoseHypotheses:
         covariance: Float[np.ndarray, "6 6"],
         odom_from_cam: Rigid3 | None,
     ) -> None:
-        """Update all hypotheses with tracked points.
-
-        The points measure the best hypothesis at this pose. The others move by the same motion.
-        """
+        """Update all hypotheses with tracked points. The points measure the best hypothesis at
+        this pose. The others move by the same motion."""
         self._ranked = [
             one.measured(
                 update_motion(one.current, one.from_best @ world_from_cam, covariance),

@@ -73,17 +73,8 @@ class StreamLocalizer:
                 if not expected.is_from_virtual_views:
                     self._hypotheses.update_weights(frame.t_ns, [])
                 return refusal
-        candidates, best = (
-            [one.as_candidate(pose_covariance) for one in found],
-            self._hypotheses.best,
-        )
-        if (
-            len(candidates) != 1
-            or best is None
-            or not self._hypotheses.is_consistent(
-                best, candidates[0].world_from_cam, candidates[0].covariance
-            )
-        ):
+        candidates = [one.as_candidate(pose_covariance) for one in found]
+        if len(candidates) != 1 or not self._hypotheses.is_expected(candidates[0]):
             refusal, found = self._localize_globally(frame)
             candidates = [one.as_candidate(pose_covariance) for one in found]
         new_evidence_ratio = self._compute_new_evidence(found)

@@ -39,7 +39,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         (*_QUERY_COMMANDS, "update", "merge"),
     ),
     "atlas": (
-        "topoloc.atlas.location_prior",
+        "topoloc.atlas.config",
         "AtlasConfig",
         ("localize", "evaluate", "explain", "serve", "follow", "update"),
     ),

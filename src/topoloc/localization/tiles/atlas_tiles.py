@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 from msgspec import structs
 
 from topoloc.atlas.atlas import Atlas
+from topoloc.atlas.config import AtlasConfig
 from topoloc.atlas.joins import sigmas_at
-from topoloc.atlas.location_prior import AtlasConfig, LocationPrior, tiles_in_reach
+from topoloc.atlas.location_prior import LocationPrior, tiles_in_reach
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError, MapError, MissingExtraError, WeightsError

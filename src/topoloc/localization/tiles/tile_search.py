@@ -19,7 +19,7 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from topoloc.atlas.location_prior import AtlasConfig
+from topoloc.atlas.config import AtlasConfig
 from topoloc.errors import AtlasError, MapError, ObjectStoreError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_context import MapContext
