@@ -57,7 +57,7 @@ FLOORS = {"documented %": 90, "typed %": 95}
 # Modules of topoloc, and how many of OpenCV, Numba, torch, FAISS and ONNX Runtime, that are loaded
 # in a fresh process after an import.
 REACH = {
-    "localizer": (81, 3),  # goal 60
+    "localizer": (80, 3),  # goal 60
     "result": (10, 0),  # goal 10, 0
     "map": (20, 0),  # goal 20
     "client": (11, 0),  # goal 10, 0
