@@ -36,10 +36,10 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 CEILINGS = {
     "lines.core": 39295,  # goal 30000
     "lines.apps": 16890,  # goal 15500
-    "statements.core": 17966,  # goal 13500
+    "statements.core": 17964,  # goal 13500
     "statements.apps": 8359,  # goal 7500
     "files_over_300": 20,  # goal 20
-    "functions_over_45": 10,  # goal 15
+    "functions_over_45": 9,  # goal 15
     "folders_over_20": 0,  # goal 0
     "one_importer": 86,  # goal 50
     "apps.deep_names": 0,  # goal 0

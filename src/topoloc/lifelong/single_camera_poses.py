@@ -57,33 +57,12 @@ def estimate_poses_by_map(
     # A frame without odometry takes the map's pose if its position sigma is at most this many
     # D_thresh.
     max_sigma = 0.1
-    by_map, localized = dict[int, Rigid3](), dict[int, Localization]()
-    results = list[Localization | NotLocalized]()
-    odometry = MonocularOdometry()
-    for index, t_ns in enumerate(sequence.t_ns):
-        frame = sequence[index]
-        if frame.camera is None:
-            raise CalibrationError(
-                f"{sequence.name}: a session that the map is asked for needs a calibration"
-                " (--camera)"
-            )
-        odometry.process(index, frame)
-        found = tracker.process(frame.image, frame.camera, t_ns)
-        results.append(found.result)
-        if found.smoothed is not None and isinstance(found.result, Localization):
-            by_map[index], localized[index] = found.smoothed, found.result
-        progress(f"localizing {sequence.name}", index + 1, len(sequence))
-    check_calibration(sequence.name, results)
-    if len(by_map) < MIN_AGREEING:
-        check_focal_length(sequence, range(len(sequence)), tracker.localizer)
-        raise TrajectoryError(
-            f"{sequence.name}: the map recognises {len(by_map)} of its {len(sequence)} pictures:"
-            " too few to join"
-        )
+    found, odometry = _localize_stream(sequence, tracker, progress)
     d_thresh = map_config.d_thresh
+    localized = {index: answer for index, (_, answer) in found.items()}
     poses = {
-        index: by_map[index]
-        for index, answer in localized.items()
+        index: pose
+        for index, (pose, answer) in found.items()
         if answer.position_sigma_m <= max_sigma * d_thresh
     }
     for stretch in odometry.submaps:
@@ -116,6 +95,36 @@ def estimate_poses_by_map(
     return SessionPoses(
         poses, answers, [index for index in queried if index in localized], propagated_idx
     )
+
+
+def _localize_stream(
+    sequence: StereoSequence, tracker: Tracker, progress: Progress
+) -> tuple[dict[int, tuple[Rigid3, Localization]], MonocularOdometry]:
+    """Return the smoothed pose and the localization of each localized frame, and the odometry of
+    all frames. Raises as `estimate_poses_by_map`."""
+    localized = dict[int, tuple[Rigid3, Localization]]()
+    odometry, results = MonocularOdometry(), list[Localization | NotLocalized]()
+    for index, t_ns in enumerate(sequence.t_ns):
+        frame = sequence[index]
+        if frame.camera is None:
+            raise CalibrationError(
+                f"{sequence.name}: a session that the map is asked for needs a calibration"
+                " (--camera)"
+            )
+        odometry.process(index, frame)
+        found = tracker.process(frame.image, frame.camera, t_ns)
+        results.append(found.result)
+        if found.smoothed is not None and isinstance(found.result, Localization):
+            localized[index] = found.smoothed, found.result
+        progress(f"localizing {sequence.name}", index + 1, len(sequence))
+    check_calibration(sequence.name, results)
+    if len(localized) < MIN_AGREEING:
+        check_focal_length(sequence, range(len(sequence)), tracker.localizer)
+        raise TrajectoryError(
+            f"{sequence.name}: the map recognises {len(localized)} of its {len(sequence)} pictures:"
+            " too few to join"
+        )
+    return localized, odometry
 
 
 def _failure_reason(localized: Mapping[int, Localization]) -> str:

@@ -223,7 +223,8 @@ def _assess_node(
         reasons.append("few_landmarks")
     if not has_opposite_view:
         reasons.append("one_direction")
-    if seen_share < min_seen_share and not _has_other_session(topomap, row, stood_by):
+    beside = (topomap.summaries[k].session_id for k in find_near_nodes(topomap, row, stood_by))
+    if seen_share < min_seen_share and all(one == summary.session_id for one in beside):
         reasons.append("single_session")
     return NodeQuality(
         summary.node_id,
@@ -244,13 +245,6 @@ def _seen_share(node: TopoNode) -> float:
         if one.session_id != node.summary.session_id:
             seen[one.rows[one.seen > 0]] = True
     return float(seen.mean()) if len(seen) else 0.0
-
-
-def _has_other_session(topomap: TopoMetricMap, row: Row, num_d_thresh: float) -> bool:
-    """Return whether a node of another session is within `num_d_thresh` times D_thresh."""
-    session_id = topomap.summaries[row].session_id
-    near = find_near_nodes(topomap, row, num_d_thresh)
-    return any(topomap.summaries[other].session_id != session_id for other in near)
 
 
 def _has_opposite_view(

@@ -111,13 +111,15 @@ class Tracker:
     def _process_in_tile(
         self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None
     ) -> StreamedPose:
-        """Process the image in the tracked tile. If it gives no pose, search the other tiles."""
+        """Process the image in the tracked tile. If it has given no pose for long, search the other
+        tiles."""
         answer = None
         if self._stream is not None:
             answer = self._stream.process(image, camera, t_ns, odom_from_cam)
             if answer.state in _LOCALIZED_STATES:
                 self._last_localized_ns = t_ns
-            if not self._is_search_due(t_ns):
+            last = max(self._last_localized_ns, self._last_search_ns)
+            if len(self.localizer.tile_ids) == 1 or t_ns - last < _SEARCH_INTERVAL_NS:
                 return answer
         self._last_search_ns = t_ns
         result = self.localizer.localize(image, camera, t_ns=t_ns)
@@ -127,11 +129,6 @@ class Tracker:
             )
         self._last_localized_ns = t_ns
         return self._enter_tile(result.provenance.tile).process(image, camera, t_ns, odom_from_cam)
-
-    def _is_search_due(self, t_ns: int) -> bool:
-        """Return whether the stream has had no pose for so long that other tiles are searched."""
-        last = max(self._last_localized_ns, self._last_search_ns)
-        return len(self.localizer.tile_ids) > 1 and t_ns - last >= _SEARCH_INTERVAL_NS
 
     def _enter_tile(self, tile_id: str | None) -> MapStream:
         """Start the stream in this tile. Its map stays open."""
