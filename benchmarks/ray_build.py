@@ -25,7 +25,7 @@ from pathlib import Path
 from ray.cluster_utils import Cluster
 
 from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
-from topoloc.apps.cluster.tiles import AtlasBuild, Outcome, TileJob, build_on_ray, derive_tile_ids
+from topoloc.apps.cluster.tiles import Outcome, TileJob, build_on_ray, derive_tile_ids
 from topoloc.atlas.atlas import Atlas
 from topoloc.mapping.build import BuildConfig
 
@@ -120,7 +120,7 @@ def on_cluster(
         for _ in range(num_nodes - 1):
             cluster.add_node(**node)
         watch = Watch()
-        outcomes = build_on_ray(AtlasBuild(jobs, atlas), cluster.address)
+        outcomes = build_on_ray(jobs, atlas, cluster.address)
         return outcomes, watch.ended()
     finally:
         cluster.shutdown()

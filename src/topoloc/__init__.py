@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from topoloc.atlas.manifest import Tile
     from topoloc.atlas.map_cache import MapCache
     from topoloc.atlas.place import SharedWorld, SingleMap, open_place
-    from topoloc.atlas.tile_fetcher import TileFetcher
     from topoloc.compiled import set_num_threads
     from topoloc.errors import (
         AtlasError,
@@ -72,7 +71,7 @@ if TYPE_CHECKING:
     from topoloc.localization.image_calibration_check import check_camera_calibrations
     from topoloc.localization.localizer import Localizer, LocalizerConfig
     from topoloc.localization.map_facts.contradictions import check_map
-    from topoloc.localization.map_facts.map_building import SkippedChecks, build_map
+    from topoloc.localization.map_facts.map_building import build_map
     from topoloc.localization.provenance import Provenance
     from topoloc.localization.result import (
         Alternative,
@@ -152,14 +151,12 @@ __all__ = [
     "ServiceError",
     "SharedWorld",
     "SingleMap",
-    "SkippedChecks",
     "SlamResult",
     "StereoFrame",
     "StereoRig",
     "StereoSequence",
     "StreamedPose",
     "Tile",
-    "TileFetcher",
     "TopoMetricMap",
     "TopoNode",
     "TopolocError",
@@ -208,107 +205,66 @@ __all__ = [
     "with_trajectory",
 ]
 
-_MODULES = {
-    "Alternative": "topoloc.localization.result",
-    "AsyncClient": "topoloc.apps.service.client",
-    "Atlas": "topoloc.atlas.atlas",
-    "AtlasConfig": "topoloc.atlas.config",
-    "AtlasError": "topoloc.errors",
-    "BuildConfig": "topoloc.mapping.build",
-    "CalibrationError": "topoloc.errors",
-    "Camera": "topoloc.geometry.camera",
-    "Client": "topoloc.apps.service.client",
-    "ClusterError": "topoloc.errors",
-    "ConfigError": "topoloc.errors",
-    "DepthImage": "topoloc.recordings.frame",
-    "DuplicateSessionError": "topoloc.errors",
-    "EvaluatedQuery": "topoloc.evaluation.metrics",
-    "Evaluation": "topoloc.evaluation.query_localization",
-    "FeatureTypeError": "topoloc.errors",
-    "GeoPoint": "topoloc.geometry.geodesy",
-    "GeoPose": "topoloc.geometry.geodesy",
-    "GeoPositionPrior": "topoloc.atlas.location_prior",
-    "Georeference": "topoloc.geometry.geodesy",
-    "GeoreferenceError": "topoloc.errors",
-    "GeoreferenceResult": "topoloc.mapping.georeference",
-    "Illumination": "topoloc.mapping.sessions",
-    "Image": "topoloc.recordings.frame",
-    "Localization": "topoloc.localization.result",
-    "Localizer": "topoloc.localization.localizer",
-    "LocalizerConfig": "topoloc.localization.localizer",
-    "MapCache": "topoloc.atlas.map_cache",
-    "MapError": "topoloc.errors",
-    "MapNotFoundError": "topoloc.errors",
-    "MapUpdate": "topoloc.lifelong.update",
-    "MemorySequence": "topoloc.recordings.memory_sequence",
-    "MissingExtraError": "topoloc.errors",
-    "NodeQuality": "topoloc.lifelong.weak_regions",
-    "NotLocalized": "topoloc.localization.result",
-    "ObjectStoreError": "topoloc.errors",
-    "PairResult": "topoloc.lifelong.tiles.tile_joining",
-    "PoseConventions": "topoloc.geometry.pose_conventions",
-    "Provenance": "topoloc.localization.provenance",
-    "QueryError": "topoloc.errors",
-    "RecordingError": "topoloc.errors",
-    "ResultError": "topoloc.errors",
-    "Rigid3": "topoloc.geometry.rigid",
-    "ServiceError": "topoloc.errors",
-    "SharedWorld": "topoloc.atlas.place",
-    "SingleMap": "topoloc.atlas.place",
-    "SkippedChecks": "topoloc.localization.map_facts.map_building",
-    "SlamResult": "topoloc.slam.slam",
-    "StereoFrame": "topoloc.recordings.frame",
-    "StereoRig": "topoloc.geometry.rig",
-    "StereoSequence": "topoloc.recordings.frame",
-    "StreamedPose": "topoloc.tracking.stream_result",
-    "Tile": "topoloc.atlas.manifest",
-    "TileFetcher": "topoloc.atlas.tile_fetcher",
-    "TopoMetricMap": "topoloc.mapping.topomap",
-    "TopoNode": "topoloc.mapping.storage.entries",
-    "TopolocError": "topoloc.errors",
-    "Trace": "topoloc.localization.search",
-    "Tracker": "topoloc.tracking.tracker",
-    "TrackerConfig": "topoloc.tracking.config",
-    "Trajectory": "topoloc.recordings.trajectory",
-    "TrajectoryError": "topoloc.errors",
-    "TriedProposal": "topoloc.localization.search",
-    "UncalibratedCamera": "topoloc.geometry.uncalibrated_camera",
-    "UnreadableImageError": "topoloc.errors",
-    "WeakRegion": "topoloc.lifelong.weak_regions",
-    "WeakRegions": "topoloc.lifelong.weak_regions",
-    "WeightsError": "topoloc.errors",
-    "WorldFit": "topoloc.evaluation.world_alignment",
-    "align_to_trajectory": "topoloc.recordings.trajectory_alignment",
-    "build_map": "topoloc.localization.map_facts.map_building",
-    "check_camera_calibrations": "topoloc.localization.image_calibration_check",
-    "check_map": "topoloc.localization.map_facts.contradictions",
-    "evaluate": "topoloc.evaluation.query_localization",
-    "explain": "topoloc.apps.report.explanation",
-    "export": "topoloc.apps.export.formats",
-    "find_frames_with_truth": "topoloc.evaluation.query_localization",
-    "find_tile_of_recording": "topoloc.lifelong.tiles.tile_joining",
-    "find_weak_regions": "topoloc.lifelong.weak_regions",
-    "georeference": "topoloc.mapping.georeference",
-    "join_tiles": "topoloc.lifelong.tiles.tile_joining",
-    "localize_out_of_map": "topoloc.evaluation.query_localization",
-    "localize_queries": "topoloc.evaluation.query_localization",
-    "merge": "topoloc.lifelong.merge",
-    "open_place": "topoloc.atlas.place",
-    "open_sequence": "topoloc.recordings.open",
-    "prune": "topoloc.lifelong.prune",
-    "read_depth": "topoloc.recordings.image_io",
-    "read_history": "topoloc.mapping.edit",
-    "read_image": "topoloc.recordings.image_io",
-    "result_from_json": "topoloc.localization.result",
-    "run_slam": "topoloc.slam.slam",
-    "set_num_threads": "topoloc.compiled",
-    "undo_edit": "topoloc.mapping.edit",
-    "update": "topoloc.lifelong.update",
-    "view": "topoloc.apps.viewer.page",
-    "warm_up": "topoloc.tracking.warm_up",
-    "with_pose_conventions": "topoloc.recordings.trajectory",
-    "with_trajectory": "topoloc.recordings.trajectory",
+_NAMES = {
+    "topoloc.apps.export.formats": "export",
+    "topoloc.apps.report.explanation": "explain",
+    "topoloc.apps.service.client": "AsyncClient Client",
+    "topoloc.apps.viewer.page": "view",
+    "topoloc.atlas.atlas": "Atlas",
+    "topoloc.atlas.config": "AtlasConfig",
+    "topoloc.atlas.location_prior": "GeoPositionPrior",
+    "topoloc.atlas.manifest": "Tile",
+    "topoloc.atlas.map_cache": "MapCache",
+    "topoloc.atlas.place": "SharedWorld SingleMap open_place",
+    "topoloc.compiled": "set_num_threads",
+    "topoloc.errors": (
+        "AtlasError CalibrationError ClusterError ConfigError DuplicateSessionError "
+        "FeatureTypeError GeoreferenceError MapError MapNotFoundError MissingExtraError "
+        "ObjectStoreError QueryError RecordingError ResultError ServiceError TopolocError "
+        "TrajectoryError UnreadableImageError WeightsError"
+    ),
+    "topoloc.evaluation.metrics": "EvaluatedQuery",
+    "topoloc.evaluation.query_localization": (
+        "Evaluation evaluate find_frames_with_truth localize_out_of_map localize_queries"
+    ),
+    "topoloc.evaluation.world_alignment": "WorldFit",
+    "topoloc.geometry.camera": "Camera",
+    "topoloc.geometry.geodesy": "GeoPoint GeoPose Georeference",
+    "topoloc.geometry.pose_conventions": "PoseConventions",
+    "topoloc.geometry.rig": "StereoRig",
+    "topoloc.geometry.rigid": "Rigid3",
+    "topoloc.geometry.uncalibrated_camera": "UncalibratedCamera",
+    "topoloc.lifelong.merge": "merge",
+    "topoloc.lifelong.prune": "prune",
+    "topoloc.lifelong.tiles.tile_joining": "PairResult find_tile_of_recording join_tiles",
+    "topoloc.lifelong.update": "MapUpdate update",
+    "topoloc.lifelong.weak_regions": "NodeQuality WeakRegion WeakRegions find_weak_regions",
+    "topoloc.localization.image_calibration_check": "check_camera_calibrations",
+    "topoloc.localization.localizer": "Localizer LocalizerConfig",
+    "topoloc.localization.map_facts.contradictions": "check_map",
+    "topoloc.localization.map_facts.map_building": "build_map",
+    "topoloc.localization.provenance": "Provenance",
+    "topoloc.localization.result": "Alternative Localization NotLocalized result_from_json",
+    "topoloc.localization.search": "Trace TriedProposal",
+    "topoloc.mapping.build": "BuildConfig",
+    "topoloc.mapping.edit": "read_history undo_edit",
+    "topoloc.mapping.georeference": "GeoreferenceResult georeference",
+    "topoloc.mapping.sessions": "Illumination",
+    "topoloc.mapping.storage.entries": "TopoNode",
+    "topoloc.mapping.topomap": "TopoMetricMap",
+    "topoloc.recordings.frame": "DepthImage Image StereoFrame StereoSequence",
+    "topoloc.recordings.image_io": "read_depth read_image",
+    "topoloc.recordings.memory_sequence": "MemorySequence",
+    "topoloc.recordings.open": "open_sequence",
+    "topoloc.recordings.trajectory": "Trajectory with_pose_conventions with_trajectory",
+    "topoloc.recordings.trajectory_alignment": "align_to_trajectory",
+    "topoloc.slam.slam": "SlamResult run_slam",
+    "topoloc.tracking.config": "TrackerConfig",
+    "topoloc.tracking.stream_result": "StreamedPose",
+    "topoloc.tracking.tracker": "Tracker",
+    "topoloc.tracking.warm_up": "warm_up",
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
@@ -318,8 +274,7 @@ def __getattr__(name: str) -> Any:
         return version("topoloc")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_MODULES[name]), name)
-    globals()[name] = value
+    globals()[name] = value = getattr(importlib.import_module(_MODULES[name]), name)
     return value
 
 

@@ -11,7 +11,7 @@ import json
 import math
 import re
 from collections.abc import Collection, Iterator
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 from numbers import Integral, Real
@@ -196,9 +196,13 @@ def field_bounds(kind: Any) -> list[Bound]:
     )
 
 
-def describe_range(kind: Any) -> str:
-    """Return the values that an annotation allows, for a comment in a file of settings: its choices
+def describe_ranges(config: type) -> dict[str, str]:
+    """Return the values that each field of a dataclass allows, for a file of settings: its choices
     or its bounds; empty if it has none."""
+    return {name: _describe_range(kind) for name, kind in field_annotations(config).items()}
+
+
+def _describe_range(kind: Any) -> str:
     plain, _ = strip_annotation(kind)
     if get_origin(plain) is Literal:
         choices = [
@@ -216,6 +220,24 @@ def strip_annotation(kind: Any) -> tuple[Any, bool]:
         others = [choice for choice in get_args(kind) if choice is not NoneType]
         return (others[0] if len(others) == 1 else Union[tuple(others)]), NoneType in get_args(kind)  # noqa: UP007
     return kind, False
+
+
+def with_setting(config: T, key: str, value: Any) -> T:
+    """Return the configuration with another value of one setting.
+
+    Args:
+        key: path of the setting, such as "nodes.d_thresh".
+
+    Raises:
+        ConfigError: the value is invalid.
+    """
+    before: Any = config
+    name, _, rest = key.partition(".")
+    if rest:
+        value = with_setting(getattr(config, name), rest, value)
+    elif wrong := find_violation(value, field_annotations(type(config))[name]):
+        raise ConfigError(wrong)
+    return replace(before, **{name: value})
 
 
 def find_violation(value: Any, kind: Any) -> str | None:

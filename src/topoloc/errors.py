@@ -26,6 +26,11 @@ TopolocError
 └── MissingExtraError         an optional dependency is not installed
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class TopolocError(Exception):
     """Report a failure that the user can understand and fix. The text is one line with the problem
@@ -127,3 +132,16 @@ class ClusterError(TopolocError):
 
 class MissingExtraError(TopolocError):
     """Report a missing optional dependency. The text names the extra that installs it."""
+
+    @classmethod
+    @contextmanager
+    def on_import(cls, text: str, extra: str) -> Iterator[None]:
+        """Raise this error if an import of another package fails in the block. The text ends with
+        the command that installs `extra`. ``{}`` in it is replaced by the name of the module."""
+        try:
+            yield
+        except ImportError as error:
+            if (error.name or "").startswith("topoloc"):
+                raise
+            need = text.replace("{}", error.name or str(error))
+            raise cls(f"{need}: pip install 'topoloc[{extra}]'") from error

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from typing import Any
+
+from topoloc.bounds import parse_settings, quote_key
+from topoloc.errors import ConfigError
 
 
 def drop_removed_settings(
@@ -32,6 +35,28 @@ def drop_removed_settings(
         named = ", ".join(changed)
         warnings.warn(f"{source}no longer settings, without effect: {named}", stacklevel=3)
     return left
+
+
+def parse_tables(
+    data: Mapping[str, Any], find_class: Callable[[str], type], source: str
+) -> list[Any]:
+    """Create the configuration of each table of a settings file, without removed settings.
+
+    Args:
+        find_class: returns the dataclass of a table. Raises ConfigError if there is none.
+        source: the beginning of warnings, such as the name of the file.
+
+    Raises:
+        ConfigError: a table or a key is unknown, or a value is invalid. The text names it.
+    """
+    configs = []
+    for name, table in drop_removed_settings(data, source=source).items():
+        try:
+            kind = find_class(name)
+        except ConfigError as error:
+            raise ConfigError(f"{quote_key(name)}: {error}") from None
+        configs.append(parse_settings(kind, table, name, default=kind()))
+    return configs
 
 
 def _drop(

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from topoloc.apps.service.application import Access, create_application
+from topoloc.apps.service.application import create_application
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.atlas.editing import add_tiles, new_tiles, remove_tiles
 from topoloc.atlas.map_cache import MapCache
@@ -27,7 +27,7 @@ from topoloc.mapping.topomap import TopoMetricMap
 @pytest.fixture
 def client(own_atlas: Path) -> Iterator[TestClient]:
     application = create_application(
-        MapCache([str(own_atlas)], Localizer, 100_000_000), ServiceConfig(workers=1), Access()
+        MapCache([str(own_atlas)], Localizer, 100_000_000), ServiceConfig(workers=1)
     )
     with TestClient(application, base_url="http://127.0.0.1") as client:
         yield client

@@ -15,8 +15,8 @@ from uuid import uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from topoloc.apps.service import served_atlases
-from topoloc.apps.service.application import Access, create_application
+from topoloc.apps.service import query_handler
+from topoloc.apps.service.application import create_application
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.stores.object_store import ObjectStore
 from topoloc.atlas import tile_fetcher
@@ -71,9 +71,7 @@ def _served(
     maps = MapCache(
         [str(source) for source in sources], Localizer, max_bytes, TileFetcher(config.fetch_s).path
     )
-    with TestClient(
-        create_application(maps, config, Access()), base_url="http://127.0.0.1"
-    ) as client:
+    with TestClient(create_application(maps, config), base_url="http://127.0.0.1") as client:
         yield client, maps
 
 
@@ -155,7 +153,7 @@ def test_tiles_are_closed_beyond_the_budget(in_memory: str, queries: Path):
 def test_what_is_written_to_the_store_is_noticed(
     store: str, room_map: Path, queries: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(served_atlases, "POLL_INTERVAL_S", 0.1)
+    monkeypatch.setattr(query_handler, "POLL_INTERVAL_S", 0.1)
     with _served(store) as (client, maps):
         assert _asked(client, "/v1/localize", queries)["map"] == "room"
         remove_tiles(store, ["room"])
@@ -238,7 +236,7 @@ def test_a_tile_that_comes_late_is_waited_for(
 def test_what_was_opened_answers_while_the_store_is_gone(
     in_memory: str, queries: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    monkeypatch.setattr(served_atlases, "POLL_INTERVAL_S", 0.02)
+    monkeypatch.setattr(query_handler, "POLL_INTERVAL_S", 0.02)
     monkeypatch.setattr(tile_fetcher, "_RETRY_AFTER_S", 0.2)
 
     def gone(*args: object, **more: object) -> None:

@@ -30,7 +30,7 @@ from topoloc.lifelong.tiles.tile_comparison import (
 )
 from topoloc.lifelong.tiles.tile_joining import TileJoiningResult, find_candidate_pairs, join_tiles
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.map_facts.map_building import SkippedChecks, build_map
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
@@ -59,9 +59,7 @@ def _map_of(
 
 
 def _built(sequence: SequenceView) -> TopoMetricMap:
-    return build_map(
-        sequence, BuildConfig(other_kinds=()), skipped_checks=SkippedChecks(poses=True)
-    )
+    return build_map(sequence, BuildConfig(other_kinds=()), are_poses_checked=False)
 
 
 @pytest.fixture(scope="module")

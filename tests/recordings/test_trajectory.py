@@ -14,8 +14,6 @@ from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import Recording, SequenceView
 from topoloc.recordings.trajectory import (
     Trajectory,
-    interpolate_poses,
-    match_frame_poses,
     with_pose_conventions,
     with_trajectory,
 )
@@ -132,15 +130,15 @@ def test_poses_between_are_interpolated_and_gaps_are_not():
     ]
     found = [
         None if pose is None else round(float(pose.translation[0]), 9)
-        for pose in interpolate_poses(trajectory, times)
+        for pose in trajectory.interpolate(times)
     ]
     assert found == [0.0, 0.25, 1.0, None, 5.0, 5.0, None, 0.0, 1.0]
-    assert interpolate_poses(trajectory, [SECOND // 2], max_gap=1.0)[0] is not None
+    assert trajectory.interpolate([SECOND // 2], max_gap=1.0)[0] is not None
 
 
 def test_rows_have_no_times_to_look_up():
     with pytest.raises(TrajectoryError, match="row"):
-        interpolate_poses(Trajectory([shift(0)]), [0])
+        Trajectory([shift(0)]).interpolate([0])
 
 
 def test_other_poses_for_the_same_recording(kitti: Path, tmp_path: Path):
@@ -216,7 +214,7 @@ def test_clocks_that_differ_are_said_and_mended(tmp_path: Path):
     )
     for path, option in ((late, "shift=5000"), (in_microseconds, "clock=1000")):
         with pytest.raises(TrajectoryError, match=f"--poses {option}"):
-            match_frame_poses(Trajectory.read(path), frames, path)
+            Trajectory.read(path).match_frames(frames, path)
         found = with_trajectory(recording_of(frames), path, PoseConventions.of(option)).poses
         assert sum(pose is not None for pose in found) >= 18
         assert all(

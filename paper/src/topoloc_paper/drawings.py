@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
 
-from topoloc.apps.report.figure_style import BAD, GREY, INK, NODE, RECORDING_COLOURS, STYLE
+from topoloc.apps.report.page_template import BAD, GREY, INK, NODE, RECORDING_COLOURS, STYLE
 
 Row = Mapping[str, Any]
 METHOD_COLOURS: dict[str, str] = dict(

@@ -12,10 +12,9 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from topoloc.apps.report.figure_style import STYLE, svg_text
 from topoloc.apps.report.figures import draw_error_curves
 from topoloc.apps.report.map_figure import draw_map
-from topoloc.apps.report.page_template import page_style
+from topoloc.apps.report.page_template import STYLE, page_style, svg_text
 from topoloc.apps.report.report import (
     render_gallery,
     select_typical_queries,

@@ -30,14 +30,12 @@ def select_frame_camera(
 def parse_camera_option(
     text: str, topomap: TopoMetricMap | None, allow_files: bool = True
 ) -> CameraOfSize:
-    """Parse the value of `--camera`. `map` is allowed only if a single map is queried.
+    """Parse the value of `--camera`. `map` is allowed only if a single map is queried. Raises
+    CalibrationError: the value is invalid.
 
     Args:
         allow_files: read the calibration from a file of that name; if not, the text must be
             ``map``, ``unknown`` or ``fx,fy,cx,cy`` (pixels).
-
-    Raises:
-        CalibrationError: the value is invalid.
     """
     if text == "map" and topomap is not None:
         return _rescaled_camera(topomap.nodes[0].camera)

@@ -88,8 +88,7 @@ def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> Op
         if sum(len(rows) for _, rows in vectors) > MAX_EXACT_DESCRIPTORS:
             live_shards[kind] = work.with_new_shards(kind, live_shards[kind], vectors)
     work.remove_unused(live_shards)
-    ids = [tile.tile_id for tile in tiles]
-    exact = dict[str, dict[str, np.ndarray]]()
+    ids, exact = [tile.tile_id for tile in tiles], dict[str, dict[str, np.ndarray]]()
     for kind, vectors in few.items():
         for tile, rows in vectors:
             exact.setdefault(tile.tile_id, {})[kind] = rows.astype(np.float32)

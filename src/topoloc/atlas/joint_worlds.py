@@ -202,8 +202,7 @@ def _reachable_worlds(
     The next join is always the one with the most agreeing images from the worlds reached so far.
     """
     places = dict[str, JointPose]()
-    queue = [(0, 0, anchor, JointPose(anchor, Rigid3.identity()))]
-    count = 0
+    queue, count = [(0, 0, anchor, JointPose(anchor, Rigid3.identity()))], 0
     while queue:
         _, _, name, place = heapq.heappop(queue)
         if name in places:

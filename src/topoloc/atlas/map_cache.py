@@ -23,7 +23,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.place import open_place
-from topoloc.atlas.tile_fetcher import WatchedAtlas
+from topoloc.atlas.tile_fetcher import TileFetcher, WatchedAtlas
 from topoloc.errors import MapError, MapNotFoundError
 from topoloc.mapping.node_cache import set_node_cache_size
 from topoloc.mapping.topomap import TopoMetricMap
@@ -123,13 +123,15 @@ class MapCache(Generic[M]):
         sources: Sequence[str],
         open_map: Callable[[TopoMetricMap], M],
         memory_mb: int,
-        tile_path: TilePath = Atlas.map_path,
+        fetch_s: float | None = None,
     ) -> MapCache[M]:
         """Create a cache that uses half of the memory (megabytes) for nodes, of all maps of this
-        process, and half for the rest of the open maps. Raises as the class does."""
+        process, and half for the rest of the open maps. Queries wait `fetch_s` seconds for a tile
+        of an object store, see `TileFetcher`; None is no limit. Raises as the class does."""
         budget = memory_mb * 500_000
         set_node_cache_size(budget)
-        return MapCache(sources, open_map, budget, tile_path)
+        path = Atlas.map_path if fetch_s is None else TileFetcher(fetch_s).path
+        return MapCache(sources, open_map, budget, path)
 
     def names(self) -> list[str]:
         """Return the names of all current maps. No object store is queried.

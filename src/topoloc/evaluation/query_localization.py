@@ -123,8 +123,7 @@ def localize_queries(
         topomap, tile_id = in_tile.topomap, in_tile.tile_ids[0]
         nodes = topomap.node_poses
     frames = find_frames_with_truth(sequence) if frames is None else frames
-    label = label or sequence.name
-    answers = []
+    label, answers = label or sequence.name, []
     for done, i in enumerate(frames):
         answer, pose = _localize(localizer, sequence, i, label), sequence.poses[i]
         if pose is None:

@@ -160,12 +160,8 @@ def open_network(
         WeightsError: the file is unreadable, not ONNX, breaks the contract, or holds an unknown
             network.
     """
-    try:
+    with MissingExtraError.on_import("learned features need ONNX Runtime", "learned"):
         import onnxruntime
-    except ImportError as error:
-        raise MissingExtraError(
-            "learned features need ONNX Runtime: pip install 'topoloc[learned]'"
-        ) from error
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = num_threads

@@ -146,8 +146,7 @@ def estimate_absolute_pose(
     Matches with a value that is not finite are outliers. The same input gives a byte-identical
     result.
     """
-    config = config or AbsolutePoseConfig()
-    normalized = camera.normalized_from_img(points_img)
+    config, normalized = config or AbsolutePoseConfig(), camera.normalized_from_img(points_img)
     usable = np.isfinite(normalized).all(axis=1) & np.isfinite(points_world).all(axis=1)
     if point_covariances is not None:
         usable &= np.isfinite(point_covariances).all(axis=(1, 2))
@@ -318,8 +317,7 @@ def _estimate_noise_scale(squares: Float[np.ndarray, " n"]) -> float:
 
     It is at least 1. If few matches fit well, this is due to chance or to the fit itself.
     """
-    num_free = max(2 * len(squares) - 6, 1)
-    variance = 1.0
+    num_free, variance = max(2 * len(squares) - 6, 1), 1.0
     for _ in range(_MAX_SCALE_STEPS):
         scaled = squares / variance
         ratio = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2))) / (

@@ -255,8 +255,7 @@ def _principal_point_covariance(
     zero = np.zeros_like(u)
     by_x = np.column_stack([w, zero, -u * w, -u * v, 1.0 + u * u, -v])
     by_y = np.column_stack([zero, w, -v * w, -(1.0 + v * v), u * v, u])
-    jacobian = np.concatenate([by_x, by_y])
-    shifts = np.zeros((2 * len(u), 2))
+    jacobian, shifts = np.concatenate([by_x, by_y]), np.zeros((2 * len(u), 2))
     shifts[: len(u), 0] = shifts[len(u) :, 1] = 1.0 / camera.fx
     by_centre = np.linalg.lstsq(jacobian, shifts, rcond=None)[0]
     return (

@@ -99,8 +99,7 @@ def undistort_fisheye(
     of the axis give NaN."""
     theta_d = np.linalg.norm(distorted, axis=1)
     limit = float(np.arctan(max_radius(tuple(coefficients.tolist()), is_fisheye=True)))
-    theta = np.minimum(theta_d, limit)
-    error = np.full(len(distorted), np.inf)
+    theta, error = np.minimum(theta_d, limit), np.full(len(distorted), np.inf)
     with np.errstate(all="ignore"):
         for _ in range(_MAX_NEWTON_STEPS):
             value, slope = _fisheye_polynomial(coefficients, theta)

@@ -158,6 +158,10 @@ class Georeference:
     source: str
     rms_m: NonNegative | None = None
 
+    def __str__(self) -> str:
+        o, fitted = self.origin, "" if self.rms_m is None else f", rms {self.rms_m:.2f} m"
+        return f"{o.lat:.7f}, {o.lon:.7f}, {o.h:.2f} m (from {self.source}{fitted})"
+
     def to_json(self) -> dict[str, object]:
         """Return the form stored in the map file."""
         return encode_json(self)

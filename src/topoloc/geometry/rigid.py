@@ -29,8 +29,7 @@ def skew(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 def exp_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return the rotation matrix of a rotation vector (radians), by Rodrigues' formula."""
-    angle = float(np.linalg.norm(omega))
-    k = skew(omega)
+    angle, k = float(np.linalg.norm(omega)), skew(omega)
     if angle < _SMALL_ANGLE:
         return np.eye(3) + k + 0.5 * k @ k
     return (
@@ -291,8 +290,7 @@ def position_covariance(
 
 
 def _left_jacobian_so3(omega: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    angle = float(np.linalg.norm(omega))
-    k = skew(omega)
+    angle, k = float(np.linalg.norm(omega)), skew(omega)
     if angle < 1e-5:  # below this the closed form loses all digits of (angle - sin angle)
         return np.eye(3) + 0.5 * k + k @ k / 6.0
     return (

@@ -96,8 +96,7 @@ def iterate_node_removals(
         order = np.argsort(-known, axis=1, kind="stable")
         first, second = order[:, 0], order[:, min(1, order.shape[1] - 1)]
         rows = np.arange(num)
-        supporter = support.supporters[rows, first]
-        remaining = known[rows, second]
+        supporter, remaining = support.supporters[rows, first], known[rows, second]
         losses = support.num_images * (weights[rows, first] - np.log1p(np.maximum(remaining, 0)))
         loss_of_supporter = np.bincount(supporter, losses, minlength=num)
         loss_of_supporter[supporter[(remaining < min_held) | (first == second)]] = np.inf
@@ -121,8 +120,7 @@ def remove_nodes(
     gone = set(removed)
     kept = [row for row in topomap.rows if row not in gone]
     ids = [summary.node_id for summary in topomap.summaries]
-    new_id = {ids[row]: ids[int(supporter[row])] for row in gone}
-    layers = {}
+    new_id, layers = {ids[row]: ids[int(supporter[row])] for row in gone}, {}
     for kind, layer in topomap.layers.items():
         models = {
             name: _reassign_descriptors(model, new_id)

@@ -199,8 +199,7 @@ def scale_to_metres(
     """
     answers = _collect_localized_frames(odom, localized)
     positions = np.array([pose.translation for pose in odom.values()])
-    path_lengths = compute_path_lengths(positions)
-    pairs = _select_pairs(answers)
+    path_lengths, pairs = compute_path_lengths(positions), _select_pairs(answers)
     if len(pairs) == 0:
         return {}
     logs, sigmas = _estimate_scale_profile(path_lengths, answers, pairs, drift)

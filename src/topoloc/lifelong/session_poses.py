@@ -140,8 +140,7 @@ def _find_consensus(
     TrajectoryError."""
     # Minimum share of the localized images that agree. The session is refused if the share is
     # smaller.
-    min_share = 0.5
-    indices = list(localized)
+    min_share, indices = 0.5, list(localized)
     if num_queried < MIN_AGREEING:
         many = f"{num_queried} of its pictures are"
         some = many if num_queried > 1 else "one of its pictures is"
@@ -175,8 +174,7 @@ def _check_scale(
     # Maximum relative difference between the motion's scale and the map's. Three sigmas of
     # the measured scale are added, and the ratio of one localization sigma to the longest
     # distance.
-    max_scale = 0.03
-    a = np.array([odom[k].translation for k in localized])
+    max_scale, a = 0.03, np.array([odom[k].translation for k in localized])
     b = np.array([answer.world_from_cam.translation for answer in localized.values()])
     rows, columns = np.triu_indices(len(a), 1)
     odom_lengths, lengths = (np.linalg.norm(p[rows] - p[columns], axis=1) for p in (a, b))
@@ -201,8 +199,7 @@ def _optimize_motion(
 ) -> dict[int, Rigid3]:
     """Optimize the motion with its anchors as a pose graph. The first node is the world of the map
     and is fixed."""
-    indices = list(odom)
-    first = min(anchors)
+    indices, first = list(odom), min(anchors)
     world_from_odom = anchors[first].world_from_cam @ odom[first].inverse()
     cam_from_worlds = [Rigid3.identity(), *((world_from_odom @ odom[k]).inverse() for k in indices)]
     steps = [_relative_motion(odom[a], odom[b]) for a, b in pairwise(indices)]
@@ -251,8 +248,7 @@ def _relative_motion(
     drift = 0.01
     # Sigma of the rotation between images, in radians per metre and per radian of rotation.
     # Half a milliradian is added.
-    turn_drift = 0.002
-    b_from_a = odom_from_b.inverse() @ odom_from_a
+    turn_drift, b_from_a = 0.002, odom_from_b.inverse() @ odom_from_a
     path_length = float(np.linalg.norm(b_from_a.translation))
     sigma_m = 0.001 + drift * path_length
     sigma_rad = 0.0005 + turn_drift * (path_length + b_from_a.angle())

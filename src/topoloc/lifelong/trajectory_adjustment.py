@@ -43,8 +43,7 @@ def adjust_trajectory(
     in metres.
     """
     # Factor of the sigmas of tracked points. A sliding point does so in all of its key frames.
-    points_widened = 8.0
-    keyframes = _transform_to_map(stretch, world_from_cams)
+    points_widened, keyframes = 8.0, _transform_to_map(stretch, world_from_cams)
     moved = set(map(id, keyframes))
     frames = {
         f.frame_idx: f

@@ -32,8 +32,7 @@ def match_projections(
     within two pixels (L1) of it are exempt, because they are one blob at two scales.
     """
     num_columns, num_rows = int(width / radius) + 1, int(height / radius) + 1
-    num_cells = num_columns * num_rows
-    cells = np.empty(len(key_points), np.int64)
+    num_cells, cells = num_columns * num_rows, np.empty(len(key_points), np.int64)
     starts = np.zeros(num_cells + 1, np.int64)
     for k in range(len(key_points)):
         column = min(max(int(key_points[k, 0] / radius), 0), num_columns - 1)

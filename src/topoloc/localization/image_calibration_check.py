@@ -184,8 +184,7 @@ def _is_calibration_off(
     Both `num_sigmas` and `share` must be exceeded. `share` refers to the focal length and the image
     width.
     """
-    camera = corrected_camera(fit.camera, found)
-    sigmas = np.sqrt(np.diag(found.covariance))
+    camera, sigmas = corrected_camera(fit.camera, found), np.sqrt(np.diag(found.covariance))
     stretch = abs(math.log(camera.fx / calibrated.fx))
     offset = np.abs(_principal_point(camera, 1.0) - _principal_point(calibrated, 1.0))
     is_far = (offset > num_sigmas * sigmas[1:] * calibrated.fx) & (

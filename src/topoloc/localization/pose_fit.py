@@ -47,8 +47,7 @@ class LocalMap:
         # three sigmas over all directions, plus 1 cm for errors outside the covariance
         radii = 0.01 + 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         points_world = world_from_cam.apply(node.points_cam.astype(np.float64))
-        node_ids = np.full(len(radii), node.summary.node_id)
-        f = node.features
+        node_ids, f = np.full(len(radii), node.summary.node_id), node.features
         sizes = f.sizes_px.astype(np.float64) / node.camera.fx * node.points_cam[:, 2]
         angles = f.angles.astype(np.float64)
         directions = (

@@ -141,8 +141,7 @@ def fit_georeference(
         )
     pairs = _PointPairs(points_world, points_enu, up)
     weights = np.ones(len(points_world)) if len(points_world) <= 4 else _robust_weights(pairs)
-    is_inlier = weights > 0.0
-    sigma = _estimate_sigma(pairs, pairs.align(weights), weights)
+    is_inlier, sigma = weights > 0.0, _estimate_sigma(pairs, pairs.align(weights), weights)
     enu_from_world = pairs.align(weights, sigma)
     residuals = pairs.residuals(enu_from_world)
     _check_fit(pairs, enu_from_world, weights, sigma)

@@ -82,8 +82,7 @@ def observe_points(
         :, None, None
     ] ** 2 * np.eye(2)
     squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)
-    seen = in_front & (squares < gate**2)
-    in_view = _in_view(points_cam, camera, cam_from_node)
+    seen, in_view = in_front & (squares < gate**2), _in_view(points_cam, camera, cam_from_node)
     return Observations(
         rows[seen], normalized[seen], sigmas[seen], cam_from_node, in_view, session_id
     )
@@ -100,10 +99,8 @@ def refine_points(
     The first measurement and its covariance are the prior."""
     # Points are dropped if the root mean square of their refined residuals exceeds this, in
     # standard deviations.
-    max_disagreement = 3.0
-    prior = np.linalg.inv(covariances)
-    points = points_cam.copy()
-    information = prior
+    max_disagreement, prior = 3.0, np.linalg.inv(covariances)
+    points, information = points_cam.copy(), prior
     for _ in range(num_iterations):
         information, gradient, _ = _normal_equations(points, points_cam, prior, observations)
         points = points - np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
@@ -261,8 +258,7 @@ def _project(
     points = cam_from_node.apply(points_node)
     in_front = points[:, 2] > 1e-3
     z = np.where(in_front, points[:, 2], 1.0)
-    projected = points[:, :2] / z[:, None]
-    by_cam = np.zeros((len(points), 2, 3))
+    projected, by_cam = points[:, :2] / z[:, None], np.zeros((len(points), 2, 3))
     by_cam[:, 0, 0] = by_cam[:, 1, 1] = 1.0 / z
     by_cam[:, :, 2] = -projected / z[:, None]
     return projected - normalized, by_cam @ cam_from_node.rotation, in_front

@@ -238,8 +238,7 @@ class PointLocator:
         poses = [other.world_from_cam for other in frames]
         chosen = select_source_images(poses, frames.index(frame), self._steps[frame.session_id])
         others = [frames[k] for k in chosen]
-        images = [self.image(other, other.view()) for other in others]
-        points = {}
+        images, points = [self.image(other, other.view()) for other in others], {}
         for kind, features in image.features.items():
             source_images = [
                 SourceImage(

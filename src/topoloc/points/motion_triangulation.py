@@ -140,8 +140,7 @@ def _fuse_depths(
     best = np.lexsort((np.nan_to_num(sigma, nan=np.inf), -support), axis=0)[0]
     chosen = agrees[best, :, columns].T
     weights = np.where(chosen, 1.0 / np.where(chosen, sigma, 1.0) ** 2, 0.0)
-    total = weights.sum(axis=0)
-    enough = support[best, columns] >= min_pictures
+    total, enough = weights.sum(axis=0), support[best, columns] >= min_pictures
     with np.errstate(divide="ignore", invalid="ignore"):
         joined = (weights * np.where(chosen, inverse, 0.0)).sum(axis=0) / total
         sigma_joined = np.sqrt(1.0 / total + own_sigma**2)

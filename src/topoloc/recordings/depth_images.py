@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -106,12 +108,8 @@ def _read_npy(path: Path) -> np.ndarray:
 def _read_exr(path: Path) -> np.ndarray:
     """Read the first channel of an EXR file. OpenCV's wheels lack OpenEXR, so this uses the OpenEXR
     package."""
-    try:
-        import OpenEXR  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise MissingExtraError(
-            f"{path}: depth in EXR files needs the extra exr: pip install 'topoloc[exr]'"
-        ) from None
+    with MissingExtraError.on_import(f"{path}: depth in EXR files needs the extra exr", "exr"):
+        OpenEXR: Any = importlib.import_module("OpenEXR")
     if not path.is_file():
         raise UnreadableImageError(f"{path}: no such file")
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from topoloc.recordings.calibration import parse_calibration, with_calibration
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.recording import parse_selection, sequence_subset
+from topoloc.recordings.recording import parse_selection, recording_notes, sequence_subset
 
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
 # accepts any other folder with images. A format's module is imported when the format is tried.
@@ -47,6 +47,7 @@ def open_sequence(
     camera: str | Path | None = None,
     images: str | Path | None = None,
     topics: str | Mapping[str, str] | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> StereoSequence:
     """Open a recording, or a selection of its frames. Images are read when a frame is accessed.
 
@@ -60,6 +61,7 @@ def open_sequence(
         images: the image folder of a COLMAP model, if it is not `images` beside the model.
         topics: the topics of a bag: ``left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom``, or a
             dictionary of these.
+        warn: called with each note on the recording, such as truncated or guessed data.
 
     Raises:
         UnknownFormatError: `format` is unknown, or no format recognises the folder.
@@ -73,6 +75,9 @@ def open_sequence(
     sequence = _open_recording(
         folder, name, camera, {"images": images and Path(images), "topics": topics}
     )
+    if warn is not None:
+        for note in recording_notes(sequence):
+            warn(note)
     if selection is None:
         return sequence
     indices = parse_selection(selection, len(sequence))

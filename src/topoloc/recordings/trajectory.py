@@ -51,6 +51,12 @@ class Trajectory:
         return len(self.world_from_cam)
 
     @staticmethod
+    def of_frames(poses: Iterable[Rigid3 | None], t_ns: Iterable[int]) -> Trajectory:
+        """Return the trajectory of the frames that have a pose."""
+        known = [(pose, time) for pose, time in zip(poses, t_ns, strict=True) if pose is not None]
+        return Trajectory([pose for pose, _ in known], [time for _, time in known])
+
+    @staticmethod
     def from_quaternions(rows: Float[np.ndarray, "n 7"], t_ns: list[int]) -> Trajectory:
         """Return the trajectory of rows x, y, z (metres), qx, qy, qz, qw at these times.
 
@@ -69,6 +75,41 @@ class Trajectory:
                 is NaN, a rotation is invalid, or times do not increase. Names the line.
         """
         return _read_numeric_trajectory(path) or _trajectory_from_rows(path)
+
+    def interpolate(self, t_ns: Sequence[int], max_gap: float = 0.2) -> list[Rigid3 | None]:
+        """Return the pose at each time.
+
+        It is interpolated if its neighbours are at most `max_gap` seconds apart. Otherwise it is a
+        pose within 1 ms, or None.
+
+        Raises:
+            TrajectoryError: the trajectory has no times.
+        """
+        if self.t_ns is None:
+            raise TrajectoryError("these poses have no times, they go with frames row by row")
+        gap_ns, poses = round(max_gap * NANOSECONDS_PER_SECOND), self.world_from_cam
+        return [_interpolate_pose(self.t_ns, poses, time, gap_ns) for time in t_ns]
+
+    def match_frames(self, t_ns: Sequence[int], path: Path) -> list[Rigid3 | None]:
+        """Return the pose of each frame by time, or by row if the trajectory has no times.
+
+        Raises:
+            TrajectoryError: the numbers of rows and frames differ, or no frame has a pose. Names
+                `path` and a likely difference of the clocks.
+        """
+        if self.t_ns is None:
+            if len(self) != len(t_ns):
+                raise TrajectoryError(f"{path}: {len(self)} poses for {len(t_ns)} frames")
+            return list(self.world_from_cam)
+        poses = self.interpolate(t_ns)
+        if t_ns and all(pose is None for pose in poses):
+            span = f"{self.t_ns[0] / 1e9:.3f} to {self.t_ns[-1] / 1e9:.3f} s"
+            frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
+            raise TrajectoryError(
+                f"{path}: no frame has a pose; it covers {span},"
+                f" {frames}{_clock_hint(self.t_ns, t_ns)}"
+            )
+        return poses
 
     def to_tum(self, header: bool = True) -> str:
         """Return the lines of a TUM file.
@@ -162,54 +203,6 @@ def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
     )
 
 
-def interpolate_poses(
-    trajectory: Trajectory, t_ns: Sequence[int], max_gap: float = 0.2
-) -> list[Rigid3 | None]:
-    """Return the pose at each time.
-
-    It is interpolated if its neighbours are at most `max_gap` seconds apart. Otherwise it is a pose
-    within 1 ms, or None.
-
-    Raises:
-        TrajectoryError: the trajectory has no times.
-    """
-    if trajectory.t_ns is None:
-        raise TrajectoryError("these poses have no times, they go with frames row by row")
-    return [
-        _interpolate_pose(
-            trajectory.t_ns,
-            trajectory.world_from_cam,
-            time,
-            round(max_gap * NANOSECONDS_PER_SECOND),
-        )
-        for time in t_ns
-    ]
-
-
-def match_frame_poses(
-    trajectory: Trajectory, t_ns: Sequence[int], path: Path
-) -> list[Rigid3 | None]:
-    """Return the pose of each frame by time, or by row if the trajectory has no times.
-
-    Raises:
-        TrajectoryError: the numbers of rows and frames differ, or no frame has a pose. Names `path`
-            and a likely difference of the clocks.
-    """
-    if trajectory.t_ns is None:
-        if len(trajectory) != len(t_ns):
-            raise TrajectoryError(f"{path}: {len(trajectory)} poses for {len(t_ns)} frames")
-        return list(trajectory.world_from_cam)
-    poses = interpolate_poses(trajectory, t_ns)
-    if t_ns and all(pose is None for pose in poses):
-        span = f"{trajectory.t_ns[0] / 1e9:.3f} to {trajectory.t_ns[-1] / 1e9:.3f} s"
-        frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
-        raise TrajectoryError(
-            f"{path}: no frame has a pose; it covers {span},"
-            f" {frames}{_clock_hint(trajectory.t_ns, t_ns)}"
-        )
-    return poses
-
-
 def with_trajectory(
     sequence: StereoSequence, path: Path, conventions: PoseConventions | None = None
 ) -> StereoSequence:
@@ -226,10 +219,10 @@ def with_trajectory(
         and isinstance(sequence, SequenceView)
         and len(trajectory) == len(sequence.base) != len(sequence)
     ):
-        rows = match_frame_poses(trajectory, sequence.base.t_ns, path)
+        rows = trajectory.match_frames(sequence.base.t_ns, path)
         poses = [rows[index] for index in sequence.indices]
     else:
-        poses = match_frame_poses(_to_frame_clock(trajectory, conventions), sequence.t_ns, path)
+        poses = _to_frame_clock(trajectory, conventions).match_frames(sequence.t_ns, path)
     return _with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
 
 
@@ -249,9 +242,8 @@ def with_pose_conventions(sequence: StereoSequence, conventions: PoseConventions
     poses = sequence.poses
     if posed and (conventions.shift_s or conventions.time_scale != 1.0):
         trajectory = Trajectory([pose for pose, _ in posed], [t_ns for _, t_ns in posed])
-        poses = match_frame_poses(
-            _to_frame_clock(trajectory, conventions), sequence.t_ns, Path(sequence.name)
-        )
+        on_frame_clock = _to_frame_clock(trajectory, conventions)
+        poses = on_frame_clock.match_frames(sequence.t_ns, Path(sequence.name))
     return _with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
 
 
@@ -298,7 +290,7 @@ def read_ground_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> lis
     """
     for path in (tum, *kitti_rows):
         if path.is_file():
-            return match_frame_poses(Trajectory.read(path), t_ns, path)
+            return Trajectory.read(path).match_frames(t_ns, path)
     return [None] * len(t_ns)
 
 

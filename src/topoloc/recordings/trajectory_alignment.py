@@ -9,7 +9,7 @@ from topoloc.geometry.alignment import align_scaled_poses
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.recording import SequenceView
-from topoloc.recordings.trajectory import Trajectory, match_frame_poses
+from topoloc.recordings.trajectory import Trajectory
 
 
 def align_to_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
@@ -19,7 +19,7 @@ def align_to_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
     Raises:
         TrajectoryError: the file is malformed, fits no frame, or its positions fix no scale.
     """
-    theirs = match_frame_poses(Trajectory.read(path), sequence.t_ns, path)
+    theirs = Trajectory.read(path).match_frames(sequence.t_ns, path)
     pairs = [
         (ours, other)
         for ours, other in zip(sequence.poses, theirs, strict=True)

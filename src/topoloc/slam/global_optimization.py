@@ -27,8 +27,7 @@ def join_submaps(
 
     Return the joined sub-maps, including `first`.
     """
-    joined = [first]
-    remaining = list(links)
+    joined, remaining = [first], list(links)
     while True:
         crossing = next(
             (

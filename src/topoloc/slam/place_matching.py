@@ -99,8 +99,7 @@ def count_repeated_features(view: PlaceFeatures, stereo: StereoCamera, min_inlie
     )
     if np.count_nonzero(mutual) < min_inliers:
         return 0
-    sources = nearest[mutual]
-    priorities = likeness[rows, nearest][mutual]
+    sources, priorities = nearest[mutual], likeness[rows, nearest][mutual]
     pose = _estimate_pose(points_img[mutual], view.points, sources, stereo, priorities)
     return 0 if pose is None else int(np.count_nonzero(pose.inliers))
 

@@ -33,7 +33,7 @@ from topoloc.geometry.pose_conventions import (
 )
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.trajectory import Trajectory, interpolate_poses
+from topoloc.recordings.trajectory import Trajectory
 from topoloc.slam.measured_steps import MeasuredStep, measure_steps
 
 _MIN_INFORMATIVE_STEPS = 5
@@ -311,7 +311,7 @@ def _find_time_shift(
     The list is empty if the recording is too short.
     """
     posed = [k for k, pose in enumerate(poses) if pose is not None]
-    trajectory = Trajectory([pose for pose in poses if pose is not None], [t_ns[k] for k in posed])
+    trajectory = Trajectory.of_frames(poses, t_ns)
     largest = min(_MAX_SHIFT_S, 0.4e-9 * (t_ns[posed[-1]] - t_ns[posed[0]]))
     shifts = np.linspace(-largest, largest, 2 * _NUM_SHIFTS + 1)
     readings = (
@@ -335,7 +335,7 @@ def _test_time_shift(
     normalized_errors = []
     for step in informative_steps:
         times = [t_ns[k] + round(1e9 * seconds) for k in (step.first, step.last)]
-        first, last = interpolate_poses(trajectory, times, _MAX_GAP_S)
+        first, last = trajectory.interpolate(times, _MAX_GAP_S)
         if first is not None and last is not None:
             normalized_errors.append(
                 float(_compute_step_errors([step], [first.inverse() @ last])[0])

@@ -43,8 +43,7 @@ def optimize_pose_graph(
         min_step: the optimisation ends at a step smaller than this, metres and radians.
     """
     # Scale of Cauchy's loss on loops, in sigma. Larger residuals have less and less weight.
-    cauchy_scale = 3.0
-    poses = list(cam_from_worlds)
+    cauchy_scale, poses = 3.0, list(cam_from_worlds)
     informations = [np.linalg.inv(edge.covariance) for edge in edges]
     pattern = BlockPattern.from_pairs(len(poses), [(edge.first, edge.second) for edge in edges])
     places = [pattern.block_idx(edge.first, edge.second) for edge in edges]

@@ -83,8 +83,7 @@ def predict_motion(
     # Standard deviation of external odometry, as a share of the translation and the rotation.
     odometry_share = 0.05
     # Standard deviation of external odometry that is added to this share, metres and radians.
-    odometry_sigma = 0.002
-    seconds = (t_ns - state.t_ns) / 1e9
+    odometry_sigma, seconds = 0.002, (t_ns - state.t_ns) / 1e9
     step = (
         Rigid3.exp(min(seconds, max_step) * state.velocity)
         if before_from_cam is None
@@ -120,8 +119,7 @@ def update_motion(
     """Return the predicted state, corrected by a measured pose."""
     error = (predicted.world_from_cam.inverse() @ world_from_cam).log()
     gain = np.linalg.solve(predicted.pose_covariance + covariance, predicted.covariance[:6]).T
-    correction = gain @ error
-    posterior = predicted.covariance - gain @ predicted.covariance[:6]
+    correction, posterior = gain @ error, predicted.covariance - gain @ predicted.covariance[:6]
     return MotionState(
         predicted.t_ns,
         predicted.world_from_cam @ Rigid3.exp(correction[:6]),

@@ -169,8 +169,7 @@ def _move_onto_rays(
             np.ones(len(inlier_points)),
         ]
     )
-    points_cam = rays * depths[:, None]
-    axis = cam_from_world.rotation[2]
+    points_cam, axis = rays * depths[:, None], cam_from_world.rotation[2]
     sigma_z = np.sqrt(
         np.maximum(np.einsum("i,nij,j->n", axis, inlier_points.covariances, axis), 0.0)
     )

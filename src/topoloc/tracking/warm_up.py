@@ -118,8 +118,7 @@ def _record_wall(wall: Float32[np.ndarray, "h w"]) -> MemorySequence:
 
 def _make_texture(seed: int) -> Float32[np.ndarray, "h w"]:
     """Return noise at several scales, in which no two places look alike."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros((480, 640), np.float32)
+    rng, total = np.random.default_rng(seed), np.zeros((480, 640), np.float32)
     for sigma in (1.5, 3.0, 6.0, 12.0):
         noise = cv2.GaussianBlur(rng.standard_normal(total.shape).astype(np.float32), (0, 0), sigma)
         total += noise / noise.std()

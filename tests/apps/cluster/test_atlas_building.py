@@ -22,7 +22,7 @@ from topoloc.apps.cli import main
 from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.tasks import JobProgress
-from topoloc.apps.cluster.tiles import AtlasBuild, Outcome, TileJob, build_on_ray
+from topoloc.apps.cluster.tiles import Outcome, TileJob, build_on_ray
 from topoloc.atlas.atlas import Atlas
 from topoloc.mapping.build import BuildConfig
 
@@ -125,9 +125,9 @@ def _wait_for(condition: Callable[[], Any], seconds: float = 180.0) -> Any:
     raise AssertionError("it never came")
 
 
-def _in_background(build: AtlasBuild, address: str) -> tuple[threading.Thread, list[Outcome]]:
+def _in_background(*args: Any, **options: Any) -> tuple[threading.Thread, list[Outcome]]:
     outcomes: list[Outcome] = []
-    thread = threading.Thread(target=lambda: outcomes.extend(build_on_ray(build, address)))
+    thread = threading.Thread(target=lambda: outcomes.extend(build_on_ray(*args, **options)))
     thread.start()
     return thread, outcomes
 
@@ -137,9 +137,7 @@ def test_a_worker_that_is_killed_is_begun_again(
     cluster: Any, walks: list[Path], one_by_one: dict[str, bytes], scratch: Path, tmp_path: Path
 ):
     log, atlas = tmp_path / "log", tmp_path / "campus"
-    thread, outcomes = _in_background(
-        AtlasBuild(_jobs(walks, log, 2.0), str(atlas)), cluster.address
-    )
+    thread, outcomes = _in_background(_jobs(walks, log, 2.0), str(atlas), cluster.address)
     _, killed, pid, _ = _wait_for(lambda: _lines(log))[0]
     os.kill(int(pid), signal.SIGKILL)
     thread.join()
@@ -155,8 +153,8 @@ def test_a_worker_that_dies_each_time_is_a_failure_of_its_recording(
     cluster: Any, walks: list[Path], tmp_path: Path
 ):
     log, atlas = tmp_path / "log", tmp_path / "campus"
-    build = AtlasBuild(_jobs(walks[:2], log, 2.0), str(atlas), config=ClusterConfig(max_retries=0))
-    thread, outcomes = _in_background(build, cluster.address)
+    jobs, config = _jobs(walks[:2], log, 2.0), ClusterConfig(max_retries=0)
+    thread, outcomes = _in_background(jobs, str(atlas), cluster.address, config=config)
     _, killed, pid, _ = _wait_for(lambda: _lines(log))[0]
     os.kill(int(pid), signal.SIGKILL)
     thread.join()
@@ -172,9 +170,7 @@ def test_a_node_that_goes_away(
 ):
     log, atlas = tmp_path / "log", tmp_path / "campus"
     head = cluster.head_node.node_id
-    thread, outcomes = _in_background(
-        AtlasBuild(_jobs(walks, log, 3.0), str(atlas)), cluster.address
-    )
+    thread, outcomes = _in_background(_jobs(walks, log, 3.0), str(atlas), cluster.address)
     _, lost, *_ = _wait_for(lambda: [line for line in _lines(log) if line[3] != head])[0]
     cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
     thread.join()
@@ -238,9 +234,10 @@ def test_an_atlas_in_an_object_store(
     jobs = _jobs(walks, tmp_path / "log", 0.0)
     seen: list[tuple[int, Outcome | JobProgress]] = []
     outcomes = build_on_ray(
-        AtlasBuild(jobs, where),
+        jobs,
+        where,
         cluster.address,
-        lambda number, state: seen.append((number, state)),
+        show=lambda number, state: seen.append((number, state)),
         is_live=True,
     )
     assert [outcome.reason for outcome in outcomes] == [None] * 3

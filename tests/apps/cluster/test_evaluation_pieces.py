@@ -17,7 +17,7 @@ from dying_piece import DyingPiece
 from built_room import unseen_views, write_pictures
 from topoloc.apps.cli import main
 from topoloc.apps.cli.queries import remote_queries
-from topoloc.apps.cli.queries.remote_queries import OpenQueries, Piece, QueryRecording, RemoteMap
+from topoloc.apps.cli.queries.remote_queries import Piece, QueryRecording, RemoteMap
 from topoloc.atlas.editing import create_atlas, new_tiles
 from topoloc.errors import MapError, MissingExtraError, RecordingError, TrajectoryError
 from topoloc.evaluation.metrics import summarize
@@ -132,10 +132,9 @@ def test_against_itself_asks_no_cluster(room_map: Path, complaint: Complaint):
 def piece(queried_map: Path) -> Piece:
     """All pictures of the room, as they are sent to a machine."""
     topomap = TopoMetricMap.load(queried_map / "room.topo")
-    recording = QueryRecording(str(queried_map / "pictures"), None, None, None, None)
-    queries = OpenQueries(recording, recording.open(), "walk", None)
+    recording = QueryRecording(str(queried_map / "pictures"), label="walk")
     sent = RemoteMap.of(Localizer(topomap), "", None)
-    (piece,) = remote_queries._split_queries(sent, queries)
+    (piece,) = remote_queries._split(sent, recording, recording.open())
     return piece
 
 
@@ -182,9 +181,9 @@ def test_a_machine_without_the_same_features_does_not_answer(piece: Piece):
 @pytest.mark.parametrize("count", [1, 3, 4, 7])
 def test_pieces_are_of_about_one_size(piece: Piece, count: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(remote_queries, "MAX_IMAGES", 3)
-    queries = OpenQueries(piece.recording, piece.recording.open(), "walk", None)
-    monkeypatch.setattr(OpenQueries, "frames", property(lambda self: [k % 2 for k in range(count)]))
-    sizes = [len(one.frames) for one in remote_queries._split_queries(piece.queried_map, queries)]
+    monkeypatch.setattr(QueryRecording, "frames", lambda *_: [k % 2 for k in range(count)])
+    parts = remote_queries._split(piece.queried_map, piece.recording, piece.recording.open())
+    sizes = [len(one.frames) for one in parts]
     assert sum(sizes) == count
     assert max(sizes) <= 3
     assert max(sizes) - min(sizes) <= 1

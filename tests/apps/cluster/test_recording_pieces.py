@@ -12,8 +12,7 @@ import pytest
 
 from tiny_world import path_pose
 from topoloc.apps.cli import main
-from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
-from topoloc.apps.cli.mapping.recording_pieces import SplitOptions, split_recording
+from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions, SplitOptions, split_recording
 from topoloc.apps.cli.output import UsageError
 from topoloc.atlas.atlas import Atlas
 from topoloc.geometry.alignment import translation_error

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from topoloc.apps.cluster.tiles import TileJob, build_tile, derive_tile_ids
+from topoloc.apps.cluster.tiles import TileJob, TileTask, derive_tile_ids
 from topoloc.atlas.atlas import Atlas
 from topoloc.errors import AtlasError, RecordingError
 from topoloc.mapping.topomap import TopoMetricMap
@@ -71,7 +71,7 @@ def test_a_recording_that_is_named_twice(recordings: list[str]):
 
 def test_a_tile_is_made_once(job: TileJob, room_map: Path, tmp_path: Path):
     where = str(tmp_path / "campus")
-    made = build_tile(job, where, False, _nothing)
+    made = TileTask(job, where, False).run(_nothing)
     assert (made.state, made.reason, made.notes, made.tile_id) == (
         "built",
         None,
@@ -83,28 +83,24 @@ def test_a_tile_is_made_once(job: TileJob, room_map: Path, tmp_path: Path):
     assert atlas.map_path(tile).stat().st_size == made.num_bytes
     assert (tile.recipe, tile.num_nodes) == (job.digest(), made.num_nodes)
     before = (tmp_path / "campus" / "atlas.json").read_bytes()
-    again = build_tile(
-        replace(job, maker=replace(job.maker, fails=AssertionError("made twice"))),
-        where,
-        False,
-        _nothing,
-    )
+    fails = replace(job, maker=replace(job.maker, fails=AssertionError("made twice")))
+    again = TileTask(fails, where, False).run(_nothing)
     assert (again.state, again.notes, again.num_nodes) == ("there", (), made.num_nodes)
     assert (tmp_path / "campus" / "atlas.json").read_bytes() == before
 
 
 def test_what_was_made_otherwise_is_replaced_only_when_it_is_said(job: TileJob, tmp_path: Path):
     where = str(tmp_path / "campus")
-    build_tile(job, where, False, _nothing)
+    TileTask(job, where, False).run(_nothing)
     otherwise = replace(job, maker=replace(job.maker, digits="cd"))
-    refused = build_tile(otherwise, where, False, _nothing)
+    refused = TileTask(otherwise, where, False).run(_nothing)
     assert refused.state == "failed"
     assert "--replace" in (refused.reason or "")
     assert Atlas.read_manifest(where).by_id["room"].recipe == job.digest()
-    assert build_tile(otherwise, where, True, _nothing).state == "built"
+    assert TileTask(otherwise, where, True).run(_nothing).state == "built"
     assert Atlas.read_manifest(where).by_id["room"].recipe == otherwise.digest()
     elsewhere = replace(otherwise, world="campus")
-    assert build_tile(elsewhere, where, True, _nothing).state == "built"
+    assert TileTask(elsewhere, where, True).run(_nothing).state == "built"
     assert Atlas.read_manifest(where).by_id["room"].world == "campus"
 
 
@@ -119,12 +115,8 @@ def test_what_was_made_otherwise_is_replaced_only_when_it_is_said(job: TileJob, 
 def test_a_failure_has_a_reason_and_leaves_nothing(
     job: TileJob, error: Exception, reason: str, tmp_path: Path
 ):
-    failed = build_tile(
-        replace(job, maker=replace(job.maker, fails=error)),
-        str(tmp_path / "campus"),
-        False,
-        _nothing,
-    )
+    fails = replace(job, maker=replace(job.maker, fails=error))
+    failed = TileTask(fails, str(tmp_path / "campus"), False).run(_nothing)
     assert (failed.state, failed.reason, failed.num_bytes) == ("failed", reason, 0)
     assert any("Traceback" in note for note in failed.notes) == isinstance(error, ZeroDivisionError)
     assert list(tmp_path.iterdir()) == []
@@ -138,5 +130,5 @@ def test_nothing_stays_in_the_folder_for_temporary_files(
     left.mkdir(parents=True)
     (left / "tile.topo").write_bytes(b"of a worker that was killed")
     monkeypatch.setattr("tempfile.tempdir", str(scratch))
-    assert build_tile(job, str(tmp_path / "campus"), False, _nothing).state == "built"
+    assert TileTask(job, str(tmp_path / "campus"), False).run(_nothing).state == "built"
     assert list(scratch.iterdir()) == []

@@ -12,7 +12,7 @@ import numpy as np
 
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
-from topoloc.apps.export.map_graph import build_graph
+from topoloc.apps.cli.maps.info import build_graph
 
 NS = {"g": "http://graphml.graphdrawing.org/xmlns"}
 

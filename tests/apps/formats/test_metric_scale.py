@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topoloc.apps.formats.metric_scale import estimate_metric_scale
+from topoloc.apps.formats.colmap import estimate_metric_scale
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.recording import Recording

@@ -13,8 +13,7 @@ import pytest
 from built_room import built_room
 from topoloc.apps.cli import main
 from topoloc.apps.viewer.document import ResultSet, create_document
-from topoloc.apps.viewer.map_scene import create_world_scene
-from topoloc.apps.viewer.world_document import create_world_document, transform_answers
+from topoloc.apps.viewer.worlds import create_world_document, create_world_scene, transform_answers
 from topoloc.atlas.atlas import Atlas
 from topoloc.atlas.editing import NewTile, add_joins, create_atlas
 from topoloc.atlas.joins import Join

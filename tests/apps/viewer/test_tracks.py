@@ -9,8 +9,7 @@ import numpy as np
 
 from built_room import built_room
 from topoloc.apps.export.colmap import to_colmap_model
-from topoloc.apps.viewer.map_scene import create_map_scene
-from topoloc.apps.viewer.tracks import MAX_ERROR_PX, find_tracks
+from topoloc.apps.viewer.map_scene import MAX_ERROR_PX, create_map_scene, find_tracks
 from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.topomap import TopoMetricMap
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import version
+from itertools import chain
 from typing import Annotated
 
 import tyro
@@ -27,18 +29,11 @@ class Command:
     """Only the settings of this command: build, slam, localize, evaluate, explain or train."""
 
     def run(self) -> int:
-        from topoloc import __version__
-
         commands_of = {name: commands for name, (_, _, commands) in all_tables().items()}
-        tables = [
-            name
-            for name, commands in commands_of.items()
-            if self.command is None or self.command in commands
-        ]
+        is_all = self.command is None
+        tables = [name for name, used in commands_of.items() if is_all or self.command in used]
         if not tables:
-            known = ", ".join(
-                dict.fromkeys(c for commands in commands_of.values() for c in commands)
-            )
+            known = ", ".join(dict.fromkeys(chain(*commands_of.values())))
             raise UsageError(f"{self.command} has no settings beside its options; {known} have")
-        print(_HEADER.format(version=__version__) + "\n\n" + settings_text(tables), end="")
+        print(_HEADER.format(version=version("topoloc")) + "\n\n" + settings_text(tables), end="")
         return 0

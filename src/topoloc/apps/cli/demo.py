@@ -57,24 +57,21 @@ class Command:
     out: Annotated[str, tyro.conf.arg(metavar="DIR")] = "topoloc-demo"
     """Output folder of map, results, trajectories and report.html."""
     recordings: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: the shipped ones)"),
+        str | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: the shipped ones)")
     ] = None
     """Recordings of `topoloc simulate demo` instead of the shipped ones."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
-        start = time.perf_counter()
-        out = _create_folder(Path(self.out))
+        start, out = time.perf_counter(), _create_folder(Path(self.out))
         check_outputs(
             [str(out / "lab.topo"), str(out / "results.jsonl"), str(out / "report.html"), self.json]
         )
         with progress_bar() as progress:
             folder = self._find_recordings()
             topomap = _build_lab_map(folder, out / "lab.topo", progress)
-            mapped = time.perf_counter()
-            answers = _localize_queries(topomap, folder, progress)
+            mapped, answers = time.perf_counter(), _localize_queries(topomap, folder, progress)
         evaluation = Evaluation(answers).to_json() | {"map": topomap.describe(out / "lab.topo")}
         _write_results(out, folder, answers)
         try:
@@ -154,12 +151,10 @@ def _write_results(out: Path, folder: Path, answers: list[EvaluatedQuery]) -> No
     groups = Evaluation(answers).by_recording
     for sequence in _open(folder, "queries"):
         t_ns = dict(zip(sequence.names, sequence.t_ns, strict=True))
-        found = [
-            (t_ns[a.query], a.result.world_from_cam)
-            for a in groups[_label(sequence)]
-            if isinstance(a.result, Localization)
-        ]
-        trajectory = Trajectory([pose for _, pose in found], [t for t, _ in found])
+        group = groups[_label(sequence)]
+        results = [a.result for a in group]
+        poses = [one.world_from_cam if isinstance(one, Localization) else None for one in results]
+        trajectory = Trajectory.of_frames(poses, [t_ns[a.query] for a in group])
         trajectory.write_tum(out / f"{sequence.name}.tum")
 
 

@@ -35,17 +35,24 @@ QUERY_FEATURES = Annotated[
     tyro.conf.arg(
         metavar="surf|learned|both|KIND[,KIND]",
         help_behavior_hint="(default: all of the map)",
+        help="Feature types of the map to use, in order. The next one is used if the pose is"
+        " unclear.",
+    ),
+]
+CoarseOption = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME",
+        help_behavior_hint="(default: the map's)",
+        help="Coarse localizer to use. `topoloc info` lists those of the map.",
     ),
 ]
 
 
 def select_build_features(config: BuildConfig, features: str | None) -> BuildConfig:
-    """Return the configuration with the feature types of the option.
-
-    Raises:
-        UsageError: a type is unknown or given twice.
-        MissingExtraError, WeightsError: a type is not available on this machine.
-    """
+    """Return the configuration with the feature types of the option. Raises UsageError: a type is
+    unknown or given twice; MissingExtraError, WeightsError: a type is not available on this
+    machine."""
     kinds = config.kinds
     if features is not None:
         try:
@@ -66,13 +73,9 @@ def open_localizer(
     tiles: AtlasConfig | None = None,
 ) -> Localizer:
     """Open a map or an atlas for queries. A line on standard error names each feature type and each
-    tile that cannot be used.
-
-    Raises:
-        MapError: it cannot be read.
-        FeatureTypeError: the map does not hold these feature types.
-        MissingExtraError, WeightsError: a feature type cannot be used on this machine.
-    """
+    tile that cannot be used. Raises MapError: it cannot be read; FeatureTypeError: the map does not
+    hold these feature types; MissingExtraError, WeightsError: a feature type cannot be used on this
+    machine."""
     return Localizer(source, config, features=features, tiles=tiles, warn=print_warning)
 
 

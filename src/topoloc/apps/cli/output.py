@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -15,7 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequence
-from topoloc.plugin import recording_notes, remove_stale_files, write_text
+from topoloc.plugin import remove_stale_files, write_text
 
 # A switch: no `--no-...`, and no "(default: False)" in the help.
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
@@ -51,6 +52,12 @@ Topics = Annotated[
 RayOption = Annotated[
     str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")
 ]
+PosesOption = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="CONVENTION[,CONVENTION]", help_behavior_hint="(default: world_from_cam, metres)"
+    ),
+]
 _COLUMNS = (
     "recording",
     "localized",
@@ -70,39 +77,28 @@ def open_recording(
     images: str | None = None,
 ) -> StereoSequence:
     """Open a recording and print its notes on standard error. See `open_sequence` for errors."""
-    sequence = open_sequence(path, format, camera, images, topics)
-    for note in recording_notes(sequence):
-        print(f"warning: {note}", file=sys.stderr)
-    return sequence
+    return open_sequence(path, format, camera, images, topics, print_warning)
 
 
 class UsageError(TopolocError):
     """The arguments of a command are wrong: exit status 2."""
 
 
-def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str] = ()) -> None:
-    """Check before the work that the output files can be written.
-
-    Args:
-        outputs: paths; None and ``-`` are ignored.
-        inputs: files that must not be overwritten.
-
-    Raises:
-        TopolocError: the folder is missing or read-only, the path is no regular file, or a file is
-            used twice.
-    """
-    taken = {Path(path).resolve() for path in inputs}
+def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str | None] = ()) -> None:
+    """Check before the work that the output files can be written. None and ``-`` are ignored.
+    `inputs`: files that must not be overwritten. Raises TopolocError: the folder is missing or
+    read-only, the path is no regular file, or a file is used twice."""
+    taken = {Path(path).resolve() for path in inputs if path}
     for path in (Path(output) for output in outputs if output not in (None, "-")):
-        if not path.parent.is_dir():
-            raise TopolocError(f"cannot write {path}: folder {path.parent} does not exist")
-        if path.is_dir():
-            raise TopolocError(f"cannot write {path}: it is a folder")
-        if path.exists() and not path.is_file():  # a device would be replaced by a file
-            raise TopolocError(f"cannot write {path}: it is no regular file")
-        if not os.access(path.parent, os.W_OK):
-            raise TopolocError(f"cannot write {path}: folder {path.parent} is read-only")
-        if path.resolve() in taken:
-            raise TopolocError(f"cannot write {path}: this file is used twice")
+        faults = {
+            f"folder {path.parent} does not exist": not path.parent.is_dir(),
+            "it is a folder": path.is_dir(),
+            "it is no regular file": path.exists() and not path.is_file(),  # such as a device
+            f"folder {path.parent} is read-only": not os.access(path.parent, os.W_OK),
+            "this file is used twice": path.resolve() in taken,
+        }
+        if fault := next((text for text, is_found in faults.items() if is_found), None):
+            raise TopolocError(f"cannot write {path}: {fault}")
         remove_stale_files(path)
         taken.add(path.resolve())
 
@@ -147,7 +143,6 @@ def catch_stop_signals() -> Iterator[threading.Event]:
 
 def _is_out_of_memory(error: Exception) -> bool:
     """Return whether an error of OpenCV, FAISS or the library loader means too little memory."""
-    text = str(error)
     words = (
         "Insufficient memory",
         "std::bad_alloc",
@@ -155,7 +150,8 @@ def _is_out_of_memory(error: Exception) -> bool:
         "failed to map segment",
         "can't start new thread",
     )
-    return (isinstance(error, OSError) and error.errno == 12) or any(word in text for word in words)
+    is_os_error = isinstance(error, OSError) and error.errno == errno.ENOMEM
+    return is_os_error or any(word in str(error) for word in words)
 
 
 @contextmanager
@@ -164,50 +160,37 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     if not sys.stderr.isatty():
         yield lambda stage, done, total: None
         return
+    from rich import progress as bars
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[speed]}"),
-        TimeRemainingColumn(),
+        bars.TextColumn("{task.description}"),
+        bars.BarColumn(),
+        bars.MofNCompleteColumn(),
+        bars.TextColumn("{task.fields[speed]}"),
+        bars.TimeRemainingColumn(),
     )
     # Printed lines go above the bar, except if stdout is a file.
-    with Progress(
-        *columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()
-    ) as progress:
+    is_above, console = sys.stdout.isatty(), Console(stderr=True)
+    with bars.Progress(*columns, console=console, redirect_stdout=is_above) as progress:
         tasks: dict[str, Any] = {}
 
         def update(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = progress.add_task(stage, total=total, speed="")
             speed = progress.tasks[tasks[stage]].speed
-            progress.update(
-                tasks[stage], completed=done, total=total, speed=f"{speed:.1f}/s" if speed else ""
-            )
+            shown = f"{speed:.1f}/s" if speed else ""
+            progress.update(tasks[stage], completed=done, total=total, speed=shown)
 
         yield update
 
 
 def import_report_writer() -> Callable[..., None]:
     """Return `write_report`. Raises MissingExtraError if the extra `report` is not installed."""
-    try:
+    with MissingExtraError.on_import("a report needs matplotlib", "report"):
         from topoloc.apps.report.report import write_report
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] != "matplotlib":
-            raise
-        raise MissingExtraError(
-            "a report needs matplotlib: pip install 'topoloc[report]'"
-        ) from error
-    return write_report
+
+        return write_report
 
 
 def print_warning(text: str) -> None:
@@ -237,22 +220,15 @@ def print_recordings(
 
 
 def _row(recording: dict[str, Any]) -> tuple[str, ...]:
-    recall, num = recording["recall"], recording["num_queries"]
+    recall, num, found = recording["recall"], recording["num_queries"], recording["num_localized"]
     shares = [f"{100 * recall[key]:.0f} %" if num else "" for key in ("0.05m_5deg", "0.25m_2deg")]
-    median = (
-        _error(recording["median_translation_m"], recording["median_rotation_deg"])
-        if recording["num_localized"]
-        else ""
-    )
+    localized, median = f"{found} of {num}" if num else "", ""
+    if found:
+        median = _error(recording["median_translation_m"], recording["median_rotation_deg"])
+    false = f"{recording['false_accepts']} of {num + recording['num_elsewhere']}"
     total = recording["median_times_ms"].get("total")
-    return (
-        recording["name"],
-        f"{recording['num_localized']} of {num}" if num else "",
-        median,
-        *shares,
-        f"{recording['false_accepts']} of {num + recording['num_elsewhere']}",
-        "" if total is None else f"{total:.0f}",
-    )
+    ms = "" if total is None else f"{total:.0f}"
+    return recording["name"], localized, median, *shares, false, ms
 
 
 def _error(metres: float, degrees: float) -> str:

@@ -9,23 +9,16 @@ import json
 import textwrap
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import is_dataclass, replace
+from dataclasses import is_dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
 from topoloc import ConfigError
 from topoloc.apps.cli import PLUGIN_PACKAGES, all_commands, load_plugins
 from topoloc.apps.cli.output import UsageError
-from topoloc.plugin import (
-    describe_range,
-    drop_removed_settings,
-    field_annotations,
-    find_violation,
-    parse_settings,
-    quote_key,
-    suggest_name,
-)
+from topoloc.plugin import describe_ranges, parse_tables, suggest_name, with_setting
 
 T = TypeVar("T")
 
@@ -69,26 +62,23 @@ class Settings:
 
 def read_settings(path: str | None) -> Settings:
     """Read the TOML file of `--config`, with the tables of all commands. None is an empty file.
-
-    Raises:
-        ConfigError: the file is missing or not TOML, or a key is unknown or has an invalid value.
-            The text names file and key.
-    """
+    Raises ConfigError: the file is missing or not TOML, or a key is unknown or has an invalid
+    value. The text names file and key."""
     if path is None:
         return Settings({})
     try:
-        configs = []
-        for name, table in drop_removed_settings(_parse_file(path), source=f"{path}: ").items():
-            if name not in all_tables():
-                problem = f"no such table{suggest_name(name, all_tables())}"
-                if name in PLUGIN_PACKAGES and name not in all_commands():
-                    problem = f"needs {PLUGIN_PACKAGES[name]}, which is not installed"
-                raise ConfigError(f"{quote_key(name)}: {problem}")
-            kind = config_class(name)
-            configs.append(parse_settings(kind, table, name, default=kind()))
+        configs = parse_tables(_parse_file(path), _find_class, f"{path}: ")
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return Settings({type(config): config for config in configs})
+
+
+def _find_class(table: str) -> type:
+    if table in all_tables():
+        return config_class(table)
+    if table in PLUGIN_PACKAGES and table not in all_commands():
+        raise ConfigError(f"needs {PLUGIN_PACKAGES[table]}, which is not installed")
+    raise ConfigError(f"no such table{suggest_name(table, all_tables())}")
 
 
 def all_tables() -> dict[str, tuple[str, str, tuple[str, ...]]]:
@@ -103,22 +93,15 @@ def config_class(table: str) -> type:
 
 
 def with_option(config: T, key: str, value: Any, option: str) -> T:
-    """Return the configuration with the value of a command line option, if it is not None.
-
-    Args:
-        key: path of the setting, such as "nodes.d_thresh".
-
-    Raises:
-        UsageError: the value is out of bounds. The text names the option.
-    """
+    """Return the configuration with the value of a command line option, if it is not None. `key`:
+    path of the setting, such as "nodes.d_thresh". Raises UsageError: the value is out of bounds.
+    The text names the option."""
     if value is None:
         return config
-    name, _, rest = key.partition(".")
-    if rest:
-        return replace(config, **{name: with_option(getattr(config, name), rest, value, option)})  # pyright: ignore[reportArgumentType]
-    if wrong := find_violation(value, field_annotations(type(config))[name]):
-        raise UsageError(f"{option}: {wrong}")
-    return replace(config, **{name: value})  # pyright: ignore[reportArgumentType]
+    try:
+        return with_setting(config, key, value)
+    except ConfigError as error:
+        raise UsageError(f"{option}: {error}") from None
 
 
 def settings_text(tables: Sequence[str]) -> str:
@@ -128,16 +111,16 @@ def settings_text(tables: Sequence[str]) -> str:
 
 def _format_table(config: Any, key: str, note: str = "") -> Iterator[str]:
     """Yield the lines of a table and its nested tables."""
-    kinds, notes = field_annotations(type(config)), read_field_docs(type(config))
-    nested = [name for name in kinds if is_dataclass(getattr(config, name))]
-    yield from _format_comment(" ".join(filter(None, (_class_summary(type(config)), note))))
+    ranges, notes = describe_ranges(type(config)), read_field_docs(type(config))
+    nested = [name for name in ranges if is_dataclass(getattr(config, name))]
+    summary = (inspect.getdoc(type(config)) or "").partition("\n\n")[0]
+    yield from _format_comment(f"{' '.join(summary.split())} {note}")
     yield f"[{key}]"
-    for name, kind in kinds.items():
+    for name, limits in ranges.items():
         if name not in nested:
             value = getattr(config, name)
             yield from _format_comment(notes.get(name, ""))
             line = f"# {name} =" if value is None else f"{name} = {_to_toml(value)}"
-            limits = describe_range(kind)
             yield f"{line}  # {limits}" if limits else line
     yield ""
     for name in nested:
@@ -148,11 +131,6 @@ def _format_comment(text: str) -> list[str]:
     return textwrap.wrap(
         text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False
     )
-
-
-def _class_summary(kind: type) -> str:
-    """Return the first paragraph of a class's docstring."""
-    return " ".join((inspect.getdoc(kind) or "").partition("\n\n")[0].split())
 
 
 def _to_toml(value: Any) -> str:
@@ -173,13 +151,10 @@ def read_field_docs(kind: type) -> dict[str, str]:
     meanings = dict[str, str]()
     for base in kind.__bases__:
         meanings |= read_field_docs(base)
-    for item, after in zip(body.body, body.body[1:], strict=False):
-        if (
-            isinstance(item, ast.AnnAssign)
-            and isinstance(after, ast.Expr)
-            and isinstance(after.value, ast.Constant)
-        ):
-            meanings[ast.unparse(item.target)] = " ".join(str(after.value.value).split())
+    for item, after in pairwise(body.body):
+        match item, after:
+            case ast.AnnAssign(target), ast.Expr(ast.Constant(text)):
+                meanings[ast.unparse(target)] = " ".join(str(text).split())
     return meanings
 
 

@@ -16,12 +16,8 @@ _MAX_LISTED = 8
 
 
 def select_tile(place: SingleMap | Atlas, tile_id: str | None) -> str:
-    """Return the id of the named tile, or of the only one.
-
-    Raises:
-        AtlasError: there is no such tile.
-        UsageError: there are several tiles, and none is named.
-    """
+    """Return the id of the named tile, or of the only one. Raises AtlasError: there is no such
+    tile; UsageError: there are several tiles, and none is named."""
     ids = place.select_tiles(tile_id)
     if len(ids) != 1:
         raise UsageError(
@@ -38,11 +34,7 @@ def _format_ids(ids: Sequence[str]) -> str:
 
 def select_world(atlas: Atlas, tile_id: str | None) -> SharedWorld:
     """Return the world of the named tile alone, or else the shared world with most nodes. A warning
-    lists the tiles of other worlds.
-
-    Raises:
-        AtlasError: there is no such tile, or no tile at all.
-    """
+    lists the tiles of other worlds. Raises AtlasError: there is no such tile, or no tile at all."""
     if tile_id is not None:
         return SharedWorld.of_tile(atlas.manifest, atlas.tile(tile_id))
     worlds = SharedWorld.group(atlas.manifest)
@@ -66,10 +58,8 @@ def run_for_each_tile(
     and return the exit status.
 
     If a tile of an atlas fails, its error is printed, the others continue, and the status is 1.
-
-    Raises:
-        MapError: the only map fails, or there is no such tile.
-        ObjectStoreError: the store does not respond, so that each other tile would wait for it too.
+    Raises MapError: the only map fails, or there is no such tile; ObjectStoreError: the store does
+    not respond, so that each other tile would wait for it too.
     """
     facts, ids = dict[str, dict[str, Any]](), place.select_tiles(tile_id)
     for one in ids:

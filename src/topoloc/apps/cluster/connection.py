@@ -28,28 +28,22 @@ _TOKEN_VARIABLES = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 def import_ray() -> Any:
     """Import Ray. Raises MissingExtraError."""
-    try:
+    with MissingExtraError.on_import("a cluster needs {}", "cluster"):
         import ray
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"a cluster needs {error.name}: pip install 'topoloc[cluster]'"
-        ) from error
-    return ray
+
+        return ray
 
 
 @contextmanager
 def connect_to_cluster(address: str) -> Iterator[Any]:
     """Connect to a cluster and return Ray. Running tasks are cancelled when the block ends.
 
-    A nested block with the same address uses the same connection.
+    A nested block with the same address uses the same connection. Raises MissingExtraError: Ray is
+    not installed; ClusterError: no Ray cluster of this version answers.
 
     Args:
         address: HOST:PORT; `auto` for the cluster of this machine or of RAY_ADDRESS; `local` for a
             temporary one of this machine's processors.
-
-    Raises:
-        MissingExtraError: Ray is not installed.
-        ClusterError: no Ray cluster of this version answers.
     """
     ray = import_ray()
     if address in _CONNECTED:
@@ -110,15 +104,11 @@ def _check_address(address: str) -> None:
 def _failure_reason(address: str, error: Exception) -> str:
     text = " ".join(str(error).split())
     if "ersion mismatch" in text:
-        return (
-            f"the Ray cluster at {address} has another version:"
-            f" {text.partition('mismatch')[2].strip(' :!.')[:300]}"
-        )
+        versions = text.partition("mismatch")[2].strip(" :!.")[:300]
+        return f"the Ray cluster at {address} has another version: {versions}"
     if "Could not find any running Ray instance" in text:
-        return (
-            "no Ray cluster runs on this machine; start one with `ray start --head`, or use --ray"
-            " local"
-        )
+        start = "start one with `ray start --head`, or use --ray local"
+        return f"no Ray cluster runs on this machine; {start}"
     reason = f"no Ray cluster answers at {address}: {text[:300] or type(error).__name__}"
     if "RAY_AUTH_MODE" in os.environ:
         return reason

@@ -42,17 +42,10 @@ class TaskRequirements:
 
 
 def run_task(packed: bytes, terms: TaskRequirements, board: Any, number: int) -> bytes:
-    """Run the job of a pickled `TaskPayload` and return its pickled outcome.
-
-    Args:
-        number: the job's number on the board.
-
-    Raises:
-        ClusterError: this machine has another version of topoloc.
-        TopolocError: raised by the job.
-    """
-    if terms.version != version("topoloc"):
-        own = version("topoloc")
+    """Run the job of a pickled `TaskPayload` and return its pickled outcome. `number`: the job's
+    number on the board. Raises ClusterError: this machine has another version of topoloc;
+    TopolocError: raised by the job."""
+    if terms.version != (own := version("topoloc")):
         raise ClusterError(
             f"{platform.node()} has topoloc {own}, but the driver has {terms.version}"
         )
@@ -110,8 +103,7 @@ class ProgressBoard:
 
 def create_progress_board(ray: Any) -> Any:
     """Start a `ProgressBoard` on the driver's machine. It restarts empty if it is lost."""
-    near = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
-        ray.get_runtime_context().get_node_id(), soft=True
-    )
+    node_id, strategies = ray.get_runtime_context().get_node_id(), ray.util.scheduling_strategies
+    near = strategies.NodeAffinitySchedulingStrategy(node_id, soft=True)
     options = {"num_cpus": 0, "max_restarts": -1, "scheduling_strategy": near}
     return ray.remote(ProgressBoard).options(**options).remote()

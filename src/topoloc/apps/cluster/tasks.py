@@ -73,7 +73,8 @@ def run_on_ray(
     is_live: bool = False,
     lines: Sequence[str] | None = None,
 ) -> list[T]:
-    """Run the jobs and return their outcomes in order.
+    """Run the jobs and return their outcomes in order. Raises MissingExtraError, ClusterError: see
+    `connect_to_cluster`.
 
     Args:
         address: cluster, as for `connect_to_cluster`.
@@ -81,9 +82,6 @@ def run_on_ray(
             running job.
         lines: a name for each job. Jobs of the same name run one after the other, in order.
             Default: all jobs may run in parallel.
-
-    Raises:
-        MissingExtraError, ClusterError: see `connect_to_cluster`.
     """
     config, show = config or ClusterConfig(), show or (lambda number, state: None)
     # Ray prints messages about restarted workers
@@ -112,8 +110,7 @@ def run_locally(
     jobs: Sequence[Job[T]], show: OnJobState[T] | None = None, is_live: bool = False
 ) -> list[T]:
     """Run the jobs in this process, one after the other. See `run_on_ray`."""
-    show = show or (lambda number, state: None)
-    outcomes = list[T]()
+    show, outcomes = show or (lambda number, state: None), list[T]()
     for number, job in enumerate(jobs):
 
         def report(stage: str, done: int, total: int, number: int = number) -> None:
@@ -141,15 +138,11 @@ def _group_queues(num_jobs: int, lines: Sequence[str] | None) -> list[deque[int]
 
 def _warn_few_cpus(ray: Any, wanted: int) -> None:
     """Warn if no machine is large enough. Unless the cluster grows, the jobs would wait forever."""
-    most = max(
-        (node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0
-    )
-    if most < wanted:
-        print(
-            f"warning: a task needs {wanted} processors, but no machine of the cluster has more"
-            f" than {most:g}",
-            file=sys.stderr,
-        )
+    counts = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
+    if (most := max(counts, default=0.0)) < wanted:
+        need = f"a task needs {wanted} processors"
+        machines = f"no machine of the cluster has more than {most:g}"
+        print(f"warning: {need}, but {machines}", file=sys.stderr)
 
 
 def _submit_job(

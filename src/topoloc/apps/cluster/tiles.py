@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import platform
 import re
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -22,7 +23,7 @@ from topoloc import Atlas, AtlasError, Tile, TopolocError, TopoMetricMap
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import OnJobState, run_on_ray
-from topoloc.plugin import absolute_address, check_tile_id, temporary_folder
+from topoloc.plugin import check_tile_id, temporary_folder
 
 State = Literal["built", "recognised", "updated", "there", "failed"]
 
@@ -42,11 +43,8 @@ class MapMaker(Protocol):
 
 @dataclass(frozen=True)
 class TileJob:
-    """A recording, the id and the world of its tile, and the builder of its map.
-
-    Raises:
-        AtlasError: the id or the world is invalid.
-    """
+    """A recording, the id and the world of its tile, and the builder of its map. Raises AtlasError:
+    the id or the world is invalid."""
 
     recording: str
     tile_id: str
@@ -100,18 +98,10 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class AtlasBuild:
-    """Recordings and the atlas of their tiles. See `build_tile` for `replaces`."""
-
-    jobs: Sequence[TileJob]
-    atlas: str
-    replaces: bool = False
-    config: ClusterConfig = field(default_factory=ClusterConfig)
-
-
-@dataclass(frozen=True)
 class TileTask:
-    """The `Job` that builds a tile from a recording."""
+    """The `Job` that builds the tile of a recording and adds it to the atlas, which is created if
+    necessary. A tile of the same id with another digest is replaced if `replaces`; if not, it is a
+    failure."""
 
     job: TileJob
     atlas: str
@@ -124,39 +114,44 @@ class TileTask:
 
     def run(self, progress: Progress) -> Outcome:
         """Build the tile."""
-        return build_tile(self.job, self.atlas, self.replaces, progress)
+        return run_tile_work(self.job.recording, self.job.tile_id, lambda: self._build(progress))
 
     def failure_outcome(self, reason: str) -> Outcome:
         """Return the outcome of a lost worker."""
         return Outcome(self.job.recording, self.job.tile_id, "failed", reason)
 
+    def _build(self, progress: Progress) -> tuple[State, Tile]:
+        job, recipe = self.job, self.job.digest()
+        before = Atlas.read_manifest(self.atlas)
+        if made := [tile for tile in before.tiles if tile.recipe == recipe]:
+            return "there", made[0]
+        if job.tile_id in before.by_id and not self.replaces:
+            raise AtlasError(
+                f"the atlas has another tile {job.tile_id} already; use --replace to replace it"
+            )
+        topomap, _ = job.maker.make(progress)
+        with temporary_folder("topoloc-tile-") as folder:
+            topomap.save(path := folder / "tile.topo")
+            add = Atlas.add_map
+            return "built", add(self.atlas, job.tile_id, path, job.world, recipe, self.replaces)
+
 
 def build_on_ray(
-    build: AtlasBuild, address: str, show: OnJobState[Outcome] | None = None, is_live: bool = False
+    jobs: Sequence[TileJob],
+    atlas: str,
+    address: str,
+    replaces: bool = False,
+    config: ClusterConfig | None = None,
+    show: OnJobState[Outcome] | None = None,
+    is_live: bool = False,
 ) -> list[Outcome]:
-    """Build all tiles on a cluster and return the outcomes in order.
-
-    Args:
-        address, show, is_live: see `run_on_ray`.
-
-    Raises:
-        MissingExtraError, ClusterError: see `connect_to_cluster`.
-        AtlasError: the address holds no atlas, or its store does not answer.
-    """
-    Atlas.read_manifest(build.atlas)  # fails before the cluster is used
-    tasks = [TileTask(job, absolute_address(build.atlas), build.replaces) for job in build.jobs]
-    return run_on_ray(tasks, address, build.config, show, is_live)
-
-
-def build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> Outcome:
-    """Build the tile of a recording and add it to the atlas, which is created if necessary.
-
-    Args:
-        replaces: replace a tile of the same id with another digest. If False, it is a failure.
-    """
-    return run_tile_work(
-        job.recording, job.tile_id, lambda: _build_tile(job, atlas, replaces, progress)
-    )
+    """Build all tiles of an atlas on a cluster and return the outcomes in order. See `TileTask` for
+    `replaces` and `run_on_ray` for the other arguments. Raises MissingExtraError, ClusterError: see
+    `connect_to_cluster`; AtlasError: the address holds no atlas, or its store does not answer."""
+    Atlas.read_manifest(atlas)  # fails before the cluster is used
+    atlas = atlas if "://" in atlas else os.path.abspath(atlas)
+    tasks = [TileTask(job, atlas, replaces) for job in jobs]
+    return run_on_ray(tasks, address, config, show, is_live)
 
 
 def run_tile_work(recording: str, tile_id: str, work: Callable[[], tuple[State, Tile]]) -> Outcome:
@@ -174,38 +169,18 @@ def run_tile_work(recording: str, tile_id: str, work: Callable[[], tuple[State, 
         except Exception as error:  # a bug; the other jobs continue
             traceback.print_exc()
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:500]
-    notes = tuple(messages.getvalue().splitlines())
-    done = Outcome(recording, tile_id, state, reason, notes, host=platform.node())
-    if tile is not None:
-        done = replace(
-            done, tile_id=tile.tile_id, num_nodes=tile.num_nodes, num_bytes=tile.map.num_bytes
-        )
     seconds, cpu_seconds = time.monotonic() - started, time.process_time() - cpu_started
-    return replace(done, seconds=seconds, cpu_seconds=cpu_seconds)
-
-
-def _build_tile(job: TileJob, atlas: str, replaces: bool, progress: Progress) -> tuple[State, Tile]:
-    recipe = job.digest()
-    before = Atlas.read_manifest(atlas)
-    if made := [tile for tile in before.tiles if tile.recipe == recipe]:
-        return "there", made[0]
-    if job.tile_id in before.by_id and not replaces:
-        raise AtlasError(
-            f"the atlas has another tile {job.tile_id} already; use --replace to replace it"
-        )
-    topomap, _ = job.maker.make(progress)
-    with temporary_folder("topoloc-tile-") as folder:
-        path = folder / "tile.topo"
-        topomap.save(path)
-        return "built", Atlas.add_map(atlas, job.tile_id, path, job.world, recipe, replaces)
+    spent = {"seconds": seconds, "cpu_seconds": cpu_seconds, "host": platform.node()}
+    notes = tuple(messages.getvalue().splitlines())
+    if tile is not None:
+        spent |= {"num_nodes": tile.num_nodes, "num_bytes": tile.map.num_bytes}
+        tile_id = tile.tile_id
+    return Outcome(recording, tile_id, state, reason, notes, **spent)
 
 
 def derive_tile_ids(recordings: Sequence[str]) -> list[str]:
-    """Return tile ids from the recordings' names, with parent folders until they are unique.
-
-    Raises:
-        AtlasError: a recording is given twice.
-    """
+    """Return tile ids from the recordings' names, with parent folders until they are unique. Raises
+    AtlasError: a recording is given twice."""
     paths = [_path_parts(recording) for recording in recordings]
     for recording, words in zip(recordings, paths, strict=True):
         if paths.count(words) > 1:

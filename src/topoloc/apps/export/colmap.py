@@ -10,57 +10,51 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from topoloc import Camera, Rigid3, TopolocError
+from topoloc import Camera, TopolocError
 from topoloc.apps.viewer.scene import Scene, View
 
 _HALF_PIXEL = 0.5  # the centre of COLMAP's top-left pixel
+_COLUMNS = {
+    "cameras": "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+    "images": "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, and a line of POINTS2D[] as"
+    " (X, Y, POINT3D_ID)",
+    "points3D": "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+    "rigs": "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]",
+    "frames": "FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], NUM_DATA_IDS,"
+    " DATA_IDS[]",
+}
 
 
 def to_colmap_model(scene: Scene) -> dict[str, bytes]:
-    """Return the files of a model by their names.
-
-    Raises:
-        TopolocError: a view has no camera.
-    """
+    """Return the files of a model by their names. Raises TopolocError: a view has no camera."""
     ids, cameras = _find_cameras(scene.views)
+    known = {number: camera.to_colmap() for camera, number in cameras.items()}
+    rows = {
+        "cameras": [
+            f"{number} {model} {width} {height} {' '.join(map(repr, params))}"
+            for number, (model, width, height, params) in known.items()
+        ],
+        "points3D": _format_points(scene),
+        "rigs": [f"{number} 1 CAMERA {number}" for number in known],
+    }
     images, frames = [], []
     for number, view in enumerate(scene.views, 1):
-        camera_id, pose = ids[number - 1], _format_pose(view.world_from_cam.inverse())
+        camera_id, cam_from_world = ids[number - 1], view.world_from_cam.inverse()
+        values = (*cam_from_world.quat_wxyz().tolist(), *cam_from_world.translation.tolist())
+        pose = " ".join(map(repr, values))
+        name = re.sub(r"\s", "_", view.name) or "_"  # COLMAP would cut it at a blank
         points_img = (view.points_img + _HALF_PIXEL).tolist()
         key_points = (
             f"{x:.6f} {y:.6f} {row + 1 if row >= 0 else -1}"
             for (x, y), row in zip(points_img, view.point_rows.tolist(), strict=True)
         )
-        images += [f"{number} {pose} {camera_id} {_image_name(view)}", " ".join(key_points)]
+        images += [f"{number} {pose} {camera_id} {name}", " ".join(key_points)]
         frames.append(f"{number} {camera_id} {pose} 1 CAMERA {camera_id} {number}")
+    rows |= {"images": images, "frames": frames}
     return {
-        "cameras.txt": _format_file(
-            "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-            [_format_camera(camera, number) for camera, number in cameras.items()],
-        ),
-        "images.txt": _format_file(
-            "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, and a line of POINTS2D[] as (X,"
-            " Y, POINT3D_ID)",
-            images,
-        ),
-        "points3D.txt": _format_file(
-            "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-            _format_points(scene),
-        ),
-        "rigs.txt": _format_file(
-            "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]",
-            [f"{number} 1 CAMERA {number}" for number in cameras.values()],
-        ),
-        "frames.txt": _format_file(
-            "FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], NUM_DATA_IDS,"
-            " DATA_IDS[]",
-            frames,
-        ),
+        f"{name}.txt": "\n".join([f"# {columns}", *rows[name], ""]).encode()
+        for name, columns in _COLUMNS.items()
     }
-
-
-def _format_file(columns: str, lines: Iterable[str]) -> bytes:
-    return "\n".join([f"# {columns}", *lines, ""]).encode()
 
 
 def _find_cameras(views: Iterable[View]) -> tuple[list[int], dict[Camera, int]]:
@@ -72,21 +66,6 @@ def _find_cameras(views: Iterable[View]) -> tuple[list[int], dict[Camera, int]]:
             raise TopolocError(f"{view.name}: a COLMAP model needs its camera, which is not known")
         ids.append(known.setdefault(view.camera, len(known) + 1))
     return ids, known
-
-
-def _format_camera(camera: Camera, camera_id: int) -> str:
-    model, width, height, params = camera.to_colmap()
-    return f"{camera_id} {model} {width} {height} {' '.join(map(repr, params))}"
-
-
-def _image_name(view: View) -> str:
-    """Return a name without blanks, at which COLMAP would cut it."""
-    return re.sub(r"\s", "_", view.name) or "_"
-
-
-def _format_pose(cam_from_world: Rigid3) -> str:
-    values = (*cam_from_world.quat_wxyz().tolist(), *cam_from_world.translation.tolist())
-    return " ".join(map(repr, values))
 
 
 def _format_points(scene: Scene) -> list[str]:

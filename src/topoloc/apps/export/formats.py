@@ -57,11 +57,7 @@ def export(path: str | Path, out: str | Path, format: str | None = None) -> None
 
 def to_tum(scene: Scene) -> bytes:
     """Return ``t tx ty tz qx qy qz qw`` of the views, world_from_cam. If no view has a time, t is
-    its number.
-
-    Raises:
-        TrajectoryError: times do not increase, for example in several sessions.
-    """
+    its number. Raises TrajectoryError: times do not increase, for example in several sessions."""
     timed = [(view.t_ns, view.world_from_cam) for view in scene.views if view.t_ns is not None]
     timed.sort(key=lambda pair: pair[0])
     if not timed:
@@ -104,11 +100,8 @@ def to_ply(scene: Scene) -> bytes:
 
 def to_geojson(scene: Scene) -> bytes:
     """Return RFC 7946: a point for each view, a line for each session. Coordinates are longitude,
-    latitude and height above the ellipsoid.
-
-    Raises:
-        GeoreferenceError: the scene is not georeferenced.
-    """
+    latitude and height above the ellipsoid. Raises GeoreferenceError: the scene is not
+    georeferenced."""
     points, lines = [], []
     for session_id, group in groupby(scene.views, lambda view: view.session_id):
         line = []
@@ -145,10 +138,8 @@ def to_nerfstudio(scene: Scene) -> dict[str, bytes]:
     """Return nerfstudio's ``transforms.json``, the images of a map, and the points for training.
 
     Camera axes are those of OpenGL: x right, y up, z back. Results refer to their own images.
+    Raises TopolocError: a view has no camera, or the cameras are of several models.
     https://docs.nerf.studio/quickstart/data_conventions.html
-
-    Raises:
-        TopolocError: a view has no camera, or the cameras are of several models.
     """
     files, frames = dict[str, bytes](), []
     for number, view in enumerate(scene.views):
@@ -219,10 +210,7 @@ FORMATS = {
 
 def find_export_format(out: Path, named: str | None = None) -> ExportFormat:
     """Return the named format, else the one of the suffix of `out`. A folder is a COLMAP model.
-
-    Raises:
-        TopolocError: the format or the suffix is unknown.
-    """
+    Raises TopolocError: the format or the suffix is unknown."""
     name = named or out.suffix.lower().removeprefix(".") or "colmap"
     if named is None and out.is_dir():
         name = "colmap"
@@ -232,11 +220,8 @@ def find_export_format(out: Path, named: str | None = None) -> ExportFormat:
 
 
 def write_scene(scene: Scene, out: Path, form: ExportFormat) -> None:
-    """Write the file or the folder atomically.
-
-    Raises:
-        TopolocError: it cannot be written, or the scene lacks data of the format.
-    """
+    """Write the file or the folder atomically. Raises TopolocError: it cannot be written, or the
+    scene lacks data of the format."""
     if form.file is not None:
         write_bytes(out, form.file(scene))
     elif form.folder is not None:

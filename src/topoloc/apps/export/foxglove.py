@@ -24,19 +24,12 @@ _STEP_NS = 1_000_000_000
 
 
 def to_mcap(scene: Scene) -> bytes:
-    """Return a log. If times are missing or decrease, views are one second apart from 0.
-
-    Raises:
-        MissingExtraError: `mcap` or Foxglove's schemas are not installed.
-    """
-    try:
+    """Return a log. If times are missing or decrease, views are one second apart from 0. Raises
+    MissingExtraError: `mcap` or Foxglove's schemas are not installed."""
+    with MissingExtraError.on_import("MCAP needs mcap and Foxglove's schemas", "bags"):
         from mcap_protobuf.writer import Writer
 
         _schema("PoseInFrame")
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            "MCAP needs mcap and Foxglove's schemas: pip install 'topoloc[bags]'"
-        ) from error
     views, times = _assign_times(scene)
     buffer = io.BytesIO()
     with Writer(buffer) as writer:
@@ -77,33 +70,20 @@ def _view_messages(view: View, t_ns: int) -> Iterator[tuple[str, Any]]:
     """Yield the topics and messages of a view."""
     pose = _to_pose(view.world_from_cam)
     yield "/camera", _message("PoseInFrame", t_ns, MAP_FRAME, pose=pose)
-    yield (
-        "/tf",
-        _schema("FrameTransform")(
-            timestamp=_to_timestamp(t_ns),
-            parent_frame_id=MAP_FRAME,
-            child_frame_id=CAMERA_FRAME,
-            translation=pose.position,
-            rotation=pose.orientation,
-        ),
-    )
+    frames = {"parent_frame_id": MAP_FRAME, "child_frame_id": CAMERA_FRAME}
+    moved = {"translation": pose.position, "rotation": pose.orientation}
+    yield "/tf", _schema("FrameTransform")(timestamp=_to_timestamp(t_ns), **frames, **moved)
     camera = view.jpeg_camera or view.camera
     if camera is not None:
         k = camera.matrix()
+        model = "kannala_brandt" if camera.is_fisheye else "rational_polynomial"
+        size = {"width": camera.width, "height": camera.height, "distortion_model": model}
+        matrices = {"K": k, "R": np.eye(3), "P": np.column_stack([k, np.zeros(3)])}
+        numbers = {name: value.ravel().tolist() for name, value in matrices.items()}
+        numbers["D"] = camera.distortion().tolist()
         yield (
             "/camera/calibration",
-            _message(
-                "CameraCalibration",
-                t_ns,
-                CAMERA_FRAME,
-                width=camera.width,
-                height=camera.height,
-                distortion_model="kannala_brandt" if camera.is_fisheye else "rational_polynomial",
-                D=camera.distortion().tolist(),
-                K=k.ravel().tolist(),
-                R=np.eye(3).ravel().tolist(),
-                P=np.column_stack([k, np.zeros(3)]).ravel().tolist(),
-            ),
+            _message("CameraCalibration", t_ns, CAMERA_FRAME, **size, **numbers),
         )
     if view.jpeg:
         image = {"data": view.jpeg, "format": "jpeg"}
@@ -125,15 +105,8 @@ def _to_point_cloud(scene: Scene, t_ns: int) -> Any:
         element(name=name, offset=12 + k, type=element.UINT8)
         for k, name in enumerate(("red", "green", "blue", "alpha"))
     ]
-    return _message(
-        "PointCloud",
-        t_ns,
-        MAP_FRAME,
-        pose=_to_pose(Rigid3.identity()),
-        point_stride=points.itemsize,
-        fields=fields,
-        data=points.tobytes(),
-    )
+    content = {"point_stride": points.itemsize, "fields": fields, "data": points.tobytes()}
+    return _message("PointCloud", t_ns, MAP_FRAME, pose=_to_pose(Rigid3.identity()), **content)
 
 
 def _to_timestamp(t_ns: int) -> Any:

@@ -7,6 +7,7 @@ trajectory. CARLA's world is that of Unreal: x forward, y right, z up, left-hand
 
 from __future__ import annotations
 
+import importlib
 import math
 import queue
 from collections.abc import Callable, Iterator
@@ -81,25 +82,14 @@ class CarlaConfig:
 
 
 def carla_client(server: str) -> tuple[Any, Any]:
-    """Return CARLA's package and a connected client.
-
-    Args:
-        server: address HOST:PORT.
-
-    Raises:
-        ConfigError: the address is malformed.
-        MissingExtraError: the extra `carla` is not installed.
-        RecordingError: no server answers.
-    """
+    """Return CARLA's package and a connected client. `server`: address HOST:PORT. Raises
+    ConfigError: the address is malformed; MissingExtraError: the extra `carla` is not installed;
+    RecordingError: no server answers."""
     host, _, port = server.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port[:6]) < 65536:
         raise ConfigError(f"--server {server[:80]} is no HOST:PORT")
-    try:
-        import carla  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise MissingExtraError(
-            "recording CARLA needs its client: pip install 'topoloc[carla]'"
-        ) from None
+    with MissingExtraError.on_import("recording CARLA needs its client", "carla"):
+        carla: Any = importlib.import_module("carla")
     client = carla.Client(host, int(port))
     client.set_timeout(_CONNECT_S)
     try:
@@ -134,16 +124,10 @@ def carla_camera(fov_deg: float, size: tuple[int, int]) -> Camera:
 def carla_frames(
     carla: Any, client: Any, config: CarlaConfig, size: tuple[int, int]
 ) -> Iterator[StereoFrame]:
-    """Yield the frames along a lane. The server's settings are restored at the end.
-
-    Args:
-        size: width and height of the images, pixels.
-
-    Raises:
-        ConfigError: a setting is invalid.
-        RecordingError: the server lacks the town or the spawn point, does not answer in time, or
-            gives images of another step.
-    """
+    """Yield the frames along a lane. The server's settings are restored at the end. `size`: width
+    and height of the images, pixels. Raises ConfigError: a setting is invalid; RecordingError: the
+    server lacks the town or the spawn point, does not answer in time, or gives images of another
+    step."""
     camera = carla_camera(config.fov, size)
     if not (config.spacing > 0.0 and config.baseline > 0.0 and config.length > 0.0):
         raise ConfigError("--spacing, --length and --baseline must be above 0 m")
@@ -181,9 +165,8 @@ def _next_image(images: queue.Queue[Any], step: int) -> Any:
         try:
             image = images.get(timeout=_ANSWER_S)
         except queue.Empty:
-            raise RecordingError(
-                f"CARLA gave no image of step {step} within {_ANSWER_S:g} s"
-            ) from None
+            fault = f"CARLA gave no image of step {step} within {_ANSWER_S:g} s"
+            raise RecordingError(fault) from None
         if image.frame == step:
             return image
         if image.frame > step:
@@ -247,13 +230,9 @@ def _heading_change(here: Any) -> Callable[[Any], float]:
 
 def _offset_transform(carla: Any, transform: Any, right_m: float, up_m: float) -> Any:
     """Return a transform moved to the right and up (metres)."""
-    location, right = transform.location, transform.get_right_vector()
-    moved = carla.Location(
-        location.x + right_m * right.x,
-        location.y + right_m * right.y,
-        location.z + right_m * right.z + up_m,
-    )
-    return carla.Transform(moved, transform.rotation)
+    here, right = transform.location, transform.get_right_vector()
+    x, y, z = here.x + right_m * right.x, here.y + right_m * right.y, here.z + right_m * right.z
+    return carla.Transform(carla.Location(x, y, z + up_m), transform.rotation)
 
 
 def _make_frame(index: int, images: list[Any], camera: Camera, rig: StereoRig) -> StereoFrame:
@@ -263,8 +242,7 @@ def _make_frame(index: int, images: list[Any], camera: Camera, rig: StereoRig) -
     right_in_left = world_from_cam.inverse().apply(world_from_right.translation)
     if np.abs(right_in_left - np.array([rig.baseline, 0.0, 0.0])).max() > _POSITION_TOLERANCE_M:
         raise RecordingError(f"CARLA's cameras had wrong positions in step {left.frame}")
-    t_ns = round(left.timestamp * 1e9)
-    metric = DepthImage(_depth_in_metres(depth), camera)
+    t_ns, metric = round(left.timestamp * 1e9), DepthImage(_depth_in_metres(depth), camera)
     return StereoFrame(
         f"{index:06d}", t_ns, _to_rgb(left), camera, _to_rgb(right), rig, metric, world_from_cam
     )

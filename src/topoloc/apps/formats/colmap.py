@@ -3,15 +3,17 @@
 pycolmap (the extra `colmap`) reads all versions of the files. Images are in the order of their
 names. If the names are numbers, they are times in seconds (nanoseconds above 1e12), so that a
 trajectory fits by time. Otherwise images are 1 s apart. A model from images only has no metric
-scale (`Recording.has_scale`).
+scale (`Recording.has_scale`). It is given by a number, or by measured distances of two cameras.
 """
 
 from __future__ import annotations
 
+import importlib
+import math
 import re
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import Any
@@ -24,6 +26,7 @@ from topoloc import (
     MissingExtraError,
     RecordingError,
     Rigid3,
+    StereoSequence,
     TrajectoryError,
 )
 from topoloc.plugin import Recording, RecordingFormat, natural_key, parse_relative_path
@@ -32,6 +35,9 @@ EXPECTED_FILES = "cameras and images (.bin or .txt) of COLMAP"
 _FILES = ("cameras", "images", "points3D")
 _SUBFOLDERS = ("sparse/0", "sparse", "0")
 _MAX_SECONDS = 10**12
+_DISTANCE = re.compile(r"(?P<one>[^,=]+),(?P<other>[^,=]+)=\s*(?P<metres>[0-9.eE+-]+)\s*m?")
+_SCALE_TOLERANCE = 0.05  # of the scale; larger than errors of a measuring tape
+_MIN_DISTANCE = 1e-9
 
 
 def can_open(path: Path) -> bool:
@@ -40,15 +46,12 @@ def can_open(path: Path) -> bool:
 
 
 def open_colmap(path: Path, images: Path | None = None) -> Recording:
-    """Open a model.
+    """Open a model. Raises RecordingError: there is no model, it is damaged or has no pose, or the
+    images are missing; CalibrationError: a camera model is unknown; MissingExtraError: pycolmap is
+    not installed.
 
     Args:
         images: folder of the images. Default: `images` beside the model or above it.
-
-    Raises:
-        RecordingError: there is no model, it is damaged or has no pose, or the images are missing.
-        CalibrationError: a camera model is unknown.
-        MissingExtraError: pycolmap is not installed.
     """
     model = _find_model(path)
     if model is None:
@@ -81,14 +84,10 @@ def _find_model(path: Path) -> Path | None:
 
 
 def _model_suffix(folder: Path) -> str | None:
-    return next(
-        (
-            suffix
-            for suffix in (".bin", ".txt")
-            if all((folder / f"{name}{suffix}").is_file() for name in _FILES)
-        ),
-        None,
-    )
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in _FILES):
+            return suffix
+    return None
 
 
 def _image_folders(path: Path, model: Path) -> list[Path]:
@@ -97,12 +96,9 @@ def _image_folders(path: Path, model: Path) -> list[Path]:
 
 
 def _read_model(model: Path) -> Any:
-    try:
-        import pycolmap  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise MissingExtraError(
-            f"{model}: models of COLMAP need the extra colmap: pip install 'topoloc[colmap]'"
-        ) from None
+    need = f"{model}: models of COLMAP need the extra colmap"
+    with MissingExtraError.on_import(need, "colmap"):
+        pycolmap: Any = importlib.import_module("pycolmap")
     if _model_suffix(model) == ".bin":
         _check_counts(model)
     with _silence_log(pycolmap):
@@ -133,20 +129,15 @@ def _check_counts(model: Path) -> None:
         if not file.is_file():
             continue
         data, at = file.read_bytes(), 8
-        try:
+        with suppress(struct.error, ValueError):
             (count,) = struct.unpack_from("<Q", data)
-            fits = count <= len(data)
-            for _ in range(count if fits else 0):
-                at += length_of(data, at)
-                if at > len(data):
-                    fits = False
-                    break
-        except (struct.error, ValueError):
-            fits = False
-        if not fits:
-            raise RecordingError(
-                f"{file}: damaged, or no model of COLMAP (it is too short for its counts)"
-            )
+            for _ in range(min(count, len(data))):
+                at = min(at + length_of(data, at), len(data) + 1)
+            if count <= len(data) and at <= len(data):
+                continue
+        raise RecordingError(
+            f"{file}: damaged, or no model of COLMAP (it is too short for its counts)"
+        )
 
 
 def _image_length(data: bytes, at: int) -> int:
@@ -183,22 +174,17 @@ _RECORD_LENGTHS = {
 
 
 def _camera(camera: Any, model: Path) -> Camera:
+    size, params = (int(camera.width), int(camera.height)), tuple(map(float, camera.params))
     try:
-        return Camera.from_colmap(
-            str(camera.model_name),
-            int(camera.width),
-            int(camera.height),
-            tuple(map(float, camera.params)),
-        )
+        return Camera.from_colmap(str(camera.model_name), *size, params)
     except CalibrationError as error:
         raise CalibrationError(f"{model}: {error}") from None
 
 
 def _world_from_cam(image: Any, model: Path) -> Rigid3:
+    matrix = np.asarray(image.cam_from_world().matrix(), dtype=np.float64)
     try:
-        return Rigid3.from_matrix(
-            np.asarray(image.cam_from_world().matrix(), dtype=np.float64)
-        ).inverse()
+        return Rigid3.from_matrix(matrix).inverse()
     except TrajectoryError as error:
         raise TrajectoryError(f"{model}, {image.name}: {error}") from None
 
@@ -216,6 +202,69 @@ def times_from_names(names: list[str]) -> list[int]:
         if all(after > before for before, after in pairwise(t_ns)):
             return t_ns
     return [number * 1_000_000_000 for number in range(len(names))]
+
+
+def estimate_metric_scale(texts: Sequence[str], sequence: StereoSequence) -> float:
+    """Return the metres in a unit of the recording's poses. Raises TrajectoryError: a text is
+    malformed, an image is missing or has no pose, or the distances do not agree.
+
+    Args:
+        texts: one number, or distances between the cameras of two images:
+            ``IMG_0001.jpg,IMG_0042.jpg=3.2m``.
+    """
+    if len(texts) == 1 and "=" not in texts[0]:
+        return _positive_number(
+            texts[0], f"a scale is a positive number, or IMAGE_A,IMAGE_B=3.2m, not {texts[0][:80]}"
+        )
+    units, metres = np.array([_units_and_metres(text, sequence) for text in texts]).T
+    scales, scale = metres / units, float(units @ metres / (units @ units))
+    worst = int(np.abs(np.log(scales / scale)).argmax())
+    if scales.max() > (1.0 + _SCALE_TOLERANCE) * scales.min():
+        details = ", ".join(
+            f"{text} makes a unit {one:.4g} m" for text, one in zip(texts, scales, strict=True)
+        )
+        raise TrajectoryError(
+            f"{sequence.name}: the distances do not agree: {details}; the worst is {texts[worst]}"
+        )
+    return scale
+
+
+def _units_and_metres(text: str, sequence: StereoSequence) -> tuple[float, float]:
+    match = _DISTANCE.fullmatch(text.strip())
+    if match is None:
+        raise TrajectoryError(
+            f"{text[:80]!r} is no distance between two images, such as IMAGE_A,IMAGE_B=3.2m"
+        )
+    metres = _positive_number(match["metres"], f"{text[:80]!r}: the distance must be above 0 m")
+    one, other = (_find_pose(match[name].strip(), sequence) for name in ("one", "other"))
+    units = float(np.linalg.norm(one.translation - other.translation))
+    if units < _MIN_DISTANCE:
+        raise TrajectoryError(f"{text[:80]!r}: both images have the same position")
+    return units, metres
+
+
+def _find_pose(name: str, sequence: StereoSequence) -> Rigid3:
+    """Find an image by its name, else by its file name with or without suffix."""
+    names = sequence.names
+    rows = [row for row, other in enumerate(names) if other == name] or [
+        row for row, other in enumerate(map(PurePath, names)) if name in (other.name, other.stem)
+    ]
+    if len(rows) != 1:
+        raise TrajectoryError(f"{sequence.name}: {len(rows)} images are named {name[:80]}")
+    pose = sequence.poses[rows[0]]
+    if pose is None:
+        raise TrajectoryError(f"{sequence.name}: {name[:80]} has no pose")
+    return pose
+
+
+def _positive_number(text: str, message: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0.0 < number < math.inf:
+        raise TrajectoryError(message)
+    return number
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_colmap, ("images",))

@@ -43,21 +43,17 @@ def can_open(path: Path) -> bool:
 
 
 def open_colmap_database(path: Path, images: Path | None = None) -> Recording:
-    """Open a database.
+    """Open a database. Raises RecordingError: the file is no database of COLMAP or damaged, or the
+    images are missing; CalibrationError: a camera model is unknown.
 
     Args:
         images: folder of the images. Default: `images` beside the database.
-
-    Raises:
-        RecordingError: the file is no database of COLMAP or damaged, or the images are missing.
-        CalibrationError: a camera model is unknown.
     """
     file = path / _NAME if path.is_dir() else path
     root = images or file.parent / "images"
     if not root.is_dir():
-        raise RecordingError(
-            f"{path}: the images of this database are missing; use --images FOLDER"
-        )
+        fault = "the images of this database are missing; use --images FOLDER"
+        raise RecordingError(f"{path}: {fault}")
     cameras, camera_id_by_image = _read_database(file)
     if not camera_id_by_image:
         raise RecordingError(f"{file}: no image in this database")
@@ -80,12 +76,11 @@ def _read_database(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:
         with closing(sqlite3.connect(uri, uri=True)) as database:
             database.execute("PRAGMA trusted_schema = OFF")
             database.text_factory = lambda data: data.decode(errors="replace")
-            cameras = database.execute(
-                f"SELECT camera_id, model, width, height, params FROM cameras LIMIT {_MAX_ROWS}"
-            ).fetchall()
-            images = database.execute(
-                f"SELECT name, camera_id FROM images LIMIT {_MAX_ROWS}"
-            ).fetchall()
+            columns = "camera_id, model, width, height, params"
+            select = f"SELECT {columns} FROM cameras LIMIT {_MAX_ROWS}"
+            cameras = database.execute(select).fetchall()
+            select = f"SELECT name, camera_id FROM images LIMIT {_MAX_ROWS}"
+            images = database.execute(select).fetchall()
     # UnicodeDecodeError: the message of an error may quote damaged data
     except (sqlite3.Error, UnicodeDecodeError, MemoryError) as error:
         reason = " ".join(str(error).split())[:120]
@@ -102,10 +97,9 @@ def _camera(row: tuple[Any, ...], file: Path) -> Camera:
     if not is_valid or len(params) % 8 or len(params) > 8 * _MAX_PARAMS:
         raise RecordingError(f"{file}: damaged, an invalid camera")
     name = _CAMERA_MODELS[model] if 0 <= model < len(_CAMERA_MODELS) else f"number {model}"
+    numbers = struct.unpack(f"<{len(params) // 8}d", params)
     try:
-        return Camera.from_colmap(
-            name, width, height, struct.unpack(f"<{len(params) // 8}d", params)
-        )
+        return Camera.from_colmap(name, width, height, numbers)
     except CalibrationError as error:
         raise CalibrationError(f"{file}: camera {number}: {error}") from None
 

@@ -45,16 +45,14 @@ class LiveImage:
 
 class LiveSource:
     """An open source; iterating gives its pictures until it ends or `stop` is set. A context
-    manager that closes it.
+    manager that closes it. Raises RecordingError: it cannot be opened; while iterating: it has
+    stalled.
 
     Args:
         source: see `is_live`; a video file is read as if it were live.
         keep_all: no picture is dropped; the source waits.
-        size: width and height (pixels) that the device is asked for.
+        size: requested width and height of the images (pixels).
         stall_s: seconds without a picture after which the source has stalled.
-
-    Raises:
-        RecordingError: it cannot be opened; while iterating: it has stalled.
     """
 
     def __init__(

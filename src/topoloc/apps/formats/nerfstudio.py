@@ -13,10 +13,9 @@ import os
 from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from msgspec import Meta, Struct
 
-from topoloc import CalibrationError, Camera, RecordingError, Rigid3
+from topoloc import CalibrationError, Camera, PoseConventions, RecordingError, Rigid3
 from topoloc.plugin import (
     DepthImages,
     Finite,
@@ -33,8 +32,6 @@ FILE_NAME = "transforms.json"
 EXPECTED_FILES = "transforms.json of nerfstudio"
 DEPTH_UNIT = 0.001
 """Metres: nerfstudio's default of `depth_unit_scale_factor`."""
-CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
-"""Axes of OpenCV (y down, z forward) from those of OpenGL (y up, z back), of one camera."""
 
 
 def can_open(path: Path) -> bool:
@@ -43,13 +40,10 @@ def can_open(path: Path) -> bool:
 
 
 def open_nerfstudio(path: Path) -> Recording:
-    """Open a folder with a transforms.json, or the file itself. Frames with depth are RGB-D.
-
-    Raises:
-        RecordingError: there are no frames, only some have depth, the file is malformed, a matrix
-            is no pose, or a name leads out of the folder.
-        CalibrationError: a key of the camera is missing or invalid, or its model is unknown.
-    """
+    """Open a folder with a transforms.json, or the file itself. Frames with depth are RGB-D. Raises
+    RecordingError: there are no frames, only some have depth, the file is malformed, a matrix is no
+    pose, or a name leads out of the folder; CalibrationError: a key of the camera is missing or
+    invalid, or its model is unknown."""
     file = path if path.is_file() else path / FILE_NAME
     data = decode_json(read_text(file, RecordingError), dict[str, Any], RecordingError, str(file))
     whole = decode_json(data, _File, RecordingError, str(file))
@@ -63,19 +57,13 @@ def open_nerfstudio(path: Path) -> Recording:
     ]
     named.sort(key=lambda pair: natural_key(pair[0]))
     names = [_with_suffix(file.parent, name) for name, _, _ in named]
-    where = [f"{file}, {name}" for name in names]
-    frames = [frame for _, frame, _ in named]
+    where, frames = [f"{file}, {name}" for name in names], [frame for _, frame, _ in named]
     poses: list[Rigid3 | None] = [_pose(frame, whole.applied_scale) for frame in frames]
     # Keys of the file take precedence, as in nerfstudio.
     cameras = [_camera(lens | data, at) for (_, _, lens), at in zip(named, where, strict=True)]
     depth = _depth(frames, whole.depth_unit_scale_factor, file, where)
     name, t_ns = file.parent.resolve().name, times_from_rate(len(names))
     return Recording.with_cameras(name, file.parent, names, t_ns, poses, cameras, depth=depth)
-
-
-def rigid_from_gl(world_from_gl: Rigid3) -> Rigid3:
-    """Convert a pose from OpenGL's camera axes to OpenCV's."""
-    return Rigid3(world_from_gl.rotation @ CV_FROM_GL, world_from_gl.translation)
 
 
 _Factor = Annotated[float, Meta(gt=1e-12, lt=1e12)]
@@ -121,7 +109,8 @@ class _Lens(Struct, frozen=True):
 
 def _pose(frame: _Frame, scale: float) -> Rigid3:
     world_from_gl = frame.transform_matrix
-    return rigid_from_gl(Rigid3(world_from_gl.rotation, world_from_gl.translation / scale))
+    metric = Rigid3(world_from_gl.rotation, world_from_gl.translation / scale)
+    return PoseConventions(("opengl",)).undo_conventions(metric)
 
 
 def _camera(data: dict[str, Any], where: str) -> Camera:

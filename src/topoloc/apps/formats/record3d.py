@@ -15,8 +15,14 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from topoloc import CalibrationError, Camera, RecordingError, Rigid3, TrajectoryError
-from topoloc.apps.formats.nerfstudio import rigid_from_gl
+from topoloc import (
+    CalibrationError,
+    Camera,
+    PoseConventions,
+    RecordingError,
+    Rigid3,
+    TrajectoryError,
+)
 from topoloc.plugin import (
     DepthImages,
     Finite,
@@ -42,14 +48,10 @@ def can_open(path: Path) -> bool:
 
 
 def open_record3d(path: Path) -> Recording:
-    """Open an export. Without depth, it has single images with poses.
-
-    Raises:
-        RecordingError: metadata.json is malformed, or the numbers of poses, times, images and depth
-            images differ.
-        CalibrationError: the intrinsics are missing or invalid.
-        TrajectoryError: a row of the poses is no pose.
-    """
+    """Open an export. Without depth, it has single images with poses. Raises RecordingError:
+    metadata.json is malformed, or the numbers of poses, times, images and depth images differ;
+    CalibrationError: the intrinsics are missing or invalid; TrajectoryError: a row of the poses is
+    no pose."""
     root = _find_root(path)
     if root is None:
         raise RecordingError(f"{path}: not an export of Record3D, which has {EXPECTED_FILES}")
@@ -61,15 +63,12 @@ def open_record3d(path: Path) -> Recording:
     poses: list[Rigid3 | None] = [
         _pose(row, f"{file}, pose {k}") for k, row in enumerate(data.poses)
     ]
-    return Recording.with_cameras(
-        path.resolve().name,
-        root,
-        [image.relative_to(root).as_posix() for image in images],
+    names, t_ns = (
+        [one.relative_to(root).as_posix() for one in images],
         _times(data, len(images), file),
-        poses,
-        _cameras(data, images, file),
-        depth=_depth(root, images),
     )
+    frames = (names, t_ns, poses, _cameras(data, images, file))
+    return Recording.with_cameras(path.resolve().name, root, *frames, depth=_depth(root, images))
 
 
 def _find_root(path: Path) -> Path | None:
@@ -97,7 +96,8 @@ def _pose(row: tuple[float, ...], where: str) -> Rigid3:
     if not 0.99 < length < 1.01:
         raise TrajectoryError(f"{where}: qx qy qz qw is no rotation")
     x, y, z, w = numbers[:4] / length
-    return rigid_from_gl(Rigid3.from_quat_wxyz(np.array([w, x, y, z]), numbers[4:]))
+    world_from_gl = Rigid3.from_quat_wxyz(np.array([w, x, y, z]), numbers[4:])
+    return PoseConventions(("opengl",)).undo_conventions(world_from_gl)
 
 
 def _cameras(data: _Metadata, images: list[Path], file: Path) -> list[Camera]:

@@ -16,15 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt16
 
-from topoloc import (
-    Camera,
-    Image,
-    RecordingError,
-    StereoFrame,
-    StereoRig,
-    TopolocError,
-    Trajectory,
-)
+from topoloc import Camera, Image, RecordingError, StereoFrame, StereoRig, TopolocError, Trajectory
 from topoloc.plugin import write_bytes, write_text
 
 DEPTH_FACTOR = 256.0
@@ -33,14 +25,12 @@ _MAX_UNITS = 65534  # larger depths are unknown
 
 
 class RecordingWriter:
-    """Writes frames of the same kind. A context manager.
+    """Writes frames of the same kind. A context manager. Raises TopolocError: the folder is not
+    empty, or cannot be created.
 
     Args:
         folder: a new or empty folder.
         jpeg: quality of JPEG images, 1 to 100; None for PNG.
-
-    Raises:
-        TopolocError: the folder is not empty, or cannot be created.
     """
 
     def __init__(self, folder: Path, jpeg: int | None = None) -> None:
@@ -72,12 +62,8 @@ class RecordingWriter:
                 self.folder.rmdir()
 
     def write(self, frame: StereoFrame) -> None:
-        """Write a frame.
-
-        Raises:
-            RecordingError: the frame is of another kind than the first.
-            TopolocError: it cannot be written.
-        """
+        """Write a frame. Raises RecordingError: the frame is of another kind than the first;
+        TopolocError: it cannot be written."""
         images = self._frame_images(frame)
         times = self._times or self._create_folder(frame, images)
         has_pose = frame.world_from_cam is not None
@@ -159,15 +145,11 @@ def _to_depth_units(depth: Float32[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h 
 
 def _encode_image(pixels: Image | UInt16[np.ndarray, "h w"], jpeg: int | None) -> bytes:
     bgr = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    suffix, settings = (
-        (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        if jpeg is None
-        else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg])
-    )
+    suffix, settings = ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    if jpeg is not None:
+        suffix, settings = ".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg]
     is_done, data = cv2.imencode(suffix, bgr, settings)
     if not is_done:
-        raise RecordingError(
-            f"an image of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be stored as"
-            f" {suffix[1:]}"
-        )
+        size = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        raise RecordingError(f"an image of {size} pixels cannot be stored as {suffix[1:]}")
     return data.tobytes()

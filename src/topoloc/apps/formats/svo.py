@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -52,12 +53,8 @@ class SvoRecording:
         return replace(self, with_right=False)
 
     def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame.
-
-        Raises:
-            IndexError: no such frame.
-            UnreadableImageError: the SDK cannot decode it.
-        """
+        """Read one frame. Raises IndexError: no such frame; UnreadableImageError: the SDK cannot
+        decode it."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of a recording of {len(self)}")
         index %= len(self)
@@ -72,12 +69,9 @@ class SvoRecording:
 
 
 def open_svo(path: Path) -> SvoRecording:
-    """Open an SVO file and read its times. Truth is ``NAME.tum`` beside it.
-
-    Raises:
-        MissingExtraError: Stereolabs' SDK is not installed.
-        RecordingError: the SDK cannot open the file, or it has no frame.
-    """
+    """Open an SVO file and read its times. Truth is ``NAME.tum`` beside it. Raises
+    MissingExtraError: Stereolabs' SDK is not installed; RecordingError: the SDK cannot open the
+    file, or it has no frame."""
     hint = (
         "; or export the rectified pairs on a machine with the SDK (its sample svo_export, mode 2)"
         " to left/ and right/ with a camera.json"
@@ -93,12 +87,9 @@ def open_svo(path: Path) -> SvoRecording:
 
 
 def sdk_frames(stop: threading.Event) -> Iterator[StereoFrame]:
-    """Yield rectified pairs of the first connected ZED until `stop` is set.
-
-    Raises:
-        MissingExtraError: Stereolabs' SDK is not installed.
-        RecordingError: there is no ZED, or it gives no more images.
-    """
+    """Yield rectified pairs of the first connected ZED until `stop` is set. Raises
+    MissingExtraError: Stereolabs' SDK is not installed; RecordingError: there is no ZED, or it
+    gives no more images."""
     sl, camera = _open_camera(None)
     try:
         rig, index, failed = rig_from_sdk(camera), 0, 0
@@ -117,12 +108,11 @@ def sdk_frames(stop: threading.Event) -> Iterator[StereoFrame]:
 def _open_camera(path: Path | None, hint: str = "") -> tuple[Any, Any]:
     """Return the SDK and an open SVO file, or the first connected camera if `path` is None."""
     source = "a ZED" if path is None else path
+    need = f"{source} needs pyzed of Stereolabs' ZED SDK, which is not installed{hint}"
     try:
-        import pyzed.sl as sl  # pyright: ignore[reportMissingImports]
+        sl: Any = importlib.import_module("pyzed.sl")
     except ImportError:
-        raise MissingExtraError(
-            f"{source} needs pyzed of Stereolabs' ZED SDK, which is not installed{hint}"
-        ) from None
+        raise MissingExtraError(need) from None
     settings = sl.InitParameters()
     if path is not None:
         settings.set_from_svo_file(str(path))

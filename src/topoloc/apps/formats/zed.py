@@ -98,17 +98,14 @@ class SideBySideVideo:
 
 
 def open_zed(path: Path, calibration: str | Path | None = None) -> StereoSequence:
-    """Open a side-by-side video or an SVO file. Truth is ``NAME.tum`` beside ``NAME.mp4``.
+    """Open a side-by-side video or an SVO file. Truth is ``NAME.tum`` beside ``NAME.mp4``. Raises
+    RecordingError: the file is no video of two images side by side; CalibrationError: there is no
+    calibration, or several, or it is invalid; TrajectoryError: the truth is malformed or fits no
+    frame; MissingExtraError: Stereolabs' SDK for an SVO file is not installed.
 
     Args:
         calibration: SN*.conf of a video, or a camera.json of one half with a baseline (metres). By
             default the one beside the video.
-
-    Raises:
-        RecordingError: the file is no video of two images side by side.
-        CalibrationError: there is no calibration, or several, or it is invalid.
-        TrajectoryError: the truth is malformed or fits no frame.
-        MissingExtraError: Stereolabs' SDK for an SVO file is not installed.
     """
     if path.suffix.lower() in SVO_SUFFIXES:
         return open_svo(path)
@@ -121,15 +118,10 @@ def open_zed(path: Path, calibration: str | Path | None = None) -> StereoSequenc
 
 
 def side_by_side_frames(source: LiveSource, calibration: Path) -> Iterator[StereoFrame]:
-    """Yield both halves of each image of a live source, distorted.
-
-    Args:
-        calibration: Stereolabs' SN*.conf, or a camera.json of one half with a baseline.
-
-    Raises:
-        RecordingError: the images are not two side by side, or the source stalls.
-        CalibrationError: the calibration is invalid or of another resolution.
-    """
+    """Yield both halves of each image of a live source, distorted. `calibration`: Stereolabs'
+    SN*.conf, or a camera.json of one half with a baseline. Raises RecordingError: the images are
+    not two side by side, or the source stalls; CalibrationError: the calibration is invalid or of
+    another resolution."""
     rig: StereoRig | None = None
     for picture in source:
         height, width = picture.image.shape[:2]
@@ -168,11 +160,9 @@ def _read_rig(path: Path, size: tuple[int, int]) -> StereoRig:
 def read_conf(path: Path, size: tuple[int, int]) -> StereoRig:
     """Return the rig of Stereolabs' SN*.conf for images of this size.
 
-    The file has lengths in mm and the rotation vector (RX, CV, RZ) in radians.
-
-    Raises:
-        CalibrationError: the file is missing or malformed, lacks this resolution, or a number is
-            missing or invalid.
+    The file has lengths in mm and the rotation vector (RX, CV, RZ) in radians. Raises
+    CalibrationError: the file is missing or malformed, lacks this resolution, or a number is
+    missing or invalid.
     """
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     try:
@@ -183,29 +173,25 @@ def read_conf(path: Path, size: tuple[int, int]) -> StereoRig:
         ) from None
     conf = {name.upper().strip(): dict(parser[name]) for name in parser.sections()}
     there = [name.removeprefix("LEFT_CAM_") for name in conf if name.startswith("LEFT_CAM_")]
-    shown = f"{size[0]}x{size[1]}"
-    resolution = RESOLUTIONS.get(size)
+    shown, resolution = f"{size[0]}x{size[1]}", RESOLUTIONS.get(size)
     if resolution is None:
         known = ", ".join(f"{width}x{height}" for width, height in RESOLUTIONS)
         raise CalibrationError(f"{path}: a ZED has no images of {shown}; its sizes are {known}")
     if resolution not in there or f"RIGHT_CAM_{resolution}" not in conf:
-        raise CalibrationError(
-            f"{path}: no calibration of {resolution} ({shown}), only of"
-            f" {', '.join(there) or 'nothing'}"
-        )
+        known = ", ".join(there) or "nothing"
+        raise CalibrationError(f"{path}: no calibration of {resolution} ({shown}), only of {known}")
     left, right = (
         _camera(path, conf, f"{side}_CAM_{resolution}", size) for side in ("LEFT", "RIGHT")
     )
     stereo = conf.get("STEREO", {})
     baseline = _number(path, stereo, "STEREO", "baseline")
 
-    def of_resolution(axis: str, default: float) -> float:
+    def of_resolution(axis: str, default: float = 0.0) -> float:
         return _number(path, stereo, "STEREO", f"{axis}_{resolution.lower()}", default)
 
-    across = [
-        of_resolution(axis, _number(path, stereo, "STEREO", axis, 0.0)) for axis in ("ty", "tz")
-    ]
-    turn = [of_resolution(axis, 0.0) for axis in ("rx", "cv", "rz")]
+    defaults = {axis: _number(path, stereo, "STEREO", axis, 0.0) for axis in ("ty", "tz")}
+    across = [of_resolution(axis, default) for axis, default in defaults.items()]
+    turn = [of_resolution(axis) for axis in ("rx", "cv", "rz")]
     if not baseline > 0.0:
         raise CalibrationError(f"{path}: STEREO baseline of {baseline:g} mm")
     translation = -np.array([baseline, *across]) / 1000.0
@@ -217,15 +203,12 @@ def _camera(
     path: Path, conf: dict[str, dict[str, str]], section: str, size: tuple[int, int]
 ) -> Camera:
     intrinsics = [_number(path, conf[section], section, key) for key in ("fx", "fy", "cx", "cy")]
-    coefficients = [
-        _number(path, conf[section], section, key, 0.0)
-        for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    ]
-    model, params = (
-        ("FULL_OPENCV", coefficients) if any(coefficients[4:]) else ("OPENCV", coefficients[:4])
-    )
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    coefficients = [_number(path, conf[section], section, key, 0.0) for key in names]
+    is_full = any(coefficients[4:])
+    params = (*intrinsics, *coefficients[: 8 if is_full else 4])
     try:
-        return Camera(model, *size, (*intrinsics, *params))
+        return Camera("FULL_OPENCV" if is_full else "OPENCV", *size, params)
     except CalibrationError as error:
         raise CalibrationError(f"{path}, {section}: {error}") from None
 
@@ -241,10 +224,8 @@ def _number(
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise CalibrationError(
-            f"{path}, {section}: {key} is"
-            f" {'missing' if text is None else f'{text[:40]!r}, not a number'}"
-        )
+        fault = "missing" if text is None else f"{text[:40]!r}, not a number"
+        raise CalibrationError(f"{path}, {section}: {key} is {fault}")
     return number
 
 

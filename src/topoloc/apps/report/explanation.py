@@ -125,16 +125,12 @@ def _verdict(
     world_from_cam: Rigid3, probability: float, result: Localization | NotLocalized
 ) -> str:
     is_localized = isinstance(result, Localization)
-    if is_localized and world_from_cam.is_same(
-        result.world_from_cam, _SAME_POSITION_M, _SAME_ROTATION
-    ):
-        return "the answer"
-    others = [] if is_localized else result.alternatives
+    others = [result] if is_localized else result.alternatives
     if any(
         world_from_cam.is_same(other.world_from_cam, _SAME_POSITION_M, _SAME_ROTATION)
         for other in others
     ):
-        return "one of the alternatives"
+        return "the answer" if is_localized else "one of the alternatives"
     if probability < _MIN_PROBABILITY:
         return "rejected: the evidence against it is stronger"
     if is_localized:
@@ -186,10 +182,8 @@ def _collect_advice(explanation: Explanation, localizer: Localizer) -> Iterator[
 def _advice_on_image(explanation: Explanation) -> Iterator[str]:
     for kind, count in explanation.num_features.items():
         if count < _MIN_FEATURES:
-            yield (
-                f"Only {count} features ({kind}) were found: the image is blurred, blank or very"
-                " dark."
-            )
+            cause = "the image is blurred, blank or very dark"
+            yield f"Only {count} features ({kind}) were found: {cause}."
     if explanation.session_lights:
         grey = explanation.light.level
         name, nearest = min(

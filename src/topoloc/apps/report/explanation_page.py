@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from topoloc.apps.report.page_template import (
     render_section,
     render_table,
 )
-from topoloc.plugin import encode_jpeg, write_text
+from topoloc.plugin import encode_jpeg
 
 _POSES_TEXT = (
     "Each row is a pose proposal. Found counts the map points that were found again, of all that"
@@ -38,13 +37,6 @@ _COLUMNS = (
     "probability",
     "verdict",
 )
-
-
-def write_explanation(
-    path: Path, name: str, image: Image, explanation: Explanation, topomap: TopoMetricMap
-) -> None:
-    """Write the page atomically. Raises TopolocError if the file cannot be written."""
-    write_text(path, explanation_page(name, image, explanation, topomap))
 
 
 def explanation_page(
@@ -108,15 +100,9 @@ def compared_to_json(
         camera = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)].camera
         matches = _find_explained_matches(image, pose, topomap)
         pixels = np.column_stack([matches.points_query, matches.points_node]).round(1)[:MAX_MATCHES]
-        compared.append(
-            {
-                "node": pose.tried.fit.node_id,
-                "node_size": [camera.width, camera.height],
-                "verdict": pose.verdict,
-                "num_inliers": pose.num_inliers,
-                "matches": pixels.tolist(),
-            }
-        )
+        node = {"node": pose.tried.fit.node_id, "node_size": [camera.width, camera.height]}
+        facts = {"verdict": pose.verdict, "num_inliers": pose.num_inliers}
+        compared.append(node | facts | {"matches": pixels.tolist()})
     return compared
 
 
@@ -157,10 +143,7 @@ def row_of(pose: EvaluatedPose) -> tuple[str, ...]:
     evidence = ("", "", "", "")
     if pose.tried.hypothesis is not None:
         e = pose.tried.hypothesis.evidence
-        evidence = (
-            f"{e.num_found} of {e.num_visible}",
-            str(e.num_by_chance),
-            f"{e.num_inliers} of {e.num_matches}",
-            "" if pose.probability is None else f"{pose.probability:.2f}",
-        )
+        found, unguided = f"{e.num_found} of {e.num_visible}", f"{e.num_inliers} of {e.num_matches}"
+        probability = "" if pose.probability is None else f"{pose.probability:.2f}"
+        evidence = (found, str(e.num_by_chance), unguided, probability)
     return (pose.tried.source, pose.tried.features, node, first, *evidence, pose.verdict)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -16,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, PercentFormatter
 
 from topoloc import EvaluatedQuery, Evaluation
-from topoloc.apps.report.figure_style import (
+from topoloc.apps.report.page_template import (
     BAD,
     GREY,
     INK,
@@ -68,10 +69,8 @@ def draw_errors_along(answers: Sequence[EvaluatedQuery]) -> str:
             xlim=(-0.5, max(len(with_truth) - 0.5, 0.5)),
         )
         if len(colours) > 1:
-            handles = [
-                panels[0].plot([], [], ".-", color=colour, label=name)[0]
-                for name, colour in colours.items()
-            ]
+            pairs, plot = colours.items(), panels[0].plot
+            handles = [plot([], [], ".-", color=colour, label=name)[0] for name, colour in pairs]
             figure.legend(handles=handles, loc="outside lower center", ncols=4)
         return svg_text(figure, "errors along the recordings")
 
@@ -111,8 +110,7 @@ def draw_stage_times(answers: Sequence[EvaluatedQuery]) -> str:
     stages = [*known, *sorted(names - {*known, *last}), *last]
     times = [[a.result.times_ms.get(stage, 0.0) for a in answers] for stage in stages]
     medians = [float(np.median(t)) for t in times]
-    highs = [float(np.percentile(t, 95)) for t in times]
-    rows = np.arange(len(stages))[::-1]
+    highs, rows = [float(np.percentile(t, 95)) for t in times], np.arange(len(stages))[::-1]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 0.6 + 0.32 * len(stages)), layout="constrained")
         axes = figure.add_subplot()
@@ -121,14 +119,9 @@ def draw_stage_times(answers: Sequence[EvaluatedQuery]) -> str:
         axes.barh(rows, medians, height=0.55, color=colours)
         axes.hlines(rows, medians, highs, color=GREY, linewidth=1.2)
         for row, median, high in zip(rows, medians, highs, strict=True):
-            axes.annotate(
-                f"{median:.1f} (95 %: {high:.0f})",
-                (max(median, high), row),
-                xytext=(6, 0),
-                textcoords="offset points",
-                va="center",
-                color=INK,
-            )
+            style: dict[str, Any] = {"textcoords": "offset points", "va": "center", "color": INK}
+            text = f"{median:.1f} (95 %: {high:.0f})"
+            axes.annotate(text, (max(median, high), row), xytext=(6, 0), **style)
         axes.set_yticks(rows, [stage.replace("_", " ") for stage in stages])
         axes.tick_params(axis="y", length=0, labelcolor=INK)
         axes.set(xlabel="ms a query", xlim=(0.0, 1.15 * max([*highs, *medians, 1e-3])))
@@ -152,13 +145,11 @@ def _draw_curves(errors: dict[str, Float[np.ndarray, " _"]], label: str, unit: s
             shares = np.arange(1, len(drawn) + 1) / len(errors[name])
             last = shares[-1] if len(shares) else 0.0
             x, y = np.r_[0.0, drawn, limit], np.r_[0.0, shares, last]
+            points = (x, y) if len(values) else ([], [])
             style = {"where": "post", "color": colours[name], "linewidth": 1.8}
-            axes.step(
-                x if len(values) else [], y if len(values) else [], label=prefix + text, **style
-            )
-        axes.set(
-            xlabel=label, ylabel="queries within this error", xlim=(0.0, limit), ylim=(0.0, 1.03)
-        )
+            axes.step(*points, label=prefix + text, **style)
+        limits = {"xlim": (0.0, limit), "ylim": (0.0, 1.03)}
+        axes.set(xlabel=label, ylabel="queries within this error", **limits)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
         figure.legend(loc="outside lower left", ncols=1, handlelength=1.4)
         return svg_text(figure, f"cumulative {label.partition(' (')[0]}")

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from topoloc import EvaluatedQuery, Evaluation, Localization, Rigid3, TopoMetricMap
-from topoloc.apps.report.figure_style import (
+from topoloc.apps.report.page_template import (
     BAD,
     ERROR,
     GREY,
@@ -31,13 +31,7 @@ MIN_ASPECT, MAX_ASPECT = 0.3, 0.8
 GAP_STEPS = 6.0
 _TRUTH = {"marker": "o", "markerfacecolor": "none", "markersize": 4.5}
 _LOST = {"linestyle": "", "marker": "D", "markerfacecolor": "white", "markersize": 5.5}
-_FALSE = {
-    "linestyle": "",
-    "marker": "x",
-    "color": BAD,
-    "markersize": 7,
-    "markeredgewidth": 1.6,
-}
+_FALSE = {"linestyle": "", "marker": "x", "color": BAD, "markersize": 7, "markeredgewidth": 1.6}
 
 
 class MapFigure:
@@ -94,8 +88,7 @@ class MapFigure:
 
     def draw_nodes(self, topomap: TopoMetricMap) -> None:
         """Draw the edges and the viewing direction of each node."""
-        centres = self.flatten(self.nodes)
-        span = 0.025 * float((self.high - self.low).max())
+        centres, span = self.flatten(self.nodes), 0.025 * float((self.high - self.low).max())
         looks = centres + span * np.array([pose.rotation[self.axes_idx, 2] for pose in self.nodes])
         edges = [
             (centres[topomap.row_of(edge.source_id)], centres[topomap.row_of(edge.target_id)])
@@ -106,23 +99,14 @@ class MapFigure:
 
     def to_svg(self, title: str, handles: list[Line2D], num_columns: int) -> str:
         """Add the legend and return the figure as SVG text."""
-        (across, up), low, high = self.axes_idx, self.low, self.high
-        self.axes.set(
-            xlim=(low[0], high[0]),
-            ylim=(low[1], high[1]),
-            xlabel=f"{'xyz'[across]} (m)",
-            ylabel=f"{'xyz'[up]} (m)",
-            aspect="equal",
-        )
+        (left, bottom), (right, top) = self.low, self.high
+        xlabel, ylabel = (f"{'xyz'[axis]} (m)" for axis in self.axes_idx)
+        limits = {"xlim": (left, right), "ylim": (bottom, top)}
+        self.axes.set(xlabel=xlabel, ylabel=ylabel, aspect="equal", **limits)
         if self._is_mirrored:
             self.axes.invert_yaxis()
-        self._figure.legend(
-            handles=handles,
-            loc="outside lower center",
-            ncols=num_columns,
-            handletextpad=0.5,
-            columnspacing=1.6,
-        )
+        spacing, place = {"handletextpad": 0.5, "columnspacing": 1.6}, "outside lower center"
+        self._figure.legend(handles=handles, loc=place, ncols=num_columns, **spacing)
         return svg_text(self._figure, title)
 
 
@@ -146,18 +130,12 @@ def draw_map(answers: Sequence[EvaluatedQuery], topomap: TopoMetricMap) -> str:
             if a.world_from_cam is not None and isinstance(a.result, Localization)
         ]
         figure.draw_lines(pairs, colors=ERROR, linewidths=1.2, zorder=3)
-        false = [
-            a.result.world_from_cam
-            for a in answers
-            if isinstance(a.result, Localization) and a.is_false_accept
-        ]
+        false = _estimates([a for a in answers if a.is_false_accept])
         shown = [pose for pose in false if figure.contains(pose)]
         figure.plot(shown, zorder=5, **_FALSE)
         if num_outside := len(false) - len(shown):
-            plural = "s" if num_outside > 1 else ""
-            figure.axes.set_title(
-                f"{num_outside} false position{plural} outside of the figure", color=BAD
-            )
+            what = "positions" if num_outside > 1 else "position"
+            figure.axes.set_title(f"{num_outside} false {what} outside of the figure", color=BAD)
         return figure.to_svg("map from above", _create_legend(answers, colours), 5)
 
 
@@ -169,8 +147,7 @@ def find_horizontal_axes(
     The vertical axis is the one that the y axes of the cameras agree on, else the one with the
     smallest extent. Inversion avoids a view from below.
     """
-    down = downs.mean(axis=0)
-    extent = np.ptp(points, axis=0)
+    down, extent = downs.mean(axis=0), np.ptp(points, axis=0)
     vertical = int(np.argmax(np.abs(down))) if np.abs(down).max() > 0.7 else int(np.argmin(extent))
     across, up = sorted(
         (axis for axis in range(3) if axis != vertical), key=lambda axis: -extent[axis]
@@ -193,18 +170,17 @@ def _truths(answers: Sequence[EvaluatedQuery]) -> list[Rigid3]:
     return [a.world_from_cam for a in answers if a.world_from_cam is not None]
 
 
+def _estimates(answers: Sequence[EvaluatedQuery]) -> list[Rigid3]:
+    return [a.result.world_from_cam for a in answers if isinstance(a.result, Localization)]
+
+
 def _draw_recording(figure: MapFigure, answers: Sequence[EvaluatedQuery], colour: str) -> None:
     """Draw the true trajectory with a ring for each query, and the estimated positions."""
     truths = _truths(answers)
-    many = len(truths) > MAX_MARKS
-    path = _insert_gaps(figure.flatten(truths))
+    many, path = len(truths) > MAX_MARKS, _insert_gaps(figure.flatten(truths))
     figure.axes.plot(*path.T, "-", color=colour, linewidth=1.0, alpha=0.45, rasterized=many)
     figure.plot(truths, linestyle="", color=colour, markeredgewidth=0.6, **_TRUTH)
-    found = [
-        a.result.world_from_cam
-        for a in answers
-        if isinstance(a.result, Localization) and not a.is_false_accept
-    ]
+    found = _estimates([a for a in answers if not a.is_false_accept])
     figure.plot(found, linestyle="", marker=".", color=colour, markersize=5, zorder=4)
     lost = _truths([a for a in answers if not a.result.localized])
     figure.plot(lost, color=colour, markeredgewidth=1.3, zorder=5, **_LOST)

@@ -133,8 +133,7 @@ def _draw_lines(
     is_inlier: Bool[np.ndarray, " n"],
 ) -> None:
     """Draw half-transparent lines, outliers first, and dots at both ends."""
-    lines = canvas.copy()
-    order = np.argsort(is_inlier, kind="stable")
+    lines, order = canvas.copy(), np.argsort(is_inlier, kind="stable")
     starts_px, ends_px = np.rint(starts).astype(int).tolist(), np.rint(ends).astype(int).tolist()
     colours = {True: _INLIER_COLOUR, False: _OUTLIER_COLOUR}
     pixels = [(starts_px[i], ends_px[i], colours[bool(is_inlier[i])]) for i in order]

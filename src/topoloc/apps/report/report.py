@@ -56,9 +56,8 @@ def select_worst_queries(
 
     Each recording has an equal share of the places.
     """
-    groups = Evaluation(
-        [a for a in answers if a.world_from_cam is not None or a.is_false_accept]
-    ).by_recording
+    judged = [a for a in answers if a.world_from_cam is not None or a.is_false_accept]
+    groups = Evaluation(judged).by_recording
     share = max(count // max(len(groups), 1), 1)
     ranked = [
         (rank, answer)
@@ -98,15 +97,12 @@ def _error_rank(answer: EvaluatedQuery) -> tuple[int, float]:
 
 def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> tuple[str, str]:
     """Return the figure and the facts of a query."""
-    result = answer.result
-    node = _select_node(answer, topomap)
+    result, node = answer.result, _select_node(answer, topomap)
     evidence = f"{result.num_inliers} inliers of {result.num_matches} matches"
     if isinstance(result, Localization):
         sigma = float(np.sqrt(max(np.trace(result.camera_covariance[:3, :3]), 0.0)))
-        evidence += (
-            f", probability {result.probability:.2f}, reported standard deviation"
-            f" {format_length(sigma)}"
-        )
+        evidence += f", probability {result.probability:.2f}"
+        evidence += f", reported standard deviation {format_length(sigma)}"
     if answer.nearest_node_id not in (None, node and node.summary.node_id):
         evidence += f"; nearest to the truth is node {answer.nearest_node_id}"
     is_right = result.localized == (answer.world_from_cam is not None)
@@ -205,14 +201,9 @@ def write_report(
     topomap: TopoMetricMap,
     texts: ReportTexts | None = None,
 ) -> None:
-    """Write the page atomically. The same results give the same bytes.
-
-    Args:
-        evaluation: `Evaluation.to_json`, with `TopoMetricMap.describe` under "map".
-
-    Raises:
-        TopolocError: the file cannot be written.
-    """
+    """Write the page atomically. The same results give the same bytes. `evaluation`:
+    `Evaluation.to_json`, with `TopoMetricMap.describe` under "map". Raises TopolocError: the file
+    cannot be written."""
     texts = texts or ReportTexts()
     names = [row["name"] for row in evaluation["recordings"] if row["name"]]
     title = texts.title or f"Localization in {Path(evaluation['map']['path']).name}"

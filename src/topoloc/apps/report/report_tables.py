@@ -8,8 +8,7 @@ from html import escape
 from typing import Any
 
 from topoloc import EvaluatedQuery
-from topoloc.apps.report.figure_style import recording_colours
-from topoloc.apps.report.page_template import render_cards, render_table
+from topoloc.apps.report.page_template import recording_colours, render_cards, render_table
 from topoloc.plugin import format_length
 
 _COLUMNS = (
@@ -82,10 +81,8 @@ def render_recordings_table(evaluation: dict[str, Any], texts: ReportTexts) -> s
     """Return a table with a row for each recording, and the published results below."""
     names = [row["name"] for row in evaluation["recordings"] if row["num_queries"]]
     colours = recording_colours(names)
-    rows = [
-        _recording_cells(row, colours, texts.about.get(row["name"], ""))
-        for row in evaluation["recordings"]
-    ]
+    about, recordings = texts.about, evaluation["recordings"]
+    rows = [_recording_cells(row, colours, about.get(row["name"], "")) for row in recordings]
     for other in texts.published:
         median = f"{format_length(other.median_translation_m)}, {other.median_rotation_deg:.2f}°"
         rows.append([f"<em>{escape(other.name)}</em>", "", f"<em>{median}</em>", "", "", "", ""])
@@ -108,10 +105,9 @@ def render_number_tables(evaluation: dict[str, Any]) -> str:
     if e["num_elsewhere"]:
         rows.append(("Out-of-map images", str(e["num_elsewhere"])))
     rows.append(("False accepts", str(e["false_accepts"])))
-    reasons = [
-        f"{count} {reason.replace('_', ' ')}" for reason, count in e["not_localized"].items()
-    ]
-    rows.append(("Reasons of refusals", ", ".join(reasons) or "none"))
+    reasons = e["not_localized"].items()
+    refused = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in reasons)
+    rows.append(("Reasons of refusals", refused or "none"))
     about_map = [
         ("Map", f"{m['num_nodes']} nodes, {m['num_points']:,} points"),
         ("Size", f"{m['bytes'] / 1e6:.2f} MB"),
@@ -152,16 +148,9 @@ def _recording_cells(row: dict[str, Any], colours: Mapping[str, str], about: str
         length = format_length(row["median_translation_m"])
         median = f"{length}, {row['median_rotation_deg']:.2f}°"
     false, num_images = row["false_accepts"], row["num_queries"] + row["num_elsewhere"]
-    kind = "bad" if false else "good"
+    accepts = f'<span class="{"bad" if false else "good"}">{false}</span> of {num_images}'
     total = row["median_times_ms"].get("total")
-    return [
-        name,
-        localized,
-        median,
-        *shares,
-        f'<span class="{kind}">{false}</span> of {num_images}',
-        "" if total is None else f"{total:.0f}",
-    ]
+    return [name, localized, median, *shares, accepts, "" if total is None else f"{total:.0f}"]
 
 
 def _render_facts(rows: list[tuple[str, str]]) -> str:

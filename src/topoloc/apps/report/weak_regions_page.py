@@ -9,10 +9,12 @@ from typing import Any
 
 from matplotlib.lines import Line2D
 
-from topoloc import NodeQuality, TopoMetricMap, WeakRegion, WeakRegions
-from topoloc.apps.report.figure_style import BAD, ERROR, GREY
+from topoloc import TopoMetricMap, WeakRegions
 from topoloc.apps.report.map_figure import MapFigure
 from topoloc.apps.report.page_template import (
+    BAD,
+    ERROR,
+    GREY,
     render_cards,
     render_figure,
     render_gallery_items,
@@ -49,22 +51,16 @@ _MARKS: dict[str | None, tuple[str, str, float, str]] = {
 def write_weak_regions(
     path: Path, weak: WeakRegions, topomap: TopoMetricMap, info: dict[str, Any]
 ) -> None:
-    """Write the page atomically. The same map gives the same bytes.
-
-    Args:
-        info: `TopoMetricMap.describe` of the map.
-
-    Raises:
-        TopolocError: the file cannot be written.
-    """
+    """Write the page atomically. The same map gives the same bytes. `info`:
+    `TopoMetricMap.describe` of the map. Raises TopolocError: the file cannot be written."""
     advice = f'<p class="lead">{escape(weak.suggest_next_recording())}</p>'
     figure = f'<div class="wide">{draw_weak_regions(weak, topomap)}</div>'
-    images = _render_images(weak.weakest[:_MAX_IMAGES], topomap)
+    images = _render_images(weak, topomap)
     sections = [
         _render_cards(weak),
         render_section("Where to record next", _METHOD, advice),
         render_section("The map from above", _MAP, figure),
-        render_section("Weak regions", "", _render_regions(weak.parts)),
+        render_section("Weak regions", "", _render_regions(weak)),
         render_section("The weakest nodes", _WEAKEST, images),
     ]
     title = f"Weak regions of {Path(info['path']).name}"
@@ -86,14 +82,11 @@ def _draw_marks(figure: MapFigure, weak: WeakRegions) -> list[Line2D]:
     ring = {"linestyle": "", "markeredgewidth": 1.4, "markerfacecolor": "white"}
     for order, (reason, (marker, colour, size, label)) in enumerate(_MARKS.items()):
         style = {"marker": marker, "color": colour, "markersize": size, "linestyle": ""}
-        marked = [node for node in weak.nodes if _worst_reason(node, weak) == reason]
+        marked = [node for node in weak.nodes if _worst_reason(node.reasons, weak) == reason]
         for is_ring in (False, True):
-            drawn = [
-                node.world_from_cam
-                for node in marked
-                if ("one_direction" in node.reasons) == is_ring
-            ]
-            figure.plot(drawn, zorder=3 + order, **style | (ring if is_ring else {}))
+            drawn = [node for node in marked if ("one_direction" in node.reasons) == is_ring]
+            poses, its_style = [node.world_from_cam for node in drawn], ring if is_ring else {}
+            figure.plot(poses, zorder=3 + order, **style | its_style)
         if marked:
             handles.append(Line2D([], [], label=label, **style))
     if weak.count("one_direction"):
@@ -102,35 +95,28 @@ def _draw_marks(figure: MapFigure, weak: WeakRegions) -> list[Line2D]:
     return handles
 
 
-def _worst_reason(node: NodeQuality, weak: WeakRegions) -> str | None:
+def _worst_reason(reasons: Sequence[str], weak: WeakRegions) -> str | None:
     """Return the most severe reason. In a map of one session, `single_session` is no reason."""
     ignored = "single_session" if len(weak.session_names) < 2 else None
     shown = [reason for reason in reversed(_MARKS) if reason not in (None, ignored)]
-    return next((reason for reason in shown if reason in node.reasons), None)
+    return next((reason for reason in shown if reason in reasons), None)
 
 
 def _render_cards(weak: WeakRegions) -> str:
     num_queried = len(weak.queried_nodes)
     num_held = num_queried - weak.count("not_held")
-    return render_cards(
-        [
-            (
-                "good" if num_held == num_queried else "bad",
-                f"{num_held} of {num_queried}",
-                "nodes localized by the rest of the map",
-            ),
-            ("", str(weak.count("few_landmarks")), "nodes with few landmarks"),
-            (
-                "",
-                str(weak.count("one_direction")),
-                f"of {len(weak.nodes)} nodes without an opposite view",
-            ),
-            ("", str(weak.count("single_session")), "nodes seen by one session only"),
-        ]
-    )
+    kind, held = "good" if num_held == num_queried else "bad", f"{num_held} of {num_queried}"
+    texts: dict[Any, str] = {
+        "few_landmarks": "nodes with few landmarks",
+        "one_direction": f"of {len(weak.nodes)} nodes without an opposite view",
+        "single_session": "nodes seen by one session only",
+    }
+    cards = [("", str(weak.count(reason)), text) for reason, text in texts.items()]
+    return render_cards([(kind, held, "nodes localized by the rest of the map"), *cards])
 
 
-def _render_regions(parts: Sequence[WeakRegion]) -> str:
+def _render_regions(weak: WeakRegions) -> str:
+    parts = weak.parts
     if not parts:
         return "<p>There are none.</p>"
     rows = [
@@ -148,26 +134,16 @@ def _render_regions(parts: Sequence[WeakRegion]) -> str:
     return render_table(_COLUMNS, rows, label="Weak regions") + more
 
 
-def _render_images(nodes: Sequence[NodeQuality], topomap: TopoMetricMap) -> str:
-    if not nodes:
-        return "<p>No node was tested.</p>"
-    return render_gallery_items(
-        (
-            render_figure(
-                topomap.nodes[topomap.row_of(node.node_id)].template_jpeg,
-                f"node {node.node_id}, {node.name}",
-            ),
-            _render_facts(node),
-        )
-        for node in nodes
-    )
-
-
-def _render_facts(node: NodeQuality) -> str:
-    outcome = "not localized without itself"
-    if node.answer is not None and node.answer.is_wrong:
-        outcome = "wrong pose without itself"
-    elif node.answer is not None and node.answer.is_localized:
-        outcome = f"{node.answer.num_inliers} inliers without itself"
-    reasons = ", ".join(REASON_TEXTS[reason] for reason in node.reasons) or "not weak"
-    return f"<b>{outcome}, {node.num_landmarks} landmarks</b><p>{reasons}</p>"
+def _render_images(weak: WeakRegions, topomap: TopoMetricMap) -> str:
+    items = list[tuple[str, str]]()
+    for node in weak.weakest[:_MAX_IMAGES]:
+        jpeg = topomap.nodes[topomap.row_of(node.node_id)].template_jpeg
+        outcome = "not localized without itself"
+        if node.answer is not None and node.answer.is_wrong:
+            outcome = "wrong pose without itself"
+        elif node.answer is not None and node.answer.is_localized:
+            outcome = f"{node.answer.num_inliers} inliers without itself"
+        reasons = ", ".join(REASON_TEXTS[reason] for reason in node.reasons) or "not weak"
+        facts = f"<b>{outcome}, {node.num_landmarks} landmarks</b><p>{reasons}</p>"
+        items.append((render_figure(jpeg, f"node {node.node_id}, {node.name}"), facts))
+    return render_gallery_items(items) if items else "<p>No node was tested.</p>"

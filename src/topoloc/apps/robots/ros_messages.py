@@ -1,15 +1,21 @@
-"""ROS 2's messages as they go over DDS, field by field as their IDL says (geometry_msgs, tf2_msgs,
-std_msgs, builtin_interfaces).
+"""Messages of ROS 2 for DDS, with the fields of their IDL (geometry_msgs, tf2_msgs, std_msgs,
+builtin_interfaces).
 
-Type names and topics are those that rmw makes of them: `geometry_msgs::msg::dds_::Pose_`, and `rt/`
-before a topic's name. This needs `cyclonedds`, the extra `ros`.
+Type names and topics are those of rmw: `geometry_msgs::msg::dds_::Pose_`, and `rt/` before the name
+of a topic. Needs `cyclonedds`, the extra `ros`.
 """
 
 # No `from __future__ import annotations`: cyclonedds reads the types of the fields as they are.
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float64, int32, sequence, uint32
+
+if TYPE_CHECKING:
+    Covariance = list[float]
+else:
+    Covariance = array[float64, 36]
 
 
 @dataclass
@@ -55,7 +61,7 @@ class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
 @dataclass
 class PoseWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
     pose: Pose
-    covariance: array[float64, 36]  # pyright: ignore[reportInvalidTypeArguments]
+    covariance: Covariance
 
 
 @dataclass

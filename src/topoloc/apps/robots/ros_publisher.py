@@ -1,9 +1,8 @@
-"""Poses for robots on the network: PoseWithCovarianceStamped and TF over DDS, without ROS
-installed.
+"""Publish poses over DDS as PoseWithCovarianceStamped and TF. ROS need not be installed.
 
-The pose is that of the camera, x right, y down, z forward (ROS calls such a frame optical), in the
-map's world. ROS writes a covariance for rotations about the axes of the pose's own frame of
-reference, at the camera's own place: translation and rotation of the camera, in axes of the world.
+A pose is that of the camera in the map's world: x right, y down, z forward, an optical frame of
+ROS. Its covariance is ROS's: translation and rotation of the camera at its position, in axes of the
+world.
 """
 
 from __future__ import annotations
@@ -20,17 +19,11 @@ MAP_FRAME, CAMERA_FRAME = "map", "topoloc_camera"
 
 
 class RosPublisher:
-    """Publishes from when it is made until it is closed.
-
-    Args:
-        domain: ROS_DOMAIN_ID of the robots.
-
-    Raises:
-        MissingExtraError: cyclonedds is not installed.
-    """
+    """A participant of a ROS 2 domain that publishes until it is closed. `domain`: ROS_DOMAIN_ID of
+    the robots. Raises MissingExtraError: cyclonedds is not installed."""
 
     def __init__(self, domain: int = 0) -> None:
-        try:
+        with MissingExtraError.on_import("publishing to ROS needs cyclonedds", "ros"):
             from cyclonedds.core import Policy, Qos
             from cyclonedds.domain import DomainParticipant
             from cyclonedds.pub import DataWriter
@@ -38,44 +31,32 @@ class RosPublisher:
             from cyclonedds.util import duration
 
             from topoloc.apps.robots import ros_messages
-        except ImportError as error:
-            raise MissingExtraError(
-                "publishing to ROS needs cyclonedds: pip install 'topoloc[ros]'"
-            ) from error
         self._messages: Any = ros_messages
         self._participant = DomainParticipant(domain)
-        qos = Qos(
-            Policy.Reliability.Reliable(duration(milliseconds=100)), Policy.History.KeepLast(10)
-        )
-        pose, tf = ros_messages.PoseWithCovarianceStamped, ros_messages.TFMessage
-        self._poses: Any = DataWriter(
-            self._participant, Topic(self._participant, POSE_TOPIC, pose, qos=qos), qos=qos
-        )
-        self._transforms: Any = DataWriter(
-            self._participant, Topic(self._participant, TF_TOPIC, tf, qos=qos), qos=qos
-        )
+        reliable = Policy.Reliability.Reliable(duration(milliseconds=100))
+        qos = Qos(reliable, Policy.History.KeepLast(10))
+
+        def create_writer(topic: str, kind: Any) -> Any:
+            named = Topic(self._participant, topic, kind, qos=qos)
+            return DataWriter(self._participant, named, qos=qos)
+
+        self._poses = create_writer(POSE_TOPIC, ros_messages.PoseWithCovarianceStamped)
+        self._transforms = create_writer(TF_TOPIC, ros_messages.TFMessage)
 
     def publish(
         self, t_ns: int, world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
     ) -> None:
-        """One pose.
-
-        Args:
-            covariance: of the left perturbation of world_from_cam (translation, rotation), as
-                `Localization.covariance`.
-        """
+        """Publish a pose. The covariance is that of `Localization`."""
         ros = self._messages
-        header = ros.Header(ros.Time(t_ns // 1_000_000_000, t_ns % 1_000_000_000), MAP_FRAME)
+        header = ros.Header(ros.Time(*divmod(t_ns, 1_000_000_000)), MAP_FRAME)
         x, y, z = world_from_cam.translation.tolist()
         w, i, j, k = world_from_cam.quat_wxyz().tolist()
         turn = ros.Quaternion(i, j, k, w)
         about_camera = camera_covariance_in_world(world_from_cam, covariance).ravel().tolist()
         pose = ros.PoseWithCovariance(ros.Pose(ros.Point(x, y, z), turn), about_camera)
         self._poses.write(ros.PoseWithCovarianceStamped(header, pose))
-        transform = ros.TransformStamped(
-            header, CAMERA_FRAME, ros.Transform(ros.Vector3(x, y, z), turn)
-        )
-        self._transforms.write(ros.TFMessage([transform]))
+        moved = ros.Transform(ros.Vector3(x, y, z), turn)
+        self._transforms.write(ros.TFMessage([ros.TransformStamped(header, CAMERA_FRAME, moved)]))
 
     def close(self) -> None:
         del self._poses, self._transforms, self._participant
@@ -84,7 +65,7 @@ class RosPublisher:
 def camera_covariance_in_world(
     world_from_cam: Rigid3, covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "6 6"]:
-    """Of the camera's place and turn, about the camera, in axes of the world: the left perturbation
-    moved from the origin to the camera."""
+    """Return the covariance of the camera's position and rotation about the camera, in axes of the
+    world. `covariance` is that of the left perturbation about the origin."""
     at_camera = Rigid3(np.eye(3), -world_from_cam.translation).adjoint()
     return at_camera @ covariance @ at_camera.T

@@ -102,23 +102,21 @@ class AccessMiddleware:
             request.check_size(int(length[:20]))
 
     def _log_request(self, request: _Request) -> None:
-        seconds = time.perf_counter() - request.start
-        scope = request.scope
+        seconds, scope = time.perf_counter() - request.start, request.scope
         route = getattr(scope.get("route"), "path", "none")
         self._metrics.requests.labels(route, request.status).inc()
         if scope["type"] == "http":
             self._metrics.seconds.labels(route).observe(seconds)
-        log(
-            "request",
-            request_id=request.id,
-            client=(scope.get("client") or ("",))[0],
-            bytes=request.num_bytes,
-            method=scope.get("method", "WEBSOCKET"),
-            path=scope["path"][:200],
-            status=request.status,
-            ms=round(1e3 * seconds, 1),
-            **request.facts,
-        )
+        facts = {
+            "request_id": request.id,
+            "client": (scope.get("client") or ("",))[0],
+            "bytes": request.num_bytes,
+            "method": scope.get("method", "WEBSOCKET"),
+            "path": scope["path"][:200],
+            "status": request.status,
+            "ms": round(1e3 * seconds, 1),
+        }
+        log("request", **facts, **request.facts)
 
 
 class _Request:
@@ -127,10 +125,10 @@ class _Request:
     def __init__(self, scope: Scope, receive: Receive, send: Send, limits: RequestLimits) -> None:
         self.scope, self._receive, self._send, self._limits = scope, receive, send, limits
         self.start, self.num_bytes, self.status = time.perf_counter(), 0, 0
-        self._headers = {
-            name.decode("latin-1").lower(): value.decode("latin-1")
-            for name, value in scope["headers"]
-        }
+        decoded = [
+            (name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]
+        ]
+        self._headers = {name.lower(): value for name, value in decoded}
         given = self.header("x-request-id")
         self.id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         self.facts: dict[str, Any] = {}

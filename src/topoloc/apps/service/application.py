@@ -1,50 +1,54 @@
-"""The service as an ASGI application."""
+"""The service as an ASGI application, and its server by uvicorn."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+import contextlib
+import signal
+import socket
+import sys
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import uvicorn
 from fastapi import FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import topoloc
-from topoloc import AtlasConfig, Localizer, MapCache, TrackerConfig
+from topoloc import AtlasConfig, Localizer, MapCache, TopolocError, TrackerConfig
 from topoloc.apps.service import geopose_routes, map_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.apps.service.logs import Metrics, log
-from topoloc.apps.service.query_handler import QueryHandler
+from topoloc.apps.service.logs import Metrics, log, log_json
+from topoloc.apps.service.query_handler import QueryHandler, ServedAtlases
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.apps.service.served_atlases import ServedAtlases
-from topoloc.apps.service.state import Service, Workers
-from topoloc.apps.service.streams import Streams
+from topoloc.apps.service.state import Service, Streams, Workers
 
 _DESCRIPTION = """6-DoF poses of images in maps that `topoloc build` made.
 
 The response for an image without a pose is 200 with `"localized": false` and the reason. Invalid
 requests are refused with one sentence."""
-
-
-@dataclass(frozen=True)
-class Access:
-    """The clients that may connect: with a token, or from this machine only."""
-
-    token: str | None = None
-    loopback_only: bool = True
+_MAX_CONNECTIONS = 1000
+_KEEP_ALIVE_S = 75
+"""Longer than clients and load balancers keep a connection (5 to 60 s). Otherwise a request may
+meet a connection that is being closed."""
 
 
 def create_application(
     maps: MapCache[Localizer],
     config: ServiceConfig,
-    access: Access,
+    token: str | None = None,
+    loopback_only: bool = True,
     tracking: TrackerConfig | None = None,
     atlas_config: AtlasConfig | None = None,
 ) -> App:
-    """Create the application. It closes the maps when it ends."""
+    """Create the application. It closes the maps when it ends. See `RequestLimits` for `token` and
+    `loopback_only`."""
     metrics = Metrics()
     atlases = ServedAtlases(maps, atlas_config or AtlasConfig())
     query_handler = QueryHandler(maps, config.max_pixels, 1e3 * config.answer_s, atlases)
@@ -53,9 +57,7 @@ def create_application(
     )
     workers = Workers(config.num_workers, config.max_queue)
     service = Service(maps, query_handler, workers, config, metrics, streams)
-    metrics.gauge(
-        "topoloc_jobs", "Requests in progress or waiting.", lambda: service.workers.num_jobs
-    )
+    metrics.gauge("topoloc_jobs", "Requests in progress or waiting.", lambda: workers.num_jobs)
     metrics.gauge("topoloc_streams", "Open streams.", lambda: len(streams))
     metrics.gauge("topoloc_open_maps", "Open maps.", lambda: maps.num_open)
     metrics.gauge("topoloc_open_map_bytes", "Bytes of open map files.", lambda: maps.num_bytes)
@@ -83,9 +85,8 @@ def create_application(
         app.include_router(routes.router)
     for kind in (RequestError, HTTPException, RequestValidationError, 404, 405):
         app.add_exception_handler(kind, _error_response)
-    limits = RequestLimits(
-        access.token, access.loopback_only, config.max_upload_bytes, config.upload_s
-    )
+    bounds = config.max_upload_bytes, config.upload_s
+    limits = RequestLimits(token, loopback_only, *bounds)
     return AccessMiddleware(app, limits, metrics)
 
 
@@ -103,3 +104,97 @@ async def _error_response(request: Request, error: Exception) -> Response:
         refusal = RequestError(status, text or str(getattr(error, "detail", error)))
         headers = dict(getattr(error, "headers", None) or {})
     return JSONResponse(refusal.to_json(request.scope["request_id"]), refusal.status, headers)
+
+
+@dataclass(frozen=True)
+class Address:
+    """Address of the service. It uses TLS if the files are given."""
+
+    host: str
+    port: int
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+    behind_proxy: bool = False
+
+
+def serve(app: App, address: Address, limits: ServiceConfig) -> None:
+    """Listen until SIGTERM or SIGINT. Requests in progress then have `limits.drain_s` seconds.
+    Raises TopolocError: the address cannot be used."""
+    config = uvicorn.Config(
+        app,
+        http=type("_PatientHere", (_HeadTimeoutProtocol,), {"head_s": limits.upload_s}),
+        ws_max_size=limits.max_upload_bytes,
+        ws_per_message_deflate=False,
+        access_log=False,
+        log_config=None,
+        server_header=False,
+        proxy_headers=address.behind_proxy,
+        limit_concurrency=_MAX_CONNECTIONS,
+        timeout_keep_alive=_KEEP_ALIVE_S,
+        timeout_graceful_shutdown=round(limits.drain_s),
+        ssl_certfile=address.tls_cert,
+        ssl_keyfile=address.tls_key,
+        lifespan="on",
+    )
+    listener = _create_socket(address)
+    log_json()
+    scheme = "https" if address.tls_cert else "http"
+    host, port = listener.getsockname()[:2]
+    shown = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
+    print(f"topoloc serves on {shown}", file=sys.stderr, flush=True)
+    asyncio.run(_Server(config).serve([listener]))
+
+
+def _create_socket(address: Address) -> socket.socket:
+    try:
+        family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+        return socket.create_server((address.host, address.port), family=family, backlog=256)
+    except OSError as error:
+        where = f"{address.host}, port {address.port}"
+        raise TopolocError(f"cannot listen on {where}: {error.strerror or error}") from None
+
+
+class _Server(uvicorn.Server):
+    """A server that ends with status 0 at a signal. uvicorn's own re-raises the signal."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        loop = asyncio.get_running_loop()
+        signals = (signal.SIGTERM, signal.SIGINT)
+        for number in signals:
+            loop.add_signal_handler(number, self.handle_exit, number, None)
+        try:
+            yield
+        finally:
+            for number in signals:
+                loop.remove_signal_handler(number)
+
+
+class _HeadTimeoutProtocol(H11Protocol):
+    """HTTP/1.1 that closes a connection if no request head arrives in time."""
+
+    head_s = 10.0
+    _timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self._wait_for_head(self.head_s)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def on_response_complete(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._wait_for_head(_KEEP_ALIVE_S + self.head_s)
+        super().on_response_complete()
+
+    def _wait_for_head(self, seconds: float) -> None:
+        self._timer = self.loop.call_later(seconds, self._close_if_idle, self.cycle)
+
+    def _close_if_idle(self, before: Any) -> None:
+        is_ours = self.transport.get_protocol() is self and not self.transport.is_closing()
+        if self.cycle is before and is_ours:
+            self.transport.close()

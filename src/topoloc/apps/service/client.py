@@ -170,13 +170,10 @@ class AsyncClient:
 
 
 def _import_httpx() -> Any:
-    try:
+    with MissingExtraError.on_import("asking a service needs httpx", "serve"):
         import httpx
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            "asking a service needs httpx: pip install 'topoloc[serve]'"
-        ) from error
-    return httpx
+
+        return httpx
 
 
 def _client_options(url: str, token: str | None, timeout_s: float) -> dict[str, Any]:

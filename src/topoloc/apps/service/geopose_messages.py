@@ -116,9 +116,8 @@ class GeoPoseRequest(BaseModel):
         if not found:
             raise RequestError(400, "the request has no reading of a camera")
         params = {sensor.id: sensor.params for sensor in self.sensors}
-        return found[0].model_copy(
-            update={"params": found[0].params or params.get(found[0].sensorId)}
-        )
+        its_params = found[0].params or params.get(found[0].sensorId)
+        return found[0].model_copy(update={"params": its_params})
 
     def near(self, slack_m: float) -> GeoPositionPrior | None:
         """Return the position of the first valid reading with an accuracy.
@@ -142,11 +141,9 @@ class GeoPoseRequest(BaseModel):
         if isinstance(readings, SensorReadings):
             return getattr(readings, name) or []
         found = [one for one in readings if key in (one.reading or {})]
+        data = [(one.reading or {}) | {"sensorId": one.sensorId} for one in found]
         try:
-            return [
-                kind.model_validate({**(one.reading or {}), "sensorId": one.sensorId})
-                for one in found
-            ]
+            return [kind.model_validate(one) for one in data]
         except ValidationError as error:
             raise _to_request_error("invalid reading", error) from None
 
@@ -203,11 +200,9 @@ class GeoPoseError(BaseModel):
 def check_version(accept: str) -> None:
     """Raise RequestError if an Accept header names a version other than 1.0 and 2.0."""
     named = _VERSION.search(accept)
-    if named and named.group(1) not in _KNOWN_VERSIONS:
-        raise RequestError(
-            400,
-            f"version {named.group(1)} of the GeoPose Protocol is not supported; use 1.0 or 2.0",
-        )
+    if named and named[1] not in _KNOWN_VERSIONS:
+        text = f"version {named[1]} of the GeoPose Protocol is not supported; use 1.0 or 2.0"
+        raise RequestError(400, text)
 
 
 def read_request(body: bytes) -> GeoPoseRequest:
@@ -221,10 +216,8 @@ def read_request(body: bytes) -> GeoPoseRequest:
 def read_image_bytes(reading: CameraReading) -> EncodedImage | Image:
     """Return the image: raw pixels if the size fits, else the bytes of an image file.
 
-    Clients name JPEG files RGBA32 too, so the format is not trusted.
-
-    Raises:
-        RequestError: the bytes are missing or not base64, or the image is mirrored or depth.
+    Clients name JPEG files RGBA32 too, so the format is not trusted. Raises RequestError: the bytes
+    are missing or not base64, or the image is mirrored or depth.
     """
     if reading.imageOrientation is not None and reading.imageOrientation.mirrored:
         raise RequestError(400, "the image is mirrored; send it as the camera captured it")
@@ -270,14 +263,12 @@ def create_reply(
     now_ms: float,
 ) -> GeoPoseReply:
     """Create the reply. Its accuracy includes the residuals of the map's georeference."""
-    position_sigma = math.hypot(result.position_sigma_m, georeference.rms_m or 0.0)
     mean = 1.0 / math.sqrt(3.0)
+    metres = mean * math.hypot(result.position_sigma_m, georeference.rms_m or 0.0)
     return GeoPoseReply(
         id=request.id,
         timestamp=request.timestamp if isinstance(request.timestamp, float) else now_ms,
-        accuracy=Accuracy(
-            position=mean * position_sigma, orientation=mean * result.rotation_sigma_deg
-        ),
+        accuracy=Accuracy(position=metres, orientation=mean * result.rotation_sigma_deg),
         geopose=GeoPoseOgc.model_validate(geopose.to_json()),
     )
 

@@ -81,8 +81,7 @@ async def geopose_lives() -> dict[str, str]:
 async def localize_geopose(request: Request, only: MapOnly = None) -> Response:
     """Localize an image on earth. The body frame of the camera is x forward, y left, z up; the pose
     is in east-north-up."""
-    service = get_service(request)
-    accept = request.headers.get("accept", "")
+    service, accept = get_service(request), request.headers.get("accept", "")
     try:
         check_version(accept)
         body = await read_body(request)
@@ -106,8 +105,7 @@ def _localize_and_reply(
     """Return the results of all maps and atlases, and the reply if their poses agree."""
     query = read_request(body)
     reading = query.camera_reading()
-    picture = read_image_bytes(reading)
-    handler = service.query_handler
+    picture, handler = read_image_bytes(reading), service.query_handler
     is_encoded = isinstance(picture, EncodedImage)
     image = decode_image(picture, handler.max_pixels) if is_encoded else picture
     atlases = [] if only is not None else handler.atlases.opened()

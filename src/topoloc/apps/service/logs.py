@@ -60,24 +60,20 @@ class Metrics:
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
-        self.requests = Counter(
-            "topoloc_requests",
-            "Requests by route and status.",
-            ("route", "status"),
-            registry=self.registry,
+        self.requests = self._counter(
+            "topoloc_requests", "Requests by route and status.", "route", "status"
         )
-        self.answers = Counter(
-            "topoloc_answers",
-            "Results by map and outcome: localized, or the reason of the refusal.",
-            ("map", "outcome"),
-            registry=self.registry,
-        )
+        meaning = "Results by map and outcome: localized, or the reason of the refusal."
+        self.answers = self._counter("topoloc_answers", meaning, "map", "outcome")
         self.seconds = self._histogram(
             "topoloc_request_seconds", "Seconds from request head to end of response.", "route"
         )
         self.search_seconds = self._histogram(
             "topoloc_localize_seconds", "Seconds of localization, without waiting.", "map"
         )
+
+    def _counter(self, name: str, meaning: str, *labels: str) -> Counter:
+        return Counter(name, meaning, labels, registry=self.registry)
 
     def _histogram(self, name: str, meaning: str, label: str) -> Histogram:
         return Histogram(name, meaning, (label,), registry=self.registry, buckets=_SECONDS)

@@ -1,15 +1,24 @@
 """Run one query in a worker: decode the image, find its camera, localize it, write the result. No
-step uses the event loop."""
+step uses the event loop.
+
+An atlas is reopened when its manifest changes. A thread for each object store checks its manifest
+every few seconds. While a store is silent, the last version is served.
+"""
 
 from __future__ import annotations
 
 import json
+import logging
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 from topoloc import (
+    Atlas,
+    AtlasConfig,
     Camera,
     Image,
     Localization,
@@ -17,18 +26,71 @@ from topoloc import (
     MapCache,
     NotLocalized,
     QueryError,
+    TopolocError,
     TopoMetricMap,
     UncalibratedCamera,
     read_image,
 )
 from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.apps.report.explanation_page import compared_to_json, explanation_page
+from topoloc.apps.service.logs import log
 from topoloc.apps.service.query_request import QueryRequest, parse_camera_field
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.apps.service.served_atlases import ServedAtlases
 from topoloc.plugin import EncodedImage, image_size
 
+POLL_INTERVAL_S = 5.0
+"""Seconds between two checks of an object store: one listing each, and a reading if it changed."""
 T = TypeVar("T")
+
+
+class ServedAtlases:
+    """Hold a localizer for each atlas. The service's cache of maps opens their tiles."""
+
+    def __init__(self, maps: MapCache[Localizer], config: AtlasConfig) -> None:
+        self._maps, self._config = maps, config
+        self._watched = {watched.where: watched for watched in maps.atlases}
+        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._opened: dict[str, tuple[Atlas, Localizer]] = {}
+
+    def opened(self) -> list[tuple[Atlas, Localizer]]:
+        """Return the current version of each atlas with its localizer. Raises AtlasError."""
+        with self._lock:
+            return [self._open_localizer(where) for where in self._watched]
+
+    def watch(self) -> None:
+        """Check the atlases in object stores until `close`."""
+        for where, watched in self._watched.items():
+            if watched.is_remote:
+                poll = partial(self._poll_atlas, where)
+                threading.Thread(target=poll, name="atlas", daemon=True).start()
+
+    def close(self) -> None:
+        """Stop the checks, without waiting for one in progress."""
+        self._ended.set()
+
+    def _open_localizer(self, where: str) -> tuple[Atlas, Localizer]:
+        atlas, known = self._watched[where].now(), self._opened.get(where)
+        if known is None or known[0] is not atlas:
+            localizer = Localizer(atlas, tiles=self._config, maps=self._maps, warn=_warn)
+            self._opened[where] = known = atlas, localizer
+        return known
+
+    def _poll_atlas(self, where: str) -> None:
+        watched, logged = self._watched[where], ""
+        while not self._ended.wait(POLL_INTERVAL_S):
+            try:
+                if watched.look():
+                    log("atlas", where=where, serial=watched.now().manifest.serial)
+                logged = ""
+            except Exception as error:  # the next check may succeed; the last version is served
+                if str(error) != logged:
+                    unknown = None if isinstance(error, TopolocError) else error
+                    log("atlas", logging.WARNING, unknown, where=where, detail=str(error))
+                logged = str(error)
+
+
+def _warn(text: str) -> None:
+    log("tile", logging.WARNING, detail=text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +112,8 @@ class QueryHandler:
     ) -> dict[str, Localization | NotLocalized]:
         """Localize in every map and every atlas of the service. Those that are left share the time
         that is left."""
-        localizers, end = (
-            [localizer for _, localizer in self.atlases.opened()],
-            time.perf_counter() + self._limit_ms(query_request) / 1e3,
-        )
+        localizers = [localizer for _, localizer in self.atlases.opened()]
+        end = time.perf_counter() + self._limit_ms(query_request) / 1e3
         tiles = {tile_id for localizer in localizers for tile_id in localizer.tile_ids}
         names = [name for name in self.maps.names() if name not in tiles]
         answers, num_left = dict[str, Localization | NotLocalized](), len(names) + len(localizers)
@@ -72,10 +132,7 @@ class QueryHandler:
     ) -> Localization | NotLocalized:
         if query_request.prior is not None:
             raise QueryError("a prior is a pose in one map's world: ask that map")
-        image = decode_image(query_request.picture, self.max_pixels)
-        camera = parse_camera_field(
-            query_request.camera, query_request.picture, (image.shape[1], image.shape[0]), None
-        )
+        image, camera = self.decode_query(query_request, None)
         localizer = localizer if query_request.near is None else localizer.near(query_request.near)
         return localizer.localize(image, camera, max_ms=query_request.max_ms)
 
@@ -88,10 +145,7 @@ class QueryHandler:
             camera: Camera | UncalibratedCamera,
             query_request: QueryRequest,
         ) -> str:
-            explanation, query = (
-                explain(localizer, image, camera),
-                query_request.picture.name,
-            )
+            explanation, query = (explain(localizer, image, camera), query_request.picture.name)
             if as_page:
                 return explanation_page(query, image, explanation, localizer.topomap)
             compared = compared_to_json(image, explanation, localizer.topomap)
@@ -103,13 +157,13 @@ class QueryHandler:
         return self._run_query(name, query_request, explain_image)
 
     def decode_query(
-        self, query_request: QueryRequest, topomap: TopoMetricMap
+        self, query_request: QueryRequest, topomap: TopoMetricMap | None
     ) -> tuple[Image, Camera | UncalibratedCamera]:
         """Return the image and its camera."""
-        image = decode_image(query_request.picture, self.max_pixels)
-        return image, parse_camera_field(
-            query_request.camera, query_request.picture, (image.shape[1], image.shape[0]), topomap
-        )
+        picture = query_request.picture
+        image = decode_image(picture, self.max_pixels)
+        size = (image.shape[1], image.shape[0])
+        return image, parse_camera_field(query_request.camera, picture, size, topomap)
 
     def _run_query(
         self,
@@ -135,12 +189,8 @@ class QueryHandler:
 
 
 def decode_image(picture: EncodedImage, max_pixels: int) -> Image:
-    """Decode an image, after a check of its size.
-
-    Raises:
-        UnreadableImageError: it is no image, or damaged.
-        RequestError: it is too large.
-    """
+    """Decode an image, after a check of its size. Raises UnreadableImageError: it is no image, or
+    damaged; RequestError: it is too large."""
     width, height = image_size(picture)
     if width * height > max_pixels:
         raise RequestError(

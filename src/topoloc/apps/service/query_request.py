@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Annotated, Any
@@ -29,6 +28,7 @@ from topoloc.plugin import EncodedImage, decode_json, exif_focal_length
 
 _MAX_FIELD_BYTES = 20_000
 _MAX_MS = 600_000.0
+_MAX_MS_FAULT = f"max_ms: above 0 and at most {_MAX_MS:g} milliseconds"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +50,8 @@ class QueryRequest:
 
 
 async def read_query_request(request: Request, parameters: QueryParameters) -> QueryRequest:
-    """Read a query. The body is an image, or a form with the field `image`.
-
-    Raises:
-        RequestError: the body is neither, or a parameter is invalid.
-    """
+    """Read a query. The body is an image, or a form with the field `image`. Raises RequestError:
+    the body is neither, or a parameter is invalid."""
     fields = {name: str(value) for name, value in parameters.model_dump(exclude_none=True).items()}
     content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if content_type == "multipart/form-data":
@@ -74,9 +71,7 @@ async def read_query_request(request: Request, parameters: QueryParameters) -> Q
     return QueryRequest(
         EncodedImage(name, data, PurePath(name).suffix),
         fields.get("camera"),
-        _parse_prior(fields["prior"]) if "prior" in fields else None,
-        _parse_max_ms(fields["max_ms"]) if "max_ms" in fields else None,
-        _parse_near(fields["near"]) if "near" in fields else None,
+        *_parse_parameters(fields),
     )
 
 
@@ -116,41 +111,34 @@ async def _read_form(request: Request) -> tuple[bytes, str, dict[str, str]]:
     raise RequestError(400, "the form has no file called `image`, or ends before it is complete")
 
 
-def _parse_prior(text: str) -> Rigid3:
+def _parse_parameters(
+    fields: dict[str, str],
+) -> tuple[Rigid3 | None, float | None, GeoPositionPrior | None]:
+    """Return the prior, the time limit and the position of a query. Raises RequestError."""
     try:
-        return Rigid3.from_json(text, "prior")
+        prior = Rigid3.from_json(fields["prior"], "prior") if "prior" in fields else None
+        max_ms = float(fields["max_ms"]) if "max_ms" in fields else None
+        near = GeoPositionPrior.parse(fields["near"]) if "near" in fields else None
     except TrajectoryError as error:
         raise RequestError(422, str(error)) from None
-
-
-def _parse_near(text: str) -> GeoPositionPrior:
-    try:
-        return GeoPositionPrior.parse(text)
     except AtlasError as error:
         raise RequestError(422, f"near: {error}") from None
-
-
-def _parse_max_ms(text: str) -> float:
-    try:
-        max_ms = float(text)
     except ValueError:
-        max_ms = math.nan
-    if not 0.0 < max_ms <= _MAX_MS:
-        raise RequestError(422, f"max_ms: above 0 and at most {_MAX_MS:g} milliseconds")
-    return max_ms
+        raise RequestError(422, _MAX_MS_FAULT) from None
+    if max_ms is not None and not 0.0 < max_ms <= _MAX_MS:
+        raise RequestError(422, _MAX_MS_FAULT)
+    return prior, max_ms, near
 
 
 def parse_camera_field(
     text: str | None, picture: EncodedImage, size: tuple[int, int], topomap: TopoMetricMap | None
 ) -> Camera | UncalibratedCamera:
     """Return the camera of an image of this width and height (pixels). Server files are not read.
+    Raises CalibrationError, QueryError: the camera is invalid or does not fit the image.
 
     Args:
         text: ``exif`` (the default), ``unknown``, ``map``, ``fx,fy,cx,cy``, or a JSON object.
         topomap: the queried map, for ``map``; None if several maps are queried.
-
-    Raises:
-        CalibrationError, QueryError: the camera is invalid or does not fit the image.
     """
     width, height = size
     text = (text or "exif").strip()
@@ -170,9 +158,7 @@ def camera_from_json(data: Any, width: int, height: int) -> Camera:
     """Convert a JSON camera: parameters as in camera.json, or `model` and `params` of COLMAP.
 
     COLMAP's centre of the top-left pixel is (0.5, 0.5). The default size is that of the image.
-
-    Raises:
-        CalibrationError: the camera is invalid.
+    Raises CalibrationError: the camera is invalid.
     """
     named = decode_json(data, dict[str, Any], CalibrationError, "camera")
     sized = {"width": width, "height": height, **named}

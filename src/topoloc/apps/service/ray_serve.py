@@ -61,23 +61,17 @@ def serve_on_ray(
     replicas: ReplicasConfig,
     wait: Callable[[], None],
 ) -> None:
-    """Serve on a cluster until `wait` returns, then finish the requests in progress.
+    """Serve on a cluster until `wait` returns, then finish the requests in progress. Raises
+    MissingExtraError: Ray Serve is not installed; ClusterError: no cluster answers, or no replica
+    can start. The text gives the reason.
 
     Args:
         address: cluster, as for `connect_to_cluster`.
         wait: called when the service runs.
-
-    Raises:
-        MissingExtraError: Ray Serve is not installed.
-        ClusterError: no cluster answers, or no replica can start. The text gives the reason.
     """
     with connect_to_cluster(address):
-        try:
+        with MissingExtraError.on_import("replicas need Ray Serve ({})", "cluster,serve"):
             from ray import serve
-        except ImportError as error:
-            raise MissingExtraError(
-                f"replicas need Ray Serve ({error}): pip install 'topoloc[cluster,serve]'"
-            ) from error
         logging.getLogger("ray.serve").setLevel(logging.ERROR)
         is_running = bool(serve.status().proxies)
         try:

@@ -23,8 +23,7 @@ from topoloc.apps.service.openapi_schemas import (
 )
 from topoloc.apps.service.query_request import QueryRequest, read_query_request
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.apps.service.state import Service, get_service
-from topoloc.apps.service.streams import Stream
+from topoloc.apps.service.state import Service, Stream, get_service
 from topoloc.plugin import EncodedImage, decode_json
 
 router = APIRouter()
@@ -99,8 +98,7 @@ async def stream_over_websocket(socket: WebSocket, map: str) -> None:
     A binary message is an image, and its result is a text. A text message sets parameters of the
     next images: `{"camera": ..., "t_ns": ...}`. The time is that of the next image only.
     """
-    service = get_service(socket)
-    camera = socket.query_params.get("camera")
+    service, camera = get_service(socket), socket.query_params.get("camera")
     try:
         stream = await service.run_job(socket, lambda: service.streams.begin(map, camera))
     except RequestError as refusal:

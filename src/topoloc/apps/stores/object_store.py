@@ -29,21 +29,16 @@ after about a minute. `timeout` bounds the transfer of a whole file."""
 
 class ObjectStore:
     """Store an atlas below a prefix of an object store. The cache folder of this machine keeps its
-    files by their checksums.
-
-    Raises:
-        MissingExtraError: obstore is not installed.
-        AtlasError: obstore does not know such a store, or its configuration is not valid.
-    """
+    files by their checksums. Raises MissingExtraError: obstore is not installed; AtlasError:
+    obstore does not know such a store, or its configuration is not valid."""
 
     def __init__(self, where: str) -> None:
         self.where = where.rstrip("/")
         try:
-            self._objects = open_objects(self.where)
-        except ModuleNotFoundError as error:
-            raise MissingExtraError(
-                f"{where}: object stores need {error.name}: pip install 'topoloc[cluster]'"
-            ) from error
+            with MissingExtraError.on_import(f"{where}: object stores need {{}}", "cluster"):
+                self._objects = open_objects(self.where)
+        except MissingExtraError:
+            raise
         except Exception as error:  # each client has its own errors
             raise AtlasError(f"{where}: {_format_error(error)}") from error
 

@@ -52,11 +52,8 @@ def create_document(
     results: Sequence[ResultSet] = (),
     budget: SceneBudget | None = None,
 ) -> dict[str, Any]:
-    """Return the document of a map and of results in it.
-
-    Raises:
-        MapError: the map cannot be read.
-    """
+    """Return the document of a map and of results in it. Raises MapError: the map cannot be
+    read."""
     budget = budget or SceneBudget()
     shown = _read_nodes(topomap, budget.max_points)
     poses = [summary.world_from_cam for summary in topomap.summaries]
@@ -141,8 +138,7 @@ def _find_up_axis(topomap: TopoMetricMap, poses: Sequence[Rigid3]) -> Float[np.n
     length = float(np.linalg.norm(up))
     if length < 0.3:
         return np.array([0.0, 0.0, 1.0])
-    up = up / length
-    axis = np.zeros(3)
+    up, axis = up / length, np.zeros(3)
     axis[np.argmax(np.abs(up))] = np.sign(up[np.argmax(np.abs(up))])
     return axis if axis @ up > np.cos(np.deg2rad(25.0)) else up
 

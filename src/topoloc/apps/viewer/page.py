@@ -130,11 +130,8 @@ def find_browser() -> str:
 
 
 def write_screenshot(page: Path, out: Path, width: int = 1300, height: int = 850) -> None:
-    """Write a PNG of the page in a window of this size (pixels).
-
-    Raises:
-        TopolocError: there is no browser, it fails, or the file cannot be written.
-    """
+    """Write a PNG of the page in a window of this size (pixels). Raises TopolocError: there is no
+    browser, it fails, or the file cannot be written."""
     browser = find_browser()
     with tempfile.TemporaryDirectory(prefix="topoloc-view-") as profile:
         picture = Path(profile) / "page.png"

@@ -25,12 +25,8 @@ from topoloc.plugin import decode_json, read_text
 
 def read_results(path: Path) -> list[ResultSet]:
     """Read the lines of `topoloc localize --json`, the results of `topoloc evaluate --json` by
-    recording, or a trajectory (TUM, KITTI).
-
-    Raises:
-        ResultError: the file is missing or of another kind. The text names the line.
-        TrajectoryError: the trajectory is malformed.
-    """
+    recording, or a trajectory (TUM, KITTI). Raises ResultError: the file is missing or of another
+    kind. The text names the line; TrajectoryError: the trajectory is malformed."""
     text = read_text(path, ResultError)
     if not text.lstrip().startswith("{"):
         return [ResultSet(path.stem, path=Trajectory.read(path).world_from_cam)]
@@ -42,12 +38,8 @@ def read_results(path: Path) -> list[ResultSet]:
 
 
 def create_results_scene(path: Path) -> Scene:
-    """Return the localized images of a result file as a scene.
-
-    Raises:
-        ResultError: the file is missing, a line is no result, or none has a pose. The text names
-            the line.
-    """
+    """Return the localized images of a result file as a scene. Raises ResultError: the file is
+    missing, a line is no result, or none has a pose. The text names the line."""
     views, count = list[View](), 0
     for place, line in _number_lines(path, read_text(path, ResultError)):
         count += 1

@@ -246,8 +246,7 @@ def find_candidate_pairs(atlas: Atlas, wanted: Collection[str]) -> list[tuple[Ti
     # Maximum number of pairs of tiles to compare. The most similar pairs come first.
     max_pairs = 10_000
     manifest, index = atlas.manifest, atlas.index
-    scores = dict[tuple[str, str], float]()
-    known = {join.pair for join in manifest.joins}
+    scores, known = dict[tuple[str, str], float](), {join.pair for join in manifest.joins}
     for tile in manifest.tiles:
         if tile.tile_id not in wanted or tile.tile_id in atlas.problems:
             continue

@@ -87,8 +87,7 @@ def find_contradictions(
     Raises:
         MapError: the map cannot be read.
     """
-    config = config or ContradictionsConfig()
-    poses = topomap.node_poses
+    config, poses = config or ContradictionsConfig(), topomap.node_poses
     errors = topomap.first_layer.shared_errors
     rho = (
         errors.rho

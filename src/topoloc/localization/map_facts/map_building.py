@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,24 +25,13 @@ from topoloc.slam.pose_checks import check_pose_coverage, check_poses
 from topoloc.slam.slam import estimate_slam_poses
 
 
-@dataclass(frozen=True)
-class SkippedChecks:
-    """Select the checks to skip.
-
-    `poses` compares the poses with the images. `gaps` requires that at least half of the frames
-    have a pose.
-    """
-
-    poses: bool = False
-    gaps: bool = False
-
-
 def build_map(
     sequences: StereoSequence | str | Path | Sequence[StereoSequence | str | Path],
     config: build.BuildConfig | None = None,
     progress: build.Progress | None = None,
     poses_from: Sequence[str] | None = None,
-    skipped_checks: SkippedChecks | None = None,
+    are_poses_checked: bool = True,
+    is_coverage_checked: bool = True,
 ) -> TopoMetricMap:
     """Build a topo-metric map from recordings whose poses share one world frame.
 
@@ -53,7 +42,9 @@ def build_map(
         sequences: the recordings, or their paths, which `open_sequence` opens.
         poses_from: source of each recording's poses (`truth`, `slam`, a file), to be stored in the
             map. If it is given, SLAM is not run.
-        skipped_checks: checks to skip. By default, poses are checked unless SLAM estimated them.
+        are_poses_checked: compare the poses with the images, unless SLAM estimated them.
+        is_coverage_checked: require that at least half of the frames have a pose, unless SLAM
+            estimated them.
 
     Raises:
         ConfigError: a value of `config` is out of bounds.
@@ -68,7 +59,6 @@ def build_map(
         find_feature_type(kind)
     given = [sequences] if isinstance(sequences, StereoSequence | str | Path) else sequences
     sequences = [open_sequence(one) if isinstance(one, str | Path) else one for one in given]
-    skipped_checks = skipped_checks or SkippedChecks()
     if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
         sequences, poses_from = (
             estimate_slam_poses(sequences, progress=progress),
@@ -76,9 +66,9 @@ def build_map(
         )
     for k, sequence in enumerate(sequences):
         is_from_slam = poses_from is not None and poses_from[k] == "slam"
-        if not (skipped_checks.gaps or is_from_slam):
+        if is_coverage_checked and not is_from_slam:
             check_pose_coverage(sequence)
-        if not (skipped_checks.poses or is_from_slam):
+        if are_poses_checked and not is_from_slam:
             check_poses(sequence)
     return with_map_statistics(build.build_map(sequences, config, progress, poses_from), progress)
 

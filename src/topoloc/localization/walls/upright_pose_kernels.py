@@ -27,8 +27,7 @@ def largest_agreement(seen, points, turns, shifts, tolerances, nearest):
             if depth < nearest:
                 continue
             miss_u = cosine * x + sine * z + shifts[j, 0] - seen[k, 0] * depth
-            miss_v = y + shifts[j, 1] - seen[k, 1] * depth
-            limit = tolerances[k] * depth
+            miss_v, limit = y + shifts[j, 1] - seen[k, 1] * depth, tolerances[k] * depth
             if miss_u * miss_u + miss_v * miss_v < limit * limit:
                 count += 1
         if count > most:

@@ -21,7 +21,7 @@ from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.recording import Recording, RightImages
 from topoloc.recordings.stereo_yaml import kalibr_camera
 from topoloc.recordings.text_files import read_file_list
-from topoloc.recordings.trajectory import interpolate_poses, read_asl_poses
+from topoloc.recordings.trajectory import read_asl_poses
 from topoloc.recordings.yaml_numbers import read_yaml, require_numbers
 
 EXPECTED_FILES = "mav0/ with cam0/data.csv, or cam0/data.csv"
@@ -118,7 +118,7 @@ def _read_ground_truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid
     )
     if path is None:
         return [None] * len(t_ns)
-    poses = interpolate_poses(read_asl_poses(path), t_ns, MAX_TRUTH_GAP)
+    poses = read_asl_poses(path).interpolate(t_ns, MAX_TRUTH_GAP)
     if all(world_from_body is None for world_from_body in poses):
         raise TrajectoryError(f"{path}: none of the {len(t_ns)} frames has a pose")
     return [

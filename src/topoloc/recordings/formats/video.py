@@ -170,8 +170,7 @@ def _open_capture(path: Path) -> cv2.VideoCapture:
 def _read_times(path: Path, rate: float) -> list[int]:
     """Return the time of each frame in nanoseconds, from the frame rate if the container has no
     times."""
-    capture = _open_capture(path)
-    t_ns = []
+    capture, t_ns = _open_capture(path), []
     while capture.grab():
         t_ns.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
     if len(t_ns) > 1 and not any(t_ns):

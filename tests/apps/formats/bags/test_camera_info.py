@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.apps.formats.bags.camera_info import CameraInfo, camera_info
+from topoloc.apps.formats.bags.bag_images import CameraInfo, camera_info
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import exp_so3

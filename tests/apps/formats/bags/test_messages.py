@@ -9,7 +9,7 @@ import pytest
 from bag_writing import ROS1, ROS2, header, image, message, write_foxglove
 from foxglove_classes import foxglove_classes
 
-from topoloc.apps.formats.bags.message_file import Topic
+from topoloc.apps.formats.bags.bag import Topic
 from topoloc.apps.formats.bags.messages import decode, decode_transforms, frame_id, header_stamp_ns
 from topoloc.errors import RecordingError
 from topoloc.recordings.frame import StereoSequence

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from topoloc.apps.formats.bags.bag import Bag
-from topoloc.apps.formats.bags.message_file import Topic
+from topoloc.apps.formats.bags.bag import Bag, Topic
 from topoloc.apps.formats.bags.topics import Roles, is_rectified, parse_topics, select_topics
 from topoloc.errors import RecordingError
 

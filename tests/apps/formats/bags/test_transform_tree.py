@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from topoloc.apps.formats.bags.bag_poses import TransformTree
 from topoloc.apps.formats.bags.messages import StampedTransform
-from topoloc.apps.formats.bags.transform_tree import TransformTree
 from topoloc.geometry.rigid import Rigid3
 
 ODOM_FROM_BASE = [

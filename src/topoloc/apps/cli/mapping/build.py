@@ -13,14 +13,20 @@ import tyro
 
 from topoloc import BuildConfig
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
-from topoloc.apps.cli.mapping.map_jobs import MapJob, PoseOptions
-from topoloc.apps.cli.mapping.recording_pieces import Pieces, SplitOptions, split_recording
+from topoloc.apps.cli.mapping.map_jobs import (
+    MapJob,
+    Pieces,
+    PoseOptions,
+    SplitOptions,
+    split_recording,
+)
 from topoloc.apps.cli.maps.atlas import JoinedTiles, join_overlapping_tiles
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
     Flag,
     Format,
+    PosesOption,
     RayOption,
     Topics,
     UsageError,
@@ -52,13 +58,7 @@ class Command:
     ] = ()
     """Source of the poses: `truth` (the recording's own), `slam`, or a TUM or KITTI file. Once for
     all recordings, or once for each."""
-    poses: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="CONVENTION[,CONVENTION]",
-            help_behavior_hint="(default: world_from_cam, metres)",
-        ),
-    ] = None
+    poses: PosesOption = None
     """Conventions of the poses of truth or FILE, if they are not world_from_cam in metres with axes
     right, down, forward: inverse, opengl, flu, frd, unity, unreal, wxyz, transposed, mm, cm, feet,
     scale=FACTOR, body=X,Y,Z,QX,QY,QZ,QW (body_from_cam), shift=SECONDS, clock=FACTOR. `unchecked`:
@@ -125,10 +125,8 @@ class Command:
             raise UsageError("--world, --replace, --join and --split need --ray")
         split = SplitOptions.of(self.split)
         recordings, target = self._split_paths()
-        read = [
-            path for path in (*self.trajectory, self.config) if path not in ("truth", "slam", None)
-        ]
-        check_outputs([target if self.ray is None else None, self.json], inputs=read)
+        read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam")]
+        check_outputs([target if self.ray is None else None, self.json], read)
         if any("=" not in text and not _is_positive(text) for text in self.scale):
             raise UsageError(
                 "--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not"
@@ -141,9 +139,8 @@ class Command:
         return self._make_map(map_job, Path(target))
 
     def _map_job(self, recordings: list[str], settings: Settings) -> MapJob:
-        config = with_option(
-            settings.of(BuildConfig), "nodes.d_thresh", self.d_thresh, "--d-thresh"
-        )
+        config = settings.of(BuildConfig)
+        config = with_option(config, "nodes.d_thresh", self.d_thresh, "--d-thresh")
         config = with_option(config, "nodes.lambda_rot", self.lambda_rot, "--lambda")
         return MapJob(
             tuple(recordings),
@@ -174,35 +171,29 @@ class Command:
         self, ray: str, map_job: MapJob, atlas: str, settings: Settings, split: SplitOptions | None
     ) -> int:
         """Build a tile from each recording on the cluster. Return 1 if one fails."""
-        from topoloc.apps.cli.mapping.recordings_table import print_notes, recordings_table
+        from topoloc.apps.cli.mapping.recordings_table import (
+            print_notes,
+            recordings_table,
+            report_outcomes,
+        )
         from topoloc.apps.cluster.config import ClusterConfig
         from topoloc.apps.cluster.connection import connect_to_cluster
-        from topoloc.apps.cluster.tiles import AtlasBuild, build_on_ray
+        from topoloc.apps.cluster.tiles import build_on_ray
 
         rows = self._jobs(map_job, split)
         jobs = [job for row in rows for job in row]
         with connect_to_cluster(ray):
             with recordings_table([job.recording for job in jobs]) as (show, is_live):
-                build = AtlasBuild(jobs, atlas, self.replace, settings.of(ClusterConfig))
-                outcomes = build_on_ray(build, ray, show, is_live)
+                how = (self.replace, settings.of(ClusterConfig), show, is_live)
+                outcomes = build_on_ray(jobs, atlas, ray, *how)
             print_notes(outcomes, is_live)
-            counts = {
-                state: sum(outcome.state == state for outcome in outcomes)
-                for state in ("built", "there", "failed")
-            }
-            if self.json != "-":
-                print(
-                    f"{atlas}: {counts['built']} recordings mapped, {counts['there']} there"
-                    f" already, {counts['failed']} failed"
-                )
+            facts = report_outcomes(atlas, outcomes, {"built": "mapped"}, self.json != "-")
             joined = self._join_tiles(rows, outcomes, atlas, settings)
-        rows_json = [outcome.to_json() for outcome in outcomes]
-        facts = {"atlas": atlas, **counts, "recordings": rows_json}
         write_json(self.json, facts | ({"tried": joined.rows} if joined else {}))
         not_compared = joined.not_compared if joined else []
         for problem in not_compared:
             print(f"error: {problem}", file=sys.stderr)
-        return 1 if counts["failed"] or not_compared else 0
+        return 1 if facts["failed"] or not_compared else 0
 
     def _jobs(self, map_job: MapJob, split: SplitOptions | None) -> list[list[TileJob]]:
         """Return the jobs of each recording."""
@@ -215,15 +206,12 @@ class Command:
         ]
         names = [piece.recordings[0] for one in pieces for piece in one.piece_jobs]
         ids = iter(derive_tile_ids(names))
-        return [
-            [
-                TileJob(
-                    piece.recordings[0], name := next(ids), self.world or one.world or name, piece
-                )
-                for piece in one.piece_jobs
-            ]
-            for one in pieces
-        ]
+
+        def create_job(piece: MapJob, world: str | None) -> TileJob:
+            tile_id = next(ids)
+            return TileJob(piece.recordings[0], tile_id, self.world or world or tile_id, piece)
+
+        return [[create_job(piece, one.world) for piece in one.piece_jobs] for one in pieces]
 
     def _join_tiles(
         self, rows: list[list[TileJob]], outcomes: list[Outcome], atlas: str, settings: Settings
@@ -257,9 +245,8 @@ class Command:
             _check_atlas(last)
             return recordings, last
         target, kind = Path(last), None
-        if target.is_dir() or (
-            not target.exists() and Path(last.rpartition("@")[0] or last).exists()
-        ):
+        whole = Path(last.rpartition("@")[0] or last)
+        if target.is_dir() or (not target.exists() and whole.exists()):
             kind = "a recording or folder"
         elif target.is_file():
             with target.open("rb") as file:

@@ -1,35 +1,41 @@
 """Build a map from recordings: the source of their poses, their conventions and all settings.
 
-`topoloc build` builds one map here, or sends one `MapJob` for each recording to other machines.
+`topoloc build` builds one map here, or sends one `MapJob` for each recording, or piece of a
+recording, to other machines.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 
 from topoloc import (
     BuildConfig,
     PoseConventions,
     RecordingError,
-    SkippedChecks,
     StereoSequence,
+    TopolocError,
     TopoMetricMap,
     align_to_trajectory,
     build_map,
+    open_sequence,
     run_slam,
     with_pose_conventions,
     with_trajectory,
 )
 from topoloc.apps.cli.output import UsageError, open_recording
 from topoloc.apps.cluster.remote import Progress
-from topoloc.apps.formats.metric_scale import estimate_metric_scale
+from topoloc.apps.formats.colmap import estimate_metric_scale
 from topoloc.plugin import has_scale, scale_poses, split_selection
+
+MIN_OVERLAP = 3
 
 
 @dataclass(frozen=True)
@@ -45,10 +51,13 @@ class PoseOptions:
     scale: tuple[str, ...] = ()
     allow_gaps: bool = False
 
-    @property
-    def conventions(self) -> list[str]:
-        """The names in `poses`."""
-        return (self.poses or "").split(",")
+
+def parse_conventions(poses: str | None) -> tuple[PoseConventions, bool]:
+    """Parse the option `--poses`, and return False if it contains `unchecked`: the poses are not
+    compared with the images. Raises TrajectoryError."""
+    names = (poses or "").split(",")
+    read = PoseConventions.of(",".join(name for name in names if name != "unchecked"))
+    return read, "unchecked" not in names
 
 
 @dataclass(frozen=True)
@@ -65,11 +74,8 @@ class MapJob:
 
     def make(self, progress: Progress) -> tuple[TopoMetricMap, list[str]]:
         """Return the map and the source of each recording's poses. Warnings go to standard error.
-
-        Raises:
-            UsageError: the options contradict each other or the recordings.
-            TopolocError: see `open_sequence`, `run_slam` and `build_map`.
-        """
+        Raises UsageError: the options contradict each other or the recordings; TopolocError: see
+        `open_sequence`, `run_slam` and `build_map`."""
         sequences, poses_from = self._open()
         is_slam = poses_from[0] == "slam"
         if is_slam:
@@ -81,37 +87,31 @@ class MapJob:
             if num_without := sum(pose is None for pose in sequence.poses):
                 count = f"{num_without} of {len(sequence)}"
                 _warn(f"{sequence.name}: {count} frames have no pose and are left out")
-        skipped_checks = SkippedChecks(
-            poses="unchecked" in self.pose_options.conventions,
-            gaps=self.pose_options.allow_gaps or is_slam,
-        )
-        return build_map(sequences, self.build, progress, poses_from, skipped_checks), poses_from
+        options = self.pose_options
+        checks = parse_conventions(options.poses)[1], not (options.allow_gaps or is_slam)
+        return build_map(sequences, self.build, progress, poses_from, *checks), poses_from
 
     def split_by_recording(self) -> list[MapJob]:
         """Return one job for each recording. Raises UsageError if the number of trajectories is
         wrong."""
         given = self.pose_options.trajectory
+        pairs = zip(self.recordings, self._for_each(given), strict=True)
+        options = self.pose_options
         return [
-            replace(
-                self,
-                recordings=(recording,),
-                pose_options=replace(self.pose_options, trajectory=(name,) if given else ()),
-            )
-            for recording, name in zip(self.recordings, self._for_each(given), strict=True)
+            replace(self, recordings=(one,), pose_options=replace(options, trajectory=source))
+            for one, source in ((one, (name,) if given else ()) for one, name in pairs)
         ]
 
     def digest(self) -> str:
         """Return the digest of settings, versions, and names, sizes and times of all files, 64
         hexadecimal digits. Raises RecordingError if a recording is missing."""
-        from topoloc import __version__
-
         files = [path for text in self.recordings for path in _list_files(split_selection(text)[0])]
         for text in (*self.pose_options.trajectory, self.camera, self.images):
             if text and os.path.exists(text):
                 files += _list_files(Path(text))
         facts = {
             "settings": asdict(self),
-            "versions": [__version__, TopoMetricMap.schema_version],
+            "versions": [version("topoloc"), TopoMetricMap.schema_version],
             "files": sorted(
                 (os.path.abspath(path), path.stat().st_size, path.stat().st_mtime_ns)
                 for path in files
@@ -152,8 +152,8 @@ class MapJob:
         return [self._with_poses(sequence, name) for sequence, name in pairs], list(trajectories)
 
     def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:
-        names = [name for name in self.pose_options.conventions if name != "unchecked"]
-        conventions, scale = PoseConventions.of(",".join(names)), self.pose_options.scale
+        conventions, _ = parse_conventions(self.pose_options.poses)
+        scale = self.pose_options.scale
         if trajectory == "truth":
             if scale:
                 sequence = scale_poses(sequence, estimate_metric_scale(scale, sequence))
@@ -179,3 +179,85 @@ def _list_files(path: Path) -> Iterator[Path]:
         yield path
     for folder, _, names in os.walk(path):
         yield from (Path(folder) / name for name in names if (Path(folder) / name).is_file())
+
+
+@dataclass(frozen=True)
+class SplitOptions:
+    """Maximum number of frames of a piece, and minimum number shared with the next one. Raises
+    UsageError: the numbers do not fit together."""
+
+    num_frames: int
+    num_shared: int
+
+    def __post_init__(self) -> None:
+        if not MIN_OVERLAP <= self.num_shared <= self.num_frames // 2:
+            raise UsageError(
+                "--split FRAMES,SHARED: successive pieces must share at least"
+                f" {MIN_OVERLAP} frames and at most half, not {self.num_shared} of"
+                f" {self.num_frames}"
+            )
+
+    @staticmethod
+    def of(text: str | None) -> SplitOptions | None:
+        """Parse the option, `500` or `500,50`. By default a tenth is shared. Raises UsageError."""
+        if text is None:
+            return None
+        parts = re.fullmatch(r"([0-9]{1,9})(?:,([0-9]{1,9}))?", text)
+        if parts is None:
+            raise UsageError(f"--split takes frames, such as 500 or 500,50, not {text[:40]!r}")
+        num_frames = int(parts[1])
+        return SplitOptions(num_frames, int(parts[2] or max(num_frames // 10, MIN_OVERLAP)))
+
+    def ranges(self, total: int) -> list[tuple[int, int]]:
+        """Return the first frame, and the one after the last, of each piece of `total` frames. All
+        pieces have the same length."""
+        if total <= self.num_frames:
+            return [(0, total)]
+        step = self.num_frames - self.num_shared
+        num = 1 + -(-(total - self.num_frames) // step)
+        starts = [round(k * (total - self.num_frames) / (num - 1)) for k in range(num)]
+        return [(start, start + self.num_frames) for start in starts]
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """The maps of successive pieces of a recording, and the world of its own poses. The world is
+    None without such poses, and for a single map."""
+
+    piece_jobs: list[MapJob]
+    world: str | None = None
+
+
+def split_recording(map_job: MapJob, tile_id: str, split: SplitOptions) -> Pieces:
+    """Split the recording of `map_job`.
+
+    A short recording stays whole, and one that cannot be opened, so that its own task fails.
+    `tile_id`: tile id of the whole recording. Raises UsageError: the recording is long, and frames
+    of it are selected.
+    """
+    (recording,) = map_job.recordings
+    try:
+        sequence = open_sequence(
+            recording, map_job.format, map_job.camera, map_job.images, map_job.topics
+        )
+    except TopolocError:
+        return Pieces([map_job])
+    ranges = split.ranges(len(sequence))
+    if len(ranges) == 1:
+        return Pieces([map_job])
+    options = map_job.pose_options
+    if not options.trajectory and any(sequence.poses):  # also for pieces without a pose
+        options = replace(options, trajectory=("truth",))
+    path, selection = split_selection(recording)
+    if selection is not None:
+        raise UsageError(
+            f"--split takes whole recordings, but frames of {path} are selected ({selection[:40]})"
+        )
+    pieces = [
+        replace(map_job, recordings=(f"{path}@{start}:{stop}",), pose_options=options)
+        for start, stop in ranges
+    ]
+    if options.trajectory in ((), ("slam",)):
+        return Pieces(pieces)
+    digest = sha256(os.fsencode(os.path.abspath(recording))).hexdigest()  # unique by recording
+    return Pieces(pieces, f"{tile_id[:80]}-{digest[:8]}")

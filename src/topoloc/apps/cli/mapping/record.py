@@ -45,8 +45,7 @@ class Command:
     source: Annotated[
         str | None,
         tyro.conf.arg(
-            metavar="SOURCE",
-            help_behavior_hint="(default: 0; for a ZED its SDK if installed)",
+            metavar="SOURCE", help_behavior_hint="(default: 0; for a ZED its SDK if installed)"
         ),
     ] = None
     """Device number or /dev/video0, rtsp:// or http:// URL, GStreamer pipeline, or a video file."""

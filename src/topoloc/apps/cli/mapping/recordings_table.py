@@ -48,6 +48,20 @@ def print_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
             print(format_outcome(outcome), file=sys.stderr)
 
 
+def report_outcomes(
+    atlas: str, outcomes: Sequence[Outcome], done: dict[str, str], is_printed: bool
+) -> dict[str, Any]:
+    """Print the number of recordings of each state, and return them with the outcomes as JSON.
+    `done`: the state of success, and its word."""
+    words = done | {"there": "there already", "failed": "failed"}
+    counts = {state: sum(one.state == state for one in outcomes) for state in words}
+    (first, word), *others = [(counts[state], word) for state, word in words.items()]
+    if is_printed:
+        rest = "".join(f", {count} {name}" for count, name in others)
+        print(f"{atlas}: {first} recordings {word}{rest}")
+    return {"atlas": atlas, **counts, "recordings": [one.to_json() for one in outcomes]}
+
+
 @contextmanager
 def recordings_table(
     recordings: Sequence[str],
@@ -85,18 +99,12 @@ def _table(recordings: Sequence[str], states: Sequence[Outcome | JobProgress | N
 
     table = Table(box=None, pad_edge=False)
     for name in ("recording", "state", "tile", "nodes", "MB", "s", "machine"):
-        table.add_column(
-            name, justify="right" if name in ("nodes", "MB", "s") else "left", overflow="fold"
-        )
+        side = "right" if name in ("nodes", "MB", "s") else "left"
+        table.add_column(name, justify=side, overflow="fold")
     for recording, state in zip(recordings, states, strict=True):
         cells = [""] * 5
         if isinstance(state, Outcome) and state.state != "failed":
-            cells = [
-                state.tile_id,
-                str(state.num_nodes),
-                f"{state.num_bytes / 1e6:.2f}",
-                f"{state.seconds:.1f}",
-                state.host,
-            ]
+            size, seconds = f"{state.num_bytes / 1e6:.2f}", f"{state.seconds:.1f}"
+            cells = [state.tile_id, str(state.num_nodes), size, seconds, state.host]
         table.add_row(recording, format_state(state), *cells)
     return table

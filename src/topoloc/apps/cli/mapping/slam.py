@@ -9,10 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc import (
-    Trajectory,
-    run_slam,
-)
+from topoloc import Trajectory, run_slam
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
@@ -48,10 +45,7 @@ class Command:
         with progress_bar() as progress:
             result = run_slam(sequence, progress)
         seconds = time.perf_counter() - start
-        pairs = zip(sequence.t_ns, result.poses[0], strict=True)
-        known = [(t_ns, pose) for t_ns, pose in pairs if pose is not None]
-        trajectory = Trajectory([pose for _, pose in known], [t_ns for t_ns, _ in known])
-        trajectory.write_tum(Path(self.out))
+        Trajectory.of_frames(result.poses[0], sequence.t_ns).write_tum(Path(self.out))
         rate = round(len(sequence) / seconds, 2)
         facts = result.to_json(sequence) | {"frames_per_second": rate}
         if self.json != "-":

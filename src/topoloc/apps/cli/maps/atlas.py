@@ -11,14 +11,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from topoloc import Atlas, PairResult, join_tiles
+from topoloc import Atlas, join_tiles
 from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, print_fields, write_json
 from topoloc.apps.cli.settings_file import Settings, read_settings
-
-Names = Annotated[
-    tyro.conf.Positional[tuple[str, ...]],
-    tyro.conf.arg(metavar="MAP|TILE ...", help_behavior_hint=""),
-]
 
 
 @dataclass(frozen=True)
@@ -34,7 +29,10 @@ class Command:
     atlas: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ATLAS")]
     """The atlas: a folder. With the extra `cluster` also a prefix of an object store, such as
     s3://bucket/campus."""
-    names: Names = ()
+    names: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.arg(metavar="MAP|TILE ...", help_behavior_hint=""),
+    ] = ()
     """`create` and `add` copy these map files. `remove` removes these tiles. `join` compares these
     tiles with the others (default: all with each other)."""
     id: Annotated[
@@ -68,34 +66,28 @@ class Command:
         self._check_usage()
         if self.action == "info":
             return show_atlas(Atlas.open(self.atlas), self.check, self.json)
-        settings = read_settings(self.config)
+        settings, ids = read_settings(self.config), self.names
         if self.action != "join":
-            manifest = self._write()
+            atlas = self._write()
             if not self.join:
-                return report_atlas(describe(self.atlas, manifest), self.json)
-        ids = self._new_ids() if self.join else self.names
+                return report_atlas(describe(self.atlas, atlas.manifest), self.json)
+            ids = [self.id or Path(name).name.removesuffix(".topo") for name in self.names]
         joined = join_overlapping_tiles(self.atlas, ids, settings, self.json != "-", ray=self.ray)
         return report_joined(self.atlas, joined, self.json)
 
-    def _write(self) -> Any:
+    def _write(self) -> Atlas:
         if self.action == "remove":
-            return Atlas.remove(self.atlas, self.names).manifest
+            return Atlas.remove(self.atlas, self.names)
         if self.action == "create":
-            return Atlas.create(self.atlas, self.names, self.id, self.world).manifest
-        return Atlas.add(self.atlas, self.names, self.id, self.world, self.replace).manifest
-
-    def _new_ids(self) -> list[str]:
-        """Return the ids of the tiles that `create` and `add` write."""
-        return [self.id or Path(name).name.removesuffix(".topo") for name in self.names]
+            return Atlas.create(self.atlas, self.names, self.id, self.world)
+        return Atlas.add(self.atlas, self.names, self.id, self.world, self.replace)
 
     def _check_usage(self) -> None:
         if self.action == "info" and self.names:
             raise UsageError("info takes an atlas alone")
         if self.action in ("add", "remove") and not self.names:
-            raise UsageError(
-                f"{self.action} takes an atlas and at least one"
-                f" {'map' if self.action == 'add' else 'tile'}"
-            )
+            one = "map" if self.action == "add" else "tile"
+            raise UsageError(f"{self.action} takes an atlas and at least one {one}")
         if self.id is not None and len(self.names) != 1:
             raise UsageError("--id names the tile of one map")
         joining = ("join", "create --join", "add --join")
@@ -173,19 +165,14 @@ def _print_atlas(facts: dict[str, Any]) -> None:
     width, check = max((len(tile["id"]) for tile in facts["tiles"]), default=0), facts.get("check")
     if isinstance(check, list):
         check = f"{len(check)} tiles are damaged"
+    size = f"{facts['num_tiles']}, {facts['num_nodes']} nodes, {facts['bytes'] / 1e6:.2f} MB"
+    shared = {name: ", ".join(ids) for name, ids in facts["worlds"].items() if len(ids) > 1}
     print_fields(
         [
             ("atlas", f"{facts['path']}, serial {facts['serial']}"),
-            (
-                "tiles",
-                f"{facts['num_tiles']}, {facts['num_nodes']} nodes, {facts['bytes'] / 1e6:.2f} MB",
-            ),
+            ("tiles", size),
             *(("", f"{tile['id']:<{width}}  {_format_tile(tile)}") for tile in facts["tiles"]),
-            *(
-                ("world", f"{name}: {', '.join(ids)}")
-                for name, ids in facts["worlds"].items()
-                if len(ids) > 1
-            ),
+            *(("world", f"{name}: {ids}") for name, ids in shared.items()),
             *(("join", _format_join(join)) for join in facts["joins"]),
             *([("check", check)] if check else []),
         ]
@@ -202,12 +189,9 @@ def _format_join(join: dict[str, Any]) -> str:
 def _format_tile(tile: dict[str, Any]) -> str:
     least, most = tile["box_world"]
     extent = " x ".join(f"{high - low:.1f}" for low, high in zip(least, most, strict=True))
-    box = tile["geo_box"]
+    box, size = tile["geo_box"], f"{tile['map']['bytes'] / 1e6:.1f} MB"
     place = "" if box is None else f"  {box[0]:.6f} {box[1]:.6f} to {box[2]:.6f} {box[3]:.6f}"
-    return (
-        f"{tile['num_nodes']} nodes  {extent} m  {tile['map']['bytes'] / 1e6:.1f} MB "
-        f" {', '.join(tile['kinds'])}{place}"
-    )
+    return f"{tile['num_nodes']} nodes  {extent} m  {size}  {', '.join(tile['kinds'])}{place}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,13 +213,9 @@ def join_overlapping_tiles(
     ray: str | None = None,
 ) -> JoinedTiles:
     """Join these tiles with overlapping ones, or only these `pairs`, on the cluster `ray` if it is
-    given.
+    given. Raises TopolocError: from `join_tiles` and `run_on_ray`."""
 
-    Raises:
-        TopolocError: from `join_tiles` and `run_on_ray`.
-    """
-
-    def report_pair(one: PairResult) -> None:
+    def report_pair(one: Any) -> None:
         if is_verbose and one.problem is None:
             print(f"{one.first} and {one.second}: {one}", file=sys.stderr)
 
@@ -250,13 +230,13 @@ def join_overlapping_tiles(
 
 
 def _run_jobs_on(
-    ray: str, settings: Settings, report_pair: Callable[[PairResult], None]
-) -> Callable[[Sequence[Any]], list[PairResult]]:
+    ray: str, settings: Settings, report_pair: Callable[[Any], None]
+) -> Callable[[Sequence[Any]], list[Any]]:
     """Return a function that runs one task for each pair and reports pairs as they finish."""
     from topoloc.apps.cluster.config import ClusterConfig
     from topoloc.apps.cluster.tasks import JobProgress, run_on_ray
 
-    def show(number: int, state: PairResult | JobProgress) -> None:
+    def show(number: int, state: Any) -> None:
         if not isinstance(state, JobProgress):
             report_pair(state)
 

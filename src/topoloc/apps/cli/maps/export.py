@@ -19,9 +19,10 @@ from topoloc.apps.cli.output import (
 )
 from topoloc.apps.cli.tile_option import TileOption, select_world
 from topoloc.apps.export.formats import ExportFormat, find_export_format, write_scene
-from topoloc.apps.viewer.map_scene import create_map_scene, create_world_scene
+from topoloc.apps.viewer.map_scene import create_map_scene
 from topoloc.apps.viewer.result_files import create_results_scene
 from topoloc.apps.viewer.scene import Scene
+from topoloc.apps.viewer.worlds import create_world_scene
 
 
 @dataclass(frozen=True)

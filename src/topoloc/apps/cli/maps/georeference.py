@@ -8,14 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc import (
-    GeoPoint,
-    Georeference,
-    GeoreferenceError,
-    GeoreferenceResult,
-    georeference,
-    open_place,
-)
+from topoloc import GeoPoint, GeoreferenceError, GeoreferenceResult, georeference, open_place
 from topoloc.apps.cli.output import (
     File,
     UsageError,
@@ -62,9 +55,7 @@ class Command:
         given = [option for option in (self.origin, self.gnss, self.points) if option is not None]
         if len(given) != 1:
             raise UsageError("georeference takes a map and one of --origin, --gnss and --points")
-        check_outputs(
-            [self.json], inputs=[path for path in (self.map, self.gnss, self.points) if path]
-        )
+        check_outputs([self.json], [self.map, self.gnss, self.points])
         origin = None if self.origin is None else _parse_origin(self.origin)
         place = open_place(self.map)
         result = place.edit(
@@ -103,38 +94,17 @@ def _parse_origin(text: str) -> tuple[GeoPoint, float]:
     return GeoPoint(lat, lon, h), heading_deg
 
 
-def format_georeference(georeference: Georeference) -> str:
-    """Return the position of a map on earth and its accuracy as one line."""
-    o, rms = georeference.origin, georeference.rms_m
-    fitted = "" if rms is None else f", rms {rms:.2f} m"
-    return f"{o.lat:.7f}, {o.lon:.7f}, {o.h:.2f} m (from {georeference.source}{fitted})"
-
-
 def _print(result: GeoreferenceResult, facts: dict[str, Any]) -> None:
-    lines = [
-        ("origin", format_georeference(result.georeference)),
-        (
-            "first picture looks to",
-            f"{facts['heading_deg']:.1f} degrees from true north, clockwise",
-        ),
-    ]
+    heading = f"{facts['heading_deg']:.1f} degrees from true north, clockwise"
+    lines = [("origin", str(result.georeference)), ("first picture looks to", heading)]
     if facts["up"] is not None:
         lines.append(("up", f"the world's {facts['up']}"))
     if result.names:
         worst = int(np.argmax(np.where(result.is_inlier, result.residuals_m, -1.0)))
+        largest = f"{result.residuals_m[worst]:.3f} m ({result.names[worst]})"
         lines.append(("points", f"{facts['num_used']} of {facts['num_points']} agree"))
-        lines.append(
-            (
-                "residuals",
-                f"rms {result.georeference.rms_m:.3f} m, largest"
-                f" {result.residuals_m[worst]:.3f} m ({result.names[worst]})",
-            )
-        )
-        if not result.is_inlier.all():
-            left_out = ", ".join(
-                result.names[k] for k in np.flatnonzero(~result.is_inlier)[:5].tolist()
-            )
-            lines.append(
-                ("left out", f"{left_out}{', ...' if (~result.is_inlier).sum() > 5 else ''}")
-            )
+        lines.append(("residuals", f"rms {result.georeference.rms_m:.3f} m, largest {largest}"))
+        if len(outliers := np.flatnonzero(~result.is_inlier).tolist()):
+            names = [result.names[k] for k in outliers[:5]] + ["..."] * (len(outliers) > 5)
+            lines.append(("left out", ", ".join(names)))
     print_fields(lines)

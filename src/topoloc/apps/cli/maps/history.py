@@ -29,56 +29,34 @@ class Command:
             if self.json != "-":
                 if tile_id:
                     print(f"tile {tile_id}")
-                _print_edits(edits)
-                _print_undo(f"{self.map} --tile {tile_id}" if tile_id else self.map, edits)
+                _print_edits(edits, f"{self.map} --tile {tile_id}" if tile_id else self.map)
             return {"edits": edits}
 
         return run_for_each_tile(place, None, show_history, self.json)
 
 
-def _print_undo(where: str, edits: list[dict[str, Any]]) -> None:
-    num_undoable = sum(edit["undoable"] for edit in edits)
-    if num_undoable:
-        print(
-            f"`topoloc undo {where}` takes the last one back"
-            + (f"; {num_undoable} can be" if num_undoable > 1 else "")
-        )
+def _print_edits(edits: list[dict[str, Any]], where: str) -> None:
+    """Print the edits, and the command that undoes the last one of `where`."""
+    rows = [
+        (f"{one['edit_id']} {one['date']}", f"{one['name']}{_format_changes(one['changes'] or {})}")
+        for one in edits
+    ]
+    print_fields(rows or [("", "the edits of this map are unknown")])
+    if num_undoable := sum(edit["undoable"] for edit in edits):
+        more = f"; {num_undoable} can be" if num_undoable > 1 else ""
+        print(f"`topoloc undo {where}` takes the last one back{more}")
 
 
-def _print_edits(edits: list[dict[str, Any]]) -> None:
-    print_fields(
-        [
-            (
-                f"{edit['edit_id']} {edit['date']}",
-                f"{edit['name']}{_format_changes(edit['changes'])}",
-            )
-            for edit in edits
-        ]
-        or [("", "the edits of this map are unknown")]
-    )
-
-
-def _format_changes(changes) -> str:
-    """Return the changes of an edit as text: each number with its name."""
-    recall, numbers = _describe_recall_change(changes or {}), (changes or {}).items()
-    shown = {
-        name.replace("_", " "): value
-        for name, value in numbers
+def _format_changes(changes: dict[str, Any]) -> str:
+    """Return the changes of an edit as text: each number with its name, and the recall of earlier
+    nodes if it was measured."""
+    texts = [
+        f"{name.replace('_', ' ')} {value}"
+        for name, value in changes.items()
         if value not in ([], None, "") and not name.startswith("earlier_")
-    }
-    texts = [f"{name} {value}" for name, value in shown.items()] + ([recall] if recall else [])
+    ]
+    if asked := changes.get("earlier_asked"):
+        before, after = changes["earlier_localized_before"], changes["earlier_localized_after"]
+        nodes = f"of {asked} earlier nodes, each asked without itself"
+        texts.append(f"{nodes}, {before} localized before and {after} after")
     return ": " + ", ".join(texts) if texts else ""
-
-
-def _describe_recall_change(changes) -> str | None:
-    """Return how many earlier nodes were localized before and after an edit, None if it was not
-    measured."""
-    if not changes.get("earlier_asked"):
-        return None
-    asked, before, after = (
-        changes[f"earlier_{name}"] for name in ("asked", "localized_before", "localized_after")
-    )
-    return (
-        f"of {asked} earlier nodes, each asked without itself, {before} localized before and"
-        f" {after} after"
-    )

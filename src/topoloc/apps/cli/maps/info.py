@@ -1,16 +1,32 @@
-"""topoloc info MAP|ATLAS."""
+"""topoloc info MAP|ATLAS, and the graph of a map as GraphML or GeoJSON."""
 
 from __future__ import annotations
 
+import json
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+from xml.etree import ElementTree
 
+import numpy as np
 import tyro
 
-from topoloc import Atlas, MapError, TopoMetricMap, check_map, open_place
+from topoloc import (
+    Atlas,
+    Georeference,
+    GeoreferenceError,
+    MapError,
+    Rigid3,
+    TopolocError,
+    TopoMetricMap,
+    check_map,
+    open_place,
+)
 from topoloc.apps.cli.maps.atlas import show_atlas
 from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_fields, write_json
+from topoloc.apps.export.formats import coordinates, geojson_feature
+from topoloc.plugin import write_bytes
 
 MAX_PROBLEMS = 20
 
@@ -50,8 +66,6 @@ class Command:
                 print("\n".join(found[:MAX_PROBLEMS]))
                 raise MapError(f"map {path} is damaged: {len(found)} faults, the first: {found[0]}")
             if self.graph:
-                from topoloc.apps.export.map_graph import write_graph
-
                 write_graph(topomap, Path(self.graph))
             info = topomap.describe(path) | ({"check": "ok"} if self.check else {})
         if self.json != "-":
@@ -63,7 +77,11 @@ class Command:
 def _print(info: dict[str, Any]) -> None:
     nodes, features = (info["config"].get(name, {}) for name in ("nodes", "features"))
     normalization, nan = features.get("normalization"), float("nan")
+    geo, unknown = info["georeference"], "unknown (topoloc georeference sets it)"
+    place = unknown if geo is None else str(Georeference.from_json(geo))
     extent = " x ".join(f"{e:.1f}" for e in info["extent_m"])
+    d_thresh, lambda_rot = (nodes.get(name, nan) for name in ("d_thresh", "lambda_rot"))
+    kinds = ", ".join(info["kinds"]) + (f", normalization {normalization}" * bool(normalization))
     print_fields(
         [
             ("map", info["path"]),
@@ -74,42 +92,139 @@ def _print(info: dict[str, Any]) -> None:
             ("place images", str(info["num_place_images"])),
             ("mapped", f"{info['length_m']:.1f} m, extent {extent} m"),
             ("recordings", ", ".join(info["recordings"])),
-            ("on earth", _format_place(info["georeference"])),
+            ("on earth", place),
             *(
                 ("coarse localizer", _format_coarse(facts, info["default_coarse"]))
                 for facts in info["coarse_models"]
             ),
-            (
-                "Eq. 1",
-                f"D_thresh {nodes.get('d_thresh', nan):.3g} m, lambda"
-                f" {nodes.get('lambda_rot', nan):.3g} m/rad",
-            ),
-            (
-                "features",
-                ", ".join(info["kinds"])
-                + (f", normalization {normalization}" if normalization else ""),
-            ),
+            ("Eq. 1", f"D_thresh {d_thresh:.3g} m, lambda {lambda_rot:.3g} m/rad"),
+            ("features", kinds),
             *([("check", info["check"])] if "check" in info else []),
         ]
     )
 
 
-def _format_place(facts: dict[str, Any] | None) -> str:
-    if facts is None:
-        return "unknown (topoloc georeference sets it)"
-    from topoloc import Georeference
-    from topoloc.apps.cli.maps.georeference import format_georeference
-
-    return format_georeference(Georeference.from_json(facts))
-
-
 def _format_coarse(facts: dict[str, Any], default: str) -> str:
-    weights = facts.get("weights")
-    source = (
-        f"{weights['file']}, SHA-256 {weights['sha256'][:12]}" if weights else "from random weights"
-    )
+    source, name = "from random weights", facts["name"]
+    if weights := facts.get("weights"):
+        source = f"{weights['file']}, SHA-256 {weights['sha256'][:12]}"
     network = f", {facts['backbone']} ({source})" if "backbone" in facts else ""
-    return (
-        f"{facts['name']}{' (default)' if facts['name'] == default else ''}{network},"
-        f" {facts['bytes'] / 1e6:.2f} MB"
-    )
+    return f"{name}{' (default)' * (name == default)}{network}, {facts['bytes'] / 1e6:.2f} MB"
+
+
+_TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
+
+
+@dataclass(frozen=True, eq=False)
+class MapGraph:
+    """`nodes` by their ids and `edges` by the ids of source and target, each with its facts.
+
+    Facts of a node: session, name, world_from_cam (x, y, z in metres; qw, qx, qy, qz), number of
+    points, number of outgoing edges, and whether it is a junction with more than two neighbours.
+    Facts of an edge: metres, source_from_target, and how often mapping images traversed it.
+    """
+
+    nodes: dict[int, dict[str, Any]]
+    edges: dict[tuple[int, int], dict[str, Any]]
+
+
+def build_graph(topomap: TopoMetricMap) -> MapGraph:
+    """Return the graph of a map. Traversals are counted from its place images."""
+    poses = {summary.node_id: summary.world_from_cam for summary in topomap.summaries}
+    out, neighbours = Counter(edge.source_id for edge in topomap.edges), defaultdict(set)
+    for edge in topomap.edges:
+        neighbours[edge.source_id].add(edge.target_id)
+        neighbours[edge.target_id].add(edge.source_id)
+    nodes: dict[int, dict[str, Any]] = {
+        s.node_id: {
+            "session": s.session_id,
+            "name": s.name,
+            **_pose(s.world_from_cam),
+            "points": s.num_points,
+            "ways_out": out[s.node_id],
+            "is_junction": len(neighbours[s.node_id]) > 2,
+        }
+        for s in topomap.summaries
+    }
+    walked, edges = _count_traversals(topomap), {}
+    for edge in topomap.edges:
+        source_from_target = poses[edge.source_id].inverse() @ poses[edge.target_id]
+        metres = float(np.linalg.norm(source_from_target.translation))
+        pair = (edge.source_id, edge.target_id)
+        edges[pair] = {"metres": metres, **_pose(source_from_target), "times": walked[pair]}
+    return MapGraph(nodes, edges)
+
+
+def write_graph(topomap: TopoMetricMap, path: Path) -> None:
+    """Write the graph in the format of the suffix: .graphml, or .geojson. Raises TopolocError:
+    another suffix, or the file cannot be written; GeoreferenceError: GeoJSON of a map that is not
+    georeferenced."""
+    graph, ending = build_graph(topomap), path.suffix.lower()
+    if ending == ".graphml":
+        write_bytes(path, _to_graphml(graph))
+    elif ending in (".geojson", ".json"):
+        write_bytes(path, _to_geojson(topomap, graph))
+    else:
+        raise TopolocError(f"{path}: a graph is written as .graphml or .geojson")
+
+
+def _count_traversals(topomap: TopoMetricMap) -> Counter[tuple[int, int]]:
+    """Count the changes from node to node between successive mapping images of a session."""
+    last, walked = dict[int, int](), Counter[tuple[int, int]]()
+    for image in topomap.place_images:
+        before = last.get(image.session_id)
+        if before is not None and before != image.node_id:
+            walked[before, image.node_id] += 1
+        last[image.session_id] = image.node_id
+    return walked
+
+
+def _pose(a_from_b: Rigid3) -> dict[str, float]:
+    values = [*a_from_b.translation.tolist(), *a_from_b.quat_wxyz().tolist()]
+    return dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), values, strict=True))
+
+
+def _to_graphml(graph: MapGraph) -> bytes:
+    root = ElementTree.Element("graphml", xmlns="http://graphml.graphdrawing.org/xmlns")
+    for of, entries in (("node", graph.nodes), ("edge", graph.edges)):
+        for name, value in next(iter(entries.values()), {}).items():
+            attributes = {"id": f"{of}_{name}", "for": of, "attr.name": name}
+            ElementTree.SubElement(root, "key", attributes | {"attr.type": _TYPES[type(value)]})
+    top = ElementTree.SubElement(root, "graph", id="map", edgedefault="directed")
+    for node_id, facts in graph.nodes.items():
+        _add_attributes(ElementTree.SubElement(top, "node", id=f"n{node_id}"), "node", facts)
+    for (source, target), facts in graph.edges.items():
+        edge = ElementTree.SubElement(top, "edge", source=f"n{source}", target=f"n{target}")
+        _add_attributes(edge, "edge", facts)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def _add_attributes(element: ElementTree.Element, of: str, facts: dict[str, Any]) -> None:
+    for name, value in facts.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        text = "".join(c for c in text if c.isprintable())
+        ElementTree.SubElement(element, "data", key=f"{of}_{name}").text = text
+
+
+def _to_geojson(topomap: TopoMetricMap, graph: MapGraph) -> bytes:
+    georeference = topomap.georeference
+    if georeference is None:
+        raise GeoreferenceError(
+            "the map is not georeferenced (topoloc georeference); .graphml needs no position"
+        )
+    places: dict[int, Any] = {
+        s.node_id: coordinates(georeference.geopose(s.world_from_cam).position)
+        for s in topomap.summaries
+    }
+    features = [
+        geojson_feature("Point", places[node_id], {"node": node_id} | facts)
+        for node_id, facts in graph.nodes.items()
+    ]
+    features += [
+        geojson_feature(
+            "LineString", [places[source], places[target]], {"from": source, "to": target} | facts
+        )
+        for (source, target), facts in graph.edges.items()
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features}).encode()

@@ -32,11 +32,8 @@ class Command:
     """TOML file with all other settings, as printed by `topoloc config update`."""
 
     def run(self) -> int:
-        if Path(self.out).exists() and any(
-            Path(self.out).samefile(path)
-            for path in (self.first, self.second)
-            if Path(path).exists()
-        ):
+        out, inputs = Path(self.out), map(Path, (self.first, self.second))
+        if out.exists() and any(out.samefile(path) for path in inputs if path.exists()):
             raise UsageError("OUT is A or B; choose another path")
         return open_place(self.first).visit(
             lambda _: open_place(self.second).visit(self._merge_maps, self._merge_tiles),
@@ -44,29 +41,20 @@ class Command:
         )
 
     def _read_settings(self, *outputs: str | None) -> Settings:
-        check_outputs(
-            outputs, inputs=[path for path in (self.first, self.second, self.config) if path]
-        )
+        check_outputs(outputs, [self.first, self.second, self.config])
         return read_settings(self.config)
 
     def _merge_maps(self, _: str) -> int:
         settings = self._read_settings(self.out, self.json)
+        config = settings.of(LocalizerConfig)
         with progress_bar() as progress:
-            c = merge(
-                self.first,
-                self.second,
-                self.out,
-                settings.of(LocalizerConfig),
-                progress,
-            )
+            c = merge(self.first, self.second, self.out, config, progress)
         if self.json != "-":
-            recognised = (
-                f"{c['agreeing']} of {c['nodes_of_second']} nodes of {self.second} were recognised"
-                f" in {self.first}"
-            )
+            nodes = f"{c['agreeing']} of {c['nodes_of_second']} nodes of {self.second}"
+            size = f"{c['bytes'] / 1e6:.2f} MB{describe_outdated_models(c)}"
             print(
-                f"{self.out}: {recognised}, {c['nodes_added']} added, {c['bytes'] / 1e6:.2f}"
-                f" MB{describe_outdated_models(c)}"
+                f"{self.out}: {nodes} were recognised in {self.first}, {c['nodes_added']} added,"
+                f" {size}"
             )
         write_json(self.json, {"map": self.out} | c)
         return 0

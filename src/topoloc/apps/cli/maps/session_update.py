@@ -13,8 +13,6 @@ from topoloc import (
     AtlasConfig,
     DuplicateSessionError,
     LocalizerConfig,
-    MapUpdate,
-    PoseConventions,
     StereoSequence,
     Tile,
     find_tile_of_recording,
@@ -24,13 +22,14 @@ from topoloc import (
     with_trajectory,
 )
 from topoloc.apps.cli.features_option import open_localizer
+from topoloc.apps.cli.mapping.map_jobs import parse_conventions
 from topoloc.apps.cli.mapping.recordings_table import print_notes, recordings_table
 from topoloc.apps.cli.output import UsageError, interruptible, open_recording, print_waiting
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.connection import connect_to_cluster
+from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import Job, JobProgress, OnJobState, run_locally, run_on_ray
 from topoloc.apps.cluster.tiles import Outcome, State, run_tile_work
-from topoloc.plugin import Progress
 
 
 @dataclass(frozen=True)
@@ -61,13 +60,10 @@ class OpenSessionUpdate:
         self.options, self.sequence = options, sequence
         self._posed_sequence: StereoSequence | None = None
 
-    def join(self, path: Path, progress: Progress) -> MapUpdate:
-        """Add the session to the map file. The changes contain its bytes before and after.
-
-        Raises:
-            UsageError: the options contradict each other.
-            TopolocError: as of `update` and `run_slam`.
-        """
+    def join(self, path: Path, progress: Progress) -> tuple[StereoSequence, dict[str, Any]]:
+        """Add the session to the map file. Return it with its poses, and the changes. Raises
+        UsageError: the options contradict each other; TopolocError: as of `update` and
+        `run_slam`."""
         one = self.options
 
         def find_poses(poses_from: str) -> StereoSequence:
@@ -75,17 +71,10 @@ class OpenSessionUpdate:
                 self._posed_sequence = self._with_poses(poses_from, progress)
             return self._posed_sequence
 
-        return update(
-            path,
-            self.sequence,
-            one.trajectory,
-            find_poses,
-            one.localize,
-            one.light,
-            "unchecked" not in (one.poses or "").split(","),
-            progress,
-            print_waiting,
-        )
+        is_checked = parse_conventions(one.poses)[1]
+        how = (one.trajectory, find_poses, one.localize, one.light, is_checked)
+        done = update(path, self.sequence, *how, progress, print_waiting)
+        return done.sequence, done.changes
 
     def _with_poses(self, poses_from: str, progress: Progress) -> StereoSequence:
         """Return the recording with its own poses."""
@@ -97,8 +86,7 @@ class OpenSessionUpdate:
             return self.sequence
         if poses_from == "slam":
             return run_slam([self.sequence], progress).apply([self.sequence])[0]
-        conventions = (self.options.poses or "").split(",")
-        reading = PoseConventions.of(",".join(name for name in conventions if name != "unchecked"))
+        reading = parse_conventions(self.options.poses)[0]
         if poses_from == "truth":
             return with_pose_conventions(self.sequence, reading)
         return with_trajectory(self.sequence, Path(poses_from), reading)
@@ -119,8 +107,7 @@ class TileSelectionJob:
     def run(self, progress: Progress) -> Outcome:
         def find_tile() -> tuple[State, Tile]:
             with interruptible():
-                sequence = self.options.open_session().sequence
-                atlas = Atlas.open(self.atlas)
+                sequence, atlas = self.options.open_session().sequence, Atlas.open(self.atlas)
                 localizer = open_localizer(atlas, self.options.localize, None, self.atlas_config)
                 return "recognised", find_tile_of_recording(atlas, localizer, sequence, progress)
 
@@ -148,10 +135,9 @@ class TileSessionJob:
         def update_tile() -> tuple[State, Tile]:
             session, state = self.options.open_session(), "there"
             with suppress(DuplicateSessionError), interruptible():
-                update = Atlas.open(self.atlas).edit(
-                    self.tile_id, lambda path: session.join(path, progress)
-                )
-                changes.update(update.changes)
+                atlas = Atlas.open(self.atlas)
+                _, done = atlas.edit(self.tile_id, lambda path: session.join(path, progress))
+                changes.update(done)
                 state = "updated"
             return state, Atlas.open(self.atlas).tile(self.tile_id)
 
@@ -175,12 +161,9 @@ class AtlasUpdate:
     cluster: ClusterConfig
 
     def outcomes(self) -> list[Outcome]:
-        """Return the outcome of each recording, and print them as they finish.
-
-        Raises:
-            AtlasError: the atlas has no tile `tile_id`.
-            MissingExtraError, ClusterError: from `connect_to_cluster`.
-        """
+        """Return the outcome of each recording, and print them as they finish. Raises AtlasError:
+        the atlas has no tile `tile_id`; MissingExtraError, ClusterError: from
+        `connect_to_cluster`."""
         where = self.atlas.address
         tile = None if self.tile_id is None else self.atlas.tile(self.tile_id)
         names = [options.recording for options in self.update_options]
@@ -235,23 +218,16 @@ class AtlasUpdate:
 
 def describe_update(changes: dict[str, Any]) -> str:
     """Return the changes of a session as one line."""
-    c = changes
-    seen = (
-        f"{c['recording']} joins as session {c['session']}: {c['frames_with_pose']} of"
-        f" {c['frames']} frames"
-    )
+    c, total, posed = changes, changes["frames"], changes["frames_with_pose"]
+    seen = f"{c['recording']} joins as session {c['session']}: {posed} of {total} frames"
     if c["poses_from"] == "map":
-        carried, without = c["frames_by_odometry"], c["frames"] - c["frames_with_pose"]
-        seen = (
-            f"{seen} ({c['frames_with_pose'] - carried} by the map, {carried} by odometry,"
-            f" {without} without a pose)"
-        )
+        carried = c["frames_by_odometry"]
+        by = f"{posed - carried} by the map, {carried} by odometry"
+        seen = f"{seen} ({by}, {total - posed} without a pose)"
     localized = f"{c['localized']} of {c['asked']} images were localized"
+    size = f"{c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f} MB"
     added = f"{c['nodes_added']} nodes added"
-    return (
-        f"{seen}, {localized}, {added}, {c['bytes_before'] / 1e6:.2f} to {c['bytes'] / 1e6:.2f}"
-        f" MB{describe_outdated_models(changes)}"
-    )
+    return f"{seen}, {localized}, {added}, {size}{describe_outdated_models(changes)}"
 
 
 def describe_outdated_models(changes: dict[str, Any]) -> str:
@@ -259,8 +235,7 @@ def describe_outdated_models(changes: dict[str, Any]) -> str:
     if not changes["not_taught"] or not changes["nodes_added"]:
         return ""
     remedies = {"cnn-fc": "`topoloc train --coarse cnn-fc --weights map` teaches it"}
-    named = [
-        f"{name} knows nothing of them: {remedies.get(name, 'PyTorch is missing here')}"
+    return "".join(
+        f"; {name} knows nothing of them: {remedies.get(name, 'PyTorch is missing here')}"
         for name in changes["not_taught"]
-    ]
-    return "".join(f"; {line}" for line in named)
+    )

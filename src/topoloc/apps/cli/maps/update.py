@@ -8,22 +8,14 @@ from typing import Annotated
 
 import tyro
 
-from topoloc import (
-    Atlas,
-    AtlasConfig,
-    LocalizerConfig,
-    Trajectory,
-    open_place,
-)
-from topoloc.apps.cli.maps.session_update import (
-    AtlasUpdate,
-    SessionUpdateOptions,
-    describe_update,
-)
+from topoloc import Atlas, AtlasConfig, LocalizerConfig, Trajectory, open_place
+from topoloc.apps.cli.mapping.recordings_table import report_outcomes
+from topoloc.apps.cli.maps.session_update import AtlasUpdate, SessionUpdateOptions, describe_update
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
     Format,
+    PosesOption,
     RayOption,
     Topics,
     UsageError,
@@ -58,32 +50,19 @@ class Command:
     """Source of the poses: `truth` (the recording's own, in any metric world), `slam` (stereo or
     RGB-D), or a TUM or KITTI file. `map` localizes each image in the map, as in a stream, and
     bridges gaps by odometry."""
-    poses: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="CONVENTION[,CONVENTION]",
-            help_behavior_hint="(default: world_from_cam, metres)",
-        ),
-    ] = None
+    poses: PosesOption = None
     """Convention of the poses of truth or FILE, as in `topoloc build`."""
     format: Format = None
-    """Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
-    rosbag, mcap, zed, video or folder."""
     camera: CameraOption = None
-    """Calibration of the recordings instead of their own: camera.json, OpenCV's or Kalibr's YAML,
-    SN*.conf, or `fx,fy,cx,cy`."""
     topics: Topics = None
-    """Topics of a bag by role: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     light: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: from the images)"),
+        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: from the images)")
     ] = None
     """Name of the illumination, such as `evening`. Sessions of one name have one illumination."""
     joined: Annotated[str | None, tyro.conf.arg(metavar="FILE.tum", help_behavior_hint="")] = None
     """Write the poses of the (one) recording in the map's world to this TUM file."""
     tile: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from the images)"),
+        str | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from the images)")
     ] = None
     """The tile of an atlas that all recordings join."""
     ray: RayOption = None
@@ -102,9 +81,7 @@ class Command:
         if self.light is not None and not self.light.strip():
             raise UsageError("--light is a name, such as evening")
         place = open_place(self.paths[0])
-        check_outputs(
-            [self.json, self.joined], inputs=[path for path in (self.paths[0], self.config) if path]
-        )
+        check_outputs([self.json, self.joined], [self.paths[0], self.config])
         settings = read_settings(self.config)
         return place.visit(
             lambda path: self._update_map(path, settings),
@@ -112,20 +89,9 @@ class Command:
         )
 
     def _session_options(self, settings: Settings) -> list[SessionUpdateOptions]:
+        read = (self.trajectory, self.poses, self.format, self.camera, self.topics, self.light)
         config = settings.of(LocalizerConfig)
-        return [
-            SessionUpdateOptions(
-                path,
-                config,
-                self.trajectory,
-                self.poses,
-                self.format,
-                self.camera,
-                self.topics,
-                self.light,
-            )
-            for path in self.paths[1:]
-        ]
+        return [SessionUpdateOptions(path, config, *read) for path in self.paths[1:]]
 
     def _update_map(self, target: str, settings: Settings) -> int:
         if self.tile is not None or self.ray is not None:
@@ -134,19 +100,12 @@ class Command:
         for options in self._session_options(settings):
             session = options.open_session()
             with progress_bar() as progress:
-                update = session.join(Path(target), progress)
+                sequence, changes = session.join(Path(target), progress)
             if self.joined:
-                known = [
-                    (t_ns, pose)
-                    for t_ns, pose in zip(update.sequence.t_ns, update.sequence.poses, strict=True)
-                    if pose is not None
-                ]
-                Trajectory([pose for _, pose in known], [t_ns for t_ns, _ in known]).write_tum(
-                    Path(self.joined)
-                )
+                Trajectory.of_frames(sequence.poses, sequence.t_ns).write_tum(Path(self.joined))
             if self.json != "-":
-                print(f"{target}: {describe_update(update.changes)}")
-            done.append(update.changes)
+                print(f"{target}: {describe_update(changes)}")
+            done.append(changes)
         write_json(self.json, {"map": target, "updates": done})
         return 0
 
@@ -155,23 +114,12 @@ class Command:
         if self.joined:
             raise UsageError("--joined needs a map file, not an atlas")
         configs = settings.of(AtlasConfig), settings.of(ClusterConfig)
-        options = self._session_options(settings)
+        options, where = self._session_options(settings), self.paths[0]
         outcomes = AtlasUpdate(options, atlas, self.tile, self.ray, *configs).outcomes()
-        counts = {
-            state: sum(outcome.state == state for outcome in outcomes)
-            for state in ("updated", "there", "failed")
-        }
-        where = self.paths[0]
         if self.json != "-":
             for outcome in outcomes:
                 if outcome.changes is not None:
                     print(f"{where}, tile {outcome.tile_id}: {describe_update(outcome.changes)}")
-            print(
-                f"{where}: {counts['updated']} recordings joined, {counts['there']} there already,"
-                f" {counts['failed']} failed"
-            )
-        write_json(
-            self.json,
-            {"atlas": where, **counts, "recordings": [outcome.to_json() for outcome in outcomes]},
-        )
-        return 1 if counts["failed"] else 0
+        facts = report_outcomes(where, outcomes, {"updated": "joined"}, self.json != "-")
+        write_json(self.json, facts)
+        return 1 if facts["failed"] else 0

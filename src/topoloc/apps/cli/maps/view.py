@@ -17,7 +17,7 @@ from topoloc.apps.cli.tile_option import TileOption, select_world
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
 from topoloc.apps.viewer.page import find_browser, write_scene_page, write_screenshot
 from topoloc.apps.viewer.result_files import read_results
-from topoloc.apps.viewer.world_document import create_world_document
+from topoloc.apps.viewer.worlds import create_world_document
 
 _DEFAULT_MAX_POINTS = SceneBudget().max_points
 
@@ -76,18 +76,15 @@ class Command:
         if self.out:
             write_scene_page(Path(self.out), document)
         if self.screenshot:
-            self._write_screenshot(document)
+            with tempfile.TemporaryDirectory(prefix="topoloc-") as folder:
+                page = Path(folder) / "scene.html"
+                write_scene_page(page, document)
+                write_screenshot(page, Path(self.screenshot))
         shown = self.out or self.screenshot or self.json or _open_in_browser(document)
         if self.json != "-":
             print(f"{shown}: {_format_summary(document['map'], results)}")
         write_json(self.json, document)
         return 0
-
-    def _write_screenshot(self, document: Mapping[str, Any]) -> None:
-        with tempfile.TemporaryDirectory(prefix="topoloc-") as folder:
-            page = Path(folder) / "scene.html"
-            write_scene_page(page, document)
-            write_screenshot(page, Path(str(self.screenshot)))
 
 
 def _open_in_browser(document: Mapping[str, Any]) -> str:
@@ -103,11 +100,8 @@ def _open_in_browser(document: Mapping[str, Any]) -> str:
 def _format_summary(facts: dict[str, Any], results: Sequence[ResultSet]) -> str:
     answers = sum(len(one.answers) for one in results)
     tiles = f"{len(facts['tiles'])} tiles, " if "tiles" in facts else ""
-    shown = (
-        f"{tiles}{facts['num_nodes']} nodes, {facts['num_points_shown']} of {facts['num_points']}"
-        " points"
-    )
-    return shown + (f", {answers} answers" if answers else "")
+    points = f"{facts['num_points_shown']} of {facts['num_points']} points"
+    return f"{tiles}{facts['num_nodes']} nodes, {points}" + (f", {answers} answers" * bool(answers))
 
 
 def _warn_of_other_worlds(results: Sequence[ResultSet], shown: Sequence[Mapping[str, Any]]) -> None:

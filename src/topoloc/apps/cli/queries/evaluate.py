@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,14 +21,15 @@ from topoloc import (
     StereoSequence,
     TopoMetricMap,
     TrajectoryError,
-    WorldFit,
 )
-from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer
+from topoloc.apps.cli.features_option import QUERY_FEATURES, CoarseOption, open_localizer
 from topoloc.apps.cli.output import (
     CameraOption,
     File,
     Flag,
     Format,
+    PosesOption,
+    RayOption,
     Topics,
     UsageError,
     check_outputs,
@@ -38,12 +39,7 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_json,
 )
-from topoloc.apps.cli.queries.remote_queries import (
-    OpenQueries,
-    QueryRecording,
-    RemoteMap,
-    localize_on_ray,
-)
+from topoloc.apps.cli.queries.remote_queries import QueryRecording, RemoteMap, localize_on_ray
 from topoloc.apps.cli.queries.self_evaluation import evaluate_map_itself
 from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.cluster.config import ClusterConfig
@@ -80,38 +76,20 @@ class Command:
     fit_map_from_truth: File = None
     """Write the rigid transform between the two worlds to this file, if one explains the errors.
     --map-from-truth reads it."""
-    coarse: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
-    ] = None
-    """Coarse localizer to use. `topoloc info` lists those of the map."""
+    coarse: CoarseOption = None
     features: QUERY_FEATURES = None
-    """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     format: Format = None
-    """Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
-    rosbag, mcap, zed, video or folder."""
     camera: CameraOption = None
-    """Calibration that replaces the recordings' own: camera.json, YAML of OpenCV or Kalibr,
-    SN*.conf, or `fx,fy,cx,cy`."""
-    poses: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="CONVENTION[,CONVENTION]",
-            help_behavior_hint="(default: world_from_cam, metres)",
-        ),
-    ] = None
+    poses: PosesOption = None
     """Convention of the true poses if it is not world_from_cam in metres: inverse, opengl, wxyz,
     mm, as in `build`."""
     topics: Topics = None
-    """Topics of a bag: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""
     report: File = None
     """Write a page with tables, a plan of the map, error curves and the worst queries to this file
     (HTML)."""
-    ray: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)"),
-    ] = None
+    ray: RayOption = None
     """Ray cluster that localizes the images, with the same results. `auto` is the running cluster
     of this machine, `local` starts one on this machine."""
     config: File = None
@@ -130,20 +108,18 @@ class Command:
         with localizer.in_tile(tile_id) as in_tile:
             topomap = in_tile.topomap
             info = topomap.describe(topomap.file.path if topomap.file else self.map)
-        map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
-        asked = self._open_recordings(map_from_truth)
+        opened = self._open_recordings()
         with progress_bar() as progress:
             if self.ray is None:
                 answers = [
                     answer
-                    for queries in asked
-                    for answer in queries.answers(localizer, tile_id, progress)
+                    for one, sequence in opened
+                    for answer in one.answers(sequence, localizer, tile_id, progress)
                 ]
             else:
                 sent = RemoteMap.of(localizer, tile_id, self.features)
-                answers = localize_on_ray(
-                    sent, asked, self.ray, settings.of(ClusterConfig), progress
-                )
+                cluster = settings.of(ClusterConfig)
+                answers = localize_on_ray(sent, opened, self.ray, cluster, progress)
         self._report(Evaluation(answers), localizer, topomap, info)
         return 0
 
@@ -157,7 +133,7 @@ class Command:
             raise UsageError("--fit-map-from-truth needs one recording and no --map-from-truth")
         if self.report:
             import_report_writer()
-        inputs = [path for path in (self.map, self.map_from_truth, self.config) if path]
+        inputs = [self.map, self.map_from_truth, self.config]
         check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
 
     def _report(
@@ -168,19 +144,17 @@ class Command:
         info: dict[str, Any],
     ) -> None:
         """Print the figures and write the files that the options name."""
-        fits = evaluated.world_fits if len(localizer.tile_ids) == 1 else []
+        fits = [fit.to_json() for fit in evaluated.world_fits if len(localizer.tile_ids) == 1]
         evaluation = evaluated.to_json() | {
             "map": info,
-            "world_fits": [fit.to_json() for fit in fits],
+            "world_fits": fits,
             "calibrations": evaluated.calibrations(),
         }
         if self.json != "-":
             _print(evaluation)
         for fit in fits:
-            print(
-                _report_world_fit(fit, self.fit_map_from_truth),
-                file=sys.stderr if self.json == "-" else sys.stdout,
-            )
+            line = _report_world_fit(fit, self.fit_map_from_truth)
+            print(line, file=sys.stderr if self.json == "-" else sys.stdout)
         answers = evaluated.answers
         write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
         if self.report:
@@ -189,36 +163,27 @@ class Command:
                 print(f"report: {self.report}")
         self._write_fit(fits)
 
-    def _open_recordings(self, map_from_truth: Rigid3 | None) -> list[OpenQueries]:
+    def _open_recordings(self) -> list[tuple[QueryRecording, StereoSequence]]:
         """Open the recordings, those with true poses first."""
+        map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         paths, count = [*self.sequences, *self.elsewhere], len(self.sequences)
         how = (self.format, self.camera, self.topics, self.poses)
         recordings = [
-            QueryRecording(path, *how, is_out_of_map=number >= count)
+            QueryRecording(path, *how, number >= count, map_from_truth)
             for number, path in enumerate(paths)
         ]
-        sequences = [recording.open() for recording in recordings]
-        labels = _unique_labels(paths, sequences)
-        return [
-            OpenQueries(*one, map_from_truth)
-            for one in zip(recordings, sequences, labels, strict=True)
-        ]
+        opened = [(one, one.open()) for one in recordings]
+        labels = _unique_labels(paths, [sequence for _, sequence in opened])
+        named = zip(opened, labels, strict=True)
+        return [(replace(one, label=label), sequence) for (one, sequence), label in named]
 
     def _check_no_recordings(self) -> None:
         """Refuse options that need a recording."""
-        names = (
-            "elsewhere",
-            "tile",
-            "map_from_truth",
-            "fit_map_from_truth",
-            "format",
-            "camera",
-            "poses",
-            "topics",
-            "ray",
-        )
-        given = ["recordings"] * bool(self.sequences) + [
-            f"--{name.replace('_', '-')}" for name in names if getattr(self, name)
+        allowed = ("map", "against_itself", "coarse", "features", "json", "report", "config")
+        given = [
+            "recordings" if one.name == "sequences" else f"--{one.name.replace('_', '-')}"
+            for one in fields(self)
+            if one.name not in allowed and getattr(self, one.name)
         ]
         if given:
             raise UsageError(f"--against-itself uses the map alone, without {', '.join(given)}")
@@ -235,35 +200,28 @@ class Command:
             )
         return self.tile or ids[0]
 
-    def _write_fit(self, fits: Sequence[WorldFit]) -> None:
-        if self.fit_map_from_truth and not fits:
+    def _write_fit(self, fits: Sequence[dict[str, Any]]) -> None:
+        path = self.fit_map_from_truth
+        if path and not fits:
             raise TrajectoryError(
-                f"{self.fit_map_from_truth} is not written: no rigid transform between two worlds"
-                " explains the errors"
+                f"{path} is not written: no rigid transform between two worlds explains the errors"
             )
-        if self.fit_map_from_truth:
-            write_json(
-                self.fit_map_from_truth,
-                {"map_from_truth": fits[0].map_from_truth.matrix().tolist()},
-            )
+        if path:
+            write_json(path, {"map_from_truth": fits[0]["map_from_truth"]})
 
 
-def _report_world_fit(fit: WorldFit, written: str | None) -> str:
+def _report_world_fit(fit: dict[str, Any], written: str | None) -> str:
     """Return one line: the worlds differ, the errors in one world, and the option that uses it."""
-    left = f"{format_length(fit.median_translation_m)} and {fit.median_rotation_deg:.2f} deg"
-    apart = (
-        f"{format_length(float(np.linalg.norm(fit.map_from_truth.translation)))},"
-        f" {np.degrees(fit.map_from_truth.angle()):.1f} deg"
-    )
-    how = (
-        f"--map-from-truth {written}"
-        if written
-        else "--fit-map-from-truth FILE writes that transform, --map-from-truth FILE judges by it"
-    )
+    left = f"{format_length(fit['median_translation_m'])} and {fit['median_rotation_deg']:.2f} deg"
+    transform = Rigid3.from_matrix(fit["map_from_truth"])
+    distance = format_length(float(np.linalg.norm(transform.translation)))
+    apart = f"{distance}, {np.degrees(transform.angle()):.1f} deg"
+    how = "--fit-map-from-truth FILE writes that transform, --map-from-truth FILE judges by it"
+    how = f"--map-from-truth {written}" if written else how
     return (
-        f"{fit.recording}: its truth is in another world than the map: one rigid transform"
-        f" ({apart}) explains {fit.num_answers} of {fit.num_localized} answers, median error then"
-        f" {left}; {how}"
+        f"{fit['recording']}: its truth is in another world than the map: one rigid transform"
+        f" ({apart}) explains {fit['num_answers']} of {fit['num_localized']} answers, median error"
+        f" then {left}; {how}"
     )
 
 
@@ -275,7 +233,7 @@ def _unique_labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) ->
 
 
 def _read_rigid(path: Path) -> Rigid3:
-    """A 4x4 matrix, alone or as the only matrix of a JSON object."""
+    """Read a 4x4 matrix, alone or as the only matrix of a JSON object."""
     data = decode_json(read_text(path, TrajectoryError), Any, TrajectoryError, str(path))
     values = data.values() if isinstance(data, dict) else [data]
     matrices = [value for value in values if isinstance(value, list)]

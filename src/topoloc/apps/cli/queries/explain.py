@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,13 +19,18 @@ from topoloc import (
     UncalibratedCamera,
     open_sequence,
 )
-from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
+from topoloc.apps.cli.features_option import (
+    QUERY_FEATURES,
+    CoarseOption,
+    open_localizer,
+    parse_camera,
+)
 from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
 from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.query_camera import select_frame_camera
 from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
-from topoloc.apps.report.explanation_page import row_of, verdict, write_explanation
-from topoloc.plugin import as_monocular
+from topoloc.apps.report.explanation_page import explanation_page, row_of, verdict
+from topoloc.plugin import as_monocular, write_text
 
 
 @dataclass(frozen=True)
@@ -43,12 +49,8 @@ class Command:
         ),
     ] = None
     """Calibration of the image, as in `topoloc localize`."""
-    coarse: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
-    ] = None
-    """Coarse localizer to use. `topoloc info` lists those of the map."""
+    coarse: CoarseOption = None
     features: QUERY_FEATURES = None
-    """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     out: File = None
     """Write a page with the images, the matches and all tried poses to this file (HTML)."""
     json: File = None
@@ -57,9 +59,7 @@ class Command:
     """TOML file with all other settings, as printed by `topoloc config explain`."""
 
     def run(self) -> int:
-        check_outputs(
-            [self.out, self.json], inputs=[path for path in (self.map, self.config) if path]
-        )
+        check_outputs([self.out, self.json], [self.map, self.config])
         settings = read_settings(self.config)
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
@@ -70,17 +70,14 @@ class Command:
         with localizer.in_tile(tile_id) as in_tile:
             explanation = explain(in_tile, frame.image, camera)
             if self.out:
-                write_explanation(
-                    Path(self.out), frame.name, frame.image, explanation, in_tile.topomap
-                )
+                page = explanation_page(frame.name, frame.image, explanation, in_tile.topomap)
+                write_text(Path(self.out), page)
         if self.json != "-":
-            for line in ranking:
-                print(line)
-            _print(explanation, self.out)
-        write_json(
-            self.json,
-            explanation_to_json(frame.name, explanation) | ({"tiles": ranking} if ranking else {}),
-        )
+            print("\n".join([*ranking, *_report(explanation)]))
+            if self.out:
+                print(f"page: {self.out}")
+        facts = explanation_to_json(frame.name, explanation)
+        write_json(self.json, facts | ({"tiles": ranking} if ranking else {}))
         return 0
 
     def _read_frame(self) -> StereoFrame:
@@ -101,10 +98,8 @@ def _select_tile(
         return localizer.tile_ids[0], []
     result = localizer.localize(frame.image, camera)
     tile_id = result.provenance.tile or ""
-    most_similar = ", ".join(
-        f"{name} {similarity:.2f}"
-        for name, similarity in localizer.rank_tiles(frame.image, camera)[:5]
-    )
+    ranking = localizer.rank_tiles(frame.image, camera)[:5]
+    most_similar = ", ".join(f"{name} {similarity:.2f}" for name, similarity in ranking)
     choice = f"in tile {tile_id}"
     if not isinstance(result, Localization):
         detail = f", {result.detail}" if result.detail else ""
@@ -112,22 +107,12 @@ def _select_tile(
     return tile_id, [f"atlas: {choice}", f"most similar tiles: {most_similar}"]
 
 
-def _print(explanation: Explanation, page: str | None) -> None:
-    print(verdict(explanation))
-    for line in explanation.advice:
-        print(f"- {line}")
+def _report(explanation: Explanation) -> Iterator[str]:
+    """Yield the result, the advice, and a line for each tried pose."""
+    yield verdict(explanation)
+    yield from (f"- {line}" for line in explanation.advice)
     for pose in explanation.poses:
         source, features, node, first, found, _, _, probability, became = row_of(pose)
-        facts = ", ".join(
-            text
-            for text in (
-                node and f"node {node}",
-                f"{first} at first",
-                found and f"found {found}",
-                probability,
-            )
-            if text
-        )
-        print(f"  {source} ({features}): {facts}: {became}")
-    if page:
-        print(f"page: {page}")
+        near, again = node and f"node {node}", found and f"found {found}"
+        facts = ", ".join(filter(None, (near, f"{first} at first", again, probability)))
+        yield f"  {source} ({features}): {facts}: {became}"

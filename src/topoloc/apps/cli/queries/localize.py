@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -20,22 +21,25 @@ from topoloc import (
     LocalizerConfig,
     NotLocalized,
     QueryError,
-    Rigid3,
     StereoSequence,
     TopolocError,
     Tracker,
     TrackerConfig,
     Trajectory,
-    UncalibratedCamera,
-    UnreadableImageError,
 )
-from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer, parse_camera
+from topoloc.apps.cli.features_option import (
+    QUERY_FEATURES,
+    CoarseOption,
+    open_localizer,
+    parse_camera,
+)
 from topoloc.apps.cli.output import (
     File,
     Flag,
     Format,
     Topics,
     UsageError,
+    catch_stop_signals,
     check_outputs,
     interruptible,
     open_recording,
@@ -43,13 +47,10 @@ from topoloc.apps.cli.output import (
     progress_bar,
     write_text,
 )
-from topoloc.apps.cli.queries.live_localization import (
-    NEEDS_CALIBRATION,
-    find_live_input,
-    localize_live,
-)
 from topoloc.apps.cli.queries.query_answers import (
     QueryAnswer,
+    QueryFrame,
+    capture_frames,
     exit_status,
     format_answer,
     report_calibrations,
@@ -57,20 +58,13 @@ from topoloc.apps.cli.queries.query_answers import (
     to_trajectory,
 )
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
-from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
-from topoloc.plugin import as_monocular, find_format, find_source_path, match_frame_poses
+from topoloc.apps.formats.live import LiveSource, is_live
+from topoloc.apps.query_camera import CameraOfSize
+from topoloc.plugin import as_monocular, find_format, split_selection
 
-
-@dataclass(frozen=True, eq=False)
-class _Query:
-    """Hold an input: its images, whether they are a stream, the odometry pose of each, and whether
-    they have times."""
-
-    path: str
-    sequence: StereoSequence
-    is_stream: bool
-    odom_from_cams: list[Rigid3 | None]
-    has_times: bool
+_NEED = (
+    "a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single"
+)
 
 
 @dataclass(frozen=True)
@@ -113,16 +107,9 @@ class Command:
     """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels,
     `map` for the map's camera, `unknown` to estimate the focal length."""
     format: Format = None
-    """Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio, record3d, colmap,
-    rosbag, mcap, zed, video or folder."""
     topics: Topics = None
-    """Topics of a bag: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom."""
-    coarse: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: the map's)")
-    ] = None
-    """Coarse localizer to use. `topoloc info` lists those of the map."""
+    coarse: CoarseOption = None
     features: QUERY_FEATURES = None
-    """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     max_ms: Annotated[
         float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: no limit)")
     ] = None
@@ -145,34 +132,29 @@ class Command:
     def run(self) -> int:
         if not self.inputs:
             raise UsageError("localize takes a map and at least one image, folder or recording")
-        self._check_usage()
-        check_outputs(
-            [self.json, self.tum],
-            inputs=[
-                path
-                for path in (self.map, *self.inputs, self.streams.odometry, self.config)
-                if path
-            ],
-        )
-        near, settings = self._parse_near, read_settings(self.config)
-        tracking = self._create_tracker(settings.of(TrackerConfig))
-        localizer = self._localizer(settings, near)
-        camera = (
-            None
-            if self.camera is None or self._stereo_calibration
-            else parse_camera(localizer, self.camera)
-        )
-        live = find_live_input(self.inputs)
+        live = next((path for path in self.inputs if is_live(path)), None)
+        self._check_usage(live)
+        inputs = (self.map, *self.inputs, self.streams.odometry, self.config)
+        check_outputs([self.json, self.tum], inputs)
+        near, settings = self._parse_near(), read_settings(self.config)
+        tracking = settings.of(TrackerConfig)
+        if self.streams.max_jump is not None:
+            tracking = with_option(tracking, "max_jump", self.streams.max_jump, "--max-jump")
+            tracking = replace(tracking, mode="paper")
+        localizer, camera = self._open_localizer(settings, near), None
+        if self.camera is not None and not self._stereo_calibration:
+            camera = parse_camera(localizer, self.camera)
+        if live and len(self.inputs) > 1:
+            raise UsageError(f"{live} is a live source, which must be the only input")
         queries = [] if live else [self._open_query(path) for path in self.inputs]
-        total = sum(len(query.sequence) for query in queries)
+        total = sum(len(query.frames) for query in queries)
         coming = _localize_queries(localizer, tracking, queries, camera)
         if live:
             if camera is None:
                 raise UsageError(f"{live} has no calibration: --camera gives it")
             tracker = None if self.streams.single else Tracker(localizer, tracking)
-            coming = localize_live(localizer, tracker, live, camera)
-        start = time.perf_counter()
-        answers = self._print_answers(coming, total)
+            coming = _localize_live(localizer, tracker, live, camera)
+        start, answers = time.perf_counter(), self._print_answers(coming, total)
         self._write_files(answers)
         if any(answer.streamed for answer in answers) and self.json != "-":
             print(summarize_stream(answers, time.perf_counter() - start))
@@ -182,16 +164,13 @@ class Command:
     def _print_answers(self, coming: Iterator[QueryAnswer], total: int) -> list[QueryAnswer]:
         """Print each answer when it comes, and return all. If the queries are interrupted, the
         files hold the answers so far."""
-        answers = list[QueryAnswer]()
+        answers, as_json = list[QueryAnswer](), self.json == "-"
         try:
             with interruptible(), progress_bar() as progress:
                 for answer in coming:
                     answers.append(answer)
-                    as_json = self.json == "-"
-                    print(
-                        json.dumps(answer.to_json()) if as_json else format_answer(answer),
-                        flush=True,
-                    )
+                    line = json.dumps(answer.to_json()) if as_json else format_answer(answer)
+                    print(line, flush=True)
                     progress("queries", len(answers), total or len(answers))
         except (KeyboardInterrupt, TopolocError) as stopped:
             files = self._write_files(answers) if answers else []
@@ -203,59 +182,52 @@ class Command:
             ) from stopped
         return answers
 
-    def _localizer(self, settings: Settings, near: GeoPositionPrior | None) -> Localizer:
+    def _open_localizer(self, settings: Settings, near: GeoPositionPrior | None) -> Localizer:
         config = with_option(settings.of(LocalizerConfig), "coarse", self.coarse, "--coarse")
         config = with_option(config, "max_ms", self.max_ms, "--max-ms")
         localizer = open_localizer(self.map, config, self.features, settings.of(AtlasConfig))
         return localizer if near is None else localizer.near(near)
 
-    @property
     def _parse_near(self) -> GeoPositionPrior | None:
         try:
             return None if self.near is None else GeoPositionPrior.parse(self.near)
         except AtlasError as error:
             raise UsageError(f"--near: {error}") from None
 
-    def _check_usage(self) -> None:
+    def _check_usage(self, live: str | None) -> None:
         if self.streams.stream and self.streams.single:
             raise UsageError("--stream and --single exclude each other")
-        if self.streams.odometry is not None and (
-            len(self.inputs) > 1 or find_live_input(self.inputs)
-        ):
+        if self.streams.odometry is not None and (len(self.inputs) > 1 or live):
             raise UsageError("--odometry needs one recorded stream as the only input")
 
     def _open_query(self, path: str) -> _Query:
         """Open an input. Recordings and videos are streams. Images and folders of images are single
         unless --stream is given."""
-        is_stream = self.streams.stream or (
-            not self.streams.single and find_format(path, self.format) != "folder"
-        )
-        sequence = as_monocular(
-            open_recording(path, self.format, self._stereo_calibration, self.topics)
-        )
-        is_stream = is_stream and len(sequence) > 1
-        odometry = None
+        is_folder = find_format(path, self.format) == "folder"
+        recording = open_recording(path, self.format, self._stereo_calibration, self.topics)
+        sequence = as_monocular(recording)
+        is_stream = self.streams.stream or not (self.streams.single or is_folder)
+        is_stream, poses = is_stream and len(sequence) > 1, [None] * len(sequence)
         if self.streams.odometry is not None:
             if not is_stream:
                 raise UsageError(
                     f"--odometry needs a stream, and {path} is none; --stream makes it one"
                 )
-            odometry = match_frame_poses(
-                Trajectory.read(Path(self.streams.odometry)),
-                sequence.t_ns,
-                Path(self.streams.odometry),
+            odometry = Path(self.streams.odometry)
+            poses = Trajectory.read(odometry).match_frames(sequence.t_ns, odometry)
+        has_times = is_stream or not is_folder or _has_times(path, sequence)
+        frames = [
+            QueryFrame(name, t_ns, lambda row=row: sequence[row], has_times, pose)
+            for row, (name, t_ns, pose) in enumerate(
+                zip(sequence.names, sequence.t_ns, poses, strict=True)
             )
-        has_times = is_stream or find_format(path, self.format) != "folder" or _has_times(sequence)
-        return _Query(path, sequence, is_stream, odometry or [None] * len(sequence), has_times)
+        ]
+        return _Query(path, frames, is_stream)
 
     @property
     def _stereo_calibration(self) -> str | None:
         """Return `--camera` if it calibrates a stereo pair; the recording is opened with it."""
         return self.camera if self.camera is not None and self.camera.endswith(".conf") else None
-
-    def _create_tracker(self, config: TrackerConfig) -> TrackerConfig:
-        config = with_option(config, "max_jump", self.streams.max_jump, "--max-jump")
-        return config if self.streams.max_jump is None else replace(config, mode="paper")
 
     def _write_files(self, answers: list[QueryAnswer]) -> list[str]:
         """Write the files and return their paths."""
@@ -272,6 +244,15 @@ class Command:
         return files
 
 
+@dataclass(frozen=True, eq=False)
+class _Query:
+    """The images of an input, and whether they are a stream."""
+
+    path: str
+    frames: Sequence[QueryFrame]
+    is_stream: bool
+
+
 def _localize_queries(
     localizer: Localizer,
     tracking: TrackerConfig,
@@ -280,66 +261,36 @@ def _localize_queries(
 ) -> Iterator[QueryAnswer]:
     for query in queries:
         tracker = Tracker(localizer, tracking) if query.is_stream else None
-        for i, frame_name in enumerate(query.sequence.names):
-            name = (
-                frame_name
-                if len(queries) == 1
-                else query.path
-                if len(query.sequence) == 1
-                else f"{query.path}/{frame_name}"
-            )
+        for frame in query.frames:
+            if len(queries) > 1:
+                name = query.path if len(query.frames) == 1 else f"{query.path}/{frame.name}"
+                frame = replace(frame, name=name)
             try:
-                answer = _localize_frame(name, query, i, localizer, tracker, camera_of_size)
+                yield frame.localize(localizer, tracker, camera_of_size, _NEED)
             except (QueryError, CalibrationError) as error:
-                if query.is_stream or len(queries) == len(query.sequence) == 1:
-                    raise type(error)(f"{name}: {error}") from error
+                text = f"{frame.name}: {error}"
+                if query.is_stream or len(queries) == len(query.frames) == 1:
+                    raise type(error)(text) from error
                 # One image has another size than its camera; the others are localized.
-                answer = QueryAnswer(
-                    name,
-                    query.sequence.t_ns[i],
-                    NotLocalized("unreadable", detail=f"{name}: {error}"),
-                )
-            yield answer
+                refusal = NotLocalized("unreadable", detail=text)
+                yield QueryAnswer(frame.name, frame.t_ns, refusal)
 
 
-def _has_times(photos: StereoSequence) -> bool:
+def _localize_live(
+    localizer: Localizer, tracker: Tracker | None, source: str, camera_of_size: CameraOfSize
+) -> Iterator[QueryAnswer]:
+    """Yield results until the source ends or the process is interrupted. Images that arrive during
+    a query are skipped. Raises RecordingError if the source does not respond or stalls."""
+    with ExitStack() as stack:
+        live = stack.enter_context(LiveSource(source))
+        stop, count = stack.enter_context(catch_stop_signals()), 0
+        for frame in capture_frames(live, stop):
+            yield frame.localize(localizer, tracker, camera_of_size, _NEED)
+            count += 1
+        if not stop.is_set():
+            print_warning(f"{source} ended after {live.num_read} images, {count} were localized")
+
+
+def _has_times(path: str, photos: StereoSequence) -> bool:
     """Return whether the images have times. Photos and folders without times.txt have none."""
-    root = find_source_path(photos)
-    return root is None or (photos.names != [photos.name] and (Path(root) / "times.txt").is_file())
-
-
-def _localize_frame(
-    name: str,
-    query: _Query,
-    index: int,
-    localizer: Localizer,
-    tracker: Tracker | None,
-    camera_of_size: CameraOfSize | None,
-) -> QueryAnswer:
-    """Localize one image, alone or as the next of a stream."""
-    t_ns, odom_from_cam = query.sequence.t_ns[index], query.odom_from_cams[index]
-    try:
-        frame = query.sequence[index]
-    except UnreadableImageError as error:
-        unreadable = localizer.with_provenance(
-            NotLocalized("unreadable", detail=str(error)), t_ns=t_ns if query.has_times else None
-        )
-        return QueryAnswer(
-            name,
-            t_ns,
-            unreadable,
-            tracker.process_missing(t_ns, unreadable, odom_from_cam)
-            if tracker is not None
-            else None,
-        )
-    camera = select_frame_camera(frame, camera_of_size)
-    if tracker is None:
-        return QueryAnswer(
-            name,
-            t_ns,
-            localizer.localize(frame.image, camera, t_ns=t_ns if query.has_times else None),
-        )
-    if isinstance(camera, UncalibratedCamera):
-        raise CalibrationError(NEEDS_CALIBRATION)
-    streamed = tracker.process(frame.image, camera, t_ns, odom_from_cam)
-    return QueryAnswer(name, t_ns, streamed.result, streamed)
+    return photos.names != [photos.name] and (split_selection(path)[0] / "times.txt").is_file()

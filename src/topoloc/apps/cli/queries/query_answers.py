@@ -1,21 +1,80 @@
-"""Results of queries: printed lines, the trajectory and the exit status."""
+"""Localize the images of queries, alone or as a stream: answers, printed lines, the trajectory."""
 
 from __future__ import annotations
 
 import sys
+import threading
 from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 from topoloc import (
+    CalibrationError,
     Localization,
+    Localizer,
     NotLocalized,
     Rigid3,
+    StereoFrame,
     StreamedPose,
+    Tracker,
     Trajectory,
+    UncalibratedCamera,
+    UnreadableImageError,
     check_camera_calibrations,
 )
+from topoloc.apps.cli.output import print_warning
+from topoloc.apps.formats.live import LiveSource
+from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
+
+
+@dataclass(frozen=True, eq=False)
+class QueryFrame:
+    """An image to localize. `read` returns it or raises UnreadableImageError. Photos have no time.
+    `odom_from_cam` is the pose of external odometry."""
+
+    name: str
+    t_ns: int
+    read: Callable[[], StereoFrame]
+    has_time: bool = True
+    odom_from_cam: Rigid3 | None = None
+
+    def localize(
+        self,
+        localizer: Localizer,
+        tracker: Tracker | None,
+        camera_of_size: CameraOfSize | None,
+        need: str,
+    ) -> QueryAnswer:
+        """Localize the image, with a tracker as the next of a stream. Raises CalibrationError: an
+        image of a stream has no calibration. The text is `need`; QueryError: the size of the image
+        is not that of its camera."""
+        t_ns = self.t_ns if self.has_time else None
+        try:
+            frame = self.read()
+        except UnreadableImageError as error:
+            refusal = NotLocalized("unreadable", detail=str(error))
+            refusal, streamed = localizer.with_provenance(refusal, t_ns=t_ns), None
+            if tracker is not None:
+                streamed = tracker.process_missing(self.t_ns, refusal, self.odom_from_cam)
+            return QueryAnswer(self.name, self.t_ns, refusal, streamed)
+        camera = select_frame_camera(frame, camera_of_size)
+        if tracker is None:
+            result = localizer.localize(frame.image, camera, t_ns=t_ns)
+            return QueryAnswer(self.name, self.t_ns, result)
+        if isinstance(camera, UncalibratedCamera):
+            raise CalibrationError(need)
+        streamed = tracker.process(frame.image, camera, self.t_ns, self.odom_from_cam)
+        return QueryAnswer(self.name, self.t_ns, streamed.result, streamed)
+
+
+def capture_frames(live: LiveSource, stop: threading.Event) -> Iterator[QueryFrame]:
+    """Yield the newest image of a live source each time, with this machine's time, until `stop`."""
+    live.stop = stop
+    for picture in live:
+        frame = StereoFrame(f"{picture.number:06d}", picture.t_ns, picture.image, None)
+        yield QueryFrame(frame.name, frame.t_ns, lambda frame=frame: frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +93,9 @@ class QueryAnswer:
         """Return world_from_cam as measured in this image, None if the pose is only predicted."""
         if not isinstance(self.result, Localization):
             return None
-        return (
-            self.streamed.smoothed
-            if smoothed and self.streamed is not None
-            else self.result.world_from_cam
-        )
+        if smoothed and self.streamed is not None:
+            return self.streamed.smoothed
+        return self.result.world_from_cam
 
 
 def to_trajectory(answers: list[QueryAnswer], smoothed: bool) -> Trajectory:
@@ -47,9 +104,7 @@ def to_trajectory(answers: list[QueryAnswer], smoothed: bool) -> Trajectory:
     times = [answer.t_ns for answer in answers]
     if any(after <= before for before, after in pairwise(times)):
         times = [number * 1_000_000_000 for number in range(len(answers))]
-    poses = [(t_ns, answer.pose(smoothed)) for t_ns, answer in zip(times, answers, strict=True)]
-    found = [(t_ns, pose) for t_ns, pose in poses if pose is not None]
-    return Trajectory([world_from_cam for _, world_from_cam in found], [t_ns for t_ns, _ in found])
+    return Trajectory.of_frames([answer.pose(smoothed) for answer in answers], times)
 
 
 def exit_status(answers: list[QueryAnswer]) -> int:
@@ -59,21 +114,13 @@ def exit_status(answers: list[QueryAnswer]) -> int:
         for a in answers
         if isinstance(a.result, NotLocalized) and a.result.reason == "unreadable"
     ]
-    if not details:
-        return 0
-    if len(details) == len(answers):
-        more = (
-            f" (and the other {len(details) - 1} could not be read either)"
-            if len(details) > 1
-            else ""
-        )
-        print(f"error: {details[0]}{more}", file=sys.stderr)
+    if details and len(details) == len(answers):
+        others = f" (and the other {len(details) - 1} could not be read either)"
+        print(f"error: {details[0]}{others if len(details) > 1 else ''}", file=sys.stderr)
         return 1
-    print(
-        f"warning: {len(details)} of {len(answers)} images could not be read; the first:"
-        f" {details[0]}",
-        file=sys.stderr,
-    )
+    if details:
+        count = f"{len(details)} of {len(answers)}"
+        print_warning(f"{count} images could not be read; the first: {details[0]}")
     return 0
 
 
@@ -81,21 +128,17 @@ def report_calibrations(answers: list[QueryAnswer]) -> None:
     """Print a warning for each camera whose calibration the images contradict together."""
     for verdict in check_camera_calibrations(answer.result for answer in answers):
         if verdict.is_contradicted:
-            print(f"warning: {verdict}", file=sys.stderr)
+            print_warning(str(verdict))
 
 
 def format_answer(answer: QueryAnswer) -> str:
     """Return one readable line."""
-    result, state = (
-        answer.result,
-        f"{answer.streamed.state}  " if answer.streamed is not None else "",
-    )
+    result, stream_state = answer.result, answer.streamed.state if answer.streamed else None
+    state = f"{stream_state}  " if stream_state else ""
     ms = f"  {result.times_ms['total']:.0f} ms" if result.times_ms else ""
     if isinstance(result, NotLocalized):
         evidence = f"  ({result.num_inliers} of {result.num_matches} matches)"
-        if result.reason == "unreadable" or (
-            answer.streamed is not None and answer.streamed.state == "ambiguous"
-        ):
+        if result.reason == "unreadable" or stream_state == "ambiguous":
             evidence = f"  ({len(result.alternatives)} alternatives)" if result.alternatives else ""
         return f"{answer.query}  {state}not localized: {result.reason}{evidence}{ms}"
     focal = "" if result.focal_length_px is None else f"  f {result.focal_length_px:.0f} px (found)"
@@ -112,8 +155,6 @@ def format_answer(answer: QueryAnswer) -> str:
 def summarize_stream(answers: list[QueryAnswer], seconds: float) -> str:
     """Return the count of each state, and the frames per second."""
     states = Counter(answer.streamed.state for answer in answers if answer.streamed is not None)
-    counts = ", ".join(
-        f"{states[state]} {state}"
-        for state in ("localized", "tracked", "predicted", "ambiguous", "lost")
-    )
+    names = ("localized", "tracked", "predicted", "ambiguous", "lost")
+    counts = ", ".join(f"{states[state]} {state}" for state in names)
     return f"{states.total()} frames: {counts}; {len(answers) / seconds:.1f} frames a second"

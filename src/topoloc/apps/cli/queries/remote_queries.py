@@ -1,22 +1,23 @@
 """Localize recordings in a map or an atlas, here or in pieces on a cluster, with equal results.
 
-A piece opens map and recording by their paths where it is asked, holds that they are those that the
-command opened, and sends back its answers, without pictures.
+A piece opens map and recording by their paths on its machine and checks that they are those of the
+command. It returns its answers without images.
 """
 
 from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from itertools import pairwise
 
 from topoloc import (
     Atlas,
     AtlasConfig,
     EvaluatedQuery,
+    Image,
     Localizer,
     LocalizerConfig,
     MissingExtraError,
@@ -32,26 +33,34 @@ from topoloc import (
     with_pose_conventions,
 )
 from topoloc.apps.cli.features_option import find_available_types
-from topoloc.apps.cli.output import open_recording
+from topoloc.apps.cli.output import open_recording, print_warning
 from topoloc.apps.cluster.config import ClusterConfig
+from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
-from topoloc.plugin import Progress
 
 MAX_IMAGES = 50
-"""Images of a piece. To open map and recording takes about a second, much less than these."""
+"""Images of a piece. It takes about a second to open map and recording, much less than these."""
 
 
 @dataclass(frozen=True)
 class QueryRecording:
-    """Hold a recording and the options of `topoloc evaluate` that read it. `is_out_of_map` is True
-    if it shows another place."""
+    """A recording and the options of `topoloc evaluate` that read it. `is_out_of_map` is True if it
+    shows another place. `label` names it in the results. `map_from_truth` is as in
+    `localize_queries`."""
 
     path: str
-    format: str | None
-    camera: str | None
-    topics: str | None
-    poses: str | None
+    format: str | None = None
+    camera: str | None = None
+    topics: str | None = None
+    poses: str | None = None
     is_out_of_map: bool = False
+    map_from_truth: Rigid3 | None = None
+    label: str = ""
+
+    @property
+    def stage(self) -> str:
+        """Return the name for the progress bar."""
+        return f"{self.label} (out of map)" if self.is_out_of_map else self.label
 
     def open(self) -> StereoSequence:
         """Open the recording. Notes about it go to standard error. Raises the errors of
@@ -60,51 +69,32 @@ class QueryRecording:
         sequence = open_recording(self.path, self.format, self.camera, self.topics)
         return sequence if self.is_out_of_map else with_pose_conventions(sequence, reading)
 
-
-@dataclass(frozen=True, eq=False)
-class OpenQueries:
-    """Hold an open recording and its label in the results. `map_from_truth` is as in
-    `localize_queries`."""
-
-    recording: QueryRecording
-    sequence: StereoSequence
-    label: str
-    map_from_truth: Rigid3 | None
-
-    @property
-    def stage(self) -> str:
-        """Return the name for the progress bar."""
-        return f"{self.label} (out of map)" if self.recording.is_out_of_map else self.label
-
-    @property
-    def frames(self) -> list[int]:
+    def frames(self, sequence: StereoSequence) -> list[int]:
         """Return the frames to localize. Raises TrajectoryError: no frame has a true pose."""
-        return (
-            list(range(len(self.sequence)))
-            if self.recording.is_out_of_map
-            else find_frames_with_truth(self.sequence)
-        )
+        is_all = self.is_out_of_map
+        return list(range(len(sequence))) if is_all else find_frames_with_truth(sequence)
 
     def answers(
         self,
+        sequence: StereoSequence,
         localizer: Localizer,
         tile_id: str,
         progress: Progress,
         frames: Sequence[int] | None = None,
     ) -> list[EvaluatedQuery]:
-        """Localize these frames, or all. See `localize_queries` and `localize_out_of_map`."""
-        if self.recording.is_out_of_map:
-            return localize_out_of_map(localizer, self.sequence, progress, self.label, frames)
-        return localize_queries(
-            localizer, self.sequence, self.map_from_truth, progress, self.label, frames, tile_id
-        )
+        """Localize these frames of the opened recording, or all. See `localize_queries` and
+        `localize_out_of_map`."""
+        if self.is_out_of_map:
+            return localize_out_of_map(localizer, sequence, progress, self.label, frames)
+        truth = self.map_from_truth
+        return localize_queries(localizer, sequence, truth, progress, self.label, frames, tile_id)
 
 
 @dataclass(frozen=True, eq=False)
 class RemoteMap:
-    """Hold a map or an atlas and how it is searched, for another process.
+    """A map or an atlas and how it is searched, for another process.
 
-    It is pickled as its path or address, and refused if another one lies there by then. `kinds` are
+    It is pickled as its path or address. A map that was replaced since is refused. `kinds` are
     the feature types that the command can use. The truth is in the world of the tile `tile_id`.
     """
 
@@ -117,24 +107,14 @@ class RemoteMap:
 
     @staticmethod
     def of(localizer: Localizer, tile_id: str, features: str | None) -> RemoteMap:
-        """Return what another process needs to search as this localizer."""
-        return RemoteMap(
-            localizer.source,
-            tile_id,
-            find_available_types(localizer.source.kinds),
-            localizer.config,
-            localizer.tile_config,
-            features,
-        )
+        """Return the description of this localizer for another process."""
+        source, how = localizer.source, (localizer.config, localizer.tile_config, features)
+        return RemoteMap(source, tile_id, find_available_types(source.kinds), *how)
 
     def open(self, notes: list[str]) -> Localizer:
-        """Open the same map or atlas here. `notes` receives the problems of its tiles.
-
-        Raises:
-            MapError: there is no such map, or another one.
-            MissingExtraError: another set of feature types can be used here, so results would
-                differ.
-        """
+        """Open the same map or atlas here. `notes` receives the problems of its tiles. Raises
+        MapError: there is no such map, or another one; MissingExtraError: another set of feature
+        types can be used here, so results would differ."""
         self._check_same_features(self.source.kinds)
         return Localizer(
             self.source, self.config, features=self.features, tiles=self.tiles, warn=notes.append
@@ -152,8 +132,7 @@ class RemoteMap:
 
 @dataclass(frozen=True, eq=False)
 class PieceAnswers:
-    """Hold the results of a piece without images, the problems of tiles, and the reason if the
-    piece failed."""
+    """The results of a piece without images, the problems of tiles, and the reason of a failure."""
 
     answers: list[EvaluatedQuery]
     notes: list[str]
@@ -162,34 +141,29 @@ class PieceAnswers:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Hold some frames of a recording as a `Job`. `image_names` are their names."""
+    """A `Job` of some frames of a recording. `image_names` are their names."""
 
     queried_map: RemoteMap
     recording: QueryRecording
-    label: str
-    map_from_truth: Rigid3 | None
     frames: list[int]
     image_names: list[str]
 
     @property
     def name(self) -> str:
-        return f"evaluate {self.label} {self.frames[0]}-{self.frames[-1]}"
+        return f"evaluate {self.recording.label} {self.frames[0]}-{self.frames[-1]}"
 
     def run(self, progress: Progress) -> PieceAnswers:
-        """Localize the frames. Raises the errors of `OpenQueries.answers`; RecordingError: the
+        """Localize the frames. Raises the errors of `QueryRecording.answers`; RecordingError: the
         recording differs from the one that the command opened."""
-        notes = list[str]()
-        queries = OpenQueries(
-            self.recording, self.recording.open(), self.label, self.map_from_truth
-        )
-        names = queries.sequence.names
+        notes, sequence = list[str](), self.recording.open()
+        names = sequence.names
         if self.image_names != [names[frame] for frame in self.frames if frame < len(names)]:
             raise RecordingError(
                 f"{self.recording.path} is another recording on {platform.node()} than where the"
                 " command was called"
             )
-        localizer = self.queried_map.open(notes)
-        answers = queries.answers(localizer, self.queried_map.tile_id, progress, self.frames)
+        where = self.queried_map.open(notes), self.queried_map.tile_id
+        answers = self.recording.answers(sequence, *where, progress, self.frames)
         return PieceAnswers([replace(answer, read_image=None) for answer in answers], notes)
 
     def failure_outcome(self, reason: str) -> PieceAnswers:
@@ -198,71 +172,55 @@ class Piece:
 
 def localize_on_ray(
     queried_map: RemoteMap,
-    recordings: Sequence[OpenQueries],
+    recordings: Sequence[tuple[QueryRecording, StereoSequence]],
     address: str,
     config: ClusterConfig,
     progress: Progress,
 ) -> list[EvaluatedQuery]:
-    """Localize recordings on a cluster. The results are in the order of recordings and frames.
-
-    Raises:
-        MissingExtraError, ClusterError: as of `connect_to_cluster`.
-        TrajectoryError: a recording has no truth.
-        TopolocError: a piece failed; its reason is told.
-    """
-    pieces = [
-        (queries, piece) for queries in recordings for piece in _split_queries(queried_map, queries)
-    ]
-    show = _create_progress_callback(
-        [(queries.stage, len(piece.frames)) for queries, piece in pieces], progress
-    )
-    outcomes = run_on_ray(
-        [piece for _, piece in pieces], address, config, show, is_live=sys.stderr.isatty()
-    )
+    """Localize opened recordings on a cluster. The results are in the order of recordings and
+    frames. Raises MissingExtraError, ClusterError: as of `connect_to_cluster`; TrajectoryError: a
+    recording has no truth; TopolocError: a piece failed. The text is its reason."""
+    split = [(sequence, _split(queried_map, one, sequence)) for one, sequence in recordings]
+    pieces = [(sequence, piece) for sequence, some in split for piece in some]
+    jobs = [piece for _, piece in pieces]
+    show = _create_progress_callback(jobs, progress)
+    outcomes = run_on_ray(jobs, address, config, show, is_live=sys.stderr.isatty())
     for note in dict.fromkeys(note for outcome in outcomes for note in outcome.notes):
-        print(f"warning: {note}", file=sys.stderr)
+        print_warning(note)
     answers = list[EvaluatedQuery]()
-    for (queries, piece), outcome in zip(pieces, outcomes, strict=True):
+    for (sequence, piece), outcome in zip(pieces, outcomes, strict=True):
         if outcome.reason is not None:
             raise TopolocError(outcome.reason)
         for frame, answer in zip(piece.frames, outcome.answers, strict=True):
-            answers.append(
-                replace(answer, read_image=partial(_read_image, queries.sequence, frame))
-            )
+            answers.append(replace(answer, read_image=partial(_read_image, sequence, frame)))
     return answers
 
 
-def _read_image(sequence: StereoSequence, index: int) -> Any:
+def _read_image(sequence: StereoSequence, index: int) -> Image:
     return sequence[index].image
 
 
-def _split_queries(queried_map: RemoteMap, queries: OpenQueries) -> Iterator[Piece]:
+def _split(
+    queried_map: RemoteMap, recording: QueryRecording, sequence: StereoSequence
+) -> list[Piece]:
     """Split one recording into pieces of about the same number of images."""
-    frames, names = queries.frames, queries.sequence.names
+    frames, names = recording.frames(sequence), sequence.names
     count = -(-len(frames) // MAX_IMAGES)
-    for number in range(count):
-        some = frames[number * len(frames) // count : (number + 1) * len(frames) // count]
-        yield Piece(
-            queried_map,
-            queries.recording,
-            queries.label,
-            queries.map_from_truth,
-            some,
-            [names[frame] for frame in some],
-        )
+    ends = [number * len(frames) // count for number in range(count + 1)] if count else []
+    parts = [frames[start:end] for start, end in pairwise(ends)]
+    return [Piece(queried_map, recording, some, [names[k] for k in some]) for some in parts]
 
 
 def _create_progress_callback(
-    pieces: Sequence[tuple[str, int]], progress: Progress
+    pieces: Sequence[Piece], progress: Progress
 ) -> OnJobState[PieceAnswers]:
-    """Return a callback that reports the localized images of each recording. `pieces` holds the
-    stage and the number of images of each piece."""
+    """Return a callback that reports the localized images of each recording."""
     done = [0] * len(pieces)
 
     def show(number: int, state: PieceAnswers | JobProgress) -> None:
-        stage, count = pieces[number]
-        done[number] = state.done if isinstance(state, JobProgress) else count
-        same = [k for k, (other, _) in enumerate(pieces) if other == stage]
-        progress(stage, sum(done[k] for k in same), sum(pieces[k][1] for k in same))
+        stage, counts = pieces[number].recording.stage, [len(piece.frames) for piece in pieces]
+        done[number] = state.done if isinstance(state, JobProgress) else counts[number]
+        same = [k for k, other in enumerate(pieces) if other.recording.stage == stage]
+        progress(stage, sum(done[k] for k in same), sum(counts[k] for k in same))
 
     return show

@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from topoloc import (
-    LocalizerConfig,
-    MissingExtraError,
-    WeakRegions,
-    find_weak_regions,
-)
+from topoloc import LocalizerConfig, MissingExtraError, WeakRegions, find_weak_regions
 from topoloc.apps.cli.features_option import open_localizer
 from topoloc.apps.cli.output import (
     UsageError,
@@ -30,13 +25,9 @@ def evaluate_map_itself(
     config: str | None,
 ) -> int:
     """Print the weak parts of a map and the place of the next recording, and write the files that
-    `outputs` names: json, report.
-
-    Raises:
-        UsageError: an atlas has several tiles, or an output would replace an input.
-        TopolocError: the map cannot be read, or a file cannot be written.
-    """
-    check_outputs(list(outputs.values()), [one for one in (path, config) if one])
+    `outputs` names: json, report. Raises UsageError: an atlas has several tiles, or an output would
+    replace an input; TopolocError: the map cannot be read, or a file cannot be written."""
+    check_outputs(list(outputs.values()), [path, config])
     localizer_config = read_settings(config).of(LocalizerConfig)
     localizer_config = with_option(localizer_config, "coarse", coarse, "--coarse")
     json, report = outputs["json"], outputs["report"]
@@ -60,15 +51,10 @@ def evaluate_map_itself(
 
 
 def _import_page_writer() -> Callable[..., None]:
-    try:
+    with MissingExtraError.on_import("a report needs matplotlib", "report"):
         from topoloc.apps.report.weak_regions_page import write_weak_regions
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] != "matplotlib":
-            raise
-        raise MissingExtraError(
-            "a report needs matplotlib: pip install 'topoloc[report]'"
-        ) from error
-    return write_weak_regions
+
+        return write_weak_regions
 
 
 def _print(weak: WeakRegions) -> None:
@@ -76,12 +62,8 @@ def _print(weak: WeakRegions) -> None:
     held = f"{num_asked - weak.count('not_held')} of {num_asked} nodes, each asked without itself"
     facts = [("held by the rest", held)]
     if weak.weakest and (least := weak.weakest[0]).answer is not None:
-        facts.append(
-            (
-                "the weakest",
-                f"node {least.node_id} ({least.name}), {least.answer.num_inliers} inliers",
-            )
-        )
+        named = f"node {least.node_id} ({least.name})"
+        facts.append(("the weakest", f"{named}, {least.answer.num_inliers} inliers"))
     facts.append(("few landmarks", f"{weak.count('few_landmarks')} of {of}"))
     facts.append(("nobody looks back", f"{weak.count('one_direction')} of {of}"))
     sessions = f"{len(weak.session_names)} session{'s' if len(weak.session_names) > 1 else ''}"

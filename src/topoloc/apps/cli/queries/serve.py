@@ -2,26 +2,92 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from topoloc import AtlasConfig, LocalizerConfig, MissingExtraError, TrackerConfig
-from topoloc.apps.cli.features_option import QUERY_FEATURES
-from topoloc.apps.cli.output import File, Flag, UsageError, catch_stop_signals
-from topoloc.apps.cli.queries.served_maps import ServedMaps, read_token
+from topoloc import (
+    AtlasConfig,
+    Localizer,
+    LocalizerConfig,
+    MapCache,
+    MissingExtraError,
+    TopolocError,
+    TrackerConfig,
+    set_num_threads,
+    warm_up,
+)
+from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer
+from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, catch_stop_signals
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ReplicasConfig
 from topoloc.apps.service.config import ServiceConfig
 
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
+MIN_TOKEN_LENGTH = 16
+
+
+@dataclass(frozen=True)
+class ServedMaps:
+    """The maps of a service and the settings of their queries. Another process can serve the same.
+    The token is read from its file, so that it is stored nowhere else."""
+
+    paths: tuple[str, ...]
+    features: str | None
+    token_file: str | None
+    loopback_only: bool
+    service: ServiceConfig
+    localizer: LocalizerConfig
+    tracker: TrackerConfig
+    atlas: AtlasConfig
+
+    def application(self):  # no return type: the service is an extra, and loaded here alone
+        """Return the application. It opens maps at their first request. Raises TopolocError."""
+        from topoloc.apps.service.application import create_application
+
+        access = read_token(self.token_file), self.loopback_only
+        configs = self.tracker, self.atlas
+        return create_application(self._open_maps(), self.service, *access, *configs)
+
+    def _open_maps(self) -> MapCache[Localizer]:
+        """Return a cache of the maps, after the kernels are compiled."""
+        warm_up(
+            only_if_cold=lambda: print("compiling, once, a minute ...", file=sys.stderr, flush=True)
+        )
+        if self.service.num_workers > 1:
+            set_num_threads(1)
+        return MapCache.with_memory(
+            self.paths,
+            lambda topomap: open_localizer(topomap, self.localizer, self.features),
+            self.service.memory_mb,
+            self.service.fetch_s,
+        )
+
+
+def read_token(path: str | None) -> str | None:
+    """Read the token from a file. Raises TopolocError: it has no usable token."""
+    if path is None:
+        return None
+    try:
+        token = Path(path).read_text(encoding="utf-8").strip()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no text"
+        raise TopolocError(f"cannot read the token in {path}: {reason}") from None
+    is_long, is_one_word = len(token) >= MIN_TOKEN_LENGTH, " " not in token
+    if not (is_long and is_one_word and token.isascii() and token.isprintable()):
+        raise TopolocError(
+            f"{path}: a token has at least {MIN_TOKEN_LENGTH} letters, digits or signs, and no"
+            " spaces"
+        )
+    return token
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `topoloc serve` takes."""
+    """Arguments of `topoloc serve`."""
 
     maps: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
@@ -30,12 +96,12 @@ class Command:
     """Map files, folders, and atlases (s3://bucket/campus, too). A map goes by the name of its file
     without .topo, a tile by its id."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Where to listen. Elsewhere than on this machine only with a token, and with TLS or a proxy
-    that speaks it."""
+    """Address to listen on. If other machines reach it, a token is needed, and TLS or a proxy with
+    TLS."""
     port: Annotated[int, tyro.conf.arg(metavar="N")] = 8571
-    """Port; 0 takes a free one, which is printed."""
+    """Port. 0 takes a free one, which is printed."""
     token_file: File = None
-    """A file whose text every client must show as its bearer token."""
+    """File with the bearer token that every client must send."""
     tls_cert: File = None
     """Certificate chain (PEM)."""
     tls_key: File = None
@@ -43,32 +109,27 @@ class Command:
     behind_proxy: Flag = False
     """A proxy in front of the service speaks TLS with the clients."""
     features: QUERY_FEATURES = None
-    """Which of the maps' features are asked; of several, the next where the one before leaves the
-    pose unclear."""
     memory_mb: Annotated[
         int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 512)")
     ] = None
-    """Megabytes of maps that are kept in memory; the maps used longest ago are closed first."""
+    """Megabytes of maps in memory. The least recently used map is closed first."""
     workers: Annotated[
         int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a processor)")
     ] = None
-    """Pictures that are localized at a time."""
+    """Images that are localized in parallel."""
     max_queue: Annotated[
         int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 32)")
     ] = None
-    """Requests that may wait for a worker; one more is told to come again later."""
-    ray: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)"),
-    ] = None
-    """A Ray cluster whose machines answer, by Ray Serve: `auto` is the one that runs on this
-    machine, `local` one of this machine alone."""
+    """Requests that may wait for a worker. Further ones are refused for the moment."""
+    ray: RayOption = None
+    """Ray cluster whose machines answer, by Ray Serve: `auto` is the one on this machine, `local` a
+    temporary one."""
     replicas: Annotated[
         str | None, tyro.conf.arg(metavar="N|LEAST-MOST", help_behavior_hint="(default: 1)")
     ] = None
-    """With --ray, processes that answer; of LEAST-MOST as many as are needed."""
+    """With --ray, the number of processes. LEAST-MOST adapts it to the load."""
     config: File = None
-    """All other settings: a TOML file, as `topoloc config serve` prints it."""
+    """TOML file with all other settings, as printed by `topoloc config serve`."""
 
     def run(self) -> int:
         if not self.maps:
@@ -81,50 +142,34 @@ class Command:
         for name in ("memory_mb", "workers", "max_queue"):
             config = with_option(config, name, getattr(self, name), f"--{name.replace('_', '-')}")
         read_token(self.token_file)
-        try:
-            from topoloc.apps.service.server import Address, serve
-        except ModuleNotFoundError as error:
-            raise MissingExtraError(
-                f"a service needs {error.name}: pip install 'topoloc[serve]'"
-            ) from error
+        with MissingExtraError.on_import("a service needs {}", "serve"):
+            from topoloc.apps.service.application import Address, serve
         if self.ray is not None:
-            return self._run_on_ray(settings, config)
+            return self._run_on_ray(self.ray, settings, config)
         cert, key = (None if path is None else Path(path) for path in (self.tls_cert, self.tls_key))
         app = self._serve(settings, config).application()
         serve(app, Address(self.host, self.port, cert, key, self.behind_proxy), config)
         return 0
 
-    def _run_on_ray(self, settings: Settings, config: ServiceConfig) -> int:
+    def _run_on_ray(self, ray: str, settings: Settings, config: ServiceConfig) -> int:
         from topoloc.apps.service.ray_serve import ProxyOptions, serve_on_ray
 
-        assert self.ray is not None
         if self.port == 0:
             raise UsageError("--ray listens on the same port of all machines: --port 0 names none")
         replicas = self._parse_replicas(settings.of(ReplicasConfig))
         config = replace(config, workers=config.workers or replicas.cpus_per_replica)
-        served = self._serve(settings, config)
-        front = ProxyOptions(
-            self.host,
-            self.port,
-            config.num_workers,
-            config.max_queue,
-            _absolute_path(self.tls_cert),
-            _absolute_path(self.tls_key),
-        )
-        serve_on_ray(served, self.ray, front, replicas, _wait_for_signal)
+        jobs = (config.num_workers, config.max_queue)
+        tls = map(_absolute_path, (self.tls_cert, self.tls_key))
+        proxy = ProxyOptions(self.host, self.port, *jobs, *tls)
+        serve_on_ray(self._serve(settings, config), ray, proxy, replicas, _wait_for_signal)
         return 0
 
     def _serve(self, settings: Settings, config: ServiceConfig) -> ServedMaps:
-        return ServedMaps(
-            tuple(path if self.ray is None else str(_absolute_path(path)) for path in self.maps),
-            self.features,
-            _absolute_path(self.token_file),
-            self.host in _LOOPBACK and not self.behind_proxy,
-            config,
-            settings.of(LocalizerConfig),
-            settings.of(TrackerConfig),
-            settings.of(AtlasConfig),
-        )
+        paths = tuple(one if self.ray is None else str(_absolute_path(one)) for one in self.maps)
+        is_private = self.host in _LOOPBACK and not self.behind_proxy
+        access = (_absolute_path(self.token_file), is_private)
+        configs = settings.of(LocalizerConfig), settings.of(TrackerConfig), settings.of(AtlasConfig)
+        return ServedMaps(paths, self.features, *access, config, *configs)
 
     def _parse_replicas(self, config: ReplicasConfig) -> ReplicasConfig:
         if self.replicas is None:
@@ -139,7 +184,7 @@ class Command:
         return config
 
     def _check_access(self) -> None:
-        """Nobody else's machine is answered without a token, and never in the clear."""
+        """Refuse other machines without a token, or without TLS."""
         if (self.tls_cert is None) != (self.tls_key is None):
             raise UsageError("--tls-cert and --tls-key go together")
         is_private = self.host in _LOOPBACK and not self.behind_proxy
@@ -160,5 +205,5 @@ def _wait_for_signal() -> None:
 
 
 def _absolute_path(path: str | None) -> str | None:
-    """The path as other processes find it, too."""
+    """Return the path for processes with another working folder."""
     return path if path is None or "://" in path else str(Path(path).absolute())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,14 @@ from topoloc import (
 from topoloc.apps.formats.bags.bag import (
     MCAP_SUFFIXES,
     Bag,
+    MessageRef,
+    Topic,
     is_bag,
     missing_bags_error,
     open_bag_files,
 )
-from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image
-from topoloc.apps.formats.bags.bag_poses import camera_poses, read_transform_tree
-from topoloc.apps.formats.bags.camera_info import CameraInfo, camera_info
-from topoloc.apps.formats.bags.message_file import MessageRef, Topic
+from topoloc.apps.formats.bags.bag_images import CameraInfo, camera_info, decode_depth, decode_image
+from topoloc.apps.formats.bags.bag_poses import TransformTree, camera_poses, read_transform_tree
 from topoloc.apps.formats.bags.messages import decode, frame_id, header_stamp_ns, num_header_bytes
 from topoloc.apps.formats.bags.topics import (
     Roles,
@@ -39,22 +40,9 @@ from topoloc.apps.formats.bags.topics import (
     parse_topics,
     select_topics,
 )
-from topoloc.apps.formats.bags.transform_tree import TransformTree
 from topoloc.plugin import RecordingFormat, find_nearest_idx, read_camera_json
 
-EXPECTED_FILES = "a ROS bag: .bag, .db3, or a folder with metadata.yaml"
-MCAP_EXPECTED_FILES = "an .mcap file"
 MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
-
-
-def can_open(path: Path) -> bool:
-    """Return whether this is a ROS bag, by its name."""
-    return is_bag(path)
-
-
-def can_open_mcap(path: Path) -> bool:
-    """Return whether this is an MCAP file, by its name."""
-    return is_bag(path, MCAP_SUFFIXES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +55,7 @@ class ImageMessages:
 
 @dataclass(frozen=True, eq=False)
 class BagRecording:
-    """Hold a StereoSequence of a bag. `names` are the times of the frames in seconds, `notes` are
-    for the user."""
+    """A StereoSequence of a bag. `names` are the times of the frames in seconds."""
 
     name: str
     bag: Bag
@@ -78,16 +65,16 @@ class BagRecording:
     left: ImageMessages
     right: tuple[ImageMessages, StereoRig] | None = None
     depth: tuple[ImageMessages, Camera, Rigid3] | None = None
-    names: list[str] = field(default_factory=list)
+
+    names: list[str] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.names.extend(
-            f"{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}"
-            for t_ns in self.t_ns[len(self.names) :]
-        )
+        names = [f"{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}" for t_ns in self.t_ns]
+        object.__setattr__(self, "names", names)  # the dataclass is frozen
 
     @property
     def notes(self) -> list[str]:
+        """Notes for the user."""
         return self.bag.notes
 
     def __len__(self) -> int:
@@ -98,12 +85,8 @@ class BagRecording:
         return replace(self, right=None, depth=None)
 
     def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame.
-
-        Raises:
-            IndexError: no such frame.
-            UnreadableImageError: a picture is damaged, or of another size than its camera.
-        """
+        """Read one frame. Raises IndexError: no such frame; UnreadableImageError: a picture is
+        damaged, or of another size than its camera."""
         frame = self.read_left_frame(index)
         if self.right is not None:
             right, rig = self.right
@@ -118,18 +101,10 @@ class BagRecording:
 
     def read_left_frame(self, index: int) -> StereoFrame:
         """Read one frame without its right or depth image. Raises the errors of `__getitem__`."""
-        image, rig = (
-            self._read_image(self.left, index, self.camera),
-            None if self.right is None else self.right[1],
-        )
-        return StereoFrame(
-            self.names[index],
-            self.t_ns[index],
-            image,
-            self.camera,
-            rig=rig,
-            world_from_cam=self.poses[index],
-        )
+        image = self._read_image(self.left, index, self.camera)
+        rig = None if self.right is None else self.right[1]
+        name, t_ns, pose = self.names[index], self.t_ns[index], self.poses[index]
+        return StereoFrame(name, t_ns, image, self.camera, rig=rig, world_from_cam=pose)
 
     def _read_image(self, images: ImageMessages, index: int, camera: Camera | None) -> Image:
         message, name = self._read_message(images, index)
@@ -147,19 +122,16 @@ class BagRecording:
 
 
 def open_bag(path: Path, topics: str | Mapping[str, str] | None = None) -> BagRecording:
-    """Open a bag. Topics that are not given are guessed. No image is read.
+    """Open a bag. Topics that are not given are guessed. No image is read. Raises RecordingError:
+    no bag, a topic that is not in it, no pictures, or none with its right picture or depth;
+    CalibrationError: the calibration of a pair or of depth is missing or not usable;
+    TrajectoryError: the requested poses fit no frame; MissingExtraError: the extra `bags`
+    is not installed.
 
     Args:
         topics: the topic of a role (``left``, ``right``, ``depth``, ``left_info``, ``right_info``,
             ``depth_info``, ``pose``), and ``pose_frame``, the frame that the poses are of; as a
             dictionary or ``left=/cam0/image_raw,pose=/odom``. ``pose`` may be ``tf`` or ``none``.
-
-    Raises:
-        RecordingError: no bag, a topic that is not in it, no pictures, or none with its right
-            picture or depth.
-        CalibrationError: the calibration of a pair or of depth is missing or not usable.
-        TrajectoryError: the poses that were asked for fit no frame.
-        MissingExtraError: the extra `bags` is not installed.
     """
     bag = open_bag_files(path)
     try:
@@ -199,22 +171,13 @@ def _open_recording(bag: Bag, roles: Roles) -> BagRecording:
 def _index_by_time(bag: Bag, name: str) -> tuple[list[int], ImageMessages]:
     """Return the messages of a topic sorted by their own times. Damaged ones are skipped with a
     note."""
-    topic, num_damaged = bag.topics[name], 0
-    stamped: list[tuple[int | None, MessageRef]] = []
-    for ref in sorted(
-        bag.messages(name), key=lambda ref: (ref.file, ref.chunk, ref.offset)
-    ):  # as they lie: a chunk is unpacked once
-        try:
-            stamped.append((header_stamp_ns(topic, bag.read(ref, num_header_bytes(topic))), ref))
-        except RecordingError:
-            num_damaged += 1
-    if num_damaged:
-        bag.notes.append(f"{bag.path}: {num_damaged} messages of {name} are damaged and left out")
-    is_stamped = (
-        sum(not stamp for stamp, _ in stamped) <= 1
-    )  # a driver that sets no times writes 0 into each
+    topic = bag.topics[name]
+    stamped, num_damaged = bag.parse_messages(name, header_stamp_ns, num_header_bytes(topic))
+    bag.note_damaged(num_damaged, name)
+    # a driver that sets no times writes 0 into each
+    is_stamped = sum(not stamp for _, stamp in stamped) <= 1
     by_time = {
-        stamp if is_stamped and stamp is not None else ref.log_t_ns: ref for stamp, ref in stamped
+        stamp if is_stamped and stamp is not None else ref.log_t_ns: ref for ref, stamp in stamped
     }
     if not by_time:
         raise RecordingError(f"{bag.path}: no whole message of {name}")
@@ -230,28 +193,20 @@ def _match_by_time(
     t_ns, left = first
     others, images = _index_by_time(bag, name)
     nearest = find_nearest_idx(np.array(t_ns), np.array(others))
-    kept = [
-        row
-        for row, other in enumerate(nearest)
-        if abs(t_ns[row] - others[other]) <= delay_ms * 1_000_000
-    ]
+    delays = [abs(time - others[other]) for time, other in zip(t_ns, nearest, strict=True)]
+    kept = [row for row, delay in enumerate(delays) if delay <= delay_ms * 1_000_000]
     lacking = (
         f"of {len(t_ns)} pictures of {left.topic.name} have none of {name} ({len(others)}) within"
         f" {delay_ms} ms"
     )
     if not kept:
-        off = (
-            min(abs(time - others[other]) for time, other in zip(t_ns, nearest, strict=True)) / 1e6
-        )
+        off = min(delays) / 1e6
         raise RecordingError(f"{bag.path}: {len(t_ns)} {lacking}; the nearest is {off:.1f} ms away")
     if len(kept) < len(t_ns):
         bag.notes.append(f"{bag.path}: {len(t_ns) - len(kept)} {lacking} and are left out")
-    times, refs = [t_ns[row] for row in kept], [left.refs[row] for row in kept]
-    return (
-        times,
-        ImageMessages(left.topic, refs),
-        ImageMessages(images.topic, [images.refs[nearest[row]] for row in kept]),
-    )
+    refs, partners = [left.refs[row] for row in kept], [images.refs[nearest[row]] for row in kept]
+    matched = ImageMessages(left.topic, refs), ImageMessages(images.topic, partners)
+    return [t_ns[row] for row in kept], *matched
 
 
 def _read_camera_info(bag: Bag, name: str | None) -> CameraInfo | None:
@@ -259,13 +214,12 @@ def _read_camera_info(bag: Bag, name: str | None) -> CameraInfo | None:
     if name is None:
         return None
     for ref in bag.messages(name)[:10]:
-        try:
-            return camera_info(decode(bag.topics[name], bag.read(ref)), name)
-        except CalibrationError:
-            raise
-        except RecordingError:
-            continue
-    raise CalibrationError(f"{bag.path}: no whole message of {name}")
+        with suppress(RecordingError):
+            message = decode(bag.topics[name], bag.read(ref))
+            break
+    else:
+        raise CalibrationError(f"{bag.path}: no whole message of {name}")
+    return camera_info(message, name)
 
 
 def _read_frame_id(bag: Bag, images: ImageMessages) -> str:
@@ -283,28 +237,21 @@ def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: TransformTree) -
         rig = left.rig(right, is_rectified(roles.left))
         if rig is not None:
             return rig
-        right_from_left = (
-            tree.find_static_transform(right.frame, left.frame)
-            if left.frame != right.frame
-            else None
-        )
+        right_from_left = None
+        if left.frame != right.frame:
+            right_from_left = tree.find_static_transform(right.frame, left.frame)
+        if right_from_left is not None and is_rectified(roles.left):
+            baseline = float(np.linalg.norm(right_from_left.translation))
+            return StereoRig.rectified(left.camera(True), baseline)
         if right_from_left is not None:
-            if is_rectified(roles.left):
-                return StereoRig.rectified(
-                    left.camera(True), float(np.linalg.norm(right_from_left.translation))
-                )
             return StereoRig(left.camera(False), right.camera(False), right_from_left)
     camera, baseline = _read_folder_camera(bag)
     if camera is not None and baseline is not None:
         return StereoRig.rectified(camera, baseline)
-    lacking = " and ".join(
-        side for side, info in (("left", left), ("right", right)) if info is None
-    )
-    what = (
-        f"no calibration of the {lacking} camera"
-        if lacking
-        else f"neither P of {roles.right_info} nor TF says where the right camera is"
-    )
+    infos = {"left": left, "right": right}
+    lacking = " and ".join(side for side, info in infos.items() if info is None)
+    what = f"neither P of {roles.right_info} nor TF says where the right camera is"
+    what = f"no calibration of the {lacking} camera" if lacking else what
     raise CalibrationError(
         f"{bag.path}: {what}; --topics left_info=TOPIC,right_info=TOPIC, or a camera.json with a"
         " baseline beside the bag"
@@ -346,5 +293,8 @@ def _check_size(name: str, shape: tuple[int, ...], camera: Camera) -> None:
         )
 
 
-ROSBAG_FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_bag, ("topics",))
-MCAP_FORMAT = RecordingFormat(MCAP_EXPECTED_FILES, can_open_mcap, open_bag, ("topics",))
+EXPECTED_FILES = "a ROS bag: .bag, .db3, or a folder with metadata.yaml"
+ROSBAG_FORMAT = RecordingFormat(EXPECTED_FILES, is_bag, open_bag, ("topics",))
+MCAP_FORMAT = RecordingFormat(
+    "an .mcap file", lambda path: is_bag(path, MCAP_SUFFIXES), open_bag, ("topics",)
+)

@@ -13,9 +13,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from topoloc.apps.formats.bags.chunked_file import ChunkedFile, Record
-from topoloc.apps.formats.bags.chunks import WHOLE_FILE, Chunk
-from topoloc.apps.formats.bags.message_file import MessageRef, Topic, TruncatedFileError
+from topoloc.apps.formats.bags.bag import MessageRef, Topic, TruncatedFileError
+from topoloc.apps.formats.bags.chunked_file import WHOLE_FILE, Chunk, ChunkedFile, Record
 
 _RECORD, _MESSAGE, _CHUNK = struct.Struct("<BQ"), struct.Struct("<HIQQ"), struct.Struct("<QQQI")
 _INDEX_ENTRY = np.dtype([("t_ns", "<u8"), ("offset", "<u8")])
@@ -47,10 +46,8 @@ class McapFile(ChunkedFile):
         raise TruncatedFileError
 
     def _find_message(self, ref: MessageRef) -> Record:
-        record = next(self._iterate_records(ref.chunk, ref.offset))
-        return record._replace(
-            start=record.start + _MESSAGE.size, length=record.length - _MESSAGE.size
-        )
+        record, size = next(self._iterate_records(ref.chunk, ref.offset)), _MESSAGE.size
+        return record._replace(start=record.start + size, length=record.length - size)
 
     def _parse_chunk(self, record: Record) -> Chunk:
         header = self._bytes.read(WHOLE_FILE, record.start, min(record.length, 64))
@@ -78,10 +75,8 @@ class McapFile(ChunkedFile):
         return number, min(t_ns, _MAX_TIME_NS)
 
     def _add_definition(self, chunk: int, record: Record) -> None:
-        if (
-            record.op not in (Opcode.SCHEMA, Opcode.CHANNEL)
-            or record.length > _MAX_DEFINITION_BYTES
-        ):
+        is_definition = record.op in (Opcode.SCHEMA, Opcode.CHANNEL)
+        if not is_definition or record.length > _MAX_DEFINITION_BYTES:
             return
         data = self._bytes.read(chunk, record.start, record.length)
         stream = ReadDataStream(io.BytesIO(data))
@@ -91,9 +86,8 @@ class McapFile(ChunkedFile):
             return
         channel = Channel.read(stream)
         schema = self._schemas.get(channel.schema_id, Schema(0, b"", "", ""))
-        self._channels[channel.id] = Topic(
-            channel.topic, _ros_type(schema.name), channel.message_encoding, schema.data
-        )
+        kind, encoding = _ros_type(schema.name), channel.message_encoding
+        self._channels[channel.id] = Topic(channel.topic, kind, encoding, schema.data)
 
 
 def _ros_type(name: str) -> str:

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from topoloc import RecordingError
-from topoloc.apps.formats.bags.message_file import Topic
+from topoloc.apps.formats.bags.bag import Topic
 
 RAW_IMAGE_TYPES = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
 COMPRESSED_IMAGE_TYPES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
@@ -39,12 +39,11 @@ POSE_TYPES = frozenset(
         "foxglove.PoseInFrame",
     }
 )
+_STAMP_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
 _NANOSECONDS = 1_000_000_000
 _HEADER_BYTES = 32
-_MAX_TRANSLATION, _ROTATION_TOLERANCE = (
-    1e9,
-    1e-2,
-)  # metres that nobody goes; how far a quaternion's length may be from 1
+# metres; and the largest difference of a quaternion's length from 1
+_MAX_TRANSLATION, _ROTATION_TOLERANCE = 1e9, 1e-2
 
 
 @dataclass(frozen=True)
@@ -60,34 +59,22 @@ class StampedTransform:
 
 
 def decode(topic: Topic, data: bytes) -> Any:
-    """Return a message with its fields as attributes.
-
-    Raises:
-        RecordingError: an encoding that is not known, or bytes that are no message of the topic's
-            type.
-    """
+    """Return a message with its fields as attributes. Raises RecordingError: an encoding that is
+    not known, or bytes that are no message of the topic's type."""
     try:
         if topic.encoding in ("cdr", "ros1"):
-            # A message's type says what it is, so what a file says of the type is not needed, nor
-            # believed.
-            store, kind = (
-                _typestore(topic.encoding),
-                topic.type.replace("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage"),
-            )
-            return (
-                store.deserialize_cdr(data, kind)
-                if topic.encoding == "cdr"
-                else store.deserialize_ros1(data, kind)
-            )
+            # The known definition of the type is used, not the one in the file.
+            store = _typestore(topic.encoding)
+            kind = topic.type.replace("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
+            is_cdr = topic.encoding == "cdr"
+            return (store.deserialize_cdr if is_cdr else store.deserialize_ros1)(data, kind)
         if topic.encoding == "json":
             return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
         if topic.encoding == "protobuf":
             return _protobuf_class(topic.type, topic.schema).FromString(data)
     except (RecordingError, ModuleNotFoundError):
         raise
-    except (
-        Exception
-    ) as error:  # whatever the decoders raise of damaged bytes, of which there is no list
+    except Exception as error:  # decoders raise many classes for damaged bytes
         raise RecordingError(
             f"{topic.name}: no whole message of type {topic.type} ({type(error).__name__})"
         ) from None
@@ -110,7 +97,9 @@ def header_stamp_ns(topic: Topic, header: bytes) -> int | None:
         elif topic.encoding == "ros1":
             seconds, nanoseconds = struct.unpack_from("<II", header, 4)
         elif topic.encoding == "protobuf" and header[:1] == b"\x0a":  # field 1, a Timestamp
-            stamp = _timestamp_class().FromString(header[2 : 2 + header[1]])
+            from google.protobuf.timestamp_pb2 import Timestamp
+
+            stamp = Timestamp.FromString(header[2 : 2 + header[1]])
             seconds, nanoseconds = stamp.seconds, stamp.nanos
         elif topic.encoding == "json":
             return stamp_ns(decode(topic, header).timestamp)
@@ -126,12 +115,7 @@ def header_stamp_ns(topic: Topic, header: bytes) -> int | None:
 
 def stamp_ns(stamp: Any) -> int:
     """Return the nanoseconds of a time. ROS, JSON and protobuf name its fields differently."""
-    for seconds, nanoseconds in (
-        ("sec", "nanosec"),
-        ("sec", "nsec"),
-        ("secs", "nsecs"),
-        ("seconds", "nanos"),
-    ):
+    for seconds, nanoseconds in _STAMP_FIELDS:
         if hasattr(stamp, seconds) and hasattr(stamp, nanoseconds):
             return int(getattr(stamp, seconds)) * _NANOSECONDS + int(getattr(stamp, nanoseconds))
     raise RecordingError("a message without a time")
@@ -153,27 +137,19 @@ def image_bytes(message: Any) -> bytes:
 
 
 def decode_transforms(topic: Topic, data: bytes) -> list[StampedTransform]:
-    """Return the transforms of a TF message, or the one of a pose message.
-
-    Raises:
-        RecordingError: no whole message of this type, or numbers that are no pose.
-    """
+    """Return the transforms of a TF message, or the one of a pose message. Raises RecordingError:
+    no whole message of this type, or numbers that are no pose."""
     message = decode(topic, data)
     try:
-        return [
-            _stamped_transform(part)
-            for part in getattr(message, "transforms", None)
-            or ([] if hasattr(message, "transforms") else [message])
-        ]
+        return [_stamped_transform(part) for part in getattr(message, "transforms", [message])]
     except (AttributeError, TypeError, ValueError, OverflowError):
         raise RecordingError(f"{topic.name}: not poses, or not as {topic.type} has them") from None
 
 
 def _stamped_transform(part: Any) -> StampedTransform:
     stamp = stamp_ns(part.header.stamp if hasattr(part, "header") else part.timestamp)
-    parent = (
-        _frame_name(part.parent_frame_id) if hasattr(part, "parent_frame_id") else frame_id(part)
-    )
+    has_parent = hasattr(part, "parent_frame_id")
+    parent = _frame_name(part.parent_frame_id) if has_parent else frame_id(part)
     child = _frame_name(getattr(part, "child_frame_id", ""))
     inner = getattr(part, "transform", None) or getattr(part, "pose", part)
     inner = getattr(inner, "pose", inner)  # with covariance
@@ -181,10 +157,8 @@ def _stamped_transform(part: Any) -> StampedTransform:
     rotation = inner.orientation if hasattr(inner, "orientation") else inner.rotation
     translation = (float(position.x), float(position.y), float(position.z))
     quat_xyzw = (float(rotation.x), float(rotation.y), float(rotation.z), float(rotation.w))
-    if (
-        not all(abs(value) < _MAX_TRANSLATION for value in translation)
-        or not abs(math.hypot(*quat_xyzw) - 1.0) <= _ROTATION_TOLERANCE
-    ):
+    is_near = all(abs(value) < _MAX_TRANSLATION for value in translation)
+    if not (is_near and abs(math.hypot(*quat_xyzw) - 1.0) <= _ROTATION_TOLERANCE):
         raise ValueError
     return StampedTransform(stamp, parent, child, translation, quat_xyzw)
 
@@ -195,11 +169,8 @@ def _typestore(encoding: str) -> Any:
 
     store = get_typestore(Stores.ROS2_HUMBLE if encoding == "cdr" else Stores.ROS1_NOETIC)
     if encoding == "ros1":
-        store.register(
-            get_types_from_msg(
-                "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
-            )
-        )
+        definition = "geometry_msgs/TransformStamped[] transforms"
+        store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
     return store
 
 
@@ -209,11 +180,5 @@ def _protobuf_class(name: str, schema: bytes) -> Any:
 
     pool = descriptor_pool.DescriptorPool()
     for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
-        pool.Add(file)  # pyright: ignore[reportAttributeAccessIssue]
+        pool.AddSerializedFile(file.SerializeToString())
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
-
-
-def _timestamp_class() -> Any:
-    from google.protobuf.timestamp_pb2 import Timestamp
-
-    return Timestamp

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topoloc.apps.formats.bags.chunked_file import ChunkedFile, Record
-from topoloc.apps.formats.bags.chunks import Chunk
-from topoloc.apps.formats.bags.message_file import MessageRef, Topic, TruncatedFileError
+from topoloc.apps.formats.bags.bag import MessageRef, Topic, TruncatedFileError
+from topoloc.apps.formats.bags.chunked_file import Chunk, ChunkedFile, Record
 
 _BAG, _CONNECTION = 3, 7
 _MAX_HEADER_BYTES = 1 << 20

@@ -11,13 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from topoloc import RecordingError
-from topoloc.apps.formats.bags.message_file import MessageRef, Topic, damaged_message_error
+from topoloc.apps.formats.bags.bag import MessageRef, Topic, damaged_message_error
 
 _ROW = -2  # in place of a chunk's number
-_DAMAGE_ERRORS = (
-    sqlite3.Error,
-    UnicodeDecodeError,
-)  # the second of an error's text, which quotes what is damaged
+# UnicodeDecodeError: the text of an error quotes damaged data
+_DAMAGE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
 
 
 @dataclass(eq=False)
@@ -37,21 +35,19 @@ class SqliteFile:
             self._database.text_factory = lambda data: data.decode(errors="replace")
             self._database.execute("PRAGMA trusted_schema = OFF")
             if self._is_cut():
-                # SQLite refuses a file that is shorter than its header says, but for this switch;
-                # nothing is written.
+                # Without this switch SQLite refuses a file that is shorter than in its header.
+                # Nothing is written.
                 self._database.execute("PRAGMA writable_schema = ON")
-            rows = self._database.execute(
-                "SELECT id, name, type, serialization_format FROM topics"
-            ).fetchall()
+            select = "SELECT id, name, type, serialization_format FROM topics"
+            rows = self._database.execute(select).fetchall()
         except _DAMAGE_ERRORS as error:
             why = " ".join(str(error).split())[:120]
             raise RecordingError(
                 f"{self.path}: not a ROS 2 bag, or damaged at its beginning ({why})"
             ) from None
         for number, name, kind, encoding in rows:
-            if isinstance(number, int) and all(
-                isinstance(text, str) for text in (name, kind, encoding)
-            ):
+            texts = (name, kind, encoding)
+            if isinstance(number, int) and all(isinstance(text, str) for text in texts):
                 self.topics.setdefault(name, Topic(name, kind, encoding))
                 self._numbers.setdefault(name, []).append(number)
 
@@ -60,9 +56,8 @@ class SqliteFile:
         refs: list[MessageRef] = []
         for number in self._numbers[topic]:
             try:
-                for row, t_ns in self._database.execute(
-                    "SELECT id, timestamp FROM messages WHERE topic_id = ?", (number,)
-                ):
+                select = "SELECT id, timestamp FROM messages WHERE topic_id = ?"
+                for row, t_ns in self._database.execute(select, (number,)):
                     if isinstance(row, int) and isinstance(t_ns, int):
                         refs.append(MessageRef(t_ns, _ROW, row))
             except _DAMAGE_ERRORS as error:
@@ -92,9 +87,8 @@ class SqliteFile:
         with self.path.open("rb") as file:
             header = file.read(32)
         page_size, size = int.from_bytes(header[16:18], "big"), self.path.stat().st_size
-        is_cut = (
-            int.from_bytes(header[28:32], "big") * (65536 if page_size == 1 else page_size) > size
-        )
+        page_size = 65536 if page_size == 1 else page_size
+        is_cut = int.from_bytes(header[28:32], "big") * page_size > size
         if is_cut:
             self.fault = f"cut off after {size / 1e6:.3f} MB"
         return is_cut

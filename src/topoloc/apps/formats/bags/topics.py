@@ -19,15 +19,10 @@ from topoloc.apps.formats.bags.messages import (
 from topoloc.plugin import suggest_name
 
 ROLES = ("left", "right", "depth", "left_info", "right_info", "depth_info", "pose", "pose_frame")
-_ROLE_ALIASES = {
-    "image": "left",
-    "mono": "left",
-    "color": "left",
-    "camera_info": "left_info",
-    "info": "left_info",
-}
+_ROLE_ALIASES: dict[str, str] = dict.fromkeys(("image", "mono", "color"), "left")
+_ROLE_ALIASES |= dict.fromkeys(("camera_info", "info"), "left_info")
 _NONE, TF = "none", "tf"
-# What tells the topic of a left picture from that of the right one.
+# Parts of the names of left and right topics.
 _LEFT_RIGHT_NAMES = (
     ("left", "right"),
     ("infra1", "infra2"),
@@ -66,11 +61,8 @@ class Roles:
 
 
 def parse_topics(text: str) -> dict[str, str]:
-    """Parse ``left=/cam0/image_raw,pose=/odom`` to a dictionary.
-
-    Raises:
-        RecordingError: not of this form, or a role that there is not.
-    """
+    """Parse ``left=/cam0/image_raw,pose=/odom`` to a dictionary. Raises RecordingError: not of this
+    form, or a role that there is not."""
     requested: dict[str, str] = {}
     for part in text.split(","):
         role, is_one, topic = (piece.strip() for piece in part.partition("="))
@@ -89,20 +81,12 @@ def parse_topics(text: str) -> dict[str, str]:
 
 
 def select_topics(bag: Bag, requested: Mapping[str, str]) -> Roles:
-    """Return the topic of each role: the given one, or the guessed one.
-
-    Raises:
-        RecordingError: a topic that is not in the bag or of another kind, or no pictures in it;
-            names those that there are.
-    """
+    """Return the topic of each role: the given one, or the guessed one. Raises RecordingError: a
+    topic that is not in the bag or of another kind, or no pictures in it; names those that there
+    are."""
     roles = _guess_images(bag, requested)
-    for role, kinds in (
-        ("left", IMAGE_TYPES),
-        ("right", IMAGE_TYPES),
-        ("depth", IMAGE_TYPES),
-        ("left_info", CALIBRATION_TYPES),
-    ):
-        _check_topic(bag, getattr(roles, role), role, kinds)
+    for role in ("left", "right", "depth"):
+        _check_topic(bag, getattr(roles, role), role, IMAGE_TYPES)
     if not roles.left:
         raise RecordingError(f"{bag.path}: no topic of pictures; there are {bag.describe_topics()}")
     for role, of in (
@@ -118,16 +102,12 @@ def select_topics(bag: Bag, requested: Mapping[str, str]) -> Roles:
     if pose not in (None, _NONE, TF):
         _check_topic(bag, pose, "pose", POSE_TYPES | TRANSFORM_TYPES)
         poses = (TF,) if bag.topics[pose].type in TRANSFORM_TYPES else poses
-    return replace(
-        roles,
-        poses=poses,
-        pose_frame=requested.get("pose_frame"),
-        is_pose_requested=pose is not None,
-    )
+    is_requested, frame = pose is not None, requested.get("pose_frame")
+    return replace(roles, poses=poses, pose_frame=frame, is_pose_requested=is_requested)
 
 
 def _check_topic(bag: Bag, name: str | None, role: str, kinds: frozenset[str]) -> None:
-    if name is None or name == "":
+    if not name:
         return
     if name not in bag.topics:
         raise RecordingError(
@@ -144,15 +124,14 @@ def _check_topic(bag: Bag, name: str | None, role: str, kinds: frozenset[str]) -
 def _guess_images(bag: Bag, requested: Mapping[str, str]) -> Roles:
     """Return left, right and depth as given. If none is given: a pair, an image with depth, or an
     image."""
+    is_given = "right" in requested or "depth" in requested
     if "left" in requested:
-        right, depth = (
-            None if requested.get(role) == _NONE else requested.get(role)
-            for role in ("right", "depth")
-        )
-        if "right" not in requested and "depth" not in requested:
+        right, depth = (requested.get(role) for role in ("right", "depth"))
+        if not is_given:
             right = _find_right_topic(bag, requested["left"])
+        right, depth = (None if name == _NONE else name for name in (right, depth))
         return Roles(requested["left"], right, depth)
-    if "right" in requested or "depth" in requested:
+    if is_given:
         raise RecordingError("topics: where right or depth is said, left must be, too")
     names = [
         name
@@ -166,32 +145,28 @@ def _guess_images(bag: Bag, requested: Mapping[str, str]) -> Roles:
     pairs = [(name, right) for name in images if (right := _find_right_topic(bag, name))]
     if pairs:
         return Roles(*pairs[0])
-    depths = sorted(
-        (name for name in names if _contains_any(name, _DEPTH_WORDS)),
-        key=lambda name: (not is_registered(name), _sort_key(bag, name)),
-    )
     if not images:
         return Roles()
+    depth = min(
+        (name for name in names if _contains_any(name, _DEPTH_WORDS)),
+        key=lambda name: (not is_registered(name), _sort_key(bag, name)),
+        default=None,
+    )
     if len(images) > 1:
         others = ", ".join(images[1:4])
         bag.notes.append(
             f"{bag.path}: of several topics of pictures {images[0]} is taken, not {others};"
             " --topics left=... says otherwise"
         )
-    return Roles(images[0], None, depths[0] if depths else None)
+    return Roles(images[0], None, depth)
 
 
 def _sort_key(bag: Bag, name: str) -> tuple[bool, bool, bool, bool, int, str]:
     """Sort the better topic first: rectified, calibrated, of a colour camera, not compressed."""
     is_compressed = bag.topics[name].type in COMPRESSED_IMAGE_TYPES
-    return (
-        not is_rectified(name),
-        _find_calibration_topic(bag, name) is None,
-        not _contains_any(name, _COLOUR_WORDS),
-        is_compressed,
-        len(name),
-        name,
-    )
+    is_bare = _find_calibration_topic(bag, name) is None
+    is_grey = not _contains_any(name, _COLOUR_WORDS)
+    return not is_rectified(name), is_bare, is_grey, is_compressed, len(name), name
 
 
 def _find_right_topic(bag: Bag, left: str) -> str | None:
@@ -210,11 +185,8 @@ def _find_calibration_topic(bag: Bag, picture: str | None) -> str | None:
         (picture.removesuffix(end) for end in _TRANSPORT_SUFFIXES if picture.endswith(end)), picture
     )
     parent = base.rpartition("/")[0]
-    for place in (
-        parent,
-        base,
-        f"{parent.rpartition('/')[0]}/info",
-    ):  # the last is how librealsense records
+    # the last one is that of librealsense
+    for place in (parent, base, f"{parent.rpartition('/')[0]}/info"):
         for name in (f"{place}/camera_info", f"{place}/calibration"):
             if name in bag.topics and bag.topics[name].type in CALIBRATION_TYPES:
                 return name

@@ -1,4 +1,5 @@
-"""Tiles of an atlas that share a world as one document: those of the tiles, transformed."""
+"""Tiles of an atlas that share a world as one scene, or as one document: those of the tiles,
+transformed."""
 
 from __future__ import annotations
 
@@ -18,9 +19,58 @@ from topoloc.apps.viewer.document import (
     results_to_json,
     to_base64,
 )
+from topoloc.apps.viewer.map_scene import create_map_scene
+from topoloc.apps.viewer.scene import Points, Progress, Scene, View
 
 _POSE_KEYS = ("world_from_cam", "true_world_from_cam", "smoothed")
 Document = dict[str, Any]
+
+
+def create_world_scene(
+    atlas: Atlas,
+    world: SharedWorld,
+    name: str,
+    with_points: bool = True,
+    progress: Progress | None = None,
+    warn: Callable[[str], None] = lambda text: None,
+) -> Scene:
+    """Return the scene of all tiles of a world.
+
+    With several tiles, image names begin with the tile. Sessions are numbered again. Points of
+    different tiles are not merged. Raises AtlasError: none of the tiles can be read;
+    ObjectStoreError: the store does not answer.
+    """
+    views, trajectory, points = list[View](), list[Rigid3](), list[Points]()
+    first_session = first_row = 0
+    for placed, topomap in world.open_tiles(atlas, warn):
+        scene = create_map_scene(topomap, name, None, with_points, progress)
+        ids = [session.session_id for session in topomap.sessions]
+        numbers = {session_id: first_session + k for k, session_id in enumerate(ids)}
+        first_session += len(numbers)
+        prefix = f"{placed.tile.tile_id}/" if len(world.tiles) > 1 else ""
+        views += [
+            replace(
+                view,
+                name=prefix + view.name,
+                world_from_cam=placed.world_from_map @ view.world_from_cam,
+                session_id=numbers.get(view.session_id, first_session),
+                point_rows=np.where(view.point_rows >= 0, view.point_rows + first_row, -1),
+            )
+            for view in scene.views
+        ]
+        trajectory += [placed.world_from_map @ pose for pose in scene.trajectory]
+        points.append(replace(scene.points, world=placed.world_from_map.apply(scene.points.world)))
+        first_row += len(scene.points.world)
+    if world.georeference is not None:
+        views = [
+            replace(view, geopose=world.georeference.geopose(view.world_from_cam)) for view in views
+        ]
+    return Scene(name, views, _merge_points(points), trajectory, world.georeference)
+
+
+def _merge_points(points: Sequence[Points]) -> Points:
+    names = ("world", "rgb", "errors_px")
+    return Points(*(np.concatenate([getattr(one, name) for one in points]) for name in names))
 
 
 def create_world_document(
@@ -34,11 +84,8 @@ def create_world_document(
     """Return the document of all tiles of a world, as `create_document` for one map.
 
     Nodes name their tile, and sessions are numbered again. Each tile has a share of the budget by
-    its number of nodes. Results are transformed; those of other worlds are left out.
-
-    Raises:
-        AtlasError: none of the tiles can be read.
-        ObjectStoreError: the store does not answer.
+    its number of nodes. Results are transformed; those of other worlds are left out. Raises
+    AtlasError: none of the tiles can be read; ObjectStoreError: the store does not answer.
     """
     budget, parts, first_session = budget or SceneBudget(), list[Document](), 0
     for placed, topomap in world.open_tiles(atlas, warn):
