@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from topoloc.geometry.calibration_consistency import check_calibration_consistency
+from topoloc.geometry.calibration_check import check_calibration_consistency
 from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.localization.localizer import Localizer

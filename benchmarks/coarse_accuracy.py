@@ -29,8 +29,7 @@ from topoloc.evaluation.query_localization import find_neighbour_ids
 from topoloc.features.extraction import extract_features
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import StereoSequence, to_grey
 from topoloc.recordings.open import open_sequence
 from topoloc.retrieval.coarse import CoarseLocalizer, open_coarse_localizer
 from topoloc.retrieval.network_config import NetworkInputConfig

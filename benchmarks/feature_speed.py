@@ -25,7 +25,7 @@ from topoloc.features.extraction import (
     patch_normalize,
 )
 from topoloc.features.matching import match_features, match_pooled
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import to_grey
 from topoloc.recordings.open import open_sequence
 
 RECORDINGS = {

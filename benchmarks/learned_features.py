@@ -23,10 +23,10 @@ import poselib
 import tyro
 
 from topoloc.features.features import Features
-from topoloc.features.learned import LearnedConfig, extract_learned
-from topoloc.features.surf import SurfConfig, extract_surf
-from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.image_io import read_image, to_grey
+from topoloc.features.learned import extract_learned
+from topoloc.features.surf import extract_surf
+from topoloc.recordings.frame import StereoFrame, to_grey
+from topoloc.recordings.image_io import read_image
 from topoloc.recordings.open import open_sequence
 
 _TURN = np.cos(np.deg2rad(25))
@@ -58,8 +58,8 @@ class Args:
 
 def extract(image: np.ndarray, kind: str, count: int) -> Features:
     if kind == "surf":
-        return extract_surf(image, SurfConfig(max_features=count))
-    return extract_learned(image, LearnedConfig(kind, _SIZES.get(kind, 64), count))
+        return extract_surf(image, max_features=count)
+    return extract_learned(image, kind, _SIZES.get(kind, 64), count)
 
 
 def match(first: Features, second: Features) -> tuple[np.ndarray, np.ndarray]:

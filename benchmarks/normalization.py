@@ -31,7 +31,7 @@ from topoloc.features.extraction import (
 )
 from topoloc.features.features import Features
 from topoloc.features.matching import match_features
-from topoloc.features.surf import SurfConfig, extract_surf
+from topoloc.features.surf import extract_surf
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
@@ -123,9 +123,8 @@ def lamplit(image: np.ndarray, seed: int) -> np.ndarray:
 def surf(
     normalization: PatchNormalizationConfig | None, threshold: float = 20.0, num: int = NUM_FEATURES
 ) -> Extract:
-    config = SurfConfig(hessian_threshold=threshold, max_features=num)
     return lambda image: extract_surf(
-        image if normalization is None else patch_normalize(image, normalization), config
+        image if normalization is None else patch_normalize(image, normalization), threshold, num
     )
 
 

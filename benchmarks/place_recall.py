@@ -28,7 +28,8 @@ from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
 from topoloc.mapping.config import MapConfig
-from topoloc.recordings.image_io import read_image, to_grey
+from topoloc.recordings.frame import to_grey
+from topoloc.recordings.image_io import read_image
 from topoloc.recordings.open import open_sequence
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words, vlad
 

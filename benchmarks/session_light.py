@@ -37,7 +37,8 @@ from topoloc.mapping.sessions import (
     Session,
     average_illumination,
 )
-from topoloc.recordings.image_io import read_image, to_grey
+from topoloc.recordings.frame import to_grey
+from topoloc.recordings.image_io import read_image
 from topoloc.recordings.open import open_sequence
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words, vlad
 

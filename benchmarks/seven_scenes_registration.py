@@ -16,8 +16,7 @@ import numpy as np
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.formats.seven_scenes import COLOUR_CAMERA, COLOUR_FROM_DEPTH, DEPTH_CAMERA
-from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import StereoFrame, to_grey
 from topoloc.recordings.open import open_sequence
 
 EVERY = 7

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import tyro
 
-from topoloc.features.surf import SurfConfig, extract_surf
+from topoloc.features.surf import extract_surf
 
 SIZES = {"kitchen": (640, 480), "zed": (672, 376), "kitti": (1241, 376)}
 
@@ -61,13 +61,8 @@ def main(args: Args) -> None:
         sift, orb = cv2.SIFT_create(count), cv2.ORB_create(count)
         times = time_interleaved_ms(
             {
-                "SURF 2 threads": lambda image=image: extract_surf(
-                    image, SurfConfig(num_threads=2)
-                ),
-                "SURF 1 thread": lambda image=image: extract_surf(image, SurfConfig(num_threads=1)),
-                "upright 2 threads": lambda image=image: extract_surf(
-                    image, SurfConfig(num_threads=2, upright=True)
-                ),
+                "SURF 2 threads": lambda image=image: extract_surf(image, num_threads=2),
+                "SURF 1 thread": lambda image=image: extract_surf(image, num_threads=1),
                 "OpenCV SIFT": lambda image=image, sift=sift: sift.detectAndCompute(image, None),
                 "OpenCV ORB": lambda image=image, orb=orb: orb.detectAndCompute(image, None),
             },

@@ -87,15 +87,15 @@ if TYPE_CHECKING:
     from topoloc.mapping.storage.entries import TopoNode
     from topoloc.mapping.topomap import TopoMetricMap
     from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
+    from topoloc.recordings.frame_checks import MemorySequence
     from topoloc.recordings.image_io import read_depth, read_image
-    from topoloc.recordings.memory_sequence import MemorySequence
     from topoloc.recordings.open import open_sequence
     from topoloc.recordings.trajectory import (
         Trajectory,
+        align_to_trajectory,
         with_pose_conventions,
         with_trajectory,
     )
-    from topoloc.recordings.trajectory_alignment import align_to_trajectory
     from topoloc.slam.slam import SlamResult, run_slam
     from topoloc.tracking.config import TrackerConfig
     from topoloc.tracking.stream_result import StreamedPose
@@ -254,10 +254,11 @@ _NAMES = {
     "topoloc.mapping.topomap": "TopoMetricMap",
     "topoloc.recordings.frame": "DepthImage Image StereoFrame StereoSequence",
     "topoloc.recordings.image_io": "read_depth read_image",
-    "topoloc.recordings.memory_sequence": "MemorySequence",
+    "topoloc.recordings.frame_checks": "MemorySequence",
     "topoloc.recordings.open": "open_sequence",
-    "topoloc.recordings.trajectory": "Trajectory with_pose_conventions with_trajectory",
-    "topoloc.recordings.trajectory_alignment": "align_to_trajectory",
+    "topoloc.recordings.trajectory": (
+        "Trajectory align_to_trajectory with_pose_conventions with_trajectory"
+    ),
     "topoloc.slam.slam": "SlamResult run_slam",
     "topoloc.tracking.config": "TrackerConfig",
     "topoloc.tracking.stream_result": "StreamedPose",

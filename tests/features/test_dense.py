@@ -84,7 +84,7 @@ def test_two_levels_are_the_sum_of_the_coarse_one_enlarged_and_the_fine_one_weig
     points = rng.uniform(-0.5, [63.4, 47.4], (500, 2)).astype(np.float32)
     points[:4] = [(-0.5, -0.5), (63.4, 47.4), (0.0, 47.4), (63.4, 0.0)]
     np.testing.assert_allclose(levels.sample(points), whole.sample(points), atol=2e-6)
-    np.testing.assert_allclose(levels._grid, whole._grid, atol=2e-6)
+    np.testing.assert_allclose(levels.grid, whole.grid, atol=2e-6)
     descriptors = whole.sample(rng.permutation(points))
     np.testing.assert_array_equal(
         levels.check_agreement(points, descriptors), whole.check_agreement(points, descriptors)

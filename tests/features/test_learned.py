@@ -13,14 +13,13 @@ from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features import learned
 from topoloc.features.feature_types import check_available, default_learned_type
 from topoloc.features.learned import (
-    LearnedConfig,
     SingleLevelDescriptors,
     extract_learned,
     run_network,
 )
 from topoloc.features.learned_kernels import find_maxima, refine_subpixel, sample_descriptors
 
-CONFIG = LearnedConfig("xfeat", 64, min_score=0.05)
+CONFIG = ("xfeat", 64, 1000, 0.05)
 
 
 @pytest.fixture
@@ -172,7 +171,7 @@ def test_features_are_the_strongest_first_with_the_descriptors_of_their_places(n
     picture = (
         255 * _bumps([(70.0, 20.0), (20.0, 30.0), (50.0, 50.0), (90.0, 60.0)], 75, 110)
     ).astype(np.uint8)
-    features = extract_learned(picture, CONFIG)
+    features = extract_learned(picture, *CONFIG)
     np.testing.assert_allclose(
         features.points_img, [(70, 20), (20, 30), (50, 50), (90, 60)], atol=0.1
     )
@@ -183,14 +182,14 @@ def test_features_are_the_strongest_first_with_the_descriptors_of_their_places(n
     expected = _bilinear(dense.planes, features.points_img, STRIDE)
     np.testing.assert_allclose(features.descriptors, expected, atol=1e-4)
     np.testing.assert_array_equal(
-        extract_learned(picture, LearnedConfig("xfeat", 64, 2, 0.05)).points_img,
+        extract_learned(picture, "xfeat", 64, 2, 0.05).points_img,
         features.points_img[:2],
     )
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (8, 400), (240, 320)], ids=str)
 def test_a_picture_without_any_gives_none(network: Path, size: tuple[int, int]):
-    features = extract_learned(np.zeros(size, np.uint8), CONFIG)
+    features = extract_learned(np.zeros(size, np.uint8), *CONFIG)
     assert len(features) == 0
     assert features.descriptors.shape == (0, 64)
 
@@ -198,8 +197,7 @@ def test_a_picture_without_any_gives_none(network: Path, size: tuple[int, int]):
 def test_the_same_on_any_number_of_threads(network: Path):
     picture = np.random.default_rng(3).integers(0, 256, (120, 160), dtype=np.uint8)
     one, two = (
-        extract_learned(picture, LearnedConfig("xfeat", 64, 500, 0.05, num_threads))
-        for num_threads in (1, 2)
+        extract_learned(picture, "xfeat", 64, 500, 0.05, num_threads) for num_threads in (1, 2)
     )
     np.testing.assert_array_equal(one.points_img, two.points_img)
     np.testing.assert_array_equal(one.descriptors, two.descriptors)
@@ -214,18 +212,18 @@ def test_cells_are_means_over_the_picture_and_nothing_beyond_it(network: Path):
     picture = np.random.default_rng(4).integers(
         0, 256, (96, 144), dtype=np.uint8
     )  # continued to 96x160
-    features = extract_learned(picture, CONFIG)
+    features = extract_learned(picture, *CONFIG)
     assert features.cells is not None
     expected = picture.reshape(4, 24, 6, 24).mean(axis=(1, 3)) / 255.0
     np.testing.assert_allclose(features.cells[:, :, 0], expected, atol=1e-5)
     assert features.select(np.arange(2)).cells is None  # of the whole picture alone
-    small = extract_learned(picture[:8, :8], CONFIG).cells
+    small = extract_learned(picture[:8, :8], *CONFIG).cells
     assert small is not None
     np.testing.assert_allclose(small, np.full((4, 6, 1), picture[:8, :8].mean() / 255.0), atol=1e-5)
 
 
 def test_networks_without_have_none(network: Path):
-    assert extract_learned(np.zeros((64, 64), np.uint8), CONFIG).cells is None
+    assert extract_learned(np.zeros((64, 64), np.uint8), *CONFIG).cells is None
 
 
 # what is not here, or is another
@@ -233,7 +231,7 @@ def test_networks_without_have_none(network: Path):
 
 def _refused(network: str = "xfeat", descriptor_size: int = 64) -> str:
     with pytest.raises(WeightsError) as caught:
-        extract_learned(np.zeros((64, 64), np.uint8), LearnedConfig(network, descriptor_size))
+        extract_learned(np.zeros((64, 64), np.uint8), network, descriptor_size)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -252,7 +250,7 @@ def test_without_onnx_runtime_the_extra_is_named(network: Path, monkeypatch: pyt
     learned.close_networks()
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     for ask in (
-        lambda: extract_learned(np.zeros((64, 64), np.uint8), CONFIG),
+        lambda: extract_learned(np.zeros((64, 64), np.uint8), *CONFIG),
         lambda: check_available("xfeat"),
         default_learned_type,
     ):

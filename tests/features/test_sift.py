@@ -1,8 +1,7 @@
 import cv2
 import numpy as np
-import pytest
 
-from topoloc.features.sift import SiftConfig, extract_sift
+from topoloc.features.sift import extract_sift
 
 
 def picture(seed: int = 0) -> np.ndarray:
@@ -10,9 +9,8 @@ def picture(seed: int = 0) -> np.ndarray:
     return cv2.resize(coarse, (320, 240), interpolation=cv2.INTER_CUBIC)
 
 
-@pytest.mark.parametrize("root", [True, False])
-def test_descriptors_have_unit_length_and_the_strongest_come_first(root):
-    features = extract_sift(picture(), SiftConfig(root=root))
+def test_descriptors_have_unit_length_and_the_strongest_come_first():
+    features = extract_sift(picture())
     assert len(features) > 100
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-4)
     assert np.all(np.diff(features.responses) <= 0)
@@ -20,13 +18,13 @@ def test_descriptors_have_unit_length_and_the_strongest_come_first(root):
 
 
 def test_no_more_features_than_asked_for():
-    assert len(extract_sift(picture(), SiftConfig(max_features=50))) == 50
+    assert len(extract_sift(picture(), 50)) == 50
 
 
 def test_key_points_follow_a_turned_picture():
     image = picture()
     turned = np.ascontiguousarray(np.rot90(image, -1))  # clockwise: (x, y) goes to (h - 1 - y, x)
-    before, after = (extract_sift(i, SiftConfig(max_features=100)) for i in (image, turned))
+    before, after = (extract_sift(i, 100) for i in (image, turned))
     expected = np.stack(
         [image.shape[0] - 1 - before.points_img[:, 1], before.points_img[:, 0]], axis=1
     )
@@ -38,6 +36,6 @@ def test_key_points_follow_a_turned_picture():
 
 
 def test_plain_picture_has_no_features():
-    features = extract_sift(np.full((100, 120), 90, np.uint8), SiftConfig())
+    features = extract_sift(np.full((100, 120), 90, np.uint8))
     assert len(features) == 0
     assert features.descriptors.shape == (0, 128)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topoloc.geometry.calibration_consistency import (
+from topoloc.geometry.calibration_check import (
     MIN_IMAGES,
     MIN_PLACES,
     check_calibration_consistency,

@@ -11,7 +11,6 @@ from topoloc.geometry.pose_conventions import (
     UNITS,
     PoseConventions,
     describe_conventions,
-    undo_pose_conventions,
 )
 from topoloc.geometry.rigid import Rigid3, exp_so3
 
@@ -30,13 +29,22 @@ def with_axes(pose: Rigid3, right: list[float], down: list[float], forward: list
 
 def test_camera_axes_are_turned():
     assert_same(
-        undo_pose_conventions(with_axes(POSE, [1, 0, 0], [0, -1, 0], [0, 0, -1]), ["opengl"]), POSE
+        PoseConventions(("opengl",)).undo_conventions(
+            with_axes(POSE, [1, 0, 0], [0, -1, 0], [0, 0, -1])
+        ),
+        POSE,
     )
     assert_same(
-        undo_pose_conventions(with_axes(POSE, [0, -1, 0], [0, 0, -1], [1, 0, 0]), ["flu"]), POSE
+        PoseConventions(("flu",)).undo_conventions(
+            with_axes(POSE, [0, -1, 0], [0, 0, -1], [1, 0, 0])
+        ),
+        POSE,
     )
     assert_same(
-        undo_pose_conventions(with_axes(POSE, [0, 1, 0], [0, 0, 1], [1, 0, 0]), ["frd"]), POSE
+        PoseConventions(("frd",)).undo_conventions(
+            with_axes(POSE, [0, 1, 0], [0, 0, 1], [1, 0, 0])
+        ),
+        POSE,
     )
 
 
@@ -46,10 +54,15 @@ def test_left_handed_worlds_are_mirrored():
     def mirrored(pose: Rigid3) -> Rigid3:
         return Rigid3(mirror @ pose.rotation @ mirror, mirror @ pose.translation)
 
-    assert_same(undo_pose_conventions(mirrored(POSE), ["unity"]), POSE)
+    assert_same(PoseConventions(("unity",)).undo_conventions(mirrored(POSE)), POSE)
     body = mirrored(with_axes(POSE, [0, -1, 0], [0, 0, -1], [1, 0, 0]))
     assert_same(
-        undo_pose_conventions(Rigid3(body.rotation, 100.0 * body.translation), ["unreal", "cm"]),
+        PoseConventions(
+            (
+                "unreal",
+                "cm",
+            )
+        ).undo_conventions(Rigid3(body.rotation, 100.0 * body.translation)),
         POSE,
     )
 
@@ -59,15 +72,19 @@ def test_a_quaternion_read_in_the_wrong_order():
     as_read = Rigid3.from_quat_wxyz(
         np.array([z, w, x, y]), POSE.translation
     )  # "w x y z" taken for x, y, z, w
-    assert_same(undo_pose_conventions(as_read, ["wxyz"]), POSE)
+    assert_same(PoseConventions(("wxyz",)).undo_conventions(as_read), POSE)
 
 
 def test_units_bodies_and_combinations():
     assert_same(
-        undo_pose_conventions(Rigid3(POSE.rotation, 1000.0 * POSE.translation), ["mm"]), POSE
+        PoseConventions(("mm",)).undo_conventions(Rigid3(POSE.rotation, 1000.0 * POSE.translation)),
+        POSE,
     )
     assert_same(
-        undo_pose_conventions(Rigid3(POSE.rotation, POSE.translation / 0.42), ["scale=0.42"]), POSE
+        PoseConventions(("scale=0.42",)).undo_conventions(
+            Rigid3(POSE.rotation, POSE.translation / 0.42)
+        ),
+        POSE,
     )
     w, x, y, z = BODY_FROM_CAM.quat_wxyz()
     text = "inverse,body=" + ",".join(

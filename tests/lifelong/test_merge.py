@@ -25,7 +25,7 @@ from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import Layer
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.recording import with_poses
 
 OTHER_WORLD = Rigid3(exp_so3(np.array([0.1, 0.4, -0.8])), np.array([-4.0, 7.0, 1.0]))
 SECOND = np.arange(4.0, 17.0)
@@ -34,9 +34,7 @@ SECOND = np.arange(4.0, 17.0)
 def _map_of(folder: Path, target: Path, moved: Rigid3) -> Path:
     sequence = open_sequence(folder)
     poses = [moved @ pose for pose in sequence.poses if pose is not None]
-    build_map(
-        SequenceView(sequence, list(range(len(sequence))), poses), BuildConfig(other_kinds=())
-    ).save(target)
+    build_map(with_poses(sequence, poses), BuildConfig(other_kinds=())).save(target)
     return target
 
 

@@ -35,7 +35,7 @@ from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.recording import SequenceView, with_poses
 
 # each part of the walk in a world of its own: own_from_room
 WORLDS = {
@@ -52,9 +52,7 @@ def _map_of(
 ) -> Path:
     sequence = open_sequence(write_stereo_recording(folder, indices=indices, panels=panels))
     poses = [own_from_room @ pose for pose in sequence.poses if pose is not None]
-    _built(SequenceView(sequence, list(range(len(sequence))), poses)).save(
-        folder.with_suffix(".topo")
-    )
+    _built(with_poses(sequence, poses)).save(folder.with_suffix(".topo"))
     return folder.with_suffix(".topo")
 
 

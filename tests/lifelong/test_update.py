@@ -37,7 +37,7 @@ from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.edit import edit_map
 from topoloc.mapping.storage.integrity_check import find_map_damage
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.recording import with_poses
 
 ON = np.arange(3.0, 24.0, 0.75)
 ELSEWHERE = Rigid3(exp_so3(np.array([0.3, -0.2, 1.1])), np.array([5.0, -3.0, 2.0]))
@@ -147,7 +147,7 @@ def test_stretches_that_nothing_joins_are_each_held_by_the_map(map_file: Path, s
         (bent, (first,), range(cut)),
     ):
         with TopoMetricMap.load(map_file) as topomap:
-            view = SequenceView(sequence, list(range(len(sequence))), poses, apart)
+            view = with_poses(sequence, poses, apart)
             update = update_map(topomap, view, "slam")
         posed = update.sequence.poses
         assert [k for k, pose in enumerate(posed) if pose is not None] == list(known)
@@ -165,7 +165,7 @@ def test_stretches_that_nothing_joins_are_each_held_by_the_map(map_file: Path, s
     ):
         update_map(
             topomap,
-            SequenceView(sequence, list(range(len(sequence))), bent, ([None] * len(sequence),)),
+            with_poses(sequence, bent, ([None] * len(sequence),)),
             "slam",
         )
 

@@ -10,7 +10,8 @@ import pytest
 
 from tiny_recordings import picture, write
 from topoloc.errors import UnreadableImageError
-from topoloc.recordings.image_io import image_size, read_depth, read_image, to_grey
+from topoloc.recordings.frame import to_grey
+from topoloc.recordings.image_io import image_size, read_depth, read_image
 
 pytestmark = pytest.mark.usefixtures("quiet")
 

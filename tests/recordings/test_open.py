@@ -6,14 +6,13 @@ import pytest
 
 from tiny_recordings import assert_same_pose, picture, write
 from topoloc.errors import RecordingError, UnknownFormatError, UnreadableImageError
+from topoloc.recordings.format import natural_key
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
-from topoloc.recordings.open import FORMATS, load_format, open_sequence
+from topoloc.recordings.open import FORMATS, load_format, open_sequence, parse_selection
 from topoloc.recordings.recording import (
     Recording,
     SequenceView,
-    natural_key,
-    parse_selection,
     read_left_frame,
     sequence_subset,
 )

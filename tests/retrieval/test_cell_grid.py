@@ -15,7 +15,8 @@ from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
 from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.config import MapConfig
-from topoloc.recordings.image_io import read_image, to_grey
+from topoloc.recordings.frame import to_grey
+from topoloc.recordings.image_io import read_image
 from topoloc.retrieval import descriptor_index
 from topoloc.retrieval.cell_grid import CellGrid
 from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer

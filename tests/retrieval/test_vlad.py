@@ -15,7 +15,7 @@ from topoloc.features.extraction import FeatureConfig, extract_features
 from topoloc.features.features import Features
 from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.nodes import NodeConfig, NodePoses, node_distances
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import to_grey
 from topoloc.retrieval.coarse import CoarseLocalizer, VladConfig, open_coarse_localizer
 from topoloc.retrieval.vlad import (
     SurfVlad,

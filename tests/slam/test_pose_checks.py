@@ -12,7 +12,7 @@ from topoloc.geometry.pose_conventions import PoseConventions
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.recording import SequenceView, with_poses
 from topoloc.slam.measured_steps import MeasuredStep, measure_steps
 from topoloc.slam.pose_checks import check_pose_coverage, check_poses, evaluate_poses
 
@@ -168,7 +168,7 @@ def test_a_recording_is_refused_in_one_line(tiny_recording: Path):
     check_poses(sequence)
     inverse = [pose.inverse() for pose in sequence.poses if pose is not None]
     with pytest.raises(TrajectoryError, match="--poses inverse"):
-        check_poses(SequenceView(sequence, list(range(len(sequence))), list(inverse)))
+        check_poses(with_poses(sequence, list(inverse)))
 
 
 class LeftPicturesAlone(SequenceView):
@@ -189,5 +189,5 @@ def test_gaps_of_more_than_half(tiny_recording: Path):
     sequence = open_sequence(tiny_recording)
     poses = [pose if k < 5 else None for k, pose in enumerate(sequence.poses)]
     with pytest.raises(TrajectoryError, match=f"only 5 of {len(sequence)} frames"):
-        check_pose_coverage(SequenceView(sequence, list(range(len(sequence))), poses))
+        check_pose_coverage(with_poses(sequence, poses))
     check_pose_coverage(sequence)

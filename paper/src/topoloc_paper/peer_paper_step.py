@@ -25,9 +25,8 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.points.metric_points import locate_points
-from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.frame import StereoFrame, StereoSequence, to_grey
 from topoloc.recordings.frame_preparation import prepare_frame
-from topoloc.recordings.image_io import to_grey
 from topoloc_paper.peer_answers import PeerAnswer
 from topoloc_paper.peer_retrieval import Retrieval
 

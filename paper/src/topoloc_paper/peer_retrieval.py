@@ -12,8 +12,7 @@ from collections.abc import Sequence
 
 from topoloc.features.extraction import extract_features
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.frame import Image, StereoFrame
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import Image, StereoFrame, to_grey
 from topoloc.retrieval.coarse import open_coarse_localizer
 from topoloc_paper.peer_answers import PeerAnswer
 

@@ -10,7 +10,7 @@ from topoloc.features.extraction import PatchNormalizationConfig, patch_normaliz
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 from topoloc.mapping.nodes import NodePoses, node_distances
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import to_grey
 from topoloc_paper import posenet_baseline
 from topoloc_paper.asking import Way, answers, queries_of
 from topoloc_paper.datasets import Dataset

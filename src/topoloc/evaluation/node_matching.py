@@ -18,8 +18,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig, match_guided
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.mapping.storage.entries import TopoNode
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import Image, to_grey
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,22 +75,13 @@ def patch_normalize(
     The image is reflected at its borders without repeating the border row. If sigma + epsilon is 0,
     N is 0. The result is byte-identical for any `num_threads`.
     """
-    first_box, second_box = config.box_sizes()
     radius = config.window_px // 2
     padded = cv2.copyMakeBorder(image, radius, radius, radius, radius, cv2.BORDER_REFLECT_101)
     normalized = np.empty_like(image, order="C")
 
     def run(first_row: int, last_row: int) -> None:
-        normalize_band(
-            padded,
-            normalized,
-            first_row,
-            last_row,
-            first_box,
-            second_box,
-            config.epsilon,
-            config.gain,
-        )
+        numbers = *config.box_sizes(), config.epsilon, config.gain
+        normalize_band(padded, normalized, first_row, last_row, *numbers)
 
     parallel_for_rows(run, len(image), num_threads)
     return normalized
@@ -116,10 +107,8 @@ def extract_features(
     Raises:
         FeatureTypeError: the feature type is unknown.
     """
-    return replace(
-        extract_from_normalized(normalize_image(image, config, num_threads), config, num_threads),
-        dense=None,
-    )
+    normalized = normalize_image(image, config, num_threads)
+    return replace(extract_from_normalized(normalized, config, num_threads), dense=None)
 
 
 def normalize_image(
@@ -127,9 +116,8 @@ def normalize_image(
 ) -> UInt8[np.ndarray, "h w"]:
     """Return the normalised image in which key points are detected. This is the first step of
     `extract_features`."""
-    normalization = NORMALIZATIONS[
-        config.normalization or find_feature_type(config.kind).normalization
-    ]
+    name = config.normalization or find_feature_type(config.kind).normalization
+    normalization = NORMALIZATIONS[name]
     return image if normalization is None else patch_normalize(image, normalization, num_threads)
 
 

@@ -111,25 +111,17 @@ def _extract_surf(
     # Detection threshold of SURF for images of 0..255. The default is low on purpose: a fixed
     # threshold depends on contrast, and a high one finds almost nothing in a dark image.
     hessian_threshold = 20.0
-    from topoloc.features.surf import SurfConfig, extract_surf
+    from topoloc.features.surf import extract_surf
 
-    settings = SurfConfig(
-        hessian_threshold=hessian_threshold,
-        max_features=config.max_features,
-        num_threads=num_threads,
-    )
-    return extract_surf(image, settings)
+    return extract_surf(image, hessian_threshold, config.max_features, num_threads)
 
 
 def _extract_sift(
     image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
 ) -> Features:
-    from topoloc.features.sift import SiftConfig, extract_sift
+    from topoloc.features.sift import extract_sift
 
-    return extract_sift(
-        image,
-        SiftConfig(max_features=config.max_features, contrast_threshold=config.contrast_threshold),
-    )
+    return extract_sift(image, config.max_features, config.contrast_threshold)
 
 
 def _learned_feature_type(
@@ -141,12 +133,10 @@ def _learned_feature_type(
     def extract(
         image: UInt8[np.ndarray, "h w"], config: FeatureConfig, num_threads: int | None
     ) -> Features:
-        from topoloc.features.learned import LearnedConfig, extract_learned
+        from topoloc.features.learned import extract_learned
 
-        return extract_learned(
-            image,
-            LearnedConfig(network, descriptor_size, config.max_features, min_score, num_threads),
-        )
+        numbers = descriptor_size, config.max_features, min_score, num_threads
+        return extract_learned(image, network, *numbers)
 
     return FeatureType(
         network,
@@ -244,17 +234,13 @@ def select_stored_types(stored: Sequence[str], text: str) -> tuple[str, ...]:
     if text == "both":
         return tuple(stored)
     named = text.split(",")
-    found = [
-        name
-        for name in stored
-        if name in named or (text == "learned" and FEATURE_TYPES[name].network is not None)
-    ]
-    missing = [name for name in named if name not in found] if text != "learned" else []
-    if missing or not found:
-        raise FeatureTypeError(
-            f"the map holds no features {(missing or [text])[0]} (it holds: {', '.join(stored)})"
-        )
-    return tuple(found)
+    if text == "learned":
+        named = [name for name in stored if FEATURE_TYPES[name].network is not None] or [text]
+    for name in named:
+        if name not in stored:
+            held = ", ".join(stored)
+            raise FeatureTypeError(f"the map holds no features {name} (it holds: {held})")
+    return tuple(name for name in stored if name in named)
 
 
 def check_available(name: str) -> None:

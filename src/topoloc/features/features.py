@@ -78,9 +78,8 @@ class Features:
     def empty(dimension: int) -> Features:
         """Return no features, with descriptors of this length."""
         zero = np.zeros(0, np.float32)
-        return Features(
-            np.zeros((0, 2), np.float32), zero, zero, zero, np.zeros((0, dimension), np.float32)
-        )
+        points_img, descriptors = (np.zeros((0, size), np.float32) for size in (2, dimension))
+        return Features(points_img, zero, zero, zero, descriptors)
 
 
 @dataclass(frozen=True, eq=False)

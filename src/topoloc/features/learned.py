@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import os
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from topoloc import compiled
 from topoloc.errors import WeightsError
-from topoloc.features.features import Features
+from topoloc.features.features import DenseDescriptors, Features
 from topoloc.features.learned_kernels import (
     combine_levels,
     find_maxima,
@@ -33,12 +33,12 @@ from topoloc.features.learned_kernels import (
     sample_descriptors,
     sample_levels,
 )
-from topoloc.features.network_files import NetworkInfo, find_network, open_network
+from topoloc.features.network_files import find_network, open_network
 
 _RADIUS = 4  # grid steps to each side in which the most similar descriptor is searched
 
 
-class GridDescriptors(ABC):
+class GridDescriptors(DenseDescriptors):
     """Hold one descriptor every `stride_px` pixels. The descriptor of pixel (x, y) lies at column
     (x + 0.5) / stride_px - 0.5, and rows likewise.
 
@@ -47,24 +47,10 @@ class GridDescriptors(ABC):
     around a map point's projection lies at the projection itself.
     """
 
-    stride_px: float
-
-    @property
-    @abstractmethod
-    def size(self) -> int:
-        """Return the length of a descriptor."""
-
-    @abstractmethod
-    def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
-        """Return descriptors of unit length at these pixels, interpolated bilinearly."""
-
-    @abstractmethod
-    def _normalized_grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        """Return the whole grid with descriptors of unit length."""
-
     @cached_property
-    def _grid(self) -> Float32[np.ndarray, "rows columns d"]:
-        return self._normalized_grid()
+    @abstractmethod
+    def grid(self) -> Float32[np.ndarray, "rows columns d"]:
+        """Return the whole grid with descriptors of unit length."""
 
     def check_agreement(
         self, points_img: Float[np.ndarray, "n 2"], descriptors: Float32[np.ndarray, "n d"]
@@ -74,13 +60,8 @@ class GridDescriptors(ABC):
         The most similar descriptor is searched within 4 grid steps to each side. It must lie at
         most one grid step from the point.
         """
-        return is_local_best_match(
-            self._grid,
-            points_img.astype(np.float32),
-            descriptors,
-            np.float32(self.stride_px),
-            _RADIUS,
-        )
+        points_img, stride_px = points_img.astype(np.float32), np.float32(self.stride_px)
+        return is_local_best_match(self.grid, points_img, descriptors, stride_px, _RADIUS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +80,9 @@ class SingleLevelDescriptors(GridDescriptors):
         """Return descriptors of unit length at these pixels, interpolated bilinearly."""
         return sample_descriptors(self.planes, points_img, np.float32(self.stride_px))
 
-    def _normalized_grid(self) -> Float32[np.ndarray, "rows columns d"]:
+    @cached_property
+    def grid(self) -> Float32[np.ndarray, "rows columns d"]:
+        """Return the whole grid with descriptors of unit length."""
         return normalize_descriptors(self.planes)
 
 
@@ -124,11 +107,12 @@ class TwoLevelDescriptors(GridDescriptors):
 
     def sample(self, points_img: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
         """Return descriptors of unit length at these pixels, interpolated bilinearly."""
-        return sample_levels(
-            self.coarse, self.fine, self.weights, points_img, np.float32(self.stride_px)
-        )
+        levels = self.coarse, self.fine, self.weights
+        return sample_levels(*levels, points_img, np.float32(self.stride_px))
 
-    def _normalized_grid(self) -> Float32[np.ndarray, "rows columns d"]:
+    @cached_property
+    def grid(self) -> Float32[np.ndarray, "rows columns d"]:
+        """Return the whole grid with descriptors of unit length."""
         return combine_levels(self.coarse, self.fine, self.weights)
 
 
@@ -139,51 +123,41 @@ KEY_POINT_SIZE_PX = 16.0
 """Constant size of all learned key points, pixels."""
 
 
-@dataclass(frozen=True)
-class LearnedConfig:
-    """Select a network and the number of its key points.
+def extract_learned(
+    image: UInt8[np.ndarray, "h w"],
+    network: str,
+    descriptor_size: int,
+    max_features: int = 1000,
+    min_score: float = 0.007,
+    num_threads: int | None = None,
+) -> Features:
+    """Return key points and descriptors of a grey image, strongest first. Size and angle are
+    constant.
 
     Args:
         min_score: key points must have a higher score.
         num_threads: threads of the network. Default: the number of `set_num_threads`.
-    """
-
-    network: str
-    descriptor_size: int
-    max_features: int = 1000
-    min_score: float = 0.007
-    num_threads: int | None = None
-
-
-def extract_learned(image: UInt8[np.ndarray, "h w"], config: LearnedConfig) -> Features:
-    """Return key points and descriptors of a grey image, strongest first. Size and angle are
-    constant.
 
     Raises:
         MissingExtraError: ONNX Runtime is not installed.
         WeightsError: the network's file is missing, damaged or of another network.
     """
     height, width = image.shape
-    network_output = run_network(image, config.network, config.num_threads)
+    network_output = run_network(image, network, num_threads)
     scores, dense = network_output.scores, network_output.dense
-    if dense.size != config.descriptor_size:
+    if dense.size != descriptor_size:
         raise WeightsError(
-            f"the network {config.network} gives descriptors of {dense.size} numbers, not"
-            f" {config.descriptor_size}"
+            f"the network {network} gives descriptors of {dense.size} numbers, not"
+            f" {descriptor_size}"
         )
-    pixels, found = find_maxima(scores, height, width, _BORDER_PX, np.float32(config.min_score))
-    order = np.argsort(-found, kind="stable")[: config.max_features]
+    pixels, found = find_maxima(scores, height, width, _BORDER_PX, np.float32(min_score))
+    order = np.argsort(-found, kind="stable")[:max_features]
     points_img = refine_subpixel(scores, pixels[order])
-    sizes, angles = (
-        np.full(len(order), KEY_POINT_SIZE_PX, np.float32),
-        np.zeros(len(order), np.float32),
-    )
-    image_fractions = (height / scores.shape[0], width / scores.shape[1])
-    cells = (
-        None
-        if network_output.places is None
-        else compute_cell_means(network_output.places, *image_fractions)
-    )
+    sizes = np.full(len(order), KEY_POINT_SIZE_PX, np.float32)
+    angles, cells = np.zeros_like(sizes), None
+    if network_output.places is not None:
+        fractions = height / scores.shape[0], width / scores.shape[1]
+        cells = compute_cell_means(network_output.places, *fractions)
     return Features(points_img, sizes, angles, found[order], dense.sample(points_img), cells, dense)
 
 
@@ -203,7 +177,7 @@ def compute_cell_means(
 
 def check_network(network: str) -> None:
     """Check that the network can be opened. Raises the errors of `extract_learned`."""
-    _open_session(network, find_network(network))
+    _session_for_size(network, find_network(network), 1, None, os.getpid())
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,54 +198,35 @@ def run_network(
     height, width = image.shape
     padding = np.array([(0, -side % _SIDE_MULTIPLE) for side in (height, width)])
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
-    session = _session_for_size(
-        network,
-        find_network(network),
-        num_threads or compiled.num_threads(),
-        grey.shape,
-        os.getpid(),
-    )
+    number, path = num_threads or compiled.num_threads(), find_network(network)
+    session = _session_for_size(network, path, number, grey.shape, os.getpid())
     names = [output.name for output in session.get_outputs()]
     outputs = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))
     scores, places = outputs["scores"][0, 0], outputs.get("places")
     if "coarse" in outputs:
-        dense = TwoLevelDescriptors(
-            outputs["coarse"][0],
-            outputs["fine"][0],
-            outputs["fine_weights"],
-            len(scores) / outputs["fine"].shape[1],
-        )
+        coarse, fine, weights = outputs["coarse"][0], outputs["fine"][0], outputs["fine_weights"]
+        dense = TwoLevelDescriptors(coarse, fine, weights, len(scores) / len(fine))
     else:
-        dense = SingleLevelDescriptors(
-            outputs["descriptors"][0], len(scores) / outputs["descriptors"].shape[2]
-        )
+        planes = outputs["descriptors"][0]
+        dense = SingleLevelDescriptors(planes, len(scores) / planes.shape[1])
     return NetworkOutput(scores, dense, None if places is None else places[0])
 
 
 @functools.lru_cache(maxsize=6)
 def _session_for_size(
-    network: str, path: Path, num_threads: int, size: tuple[int, int], process_id: int
+    network: str, path: Path, num_threads: int, size: tuple[int, int] | None, process_id: int
 ) -> Any:
     """Return a session prepared for images of one size. The preparation takes some 10 ms, and each
     image then takes 0.8 of the time. A forked child creates its own session.
 
     Each session holds some 100 bytes per pixel, so only a few are kept.
     """
-    return _check_network_name(network, path, *open_network(path, num_threads, size))
-
-
-@functools.lru_cache(maxsize=16)
-def _open_session(network: str, path: Path) -> Any:
-    return _check_network_name(network, path, *open_network(path, num_threads=1))
+    known, session = open_network(path, num_threads, size)
+    if known.name != network:
+        raise WeightsError(f"network {path}: holds {known.name}, not {network}")
+    return session
 
 
 def close_networks() -> None:
     """Close all open networks. They are opened again when needed."""
     _session_for_size.cache_clear()
-    _open_session.cache_clear()
-
-
-def _check_network_name(network: str, path: Path, known: NetworkInfo, session: Any) -> Any:
-    if known.name != network:
-        raise WeightsError(f"network {path}: holds {known.name}, not {network}")
-    return session

@@ -15,15 +15,12 @@ def find_maxima(scores, height, width, border, min_score):
     A maximum exceeds `min_score` and all other scores within two pixels. Of equal scores the first
     one counts. The image has `height` rows and `width` columns. The padded scores may have more.
     """
-    pixels, found = (
-        np.empty((height * width // 9 + 1, 2), np.int32),
-        np.empty(height * width // 9 + 1, np.float32),
-    )
+    most = height * width // 9 + 1
+    pixels, found = np.empty((most, 2), np.int32), np.empty(most, np.float32)
     border = max(border, _RADIUS)
     count, num_columns = 0, max(width - 2 * border, 0)
-    along = np.empty(
-        (2 * _RADIUS + 1, num_columns), np.float32
-    )  # maxima along the window of each row, for as many rows as a window has
+    # Maxima along the window of each row, for as many rows as a window has.
+    along = np.empty((2 * _RADIUS + 1, num_columns), np.float32)
     around = np.empty(num_columns, np.float32)
     for y in range(border - _RADIUS, min(height - border + _RADIUS, height) if num_columns else 0):
         _max_along_windows(scores[y], border, along[y % len(along)])
@@ -33,11 +30,8 @@ def find_maxima(scores, height, width, border, min_score):
         _max_over_rows(along, around)
         row = scores[middle][border : border + num_columns]
         for x in range(num_columns):
-            if (
-                row[x] >= around[x]
-                and row[x] > min_score
-                and _is_first_maximum(scores, middle, border + x)
-            ):
+            is_maximum = row[x] >= around[x] and row[x] > min_score
+            if is_maximum and _is_first_maximum(scores, middle, border + x):
                 pixels[count, 0], pixels[count, 1], found[count] = border + x, middle, row[x]
                 count += 1
     return pixels[:count].copy(), found[:count].copy()
@@ -47,11 +41,8 @@ def find_maxima(scores, height, width, border, min_score):
 def _max_along_windows(row, border, out):
     """Write the maximum score within two pixels along a row, for each pixel from `border` on."""
     n = len(out)
-    a, b, c = (
-        row[border - 2 : border - 2 + n],
-        row[border - 1 : border - 1 + n],
-        row[border : border + n],
-    )
+    a, b = row[border - 2 : border - 2 + n], row[border - 1 : border - 1 + n]
+    c = row[border : border + n]
     d, e = row[border + 1 : border + 1 + n], row[border + 2 : border + 2 + n]
     for x in range(n):  # without branches, so that the loop vectorises
         left = a[x] if a[x] > b[x] else b[x]
@@ -98,11 +89,8 @@ def refine_subpixel(scores, pixels):
 def _parabola_vertex(before, here, after):
     """Return the vertex of the parabola through the logarithms of three scores at -1, 0 and 1. It
     is limited to half a pixel."""
-    a, b, c = (
-        np.log(before + np.float32(1e-6)),
-        np.log(here + np.float32(1e-6)),
-        np.log(after + np.float32(1e-6)),
-    )
+    least = np.float32(1e-6)
+    a, b, c = np.log(before + least), np.log(here + least), np.log(after + least)
     bend = a - 2 * b + c
     if bend > -1e-6:
         return np.float32(0.0)
@@ -110,22 +98,23 @@ def _parabola_vertex(before, here, after):
 
 
 @kernel()
+def _grid_position(pixel, stride, length):
+    """Return the grid index before a pixel and the fraction to the next one. Pixel x lies at (x +
+    0.5) / stride - 0.5 in a grid of this length."""
+    at = max((pixel + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0))
+    at = min(at, np.float32(length - 1))
+    index = min(int(at), length - 2)
+    return index, np.float32(at - index)
+
+
+@kernel()
 def sample_descriptors(dense, points_img, stride):
-    """Return (n, d) descriptors of unit length, interpolated bilinearly. Pixel x lies at (x + 0.5)
-    / stride - 0.5 in the grid."""
+    """Return (n, d) descriptors of unit length, interpolated bilinearly."""
     size, rows, columns = dense.shape
     out = np.empty((len(points_img), size), np.float32)
     for k in range(len(points_img)):
-        u = min(
-            max((points_img[k, 0] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)),
-            np.float32(columns - 1),
-        )
-        v = min(
-            max((points_img[k, 1] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)),
-            np.float32(rows - 1),
-        )
-        x, y = min(int(u), columns - 2), min(int(v), rows - 2)
-        s, t = np.float32(u - x), np.float32(v - y)
+        x, s = _grid_position(points_img[k, 0], stride, columns)
+        y, t = _grid_position(points_img[k, 1], stride, rows)
         total = np.float32(0)
         for c in range(size):
             grid = dense[c]
@@ -165,16 +154,8 @@ def sample_levels(coarse, fine, weights, points_img, stride):
     rows, columns, size = fine.shape[0], fine.shape[1], coarse.shape[2]
     out, mixed = np.empty((len(points_img), size), np.float32), np.empty(fine.shape[2], np.float32)
     for k in range(len(points_img)):
-        u = min(
-            max((points_img[k, 0] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)),
-            np.float32(columns - 1),
-        )
-        v = min(
-            max((points_img[k, 1] + np.float32(0.5)) / stride - np.float32(0.5), np.float32(0)),
-            np.float32(rows - 1),
-        )
-        x, y = min(int(u), columns - 2), min(int(v), rows - 2)
-        s, t = np.float32(u - x), np.float32(v - y)
+        x, s = _grid_position(points_img[k, 0], stride, columns)
+        y, t = _grid_position(points_img[k, 1], stride, rows)
         value = out[k]
         value[:], mixed[:] = np.float32(0), np.float32(0)
         for below in range(2):
@@ -211,15 +192,11 @@ def combine_levels(coarse, fine, weights):
     by_four = weights.copy().reshape(weights.shape[0] // 4, 4 * size)
     for y in range(rows):
         _blend_rows(coarse, y, blend)
-        for x in range(
-            0, columns, 4
-        ):  # four columns at a time, so that the weights are read a quarter as often
+        # Four columns at a time, so that the weights are read a quarter as often.
+        for x in range(0, columns, 4):
             for half in range(2):
-                before, here, after = (
-                    blend[x // 2 + half],
-                    blend[x // 2 + half + 1],
-                    blend[x // 2 + half + 2],
-                )
+                at = x // 2 + half
+                before, here, after = blend[at], blend[at + 1], blend[at + 2]
                 for j in range(size):
                     most = np.float32(0.75) * here[j]
                     sums[2 * half * size + j] = most + np.float32(0.25) * before[j]
@@ -251,27 +228,13 @@ def _blend_rows(coarse, y, out):
 def _add_fine_level(row, x, by_four, size, sums):
     """Add the finer level at four pixels from x on to `sums`, which holds their descriptors one
     after the other. A row of `by_four` holds the weights of four components."""
+    a, b, c, d = row[x], row[x + 1], row[x + 2], row[x + 3]
     for k in range(by_four.shape[0]):
         w = by_four[k]
-        a0, a1, a2, a3 = row[x, 4 * k], row[x, 4 * k + 1], row[x, 4 * k + 2], row[x, 4 * k + 3]
-        b0, b1, b2, b3 = (
-            row[x + 1, 4 * k],
-            row[x + 1, 4 * k + 1],
-            row[x + 1, 4 * k + 2],
-            row[x + 1, 4 * k + 3],
-        )
-        c0, c1, c2, c3 = (
-            row[x + 2, 4 * k],
-            row[x + 2, 4 * k + 1],
-            row[x + 2, 4 * k + 2],
-            row[x + 2, 4 * k + 3],
-        )
-        d0, d1, d2, d3 = (
-            row[x + 3, 4 * k],
-            row[x + 3, 4 * k + 1],
-            row[x + 3, 4 * k + 2],
-            row[x + 3, 4 * k + 3],
-        )
+        a0, a1, a2, a3 = a[4 * k], a[4 * k + 1], a[4 * k + 2], a[4 * k + 3]
+        b0, b1, b2, b3 = b[4 * k], b[4 * k + 1], b[4 * k + 2], b[4 * k + 3]
+        c0, c1, c2, c3 = c[4 * k], c[4 * k + 1], c[4 * k + 2], c[4 * k + 3]
+        d0, d1, d2, d3 = d[4 * k], d[4 * k + 1], d[4 * k + 2], d[4 * k + 3]
         for j in range(size):
             w0, w1, w2, w3 = w[j], w[size + j], w[2 * size + j], w[3 * size + j]
             sums[j] = sums[j] + a0 * w0 + a1 * w1 + a2 * w2 + a3 * w3
@@ -287,12 +250,8 @@ def _add_coarse_level(coarse, y, x, share, out):
     below, right = min((y + 1) // 2, coarse.shape[0] - 1), min((x + 1) // 2, coarse.shape[1] - 1)
     t = np.float32(0.25) if y % 2 else np.float32(0.75)
     s = np.float32(0.25) if x % 2 else np.float32(0.75)
-    a, b, c, d = (
-        coarse[above, left],
-        coarse[above, right],
-        coarse[below, left],
-        coarse[below, right],
-    )
+    a, b = coarse[above, left], coarse[above, right]
+    c, d = coarse[below, left], coarse[below, right]
     p, q, r, z = share * (1 - t) * (1 - s), share * (1 - t) * s, share * t * (1 - s), share * t * s
     for j in range(len(out)):
         out[j] += p * a[j] + q * b[j] + r * c[j] + z * d[j]

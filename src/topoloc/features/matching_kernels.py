@@ -15,9 +15,8 @@ from topoloc.compiled import kernel
 TILE = 96
 ROWS = 2  # query rows processed together; with GROUP components they fit into the registers
 GROUP = 4
-ROWS_AT_ONCE = (
-    32  # a multiple of ROWS; their products are read again while they are still in the cache
-)
+# A multiple of ROWS. Their products are read again while they are still in the cache.
+ROWS_AT_ONCE = 32
 
 
 @kernel(fastmath={"contract"})
@@ -28,20 +27,11 @@ def multiply(query, packed, out):
     for tile in range(packed.shape[0]):
         for i in range(0, query.shape[0] - ROWS + 1, ROWS):
             sums[:] = np.float32(0.0)
+            a, b = query[i], query[i + 1]
             for k in range(packed.shape[1]):
                 t = packed[tile, k]
-                a0, a1, a2, a3 = (
-                    query[i, 4 * k],
-                    query[i, 4 * k + 1],
-                    query[i, 4 * k + 2],
-                    query[i, 4 * k + 3],
-                )
-                b0, b1, b2, b3 = (
-                    query[i + 1, 4 * k],
-                    query[i + 1, 4 * k + 1],
-                    query[i + 1, 4 * k + 2],
-                    query[i + 1, 4 * k + 3],
-                )
+                a0, a1, a2, a3 = a[4 * k], a[4 * k + 1], a[4 * k + 2], a[4 * k + 3]
+                b0, b1, b2, b3 = b[4 * k], b[4 * k + 1], b[4 * k + 2], b[4 * k + 3]
                 for j in range(TILE):
                     t0, t1, t2, t3 = t[j], t[TILE + j], t[2 * TILE + j], t[3 * TILE + j]
                     sums[j] = sums[j] + a0 * t0 + a1 * t1 + a2 * t2 + a3 * t3
@@ -52,13 +42,13 @@ def multiply(query, packed, out):
 
 
 @kernel()
-def find_similar(query, packed, num_columns, least, found, count):
-    """Append (row, column) of all products of at least `least` to `found` (k, 2), which holds
-    `count` pairs. Return the array, enlarged if necessary, and the new count.
+def find_similar(query, packed, num_columns, least):
+    """Return (row, column) of all products of at least `least`, an array (k, 2).
 
     `query` and `packed` are those of `multiply`. Columns from `num_columns` on are ignored.
     """
     products = np.empty((ROWS, TILE * packed.shape[0]), np.float32)
+    found, count = np.empty((1024, 2), np.int64), 0
     for i in range(0, query.shape[0] - ROWS + 1, ROWS):
         multiply(query[i : i + ROWS], packed, products)
         for row in range(ROWS):
@@ -74,7 +64,7 @@ def find_similar(query, packed, num_columns, least, found, count):
                     found[count, 0] = i + row
                     found[count, 1] = column
                     count += 1
-    return found, count
+    return found[:count]
 
 
 @kernel()
@@ -100,10 +90,8 @@ def find_nearest(
     disables the test. The length of `out_winner` is the number of query rows. `column_largest` is
     updated with the largest product of each column.
     """
-    table, lanes = (
-        np.empty((ROWS_AT_ONCE, TILE * packed.shape[0]), np.float32),
-        np.empty(TILE, np.float32),
-    )
+    table = np.empty((ROWS_AT_ONCE, TILE * packed.shape[0]), np.float32)
+    lanes = np.empty(TILE, np.float32)
     for start in range(0, query.shape[0], ROWS_AT_ONCE):
         stop = min(start + ROWS_AT_ONCE, query.shape[0])
         multiply(query[start:stop], packed, table)
@@ -123,10 +111,8 @@ def _row_maximum(row, lanes, column_largest):
     over column j of all tiles."""
     lanes[:] = -np.inf
     for tile in range(len(row) // TILE):
-        part, above = (
-            row[tile * TILE : (tile + 1) * TILE],
-            column_largest[tile * TILE : (tile + 1) * TILE],
-        )
+        part = row[tile * TILE : (tile + 1) * TILE]
+        above = column_largest[tile * TILE : (tile + 1) * TILE]
         for j in range(TILE):  # each lane by itself, so that the loop vectorises
             lanes[j] = part[j] if part[j] > lanes[j] else lanes[j]
         for j in range(TILE):

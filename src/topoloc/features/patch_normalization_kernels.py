@@ -45,14 +45,11 @@ def normalize_band(padded, out, first_row, last_row, first_box, second_box, epsi
     inner_width = padded_width - first_box + 1
     height_of_window = first_box + second_box - 1
     width = out.shape[1]
-    columns = np.zeros(padded_width, np.int32)
-    columns_sq = np.zeros(padded_width, np.int32)
+    columns, columns_sq = np.zeros(padded_width, np.int32), np.zeros(padded_width, np.int32)
     ring = np.zeros((second_box, inner_width), np.int32)
     ring_sq = np.zeros((second_box, inner_width), np.int32)
-    rows = np.zeros(inner_width, np.int32)
-    rows_sq = np.zeros(inner_width, np.int32)
-    sums = np.zeros(width, np.int32)
-    sums_sq = np.zeros(width, np.int32)
+    rows, rows_sq = np.zeros(inner_width, np.int32), np.zeros(inner_width, np.int32)
+    sums, sums_sq = np.zeros(width, np.int32), np.zeros(width, np.int32)
     weight = float((first_box * second_box) ** 2)
     radius = height_of_window // 2
     for step in range(last_row - first_row + height_of_window - 1):

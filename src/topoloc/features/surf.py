@@ -17,13 +17,11 @@ matters, choose SIFT (`topoloc.features.sift`). Its patent, US 6,711,293, expire
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt8
 
-from topoloc.bounds import AtLeast, Between
-from topoloc.compiled import num_threads
+from topoloc.compiled import num_threads as default_num_threads
 from topoloc.features.features import Features
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.features.surf_descriptor_kernels import describe, orient, smooth_rows
@@ -34,94 +32,58 @@ MIN_FILTER_PX = 9  # this filter has a sigma of 1.2 pixels (Bay et al. 2008, 3.3
 FILTER_INCREMENT_PX = 6
 SIGMA_PER_FILTER_PX = 1.2 / MIN_FILTER_PX
 PATCH_SAMPLES = 21
-# 32-bit sums hold a filter response up to this side (whole box 1 by 5/9 of it, values of 255).
-MAX_FILTER_PX = 3600
 # Sample spacings in pixels for which smoothed images are made, from the smallest key points on.
 LEVEL_RATIO = 1.2
 LEVEL_SPACINGS = 1.4 * LEVEL_RATIO ** np.arange(33)
 
 
-@dataclass(frozen=True)
-class SurfConfig:
-    """Hold the settings of SURF."""
-
-    hessian_threshold: Annotated[float, AtLeast(0)] = 400.0
-    """Threshold of the Hessian's determinant for images of 0..255, as in OpenCV."""
-    num_octaves: Annotated[int, Between(1, 8)] = 4
-    """Octaves of filters, each twice as large as the one before."""
-    num_layers: Annotated[int, Between(1, 64)] = 3
-    """Layers of each octave in which maxima are detected."""
-    upright: bool = False
-    """Set all orientations to 0, for cameras that never roll."""
-    max_features: Annotated[int, Between(0, 100_000)] = 2000
-    """Number of features to keep, strongest first."""
-    num_threads: Annotated[int | None, Between(1, 1024)] = None
-    """Threads. The features are the same for any number. Unset: the number of `set_num_threads`."""
-
-    def __post_init__(self) -> None:
-        counts = (
-            self.num_octaves,
-            self.num_layers,
-            1 if self.num_threads is None else self.num_threads,
-        )
-        if self.hessian_threshold < 0 or min(counts) < 1 or self.max_features < 0:
-            raise ValueError(
-                "SURF: threshold and max_features must be at least 0, the other numbers at least"
-                f" 1: {self}"
-            )
-        if (MIN_FILTER_PX + FILTER_INCREMENT_PX * (self.num_layers + 1)) << (
-            self.num_octaves - 1
-        ) > MAX_FILTER_PX:
-            raise ValueError(
-                f"SURF: filters beyond {MAX_FILTER_PX} px, fewer octaves or layers are needed:"
-                f" {self}"
-            )
-
-
-def extract_surf(image: UInt8[np.ndarray, "h w"], config: SurfConfig = SurfConfig()) -> Features:
+def extract_surf(
+    image: UInt8[np.ndarray, "h w"],
+    hessian_threshold: float = 400.0,
+    max_features: int = 2000,
+    num_threads: int | None = None,
+) -> Features:
     """Return the strongest SURF key points of a grey image, strongest first, with descriptors (n,
-    64) of unit length.
+    64) of unit length. The result is the same for any number of threads.
 
-    Upright key points have angle 0. As in OpenCV, their windows are sampled turned by 270 degrees.
-    The result is the same for any number of threads.
+    Args:
+        hessian_threshold: threshold of the Hessian's determinant for images of 0..255, as in
+            OpenCV.
+        max_features: number of features to keep.
+        num_threads: default: the number of `set_num_threads`.
     """
     integral = integral_image(np.ascontiguousarray(image))
-    found = _detect(integral, config)
-    found = found[np.argsort(-found[:, 3], kind="stable")[: config.max_features]]
+    num_parts = num_threads or default_num_threads()
+    found = _detect(integral, hessian_threshold, num_parts)
+    found = found[np.argsort(-found[:, 3], kind="stable")[:max_features]]
     if len(found) == 0:
         return Features.empty(DESCRIPTOR_LENGTH)
     points, sizes = np.ascontiguousarray(found[:, :2]), found[:, 2].copy()
-    angles, descriptors = _describe(
-        integral, points, sizes * np.float32(SIGMA_PER_FILTER_PX), config
-    )
+    scales = sizes * np.float32(SIGMA_PER_FILTER_PX)
+    angles, descriptors = _describe(integral, points, scales, num_parts)
     return Features(points, sizes, angles, found[:, 3].copy(), descriptors)
 
 
-def _filter_sizes(octave: int, num_layers: int) -> Int64[np.ndarray, " layers"]:
-    """Return the filter sizes of an octave in pixels. They include one layer below and one above
-    the layers in which maxima are searched."""
-    return (MIN_FILTER_PX + FILTER_INCREMENT_PX * np.arange(num_layers + 2)) << octave
+def _filter_edges(octave: int) -> Int64[np.ndarray, "layers 10"]:
+    """Return the edges (pixels) of the lobes of a 9x9 second-derivative pattern scaled to the
+    filters of an octave: three layers in which maxima are searched, one below and one above."""
+    sizes = (MIN_FILTER_PX + FILTER_INCREMENT_PX * np.arange(5)) << octave
+    edges = np.outer((sizes / MIN_FILTER_PX).astype(np.float32), np.arange(10, dtype=np.float32))
+    return np.rint(edges).astype(np.int64)
 
 
-def _pattern_edges(sizes: Int64[np.ndarray, " layers"]) -> Int64[np.ndarray, "layers 10"]:
-    """Return the edges of the lobes of a 9x9 second-derivative pattern scaled to each size, in
-    pixels."""
-    return np.rint(
-        np.outer((sizes / MIN_FILTER_PX).astype(np.float32), np.arange(10, dtype=np.float32))
-    ).astype(np.int64)
-
-
-def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32[np.ndarray, "m 4"]:
+def _detect(
+    integral: Int32[np.ndarray, "h1 w1"], hessian_threshold: float, num_parts: int
+) -> Float32[np.ndarray, "m 4"]:
     """Return the maxima of the Hessian's determinant: rows x, y, size, response."""
+    num_octaves = 4  # octaves of filters, each twice as large as the one before
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
-
     # A maximum needs filters below and above its own. An octave whose third filter does not fit
     # into the image has none.
-    sizes = {
-        octave: _filter_sizes(octave, config.num_layers) for octave in range(config.num_octaves)
-    }
     octaves = {
-        octave: _pattern_edges(s) for octave, s in sizes.items() if s[2] < min(height, width)
+        octave: edges
+        for octave in range(num_octaves)
+        if (edges := _filter_edges(octave))[2, -1] < min(height, width)
     }
     if not octaves:
         return np.zeros((0, 4), np.float32)
@@ -132,10 +94,8 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
             first, last = _part_bounds(height // step, part, num_parts)
             columns, top, rows = edges, 0, integral
             if step > 1:
-                top, bottom = (
-                    max((first - 1) * step - size, 0),
-                    min(last * step + size + step, height + 1),
-                )
+                top = max((first - 1) * step - size, 0)
+                bottom = min(last * step + size + step, height + 1)
                 rows = scratch[part][: (bottom - top) * split_width(step)].reshape(bottom - top, -1)
                 split_columns(integral, step, top, rows)
                 columns = edges % step * (split_width(step) // step) + edges // step
@@ -148,16 +108,14 @@ def _detect(integral: Int32[np.ndarray, "h1 w1"], config: SurfConfig) -> Float32
 
     def largest_split(part_rows: int) -> int:
         """Return the size of the largest band of reordered sums over all octaves but the first."""
-        return max(
-            (
-                (part_rows + 3 * (1 << o) + 2 * int(e[-1, -1])) * split_width(1 << o)
-                for o, e in octaves.items()
-                if o > 0
-            ),
-            default=0,
+        splits = (
+            (part_rows + 3 * (1 << octave) + 2 * int(edges[-1, -1])) * split_width(1 << octave)
+            for octave, edges in octaves.items()
+            if octave > 0
         )
+        return max(splits, default=0)
 
-    num_parts, threshold = config.num_threads or num_threads(), np.float32(config.hessian_threshold)
+    threshold = np.float32(hessian_threshold)
     # Allocated here, not in the threads: the allocator returns the memory of a worker thread to the
     # system after each call.
     scratch = np.empty((num_parts, largest_split(-(-height // num_parts))), np.int32)
@@ -214,43 +172,31 @@ def _describe(
     integral: Int32[np.ndarray, "h1 w1"],
     points: Float32[np.ndarray, "n 2"],
     scales: Float32[np.ndarray, " n"],
-    config: SurfConfig,
+    num_parts: int,
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 64"]]:
     """Return angles in radians and descriptors of key points at these scales (sigma, pixels)."""
-    num_parts = config.num_threads or num_threads()
     angles = np.zeros(len(points), np.float32)
     descriptors = np.empty((len(points), DESCRIPTOR_LENGTH), np.float32)
     # OpenCV averages over a whole number of pixels a side
     spacings = (np.floor(PATCH_SAMPLES * scales) / PATCH_SAMPLES).astype(np.float32)
     level_idx = np.searchsorted(LEVEL_SPACINGS[:-1] * np.sqrt(LEVEL_RATIO), spacings)
-    levels = {
-        int(k): _empty_level(integral, float(LEVEL_SPACINGS[k])) for k in np.unique(level_idx)
-    }
+    used = np.unique(level_idx).tolist()
+    levels = {k: _empty_level(integral, float(LEVEL_SPACINGS[k])) for k in used}
 
     def prepare_part(part: int, _: int) -> None:
         for level in levels.values():
             first, last = _part_bounds(len(level.pixels), part, num_parts)
             smooth_rows(integral, level.box, level.share, level.step, level.pixels, first, last)
-        if not config.upright:
-            orient(integral, points, scales, _select_part(rows_by_y, part, num_parts), angles)
+        orient(integral, points, scales, _select_part(rows_by_y, part, num_parts), angles)
 
     def describe_part(part: int, _: int) -> None:
         for k, level in levels.items():
             rows = _select_part(rows_by_y[level_idx[rows_by_y] == k], part, num_parts)
-            describe(
-                level.pixels,
-                level.offset,
-                level.step,
-                points,
-                spacings,
-                directions,
-                rows,
-                descriptors,
-            )
+            given = points, spacings, angles, rows, descriptors
+            describe(level.pixels, level.offset, level.step, *given)
 
     # From the top of the image down, so that the reads of a thread stay in its core's cache.
     rows_by_y = np.argsort(points[:, 1], kind="stable")
     parallel_for_rows(prepare_part, num_parts, num_parts)
-    directions = np.full_like(angles, 1.5 * np.pi) if config.upright else angles
     parallel_for_rows(describe_part, num_parts, num_parts)
     return angles, descriptors

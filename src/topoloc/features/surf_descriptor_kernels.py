@@ -21,9 +21,7 @@ def _orientation_samples():
     """Return rows (x, y, weight) of the samples within 6 s of the key point, in units of s. Weights
     are from a Gaussian of 2.5 s."""
     radius = ORIENTATION_RADIUS
-    x, y = np.meshgrid(
-        np.arange(-radius, radius + 1), np.arange(-radius, radius + 1), indexing="ij"
-    )
+    x, y = np.indices((2 * radius + 1, 2 * radius + 1)) - radius
     inside = x**2 + y**2 <= radius**2
     kernel = _gaussian(2 * radius + 1, 2.5)
     return np.stack([x[inside], y[inside], np.outer(kernel, kernel)[inside]]).astype(np.float32)
@@ -61,11 +59,8 @@ def smooth_rows(integral, box, share, step, level, first, last):
         for x in range(width):
             columns[x] = np.int32(bottom[x] - top[x])
             columns_inner[x] = np.int32(bottom_inner[x] - top_inner[x])
-        right, left_inner, right_inner = (
-            columns[larger:],
-            columns_inner[1:],
-            columns_inner[1 + box :],
-        )
+        right = columns[larger:]
+        left_inner, right_inner = columns_inner[1:], columns_inner[1 + box :]
         # Compute the whole line although only every step-th pixel is kept: only reads without a
         # stride vectorise.
         target = level[i] if step == 1 else line
@@ -91,10 +86,8 @@ def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradien
     half = np.int32(np.rint(np.float32(2.0) * scale))
     side = np.int32(2 * half)
     last_x, last_y = np.int32(integral.shape[1] - side), np.int32(integral.shape[0] - side)
-    start_x, start_y = (
-        centre_x - (side - 1) * np.float32(0.5),
-        centre_y - (side - 1) * np.float32(0.5),
-    )
+    start_x = centre_x - (side - 1) * np.float32(0.5)
+    start_y = centre_y - (side - 1) * np.float32(0.5)
     for k in range(corners.shape[0]):
         x = np.int32(np.rint(start_x + ORIENTATION_SAMPLES[0, k] * scale))
         y = np.int32(np.rint(start_y + ORIENTATION_SAMPLES[1, k] * scale))
@@ -104,15 +97,11 @@ def _haar_samples(integral, centre_x, centre_y, scale, corners, weights, gradien
     a_flat = integral.ravel()
     b_flat, c_flat = a_flat[half:], a_flat[side:]
     d_flat, f_flat = a_flat[half * stride :], a_flat[half * stride + side :]
-    g_flat, h_flat, i_flat = (
-        a_flat[side * stride :],
-        a_flat[side * stride + half :],
-        a_flat[side * stride + side :],
-    )
+    g_flat = a_flat[side * stride :]
+    h_flat, i_flat = g_flat[half:], g_flat[side:]
     for k in range(corners.shape[0]):
         at = np.uintp(corners[k])
-        rising = np.int32(i_flat[at] - a_flat[at])
-        falling = np.int32(g_flat[at] - c_flat[at])
+        rising, falling = np.int32(i_flat[at] - a_flat[at]), np.int32(g_flat[at] - c_flat[at])
         across = np.int32(rising - 2 * (h_flat[at] - b_flat[at]) + falling)
         down = np.int32(rising - 2 * (f_flat[at] - d_flat[at]) - falling)
         gradients[0, k] = np.float32(across) * weights[k]
@@ -187,10 +176,8 @@ def orient(integral, points, scales, rows, angles):
     num_samples, num_sectors = ORIENTATION_SAMPLES.shape[1], 360 // SECTOR_DEG
     corners, sectors = np.empty(num_samples, np.int32), np.empty(num_samples, np.int32)
     weights = np.empty(num_samples, np.float32)
-    gradients, first_degree = (
-        np.empty((2, num_samples), np.float32),
-        np.empty((2, num_samples), np.float32),
-    )
+    gradients = np.empty((2, num_samples), np.float32)
+    first_degree = np.empty_like(gradients)
     sums = np.empty((2, num_sectors + WINDOW_SECTORS), np.float32)
     threes = np.empty(num_sectors + WINDOW_SECTORS - 3, np.float32)
     windows = np.empty((2, num_sectors), np.float32)
@@ -263,8 +250,7 @@ def describe(level, offset, level_step, points, spacings, angles, rows, descript
     """Fill descriptors[rows] from one level of the pyramid, whose pixel (0, 0) is at (offset,
     offset) of the image."""
     side = PATCH_SIZE + 1
-    indices = np.empty(side * side, np.int32)
-    fractions = np.empty((2, side * side), np.float32)
+    indices, fractions = np.empty(side * side, np.int32), np.empty((2, side * side), np.float32)
     patch = np.zeros(side * side + PADDED_SIZE, np.float32)
     sums = np.empty((4, PADDED_SIZE), np.float32)
     per_pixel = 1.0 / level_step

@@ -58,40 +58,24 @@ def _hessian_row(sums, top, edges, columns, rows, out):
     `split_columns`.
     """
     rows_xx, rows_yy, rows_xy = rows[0], rows[1], rows[2]
-    i0, i1, i2, i3, i4 = (
-        sums[top],
-        sums[top + edges[1]],
-        sums[top + edges[2]],
-        sums[top + edges[3]],
-        sums[top + edges[4]],
-    )
-    i5, i6, i7 = sums[top + edges[5]], sums[top + edges[6]], sums[top + edges[7]]
-    i8, i9 = sums[top + edges[8]], sums[top + edges[9]]
+    s, e = sums[top:], edges
+    i0, i1, i2, i3, i4 = s[0], s[e[1]], s[e[2]], s[e[3]], s[e[4]]
+    i5, i6, i7, i8, i9 = s[e[5]], s[e[6]], s[e[7]], s[e[8]], s[e[9]]
     # A second derivative is the whole box minus three times its middle third: two boxes instead of
     # three.
     for x in range(rows.shape[1]):
         rows_xx[x] = np.int32(i7[x] - i2[x])
         rows_yy[x] = np.int32(i9[x] - i0[x] - 3 * (i6[x] - i3[x]))
         rows_xy[x] = np.int32(i4[x] - i1[x] - i8[x] + i5[x])
-    xx_0, xx_3, xx_6, xx_9 = (
-        rows_xx,
-        rows_xx[columns[3] :],
-        rows_xx[columns[6] :],
-        rows_xx[columns[9] :],
-    )
+    xx_3, xx_6, xx_9 = rows_xx[columns[3] :], rows_xx[columns[6] :], rows_xx[columns[9] :]
     yy_2, yy_7 = rows_yy[columns[2] :], rows_yy[columns[7] :]
-    xy_1, xy_4, xy_5, xy_8 = (
-        rows_xy[columns[1] :],
-        rows_xy[columns[4] :],
-        rows_xy[columns[5] :],
-        rows_xy[columns[8] :],
-    )
+    xy_1, xy_4 = rows_xy[columns[1] :], rows_xy[columns[4] :]
+    xy_5, xy_8 = rows_xy[columns[5] :], rows_xy[columns[8] :]
     lobe = np.float32(1.0) / np.float32((edges[6] - edges[3]) * (edges[7] - edges[2]))
-    quarter = np.float32(0.9) / np.float32(
-        (edges[4] - edges[1]) * (edges[4] - edges[1])
-    )  # 0.9^2 = 0.81, Bay et al. 2008, Eq. 3
+    # 0.9^2 = 0.81, Bay et al. 2008, Eq. 3.
+    quarter = np.float32(0.9) / np.float32((edges[4] - edges[1]) * (edges[4] - edges[1]))
     for x in range(out.shape[0]):
-        dxx = np.float32(np.int32(xx_9[x] - xx_0[x] - 3 * (xx_6[x] - xx_3[x]))) * lobe
+        dxx = np.float32(np.int32(xx_9[x] - rows_xx[x] - 3 * (xx_6[x] - xx_3[x]))) * lobe
         dyy = np.float32(np.int32(yy_7[x] - yy_2[x])) * lobe
         dxy = np.float32(np.int32(xy_4[x] - xy_1[x] - xy_8[x] + xy_5[x])) * quarter
         out[x] = dxx * dyy - dxy * dxy
@@ -103,18 +87,12 @@ def _mark_candidates(below, up, mid, down, above, first, last, threshold, marks)
     filter vectorises."""
     count = last - first
     centre, left, right = mid[first:last], mid[first - 1 : last - 1], mid[first + 1 : last + 1]
-    north, south, smaller, larger = (
-        up[first:last],
-        down[first:last],
-        below[first:last],
-        above[first:last],
-    )
+    north, south = up[first:last], down[first:last]
+    smaller, larger = below[first:last], above[first:last]
     for j in range(count):
         value = centre[j]
-        ring = max(
-            max(max(left[j], right[j]), max(north[j], south[j])),
-            max(max(smaller[j], larger[j]), threshold),
-        )
+        beside = max(max(left[j], right[j]), max(north[j], south[j]))
+        ring = max(beside, max(max(smaller[j], larger[j]), threshold))
         marks[j] = np.uint8(value > ring)
 
 
@@ -137,8 +115,7 @@ def _refine(ring, layer, up, mid, down, j):
     units. ok is False beyond one unit."""
     below, here, above = ring[layer - 1], ring[layer], ring[layer + 1]
     value = np.float64(here[mid, j])
-    gx = (here[mid, j + 1] - here[mid, j - 1]) * 0.5
-    gy = (here[down, j] - here[up, j]) * 0.5
+    gx, gy = (here[mid, j + 1] - here[mid, j - 1]) * 0.5, (here[down, j] - here[up, j]) * 0.5
     gs = (above[mid, j] - below[mid, j]) * 0.5
     xx = here[mid, j + 1] - 2.0 * value + here[mid, j - 1]
     yy = here[down, j] - 2.0 * value + here[up, j]
@@ -165,16 +142,9 @@ def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, co
     margin = sizes[layer + 1] // 2 // step + 1
     up, mid, down = (i - 1) % 3, i % 3, (i + 1) % 3
     last = num_columns - margin
+    below, here, above = ring[layer - 1], ring[layer], ring[layer + 1]
     _mark_candidates(
-        ring[layer - 1, mid],
-        ring[layer, up],
-        ring[layer, mid],
-        ring[layer, down],
-        ring[layer + 1, mid],
-        margin,
-        last,
-        threshold,
-        marks,
+        below[mid], here[up], here[mid], here[down], above[mid], margin, last, threshold, marks
     )
     num_marks = last - margin
     for k in range(num_marks, min((num_marks + 7) // 8 * 8, marks.shape[0])):
@@ -191,11 +161,7 @@ def _collect_row(ring, layer, i, sizes, step, threshold, marks, words, found, co
             if not ok:
                 continue
             if count == found.shape[0]:
-                grown = np.empty((2 * count, 4), np.float32)
-                for row in range(count):
-                    for column in range(4):
-                        grown[row, column] = found[row, column]
-                found = grown
+                found = np.concatenate((found, np.empty_like(found)))
             half = (size - 1) * 0.5
             found[count, 0] = step * (j - size // 2 // step) + half + dx * step
             found[count, 1] = step * (i - size // 2 // step) + half + dy * step

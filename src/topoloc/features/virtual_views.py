@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
@@ -44,14 +45,10 @@ class VirtualView:
     def picture(self, grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "a b"]:
         """Return the image of the virtual camera. Beyond the original image its border is repeated,
         which adds no edges."""
-        # None is right here despite the stubs: OpenCV 5 takes an empty array for a second map.
-        return cv2.remap(
-            grey,
-            self.points_img,
-            None,  # pyright: ignore
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        # The stubs reject None although it is right: OpenCV 5 takes an empty array for a map.
+        remap: Any = cv2.remap
+        points_img, border = self.points_img, cv2.BORDER_REPLICATE
+        return remap(grey, points_img, None, cv2.INTER_LINEAR, borderMode=border)
 
     def select_inside(self, features: Features) -> Features:
         """Return the features inside the rendered area. All dense descriptors are kept."""
@@ -60,10 +57,8 @@ class VirtualView:
 
     def to_image_pixels(self, features: Features, camera: Camera) -> Features:
         """Return the same features at the pixels of the original image, taken by `camera`."""
-        rays = (
-            self.camera.rays_from_img(features.points_img.astype(np.float64))
-            @ self.cam_from_virtual.rotation.T
-        )
+        rays_virtual = self.camera.rays_from_img(features.points_img.astype(np.float64))
+        rays = rays_virtual @ self.cam_from_virtual.rotation.T
         return replace(features, points_img=camera.img_from_cam(rays).astype(np.float32))
 
 
@@ -71,10 +66,8 @@ class VirtualView:
 def make_virtual_views(camera: Camera, max_nearest: float = 1.5) -> tuple[VirtualView, ...]:
     """Return the virtual views to the left and to the right, without those for which the field of
     view is too narrow: it begins beyond `max_nearest`, a tangent off the virtual camera's axis."""
-    views = (
-        _make_virtual_view(camera, name, sign, max_nearest)
-        for name, sign in (("left", -1.0), ("right", 1.0))
-    )
+    sides = (("left", -1.0), ("right", 1.0))
+    views = (_make_virtual_view(camera, name, sign, max_nearest) for name, sign in sides)
     return tuple(view for view in views if view is not None)
 
 
@@ -90,7 +83,10 @@ def _make_virtual_view(
     cam_from_virtual = Rigid3(
         np.array([[0.0, 0.0, sign], [0.0, 1.0, 0.0], [-sign, 0.0, 0.0]]), np.zeros(3)
     )
-    tangent = _max_tangent(camera, sign)
+    # The largest tangent to the side in the field of view. Rays behind the camera, at the ends of
+    # its rows, have no tangent and are ignored.
+    row = np.column_stack([np.arange(camera.width), np.full(camera.width, camera.cy)])
+    tangent = float(np.nanmax(sign * camera.normalized_from_img(row)[:, 0]))
     if tangent * max_nearest < 1.0:
         return None
     nearest, focal = 1.0 / tangent, camera.fx
@@ -101,32 +97,12 @@ def _make_virtual_view(
     # on the other
     cx = -focal * nearest if sign < 0 else focal * farthest
     virtual = Camera.pinhole(int(width), int(height), focal, focal, cx, focal * half_height)
-    points_img = _points_img(camera, virtual, cam_from_virtual)
+    shape = virtual.height, virtual.width
+    rays = virtual.rays_from_img(np.indices(shape, np.float64)[::-1].reshape(2, -1).T)
+    points_img = camera.img_from_cam(rays @ cam_from_virtual.rotation.T).reshape(*shape, 2)
     reach = np.isfinite(points_img).all(axis=2) & (points_img >= 0).all(axis=2)
     reach &= (points_img <= [camera.width - 1, camera.height - 1]).all(axis=2)
     kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)
-    inside = cv2.erode(
-        np.asarray(reach, np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0
-    ).astype(bool)  # pyright: ignore
+    padded = np.pad(reach.astype(np.uint8), 1)  # by default, pixels beyond the border do not count
+    inside = cv2.erode(padded, kernel)[1:-1, 1:-1].astype(bool)
     return VirtualView(name, virtual, cam_from_virtual, points_img.astype(np.float32), inside)
-
-
-def _max_tangent(camera: Camera, sign: float) -> float:
-    """Return the largest tangent to the side in the camera's field of view. Rays behind the camera,
-    at the ends of its rows, have no tangent and are ignored."""
-    row = np.column_stack(
-        [np.arange(camera.width, dtype=np.float64), np.full(camera.width, camera.cy)]
-    )
-    return float(np.nanmax(sign * camera.normalized_from_img(row)[:, 0]))
-
-
-def _points_img(
-    camera: Camera, virtual: Camera, cam_from_virtual: Rigid3
-) -> Float[np.ndarray, "a b 2"]:
-    columns, rows = np.meshgrid(
-        np.arange(virtual.width, dtype=np.float64), np.arange(virtual.height, dtype=np.float64)
-    )
-    rays = virtual.rays_from_img(np.column_stack([columns.ravel(), rows.ravel()]))
-    return camera.img_from_cam(rays @ cam_from_virtual.rotation.T).reshape(
-        virtual.height, virtual.width, 2
-    )

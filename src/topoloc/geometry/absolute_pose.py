@@ -18,19 +18,23 @@ import poselib
 from jaxtyping import Bool, Float
 
 from topoloc.bounds import Above, Between
-from topoloc.geometry.absolute_pose_kernels import normal_equations, refine, squared_errors
+from topoloc.geometry.absolute_pose_kernels import normal_equations, squared_errors
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_matches import (
+    CAUCHY_SCALE,
+    MIN_POINTS,
+    Matches,
+    is_non_collinear,
+    refine_pose,
+)
 from topoloc.geometry.rigid import Rigid3
 
-_Array = np.ndarray
-_MIN_POINTS = 4
 _MAX_THRESHOLD_SCALE = 3.0
 # OpenCV draws five points per sample and refines no candidate. It would need a second for the
 # iterations that PoseLib runs in milliseconds.
 _OPENCV_MAX_ITERATIONS = 1000
 _OPENCV_CONFIDENCE = 0.99  # its default
 _MAX_SCALE_STEPS = 30
-CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
 # Effect of Cauchy's weights w on Gaussian residuals r of two dimensions, to correct the covariance
 # for it: E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance
 # over the inverse of its information.
@@ -74,55 +78,6 @@ class AbsolutePose:
     covariance: Float[np.ndarray, "6 6"]
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
-    """Hold the usable matches: pixels, their coordinates and covariances on the plane z = 1, and
-    world points."""
-
-    points_img: Float[np.ndarray, "n 2"]
-    normalized: Float[np.ndarray, "n 2"]
-    covariances: Float[np.ndarray, "n 2 2"]
-    points_world: Float[np.ndarray, "n 3"]
-    point_covariances: Float[np.ndarray, "n 3 3"] | Float[np.ndarray, "0 3 3"]
-
-    @staticmethod
-    def from_pixels(
-        points_img: _Array,
-        normalized: Float[np.ndarray, "n 2"],
-        points_world: _Array,
-        point_covariances: _Array,
-        camera: Camera,
-        sigma_px: float,
-    ) -> Matches:
-        """Create matches from pixels, their coordinates on the plane z = 1, world points (metres)
-        and the points' covariances (m^2). `sigma_px` is the standard deviation of the pixels."""
-        to_normalized = sigma_px * camera.normalized_jacobian(normalized)
-        return Matches(
-            points_img=np.ascontiguousarray(points_img, dtype=np.float64),
-            normalized=normalized,
-            covariances=to_normalized @ to_normalized.transpose(0, 2, 1),
-            points_world=np.ascontiguousarray(points_world, dtype=np.float64),
-            point_covariances=np.ascontiguousarray(point_covariances, dtype=np.float64),
-        )
-
-    def kernel_args(
-        self, cam_from_world: Rigid3
-    ) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array]:
-        """Return the arguments that all kernels share."""
-        rotation, translation = (
-            np.ascontiguousarray(cam_from_world.rotation),
-            np.ascontiguousarray(cam_from_world.translation),
-        )
-        return (
-            rotation,
-            translation,
-            self.normalized,
-            self.covariances,
-            self.points_world,
-            self.point_covariances,
-        )
-
-
 def estimate_absolute_pose(
     points_img: Float[np.ndarray, "n 2"],
     points_world: Float[np.ndarray, "n 3"],
@@ -154,36 +109,28 @@ def estimate_absolute_pose(
     if priorities is not None:
         order = order[np.argsort(-priorities[order], kind="stable")]
     covariances = np.zeros((0, 3, 3)) if point_covariances is None else point_covariances[order]
+    pixels, sigma_px = points_img[order], config.key_point_sigma_px
     matches = Matches.from_pixels(
-        points_img[order],
-        normalized[order],
-        points_world[order],
-        covariances,
-        camera,
-        config.key_point_sigma_px,
+        pixels, points_world[order], covariances, camera, sigma_px, normalized[order]
     )
     if not is_non_collinear(matches.points_world) or not is_non_collinear(
         np.insert(matches.normalized, 2, 0.0, axis=1)
     ):
         return None
-    if start is not None:
-        cam_from_world = _refine_on_inliers(start, matches, camera, config)
+    # The solvers get a pinhole of the same focal length and undistorted pixels. So thresholds keep
+    # their meaning and all camera models work alike. PoseLib adds no half pixel of its own.
+    undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    if start is None and config.method == "opencv":
+        cam_from_world = _solve_with_opencv(undistorted, matches.points_world, camera, config)
     else:
-        solve = _solve_with_opencv if config.method == "opencv" else _solve_with_poselib
-        cam_from_world = solve(matches, camera, config, priorities is not None)
+        if start is None:
+            start, *_ = estimate_pose_ransac(
+                undistorted, matches.points_world, camera, config, priorities is not None
+            ) or (None,)
+        cam_from_world = start and _refine_on_inliers(start, matches, camera, config)
     if cam_from_world is None:
         return None
     return _with_covariance(cam_from_world, matches, camera, config, order, len(points_img))
-
-
-def _solve_with_poselib(
-    matches: Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool
-) -> Rigid3 | None:
-    # PoseLib gets a pinhole of the same focal length and undistorted pixels. So thresholds keep
-    # their meaning and all camera models work alike. PoseLib adds no half pixel of its own.
-    undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    found = estimate_pose_ransac(undistorted, matches.points_world, camera, config, is_sorted)
-    return _refine_on_inliers(found[0], matches, camera, config) if found else None
 
 
 def estimate_pose_ransac(
@@ -218,16 +165,15 @@ def estimate_pose_ransac(
         "progressive_sampling": is_sorted,
         "seed": config.seed,
     }
-    bundle = {"max_iterations": 0}  # the refinement on the inliers replaces it
+    no_bundle = {"max_iterations": 0}  # the refinement on the inliers replaces it
     pose, ransac_info = poselib.estimate_absolute_pose(
-        undistorted, points_world, pinhole, ransac, bundle
+        undistorted, points_world, pinhole, ransac, no_bundle
     )
     matrix = np.asarray(pose.Rt, dtype=np.float64)
     if not np.isfinite(matrix).all():
         return None
-    loss = (
-        float(ransac_info["model_score"]) * ((camera.fx + camera.fy) / 2) ** 2
-    )  # PoseLib's is on the plane z = 1
+    # PoseLib's score is on the plane z = 1.
+    loss = float(ransac_info["model_score"]) * ((camera.fx + camera.fy) / 2) ** 2
     return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), int(ransac_info["num_inliers"]), loss
 
 
@@ -242,43 +188,26 @@ def _refine_on_inliers(
     return cam_from_world
 
 
-def refine_pose(
-    cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"], max_steps: int = 10
-) -> Rigid3:
-    """Return the pose that fits the active matches best, starting from a nearby pose, in at most
-    `max_steps` steps."""
-    rotation, translation = refine(
-        *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, max_steps
-    )
-    return Rigid3(rotation, translation)
-
-
 def _solve_with_opencv(
-    matches: Matches, camera: Camera, config: AbsolutePoseConfig, is_sorted: bool
+    undistorted: np.ndarray, points_world: np.ndarray, camera: Camera, config: AbsolutePoseConfig
 ) -> Rigid3 | None:
-    del is_sorted  # OpenCV's RANSAC has no ordering
-    undistorted = matches.normalized * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    matrix = camera.matrix()
     try:
         found, rotation, translation, idx = cv2.solvePnPRansac(
-            matches.points_world,
+            points_world,
             undistorted,
-            camera.matrix(),
+            matrix,
             None,
             iterationsCount=min(config.max_iterations, _OPENCV_MAX_ITERATIONS),
             reprojectionError=config.max_reprojection_error_px,
             confidence=_OPENCV_CONFIDENCE,
             flags=cv2.SOLVEPNP_EPNP,
         )
-        if not found or idx is None or len(idx) < _MIN_POINTS:
+        if not found or idx is None or len(idx) < MIN_POINTS:
             return None
         rows = np.sort(np.asarray(idx, dtype=np.intp)[:, 0])
         rotation, translation = cv2.solvePnPRefineLM(
-            matches.points_world[rows],
-            undistorted[rows],
-            camera.matrix(),
-            None,
-            rotation,
-            translation,
+            points_world[rows], undistorted[rows], matrix, None, rotation, translation
         )
     except cv2.error:  # thrown for some degenerate samples
         return None
@@ -296,12 +225,11 @@ def _with_covariance(
     num_points: int,
 ) -> AbsolutePose | None:
     active = select_inliers(cam_from_world, matches, camera, config)
-    if np.count_nonzero(active) < _MIN_POINTS or not is_non_collinear(matches.points_world[active]):
+    if np.count_nonzero(active) < MIN_POINTS or not is_non_collinear(matches.points_world[active]):
         return None
-    scale = _estimate_noise_scale(squared_errors(*matches.kernel_args(cam_from_world))[active])
-    information, *_ = normal_equations(
-        *matches.kernel_args(cam_from_world), active, CAUCHY_SCALE * scale, 6
-    )
+    arguments = matches.kernel_args(cam_from_world)
+    scale = _estimate_noise_scale(squared_errors(*arguments)[active])
+    information, *_ = normal_equations(*arguments, active, CAUCHY_SCALE * scale, 6)
     inverse = _invert_information(information)
     if inverse is None:
         return None
@@ -320,9 +248,8 @@ def _estimate_noise_scale(squares: Float[np.ndarray, " n"]) -> float:
     num_free, variance = max(2 * len(squares) - 6, 1), 1.0
     for _ in range(_MAX_SCALE_STEPS):
         scaled = squares / variance
-        ratio = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2))) / (
-            _MEAN_WEIGHTED_SQUARE * num_free
-        )
+        total = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2)))
+        ratio = total / (_MEAN_WEIGHTED_SQUARE * num_free)
         if ratio <= 1.001:
             break
         variance *= ratio
@@ -346,12 +273,10 @@ def select_inliers(
     cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig
 ) -> Bool[np.ndarray, " n"]:
     """Return the inliers of a pose. With poselib the threshold is widened for uncertain points."""
-    errors_px = np.linalg.norm(
-        camera.img_from_cam(cam_from_world.apply(matches.points_world)) - matches.points_img, axis=1
-    )
-    limit_px = (
-        config.max_reprojection_error_px
-    )  # NaN, for points behind the camera or outside its field, is not below the limit
+    pixels = camera.img_from_cam(cam_from_world.apply(matches.points_world))
+    # NaN, for points behind the camera or outside its field, is not below the limit.
+    errors_px = np.linalg.norm(pixels - matches.points_img, axis=1)
+    limit_px = config.max_reprojection_error_px
     if config.method == "opencv" or len(matches.point_covariances) == 0:
         return errors_px <= limit_px
     # A plain threshold would truncate the errors of uncertain points, and the rest would look too
@@ -360,15 +285,3 @@ def select_inliers(
     return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (
         errors_px <= _MAX_THRESHOLD_SCALE * limit_px
     )
-
-
-def is_non_collinear(points: Float[np.ndarray, "n 3"]) -> bool:
-    """Return whether there are at least four points, not all on one line."""
-    if len(points) < _MIN_POINTS:
-        return False
-    centred = points - points.mean(axis=0)
-    scatter = (
-        centred.T @ centred
-    )  # of variances a <= b <= c: trace^2 - |scatter|^2 is 2 (ab + ac + bc), between 2 bc and 6 bc
-    total = float(np.trace(scatter)) ** 2
-    return total - float(np.vdot(scatter, scatter)) > 2e-9 * total

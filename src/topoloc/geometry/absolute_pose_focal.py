@@ -16,18 +16,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.geometry.absolute_pose import (
-    CAUCHY_SCALE,
     AbsolutePose,
     AbsolutePoseConfig,
-    Matches,
     estimate_absolute_pose,
     estimate_pose_ransac,
-    is_non_collinear,
-    refine_pose,
     select_inliers,
 )
 from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_cholesky
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_matches import CAUCHY_SCALE, Matches, is_non_collinear, refine_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 
@@ -81,14 +78,11 @@ def estimate_pose_and_focal(
     )
     finite = points_img[usable], points_world[usable], point_covariances[usable]
     starts = [start] if start else _search_focal_lengths(finite, uncalibrated, config)
-    refined = [
-        one
-        for each in starts
-        if (one := _refine_pose_and_focal(each, finite, uncalibrated, config))
-    ]
-    if not refined:
+    refined = [_refine_pose_and_focal(each, finite, uncalibrated, config) for each in starts]
+    best = max(filter(None, refined), key=lambda one: one[0], default=None)
+    if best is None:
         return None
-    _, cam_from_world, camera = max(refined, key=lambda one: one[0])
+    _, cam_from_world, camera = best
     pose = estimate_absolute_pose(
         points_img,
         points_world,
@@ -99,22 +93,13 @@ def estimate_pose_and_focal(
     )
     if pose is None:
         return None
+    matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)
     information, _ = _normal_equations(
-        pose.cam_from_world,
-        _matches(finite, camera, config),
-        pose.inliers[usable],
-        camera,
-        uncalibrated,
+        pose.cam_from_world, matches, pose.inliers[usable], camera, uncalibrated
     )
-    covariance = _add_focal_uncertainty(pose.covariance, information)
-    return (
-        replace(
-            pose,
-            covariance=covariance
-            + _principal_point_covariance(points_world[pose.inliers], pose, camera),
-        ),
-        camera,
-    )
+    of_focal = _add_focal_uncertainty(pose.covariance, information)
+    of_centre = _principal_point_covariance(points_world[pose.inliers], pose, camera)
+    return replace(pose, covariance=of_focal + of_centre), camera
 
 
 def _search_focal_lengths(
@@ -125,44 +110,28 @@ def _search_focal_lengths(
     points_img, points_world, _ = finite
     if len(points_img) < _MIN_INLIERS:
         return []
-    num_steps = max(
-        1,
-        math.ceil(
-            math.log(uncalibrated.max_focal / uncalibrated.min_focal) / math.log(_FOCAL_STEP)
-        ),
-    )
+    ratio = uncalibrated.max_focal / uncalibrated.min_focal
+    num_steps = max(1, math.ceil(math.log(ratio) / math.log(_FOCAL_STEP)))
     exponents = sorted((np.arange(num_steps) + 0.5) / num_steps, key=lambda one: abs(one - 0.5))
     found: list[tuple[float, Rigid3, Camera]] = []
     most = _MIN_INLIERS - 1
     for k, exponent in enumerate(exponents):
-        camera = uncalibrated.with_focal(
-            uncalibrated.min_focal
-            * (uncalibrated.max_focal / uncalibrated.min_focal) ** float(exponent)
-        )
-        enough = _num_ransac_iterations(most / len(points_img))
-        quick = replace(
-            config,
-            max_iterations=min(config.max_iterations, _MAX_ITERATIONS, enough),
-            seed=config.seed + k,
-        )
+        camera = uncalibrated.with_focal(uncalibrated.min_focal * ratio ** float(exponent))
+        # After this many samples of three, one contains only right matches with a confidence of
+        # 99.9 %.
+        share = min(most / len(points_img), 0.99)
+        enough = max(1, math.ceil(math.log(1.0 - 0.999) / math.log1p(-(share**3))))
+        iterations = min(config.max_iterations, _MAX_ITERATIONS, enough)
+        quick = replace(config, max_iterations=iterations, seed=config.seed + k)
         cam_from_world, num_inliers, loss = estimate_pose_ransac(
             points_img, points_world, camera, quick
         ) or (None, 0, math.inf)
         if cam_from_world is not None and num_inliers >= _MIN_INLIERS:
             found.append((loss, cam_from_world, camera))
             most = max(most, num_inliers)
-    found.sort(
-        key=lambda one: one[0]
-    )  # distant and flat scenes give similar inlier counts at all focal lengths, but not errors
+    # Distant and flat scenes give similar inlier counts at all focal lengths, but not errors.
+    found.sort(key=lambda one: one[0])
     return [(cam_from_world, camera) for _, cam_from_world, camera in found[:_MAX_STARTS]]
-
-
-def _num_ransac_iterations(share: float, confidence: float = 0.999) -> int:
-    """Return the number of samples of three after which one contains only right matches, at this
-    confidence. `share` is the inlier ratio."""
-    return max(
-        1, math.ceil(math.log(max(1.0 - confidence, 1e-9)) / math.log1p(-(min(share, 0.99) ** 3)))
-    )
 
 
 def _refine_pose_and_focal(
@@ -176,7 +145,7 @@ def _refine_pose_and_focal(
     cam_from_world, camera = start
     num_inliers = 0
     for _ in range(_MAX_ROUNDS):
-        matches = _matches(finite, camera, config)
+        matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)
         inliers = select_inliers(cam_from_world, matches, camera, config)
         num_inliers = int(np.count_nonzero(inliers))
         if not is_non_collinear(matches.points_world[inliers]):
@@ -188,32 +157,13 @@ def _refine_pose_and_focal(
         is_definite, step = solve_cholesky(information, -gradient)
         if not is_definite:
             return None
-        focal = float(
-            np.clip(
-                camera.fx * math.exp(np.clip(step[6], -0.2, 0.2)),
-                uncalibrated.min_focal,
-                uncalibrated.max_focal,
-            )
-        )
+        focal = camera.fx * math.exp(np.clip(step[6], -0.2, 0.2))
+        focal = float(np.clip(focal, uncalibrated.min_focal, uncalibrated.max_focal))
         if abs(math.log(focal / camera.fx)) < 1e-4:
             break
-        camera, cam_from_world = (
-            uncalibrated.with_focal(focal),
-            Rigid3.exp(step[:6]) @ cam_from_world,
-        )
+        camera = uncalibrated.with_focal(focal)
+        cam_from_world = Rigid3.exp(step[:6]) @ cam_from_world
     return num_inliers, cam_from_world, camera
-
-
-def _matches(finite: _FiniteMatches, camera: Camera, config: AbsolutePoseConfig) -> Matches:
-    pixels, points_world, covariances = finite
-    return Matches.from_pixels(
-        pixels,
-        camera.normalized_from_img(pixels),
-        points_world,
-        covariances,
-        camera,
-        config.key_point_sigma_px,
-    )
 
 
 def _normal_equations(

@@ -41,18 +41,12 @@ def _whiten_residual(
             point_covariances[i, 2, 1],
             point_covariances[i, 2, 2],
         )
-        a0, b0 = (
-            w * (rotation[0, 0] - u * rotation[2, 0]),
-            w * (rotation[1, 0] - v * rotation[2, 0]),
-        )
-        a1, b1 = (
-            w * (rotation[0, 1] - u * rotation[2, 1]),
-            w * (rotation[1, 1] - v * rotation[2, 1]),
-        )
-        a2, b2 = (
-            w * (rotation[0, 2] - u * rotation[2, 2]),
-            w * (rotation[1, 2] - v * rotation[2, 2]),
-        )
+        a0 = w * (rotation[0, 0] - u * rotation[2, 0])
+        a1 = w * (rotation[0, 1] - u * rotation[2, 1])
+        a2 = w * (rotation[0, 2] - u * rotation[2, 2])
+        b0 = w * (rotation[1, 0] - v * rotation[2, 0])
+        b1 = w * (rotation[1, 1] - v * rotation[2, 1])
+        b2 = w * (rotation[1, 2] - v * rotation[2, 2])
         pa0, pb0 = p00 * a0 + p01 * a1 + p02 * a2, p00 * b0 + p01 * b1 + p02 * b2
         pa1, pb1 = p10 * a0 + p11 * a1 + p12 * a2, p10 * b0 + p11 * b1 + p12 * b2
         pa2, pb2 = p20 * a0 + p21 * a1 + p22 * a2, p20 * b0 + p21 * b1 + p22 * b2
@@ -81,16 +75,9 @@ def squared_errors(rotation, translation, normalized, covariances, points_world,
 
 @kernel()
 def normal_equations(
-    rotation,
-    translation,
-    normalized,
-    covariances,
-    points_world,
-    point_covariances,
-    active,
-    cauchy_scale,
-    num_unknowns,
-):
+    rotation, translation, normalized, covariances, points_world, point_covariances,
+    active, cauchy_scale, num_unknowns,
+):  # fmt: skip
     """Return Gauss-Newton's normal equations of the whitened reprojection errors on the plane z =
     1.
 
@@ -105,10 +92,8 @@ def normal_equations(
     Returns the information (k, k) and the gradient (k) of k unknowns, the Cauchy cost, and the sum
     of the weighted squared residuals.
     """
-    information = np.zeros((num_unknowns, num_unknowns))
-    gradient = np.zeros(num_unknowns)
-    cost = 0.0
-    squares = 0.0
+    information, gradient = np.zeros((num_unknowns, num_unknowns)), np.zeros(num_unknowns)
+    cost, squares = 0.0, 0.0
     jacobian = np.zeros((2, 7))
     for i in range(len(normalized)):
         if not active[i]:
@@ -142,16 +127,9 @@ def normal_equations(
 
 @kernel()
 def score_outer_products(
-    rotation,
-    translation,
-    normalized,
-    covariances,
-    points_world,
-    point_covariances,
-    cells,
-    num_cells,
-    cauchy_scale,
-):
+    rotation, translation, normalized, covariances, points_world, point_covariances,
+    cells, num_cells, cauchy_scale,
+):  # fmt: skip
     """Return the information (6, 6) of all matches, and two sums of outer products g g' of the
     gradients minus their mean. The first sum is over single matches. The second sum is over cells,
     with the gradients in each cell added first."""
@@ -161,16 +139,9 @@ def score_outer_products(
     gradients, cell_gradients = np.zeros((count, 6)), np.zeros((num_cells, 6))
     for i in range(count):
         own, gradients[i], _, _ = normal_equations(
-            rotation,
-            translation,
-            normalized[i : i + 1],
-            covariances[i : i + 1],
-            points_world[i : i + 1],
-            point_covariances[i : i + 1],
-            active,
-            cauchy_scale,
-            6,
-        )
+            rotation, translation, normalized[i : i + 1], covariances[i : i + 1],
+            points_world[i : i + 1], point_covariances[i : i + 1], active, cauchy_scale, 6,
+        )  # fmt: skip
         information += own
     mean = gradients.sum(axis=0) / max(count, 1)
     for i in range(count):
@@ -188,29 +159,15 @@ def score_outer_products(
 
 @kernel()
 def refine(
-    rotation,
-    translation,
-    normalized,
-    covariances,
-    points_world,
-    point_covariances,
-    active,
-    cauchy_scale,
-    max_steps,
-):
+    rotation, translation, normalized, covariances, points_world, point_covariances,
+    active, cauchy_scale, max_steps,
+):  # fmt: skip
     """Run iteratively reweighted Gauss-Newton under Cauchy's loss until the cost no longer falls.
     Returns (rotation, translation)."""
     information, gradient, cost, _ = normal_equations(
-        rotation,
-        translation,
-        normalized,
-        covariances,
-        points_world,
-        point_covariances,
-        active,
-        cauchy_scale,
-        6,
-    )
+        rotation, translation, normalized, covariances, points_world, point_covariances,
+        active, cauchy_scale, 6,
+    )  # fmt: skip
     for _ in range(max_steps):
         is_definite, step = solve_cholesky(information, -gradient)
         if not is_definite:
@@ -224,16 +181,9 @@ def refine(
                 for j in range(3):
                     new_rotation[i, j] += turn[i, k] * rotation[k, j]
         information, gradient, new_cost, _ = normal_equations(
-            new_rotation,
-            new_translation,
-            normalized,
-            covariances,
-            points_world,
-            point_covariances,
-            active,
-            cauchy_scale,
-            6,
-        )
+            new_rotation, new_translation, normalized, covariances, points_world, point_covariances,
+            active, cauchy_scale, 6,
+        )  # fmt: skip
         if not new_cost <= cost:
             break
         rotation, translation = new_rotation, new_translation
@@ -248,8 +198,7 @@ def solve_cholesky(matrix, right):
     """Return (True, x) with matrix @ x = right by Cholesky's decomposition, or (False, _) if the
     matrix is not positive definite."""
     n = len(right)
-    lower = np.zeros((n, n))
-    x = np.zeros(n)
+    lower, x = np.zeros((n, n)), np.zeros(n)
     for i in range(n):
         for j in range(i + 1):
             total = matrix[i, j]

@@ -7,7 +7,7 @@ a and b, give ``a_from_b`` of the worlds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,18 +37,13 @@ def align_points(points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray,
         TrajectoryError: the numbers of points differ, there are fewer than three, all lie on one
             line, or some are not finite.
     """
-    if len(points_a) != len(points_b):
-        raise TrajectoryError(
-            f"point sets to align have {len(points_a)} and {len(points_b)} points"
-        )
+    _check_lengths(points_a, points_b)
     if not (np.isfinite(points_a).all() and np.isfinite(points_b).all()):
         raise TrajectoryError("points to align hold values that are not finite")
     for points in (points_a, points_b):
-        spread = (
-            np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-            if len(points) >= 3
-            else np.zeros(3)
-        )
+        spread = np.zeros(3)
+        if len(points) >= 3:
+            spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if spread[1] <= max(_MIN_SPREAD, _MIN_RELATIVE_SPREAD * spread[0]):
             raise TrajectoryError(
                 f"{len(points)} points on one line (or fewer than three) fix no rotation"
@@ -201,10 +196,8 @@ def absolute_trajectory_errors(
         true_from_estimated = align_trajectories(true_world_from_cams, world_from_cams)
     except TrajectoryError:
         true_from_estimated = align_poses(true_world_from_cams, world_from_cams)
-    positions = true_from_estimated.apply(np.array([pose.translation for pose in world_from_cams]))
-    return np.linalg.norm(
-        positions - np.array([pose.translation for pose in true_world_from_cams]), axis=1
-    )
+    positions = true_from_estimated.apply(_positions(world_from_cams))
+    return np.linalg.norm(positions - _positions(true_world_from_cams), axis=1)
 
 
 def relative_drift(
@@ -219,13 +212,8 @@ def relative_drift(
     Raises:
         TrajectoryError: the lengths differ.
     """
-    if len(true_world_from_cams) != len(world_from_cams):
-        raise TrajectoryError(
-            f"trajectories to compare have {len(true_world_from_cams)} and {len(world_from_cams)}"
-            " poses"
-        )
-    positions = np.array([pose.translation for pose in true_world_from_cams]).reshape(-1, 3)
-    path_lengths = compute_path_lengths(positions)
+    _check_lengths(true_world_from_cams, world_from_cams)
+    path_lengths = compute_path_lengths(_positions(true_world_from_cams))
     lengths = KITTI_LENGTHS if path_lengths[-1] >= _MIN_KITTI_LENGTH else SHORT_LENGTHS
     translations, rotations = [], []
     for length in lengths:
@@ -250,11 +238,6 @@ def _positions(world_from_cams: Sequence[Rigid3]) -> Float[np.ndarray, "n 3"]:
     return np.array([pose.translation for pose in world_from_cams], dtype=np.float64).reshape(-1, 3)
 
 
-def _check_lengths(
-    world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]
-) -> None:
-    if len(world_a_from_cams) != len(world_b_from_cams):
-        raise TrajectoryError(
-            f"trajectories to align have {len(world_a_from_cams)} and {len(world_b_from_cams)}"
-            " poses"
-        )
+def _check_lengths(a: Sized, b: Sized) -> None:
+    if len(a) != len(b):
+        raise TrajectoryError(f"trajectories to compare have {len(a)} and {len(b)} poses")

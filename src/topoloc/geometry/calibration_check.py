@@ -1,17 +1,25 @@
-"""Check a camera's calibration in one image: estimate pose, focal length and principal point
-together from pixels of map points.
+"""Check a camera's calibration in one image and in many: estimate pose, focal length and principal
+point together from pixels of map points.
 
 A pose found with a wrong focal length or principal point absorbs part of the error, but the
 residuals stay systematic. So Gauss-Newton starts from this pose and estimates three more unknowns
 on the plane z = 1. Observations are `scale` times the projection plus `offset`. `scale` is the
 focal length relative to the calibrated one. `offset` is the shift of the principal point in
 calibrated focal lengths.
+
+Many images together are more precise than one. Each image is weighted by its information. Images
+that disagree by more than their noise get smaller weights (Cauchy). Their scatter beyond the noise
+is added to each variance (random effects: DerSimonian and Laird, *Controlled Clinical Trials* 7,
+1986). Images of one place share the errors of its points, so the covariance is scaled to the number
+of places.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +28,7 @@ from topoloc.geometry.calibration_check_kernels import calibration_equations
 from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import encode_json
 
 _NUM_ITERATIONS = 3
 _MAX_POINTS = 256  # evenly chosen among all: their noise is the smallest error
@@ -28,6 +37,10 @@ _CAUCHY_SCALE = 2.3849
 # length from the distance.
 _PRIOR_SIGMA = 0.3
 _MIN_POINTS = 20
+MIN_IMAGES, MIN_PLACES = 5, 4  # images of one place share their errors, however many there are
+_NUM_SIGMAS, _MIN_RELATIVE_DEVIATION = 3.0, 0.02  # of the focal length, or of the image's width
+_NUM_MEAN_ITERATIONS = 10
+_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,28 +73,14 @@ def estimate_image_calibration(
     if len(points_img) < _MIN_POINTS:
         return None
     rows = np.unique(np.linspace(0, len(points_img) - 1, _MAX_POINTS).astype(int))
-    points_img, points_world, point_covariances = (
-        points_img[rows],
-        points_world[rows],
-        point_covariances[rows],
-    )
-    observed = camera.normalized_from_img(points_img)
+    observed = camera.normalized_from_img(points_img[rows])
+    of_points = points_world[rows], point_covariances[rows], sigma_px / camera.fx, _CAUCHY_SCALE
     pose, free = cam_from_world, np.zeros(3)  # logarithm of the scale, offset
     information, squares = np.eye(9), np.zeros(len(rows))
     for _ in range(_NUM_ITERATIONS):
-        rotation, translation = (
-            np.ascontiguousarray(pose.rotation),
-            np.ascontiguousarray(pose.translation),
-        )
-        point_args = (
-            observed,
-            points_world,
-            point_covariances,
-            sigma_px / camera.fx,
-            _CAUCHY_SCALE,
-        )
+        rotation, translation = map(np.ascontiguousarray, (pose.rotation, pose.translation))
         information, gradient, squares = calibration_equations(
-            rotation, translation, free, *point_args
+            rotation, translation, free, observed, *of_points
         )
         information[6:, 6:] += np.eye(3) / _PRIOR_SIGMA**2
         gradient[6:] += free / _PRIOR_SIGMA**2
@@ -92,9 +91,8 @@ def estimate_image_calibration(
         if not np.isfinite(step).all() or abs(step[6]) > 1.0:
             return None
         pose, free = Rigid3.exp(step[:6]) @ pose, free + step[6:]
-    noise = max(
-        float(np.median(squares)) / (2.0 * math.log(2.0)), 0.05
-    )  # a chi-square of two has its median at 2 ln 2
+    # A chi-square of two has its median at 2 ln 2.
+    noise = max(float(np.median(squares)) / (2.0 * math.log(2.0)), 0.05)
     covariance = np.linalg.inv(information)[6:, 6:] * noise
     return ImageCalibration(math.exp(free[0]), free[1:], covariance, pose)
 
@@ -102,19 +100,11 @@ def estimate_image_calibration(
 def corrected_camera(camera: Camera, found: ImageCalibration) -> Camera:
     """Return the camera with the estimated focal length and principal point. Its distortion is
     unchanged."""
-    focal = np.array([camera.fx, camera.fy])
-    (fx, fy), (cx, cy) = (
-        found.scale * focal,
-        np.array([camera.cx, camera.cy]) + focal * found.offset,
-    )
+    fx, fy = found.scale * camera.fx, found.scale * camera.fy
+    cx, cy = camera.cx + camera.fx * found.offset[0], camera.cy + camera.fy * found.offset[1]
     moved = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return replace(
-        camera,
-        params=tuple(
-            float(moved.get(name, value))
-            for name, value in zip(MODELS[camera.model], camera.params, strict=True)
-        ),
-    )
+    named = zip(MODELS[camera.model], camera.params, strict=True)
+    return replace(camera, params=tuple(float(moved.get(name, value)) for name, value in named))
 
 
 def compute_intrinsics_deviation(
@@ -123,11 +113,101 @@ def compute_intrinsics_deviation(
     """Return the deviation of the estimate, found with `camera`, from the image's original
     calibration. Both cameras must have one image size."""
     estimated = corrected_camera(camera, found)
-    principal_point_shift = (
-        np.array([estimated.cx - calibrated.cx, estimated.cy - calibrated.cy]) / calibrated.fx
+    x = (estimated.cx - calibrated.cx) / calibrated.fx
+    y = (estimated.cy - calibrated.cy) / calibrated.fx
+    deviation = np.array([math.log(estimated.fx / calibrated.fx), x, y])
+    return IntrinsicsDeviation(deviation, found.covariance, place)
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationConsistency:
+    """Hold the intrinsics estimated from many images, in pixels of the original images. Each sigma
+    is the standard deviation of the field before it. `num_images` is the number of images used."""
+
+    num_images: int
+    focal_length_px: float
+    focal_sigma_px: float
+    calibrated_focal_length_px: float
+    principal_point_px: Float[np.ndarray, " 2"]
+    principal_point_sigma_px: Float[np.ndarray, " 2"]
+    calibrated_principal_point_px: Float[np.ndarray, " 2"]
+    has_focal_mismatch: bool
+    has_principal_point_mismatch: bool
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Return whether the images contradict the calibration."""
+        return self.has_focal_mismatch or self.has_principal_point_mismatch
+
+    def __str__(self) -> str:
+        (x, y), (x_sigma, y_sigma) = self.principal_point_px, self.principal_point_sigma_px
+        cx, cy = self.calibrated_principal_point_px
+        focal = (
+            f"f = {self.focal_length_px:.1f} +- {self.focal_sigma_px:.1f} px, the calibration"
+            f" {self.calibrated_focal_length_px:.1f}"
+        )
+        centre = (
+            f"the principal point at ({x:.1f} +- {x_sigma:.1f}, {y:.1f} +- {y_sigma:.1f}), the"
+            f" calibration ({cx:.1f}, {cy:.1f})"
+        )
+        parts = [focal] * self.has_focal_mismatch + [centre] * self.has_principal_point_mismatch
+        found = f"say {'; '.join(parts)}" if parts else f"agree with it: {focal}"
+        return f"the pictures {found} ({self.num_images} pictures)"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as JSON, with a text for the user as `detail`."""
+        values = encode_json(self)
+        return {
+            "num_pictures": values.pop("num_images"),
+            **{name: value for name, value in values.items() if not name.startswith("has_")},
+            "contradicted": self.is_contradicted,
+            "detail": str(self),
+        }
+
+
+def check_calibration_consistency(
+    observations: Sequence[IntrinsicsDeviation], calibrated: Camera
+) -> CalibrationConsistency | None:
+    """Return the intrinsics estimated from images of one camera. Return None if there are fewer
+    than five images or fewer than four places."""
+    if len(observations) < MIN_IMAGES or len({one.place for one in observations}) < MIN_PLACES:
+        return None
+    deviation, covariance = _robust_mean(observations)
+    sigmas = np.sqrt(np.diag(covariance))
+    shares = np.abs(deviation) * np.array([1.0, *np.repeat(calibrated.fx / calibrated.width, 2)])
+    is_off = (np.abs(deviation) > _NUM_SIGMAS * sigmas) & (shares > _MIN_RELATIVE_DEVIATION)
+    focal = calibrated.fx * float(np.exp(deviation[0]))
+    centre = np.array([calibrated.cx, calibrated.cy])
+    return CalibrationConsistency(
+        len(observations),
+        focal,
+        focal * float(sigmas[0]),
+        calibrated.fx,
+        centre + calibrated.fx * deviation[1:],
+        calibrated.fx * sigmas[1:],
+        centre,
+        bool(is_off[0]),
+        bool(is_off[1:].any()),
     )
-    return IntrinsicsDeviation(
-        np.array([math.log(estimated.fx / calibrated.fx), *principal_point_shift]),
-        found.covariance,
-        place,
-    )
+
+
+def _robust_mean(
+    observations: Sequence[IntrinsicsDeviation],
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
+    """Return the robust mean of the deviations and its covariance."""
+    deviations = np.stack([one.deviation for one in observations])
+    covariances = np.stack([one.covariance for one in observations])
+    variances = np.einsum("nii->ni", covariances)
+    mean = np.median(deviations, axis=0)
+    information = np.eye(3)
+    for _ in range(_NUM_MEAN_ITERATIONS):
+        residuals = deviations - mean
+        spread = (_MAD_TO_SIGMA * np.median(np.abs(residuals), axis=0)) ** 2
+        excess = np.maximum(spread - np.median(variances, axis=0), 0.0)
+        inverse = np.linalg.inv(covariances + np.diag(excess))
+        squares = np.einsum("ni,nij,nj->n", residuals, inverse, residuals)
+        inverse /= (1.0 + squares / _CAUCHY_SCALE**2)[:, None, None]
+        information = inverse.sum(axis=0)
+        mean = np.linalg.solve(information, np.einsum("nij,nj->i", inverse, deviations))
+    num_places = len({one.place for one in observations})
+    return mean, np.linalg.inv(information) * len(observations) / num_places

@@ -39,10 +39,8 @@ _JSON = {
     model: defstruct("CameraJson", [(key, Finite) for key in ("width", "height", *names)])
     for model, names in {**MODELS, "": ()}.items()
 }
-_MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = (
-    1e-3,
-    1e4,
-)  # times the longer side of the image; real lenses have 0.2 to 100
+# Times the longer side of the image; real lenses have 0.2 to 100.
+_MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 1e-3, 1e4
 _TWO_FOCAL_MODELS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
 
 
@@ -84,9 +82,8 @@ class Camera:
                 f" = {self.fx:g}"
             )
         side = max(self.width, self.height)
-        if not all(
-            _MIN_FOCAL_RATIO < focal / side < _MAX_FOCAL_RATIO for focal in (self.fx, self.fy)
-        ):
+        ratios = self.fx / side, self.fy / side
+        if not _MIN_FOCAL_RATIO < min(ratios) <= max(ratios) < _MAX_FOCAL_RATIO:
             raise CalibrationError(
                 f"no lens has a focal length of {self.fx:g}, {self.fy:g} pixels with a picture of"
                 f" {side} pixels"
@@ -98,8 +95,7 @@ class Camera:
         return Camera("PINHOLE", width, height, (float(fx), float(fy), float(cx), float(cy)))
 
     def _param(self, name: str) -> float:
-        names = MODELS[self.model]
-        return self.params[names.index(name)] if name in names else 0.0
+        return dict(zip(MODELS[self.model], self.params, strict=True)).get(name, 0.0)
 
     @property
     def fx(self) -> float:
@@ -143,11 +139,7 @@ class Camera:
     def distortion(self) -> Float[np.ndarray, " d"]:
         """Return the coefficients in OpenCV's order: (k1, k2, p1, p2, k3 .. k6), or (k1 .. k4) for
         fisheye."""
-        names = (
-            ("k1", "k2", "k3", "k4")
-            if self.is_fisheye
-            else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        )
+        names = MODELS["OPENCV_FISHEYE" if self.is_fisheye else "FULL_OPENCV"][4:]
         return np.array([self._param(name) for name in names])
 
     def img_from_cam(self, points_cam: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
@@ -159,19 +151,16 @@ class Camera:
         in_front = points_cam[:, 2] > 1e-9
         normalized = points_cam[:, :2] / np.where(in_front, points_cam[:, 2], np.nan)[:, None]
         if self.is_distorted:
-            in_field = np.linalg.norm(normalized, axis=1) <= max_radius(
-                tuple(self.distortion().tolist()), self.is_fisheye
-            )
+            limit = max_radius(tuple(self.distortion().tolist()), self.is_fisheye)
+            in_field = np.linalg.norm(normalized, axis=1) <= limit
             normalized = self._distort(np.where(in_field[:, None], normalized, np.nan))[0]
         return normalized * [self.fx, self.fy] + [self.cx, self.cy]
 
     def normalized_from_img(self, points_img: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Return the undistorted coordinates (x / z, y / z) of pixels on the plane z = 1, NaN for
         pixels without a ray."""
-        distorted = (np.asarray(points_img, dtype=np.float64) - [self.cx, self.cy]) / [
-            self.fx,
-            self.fy,
-        ]
+        centred = np.asarray(points_img, dtype=np.float64) - [self.cx, self.cy]
+        distorted = centred / [self.fx, self.fy]
         if not self.is_distorted:
             return distorted
         undistort = undistort_fisheye if self.is_fisheye else undistort_rational
@@ -192,9 +181,8 @@ class Camera:
     def _distort(
         self, normalized: Float[np.ndarray, "n 2"]
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-        return (distort_fisheye if self.is_fisheye else distort_rational)(
-            self.distortion(), normalized
-        )
+        distort = distort_fisheye if self.is_fisheye else distort_rational
+        return distort(self.distortion(), normalized)
 
     def rays_from_img(self, points_img: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """Return the unit direction of each pixel in the camera frame."""
@@ -214,17 +202,15 @@ class Camera:
         """
         scale_x, scale_y = width / self.width, height / self.height
         model = self.model if scale_x == scale_y else _TWO_FOCAL_MODELS.get(self.model, self.model)
-        values = {name: self._param(name) for name in MODELS[model]}
-        for name, value in (
-            ("f", self.fx * scale_x),
-            ("fx", self.fx * scale_x),
-            ("fy", self.fy * scale_y),
-        ):
-            if name in values:
-                values[name] = value
-        values["cx"] = (self.cx + 0.5) * scale_x - 0.5
-        values["cy"] = (self.cy + 0.5) * scale_y - 0.5
-        return Camera(model, width, height, tuple(values.values()))
+        scaled = {
+            "f": self.fx * scale_x,
+            "fx": self.fx * scale_x,
+            "fy": self.fy * scale_y,
+            "cx": (self.cx + 0.5) * scale_x - 0.5,
+            "cy": (self.cy + 0.5) * scale_y - 0.5,
+        }
+        params = (scaled.get(name, self._param(name)) for name in MODELS[model])
+        return Camera(model, width, height, tuple(params))
 
     def to_colmap(self) -> tuple[str, int, int, tuple[float, ...]]:
         """Return (model, width, height, params) in COLMAP's convention: the centre of the top-left

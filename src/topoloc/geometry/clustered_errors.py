@@ -12,9 +12,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.absolute_pose import CAUCHY_SCALE, AbsolutePoseConfig, Matches
+from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.absolute_pose_kernels import score_outer_products
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_matches import CAUCHY_SCALE, Matches
 from topoloc.geometry.rigid import Rigid3
 
 _COLUMNS, _ROWS = 8, 6
@@ -39,14 +40,11 @@ def compute_variance_inflation(
         points_world: world points of the inliers (metres).
         point_covariances: covariances of these points (m^2).
     """
-    normalized = camera.normalized_from_img(points_img)
     matches = Matches.from_pixels(
-        points_img, normalized, points_world, point_covariances, camera, config.key_point_sigma_px
+        points_img, points_world, point_covariances, camera, config.key_point_sigma_px
     )
-    columns = np.clip((points_img[:, 0] + 0.5) * _COLUMNS / camera.width, 0, _COLUMNS - 1).astype(
-        np.intp
-    )
-    rows = np.clip((points_img[:, 1] + 0.5) * _ROWS / camera.height, 0, _ROWS - 1).astype(np.intp)
+    grid, size = np.array([_COLUMNS, _ROWS]), [camera.width, camera.height]
+    columns, rows = np.clip((points_img + 0.5) * grid / size, 0, grid - 1).astype(np.intp).T
     used, cells = np.unique(rows * _COLUMNS + columns, return_inverse=True)
     if len(used) < _MIN_CELLS:
         return 1.0
@@ -57,14 +55,11 @@ def compute_variance_inflation(
         np.isfinite(information).all() and np.linalg.matrix_rank(information, hermitian=True) == 6
     ):
         return 1.0
-    fit_correction = len(used) / (
-        len(used) - 3.0
-    )  # the pose is fitted to the same matches, which makes the sums smaller
+    # The pose is fitted to the same matches, which makes the sums smaller.
+    fit_correction = len(used) / (len(used) - 3.0)
     variance_alone, variance_together = (
         np.trace(np.linalg.solve(information, gradients)) for gradients in (independent, clustered)
     )
-    return (
-        max(1.0, float(fit_correction * variance_together / variance_alone))
-        if variance_alone > 0.0
-        else 1.0
-    )
+    if variance_alone <= 0.0:
+        return 1.0
+    return max(1.0, float(fit_correction * variance_together / variance_alone))

@@ -29,21 +29,15 @@ def distort_rational(
     xy, r2 = x * y, x * x + y * y
     denominator = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / denominator
-    slope = (
-        k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
-    ) / denominator
-    distorted = np.stack(
-        [
-            x * radial + 2 * p1 * xy + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * xy,
-        ],
-        axis=1,
-    )
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
+    slope = slope / denominator
+    distorted_x = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * x * x)
+    distorted_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * xy
     jacobian = np.empty((len(normalized), 2, 2))
     jacobian[:, 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
     jacobian[:, 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
     jacobian[:, 0, 1] = jacobian[:, 1, 0] = 2 * xy * slope + 2 * p1 * x + 2 * p2 * y
-    return distorted, jacobian
+    return np.stack([distorted_x, distorted_y], axis=1), jacobian
 
 
 def distort_fisheye(
@@ -57,11 +51,8 @@ def distort_fisheye(
     scale = np.where(r > 1e-9, theta_d / safe, 1.0)
     scale_slope = np.where(r > 1e-9, (theta_d_slope / (1.0 + r * r) - scale) / safe, 0.0)
     unit = normalized / safe[:, None]
-    jacobian = (
-        scale[:, None, None] * np.eye(2)
-        + (r * scale_slope)[:, None, None] * unit[:, :, None] * unit[:, None, :]
-    )
-    return normalized * scale[:, None], jacobian
+    along = (r * scale_slope)[:, None, None] * unit[:, :, None] * unit[:, None, :]
+    return normalized * scale[:, None], scale[:, None, None] * np.eye(2) + along
 
 
 def undistort_rational(
@@ -123,9 +114,8 @@ def max_radius(coefficients: tuple[float, ...], is_fisheye: bool) -> float:
         # Use the radial part alone: the tangential one is a small correction without a fold.
         radial_only = k * [1, 1, 0, 0, 1, 1, 1, 1]
         with np.errstate(all="ignore"):
-            distorted, jacobian = distort_rational(
-                radial_only, np.stack([r, np.zeros_like(r)], axis=1)
-            )
+            along_x = np.stack([r, np.zeros_like(r)], axis=1)
+            distorted, jacobian = distort_rational(radial_only, along_x)
         grows = (jacobian[:, 0, 0] > 0.0) & (distorted[:, 0] >= 0.0)
     folds = np.flatnonzero(~grows)
     return float(r[-1] if len(folds) == 0 else r[max(int(folds[0]) - 1, 0)])

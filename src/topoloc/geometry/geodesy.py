@@ -59,13 +59,8 @@ class GeoPoint:
         lat, lon = math.radians(self.lat), math.radians(self.lon)
         normal = SEMI_MAJOR / math.sqrt(1.0 - _ECCENTRICITY_SQUARED * math.sin(lat) ** 2)
         across = (normal + self.h) * math.cos(lat)
-        return np.array(
-            [
-                across * math.cos(lon),
-                across * math.sin(lon),
-                (normal * (1.0 - _ECCENTRICITY_SQUARED) + self.h) * math.sin(lat),
-            ]
-        )
+        z = (normal * (1.0 - _ECCENTRICITY_SQUARED) + self.h) * math.sin(lat)
+        return np.array([across * math.cos(lon), across * math.sin(lon), z])
 
     @staticmethod
     def from_ecef(ecef: Float[np.ndarray, "3"]) -> GeoPoint:
@@ -74,23 +69,14 @@ class GeoPoint:
         x, y, z = (float(value) for value in ecef)
         across = math.hypot(x, y)
         beta = math.atan2(SEMI_MAJOR * z, _SEMI_MINOR * across)
-        lat = 0.0
+        lat, second_squared = 0.0, _ECCENTRICITY_SQUARED / (1.0 - _ECCENTRICITY_SQUARED)
         for _ in range(5):
-            up = (
-                z
-                + _ECCENTRICITY_SQUARED
-                / (1.0 - _ECCENTRICITY_SQUARED)
-                * _SEMI_MINOR
-                * math.sin(beta) ** 3
-            )
+            up = z + second_squared * _SEMI_MINOR * math.sin(beta) ** 3
             lat = math.atan2(up, across - _ECCENTRICITY_SQUARED * SEMI_MAJOR * math.cos(beta) ** 3)
             beta = math.atan2((1.0 - FLATTENING) * math.sin(lat), math.cos(lat))
-        normal = SEMI_MAJOR / math.sqrt(1.0 - _ECCENTRICITY_SQUARED * math.sin(lat) ** 2)
-        height = (
-            across * math.cos(lat)
-            + z * math.sin(lat)
-            - normal * (1.0 - _ECCENTRICITY_SQUARED * math.sin(lat) ** 2)
-        )
+        shape = 1.0 - _ECCENTRICITY_SQUARED * math.sin(lat) ** 2
+        normal = SEMI_MAJOR / math.sqrt(shape)
+        height = across * math.cos(lat) + z * math.sin(lat) - normal * shape
         return GeoPoint(math.degrees(lat), math.degrees(math.atan2(y, x)), height)
 
     def ecef_from_enu(self) -> Rigid3:

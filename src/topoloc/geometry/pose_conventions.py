@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
@@ -36,27 +37,16 @@ def _rotate_camera_axes(pose: Rigid3, body_from_cam: Float[np.ndarray, "3 3"]) -
     return Rigid3(pose.rotation @ body_from_cam, pose.translation)
 
 
-def _reorder_quaternion(pose: Rigid3) -> Rigid3:
-    w, x, y, z = pose.quat_wxyz()
-    return Rigid3.from_quat_wxyz(
-        np.array([x, y, z, w]), pose.translation
-    )  # the value read as x is w, y is x, z is y and w is z
-
-
 def _mirror_pose(pose: Rigid3) -> Rigid3:
     return Rigid3(_MIRROR_Y @ pose.rotation @ _MIRROR_Y, _MIRROR_Y @ pose.translation)
 
 
-_PARAMETRIC_CONVENTIONS = (
-    "scale=FACTOR",
-    "body=X,Y,Z,QX,QY,QZ,QW",
-    "shift=SECONDS",
-    "clock=FACTOR",
-)
+_PARAMETRIC_CONVENTIONS = "scale=FACTOR, body=X,Y,Z,QX,QY,QZ,QW, shift=SECONDS, clock=FACTOR"
 UNITS = {"mm": 0.001, "cm": 0.01, "feet": 0.3048}
 """Length of each unit in metres."""
 ROTATIONS: dict[str, PoseConversion] = {
-    "wxyz": _reorder_quaternion,
+    # The value read as x is w, y is x, z is y and w is z.
+    "wxyz": lambda pose: Rigid3.from_quat_wxyz(np.roll(pose.quat_wxyz(), -1), pose.translation),
     "transposed": lambda pose: Rigid3(pose.rotation.T.copy(), pose.translation),
 }
 DIRECTIONS: dict[str, PoseConversion] = {"inverse": lambda pose: pose.inverse()}
@@ -95,8 +85,11 @@ class PoseConventions:
     shift_s: float = 0.0
 
     def undo_conventions(self, pose: Rigid3) -> Rigid3:
-        """Return the pose in topoloc's convention."""
-        return undo_pose_conventions(pose, self.conventions)
+        """Return the pose in topoloc's convention. Raises TrajectoryError if one of `conventions`
+        is unknown."""
+        for convention in self.conventions:
+            pose = find_conversion(convention)(pose)
+        return pose
 
     @staticmethod
     def of(text: str | None) -> PoseConventions:
@@ -113,30 +106,18 @@ class PoseConventions:
                 parts[-1] += "," + part
             elif part:
                 parts.append(part)
-        times = {
-            name: value
-            for name, _, value in (part.partition("=") for part in parts)
-            if name in ("clock", "shift")
-        }
-        conventions = tuple(part for part in parts if part.partition("=")[0] not in times)
-        for convention in conventions:
-            find_conversion(convention)
-        time_scale = _parse_numbers("clock", times["clock"], 1)[0] if "clock" in times else 1.0
-        if time_scale <= 0.0:
+        factors = {"clock": 1.0, "shift": 0.0}
+        conventions = []
+        for part in parts:
+            name, _, value = part.partition("=")
+            if name in factors:
+                factors[name] = _parse_numbers(name, value, 1)[0]
+            else:
+                find_conversion(part)
+                conventions.append(part)
+        if factors["clock"] <= 0.0:
             raise TrajectoryError("poses 'clock': the factor must be above 0")
-        return PoseConventions(
-            conventions,
-            time_scale,
-            _parse_numbers("shift", times["shift"], 1)[0] if "shift" in times else 0.0,
-        )
-
-
-def undo_pose_conventions(pose: Rigid3, conventions: Sequence[str]) -> Rigid3:
-    """Return one pose with these conventions undone in turn. Raises TrajectoryError if a convention
-    is unknown."""
-    for convention in conventions:
-        pose = find_conversion(convention)(pose)
-    return pose
+        return PoseConventions(tuple(conventions), factors["clock"], factors["shift"])
 
 
 def describe_conventions(conventions: Sequence[str]) -> str:
@@ -156,15 +137,13 @@ def find_conversion(convention: str) -> PoseConversion:
             if numbers[0] <= 0.0:
                 raise TrajectoryError(f"poses {convention!r}: the scale must be above 0")
             return lambda pose: _scale_pose(pose, numbers[0])
-        body_from_cam = Rigid3.from_quat_wxyz(
-            np.array([numbers[6], *numbers[3:6]]), np.array(numbers[:3])
-        )
+        body_from_cam = pose_from_quaternion(np.array(numbers))
         return lambda pose: pose @ body_from_cam
     if name in UNITS and not value:
         return lambda pose: _scale_pose(pose, UNITS[name])
     found = (ROTATIONS | DIRECTIONS | AXES).get(convention)
     if found is None:
-        known = ", ".join([*UNITS, *ROTATIONS, *DIRECTIONS, *AXES, *_PARAMETRIC_CONVENTIONS])
+        known = ", ".join([*UNITS, *ROTATIONS, *DIRECTIONS, *AXES, _PARAMETRIC_CONVENTIONS])
         raise TrajectoryError(f"poses {convention!r}: not known; known are {known}")
     return found
 
@@ -179,3 +158,56 @@ def _parse_numbers(convention: str, value: str, count: int) -> list[float]:
             f"poses {convention[:80]!r}: {count} number{'s' if count > 1 else ''} are needed"
         )
     return numbers
+
+
+@dataclass(frozen=True, eq=False)
+class LazyPoses(Sequence[Rigid3]):
+    """Hold one row of numbers per pose. `to_pose` converts a row when it is accessed: a file may
+    hold a million poses, and a recording uses few of them."""
+
+    rows: Float[np.ndarray, "n c"]
+    to_pose: Callable[[Float[np.ndarray, " c"]], Rigid3]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, index: int) -> Rigid3: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Rigid3]: ...
+    def __getitem__(self, index: int | slice) -> Rigid3 | Sequence[Rigid3]:
+        rows, is_slice = self.rows[index], isinstance(index, slice)
+        return LazyPoses(rows, self.to_pose) if is_slice else self.to_pose(rows)
+
+
+def pose_from_quaternion(row: Float[np.ndarray, "7"]) -> Rigid3:
+    """Return the pose of a row: position (metres) and quaternion (x, y, z, w) of any length above
+    zero. Raises TrajectoryError if the quaternion is zero or a value is not finite."""
+    return Rigid3.from_quat_wxyz(row[[6, 3, 4, 5]], row[:3])
+
+
+def _pose_from_matrix(row: Float[np.ndarray, "12"]) -> Rigid3:
+    """Return the pose of the upper 3x4 of a matrix, row by row. Its 3x3 part must be a rotation."""
+    matrix = row.reshape(3, 4)
+    return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy())
+
+
+def poses_from_matrices(
+    numbers: Float[np.ndarray, "n 12"], tolerance: float
+) -> tuple[LazyPoses, Bool[np.ndarray, " n"]]:
+    """Return the poses of the upper 3x4 rows of matrices, and whether each 3x3 part is a rotation
+    within the tolerance.
+
+    Rotations are made orthonormal by Newton's iteration for the polar factor. Other 3x3 parts are
+    replaced by the identity.
+    """
+    matrices = numbers.reshape(-1, 3, 4).copy()
+    given = matrices[:, :, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        residual = np.abs(given @ given.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        is_rotation = (residual <= 2.0 * tolerance) & (np.linalg.det(given) > 0.0)
+    rotations = np.where(is_rotation[:, None, None], given, np.eye(3))
+    for _ in range(4):
+        rotations = 0.5 * rotations @ (3.0 * np.eye(3) - rotations.transpose(0, 2, 1) @ rotations)
+    matrices[:, :, :3] = rotations
+    return LazyPoses(matrices.reshape(-1, 12), _pose_from_matrix), is_rotation

@@ -43,20 +43,13 @@ def estimate_relative_pose(
     """
     if len(first_img) < 8:
         return None
-    rays = [
-        camera.normalized_from_img(points)
-        for points, camera in ((first_img, first), (second_img, second))
-    ]
+    rays = [first.normalized_from_img(first_img), second.normalized_from_img(second_img)]
     kept = np.flatnonzero(np.isfinite(np.column_stack(rays)).all(axis=1))
     if len(kept) < 8:
         return None
     focal = 0.5 * (first.fx + second.fx)
-    pinhole = {
-        "model": "SIMPLE_PINHOLE",
-        "width": first.width,
-        "height": first.height,
-        "params": [focal, 0.0, 0.0],
-    }
+    size = {"width": first.width, "height": first.height}
+    pinhole = {"model": "SIMPLE_PINHOLE", **size, "params": [focal, 0.0, 0.0]}
     ransac = {"max_epipolar_error": _MAX_EPIPOLAR_ERROR_PX, "seed": 0}
     pose, ransac_info = poselib.estimate_relative_pose(
         focal * rays[0][kept], focal * rays[1][kept], pinhole, pinhole, ransac, {}
@@ -66,13 +59,10 @@ def estimate_relative_pose(
     distance = float(np.linalg.norm(matrix[:, 3]))
     if not np.isfinite(matrix).all() or distance == 0.0 or not inliers.any():
         return None
-    rotated = (
-        np.column_stack([rays[0][inliers], np.ones(np.count_nonzero(inliers))]) @ matrix[:, :3].T
-    )
-    seen = np.column_stack([rays[1][inliers], np.ones(len(rotated))])
-    cosines = np.sum(rotated * seen, axis=1) / (
-        np.linalg.norm(rotated, axis=1) * np.linalg.norm(seen, axis=1)
-    )
+    firsts, seconds = (np.insert(rays_of[inliers], 2, 1.0, axis=1) for rays_of in rays)
+    rotated = firsts @ matrix[:, :3].T
+    lengths = np.linalg.norm(rotated, axis=1) * np.linalg.norm(seconds, axis=1)
+    cosines = np.sum(rotated * seconds, axis=1) / lengths
     if np.median(np.arccos(np.clip(cosines, -1.0, 1.0))) < _MIN_PARALLAX:
         return None
     return RelativePose(Rigid3(matrix[:, :3].copy(), matrix[:, 3] / distance), inliers)

@@ -3,7 +3,7 @@ pinholes side by side."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -112,16 +112,11 @@ class StereoRig:
     def is_rectified(self) -> bool:
         """Return whether both cameras are undistorted with equal rows, and the right one lies
         straight to +x. Principal points may differ in x."""
-        if self.left.is_distorted or self.right.is_distorted:
-            return False
-        translation = self.right_from_left.translation
+        left, right, translation = self.left, self.right, self.right_from_left.translation
         return bool(
-            (self.left.width, self.left.height) == (self.right.width, self.right.height)
-            and np.allclose(
-                [self.left.fx, self.left.fy, self.left.cy],
-                [self.right.fx, self.right.fy, self.right.cy],
-                atol=1e-6,
-            )
+            not (left.is_distorted or right.is_distorted)
+            and (left.width, left.height) == (right.width, right.height)
+            and np.allclose([left.fx, left.fy, left.cy], [right.fx, right.fy, right.cy], atol=1e-6)
             and np.allclose(self.right_from_left.rotation, np.eye(3), atol=1e-9)
             and translation[0] < 0
             and np.allclose(translation[1:], 0.0, atol=1e-9)
@@ -162,12 +157,11 @@ def rectify(rig: StereoRig) -> Rectification:
             f" {rig.right.width}x{rig.right.height}; sizes must agree"
         )
     rotation_left, rotation_right = _rectifying_rotations(rig)
-    if rig.is_rectified:
-        left, right = rig.left, rig.right
-    else:
+    left, right = rig.left, rig.right
+    if not rig.is_rectified:
         left = right = _common_pinhole(rig, rotation_left, rotation_right)
     return Rectification(
-        rig=StereoRig(left, right, Rigid3(np.eye(3), np.array([-rig.baseline, 0.0, 0.0]))),
+        rig=replace(StereoRig.rectified(left, rig.baseline), right=right),
         rectified_from_left=Rigid3(rotation_left, np.zeros(3)),
         left_map=_compute_remap(rig.left, left, rotation_left),
         right_map=_compute_remap(rig.right, right, rotation_right),
@@ -182,10 +176,8 @@ def _rectifying_rotations(
     mid_from_left, mid_from_right = exp_so3(half), exp_so3(-half)
     right_in_mid = -(mid_from_right @ rig.right_from_left.translation)
     x, y, z = right_in_mid
-    shown = (
-        f"the right camera is at ({x:.3g}, {y:.3g}, {z:.3g}) m from the left one (x right, y down,"
-        " z forward)"
-    )
+    place = f"({x:.3g}, {y:.3g}, {z:.3g}) m from the left one (x right, y down, z forward)"
+    shown = f"the right camera is at {place}"
     if abs(x) < max(abs(y), abs(z)):
         raise CalibrationError(f"stereo rig: not side by side: {shown}")
     if x < 0:
@@ -193,9 +185,8 @@ def _rectifying_rotations(
     direction = right_in_mid / rig.baseline
     axis = np.cross(direction, [1.0, 0.0, 0.0])
     length = float(np.linalg.norm(axis))
-    rectified_from_mid = (
-        exp_so3(axis / length * np.arctan2(length, direction[0])) if length > 0.0 else np.eye(3)
-    )
+    turn = axis / length * np.arctan2(length, direction[0]) if length > 0.0 else np.zeros(3)
+    rectified_from_mid = exp_so3(turn)
     return rectified_from_mid @ mid_from_left, rectified_from_mid @ mid_from_right
 
 
@@ -205,12 +196,9 @@ def _common_pinhole(
     rotation_right: Float[np.ndarray, "3 3"],
 ) -> Camera:
     """Return the widest pinhole whose pixels all lie in both raw images."""
-    lows, highs = zip(
-        _inner_rectangle(rig.left, rotation_left),
-        _inner_rectangle(rig.right, rotation_right),
-        strict=True,
-    )
-    low, high = np.max(lows, axis=0), np.min(highs, axis=0)
+    low, high = _inner_rectangle(rig.left, rotation_left)
+    low_right, high_right = _inner_rectangle(rig.right, rotation_right)
+    low, high = np.maximum(low, low_right), np.minimum(high, high_right)
     size = np.array([rig.left.width, rig.left.height], dtype=np.float64)
     if not np.all(high - low > 1e-3):
         raise CalibrationError(
@@ -238,23 +226,17 @@ def _inner_rectangle(
         rays = camera.rays_from_img(np.column_stack([x * right, y * bottom])) @ rotation.T
         sides.append(rays[:, :2] / np.where(rays[:, 2:] > np.cos(_MAX_ANGLE), rays[:, 2:], np.nan))
     widest = np.tan(_MAX_ANGLE)
-    low = np.array(
-        [np.nanmax(sides[0][:, 0], initial=-widest), np.nanmax(sides[1][:, 1], initial=-widest)]
-    )
-    high = np.array(
-        [np.nanmin(sides[2][:, 0], initial=widest), np.nanmin(sides[3][:, 1], initial=widest)]
-    )
-    return low, high
+    low = [np.nanmax(side[:, axis], initial=-widest) for axis, side in enumerate(sides[:2])]
+    high = [np.nanmin(side[:, axis], initial=widest) for axis, side in enumerate(sides[2:])]
+    return np.array(low), np.array(high)
 
 
 def _compute_remap(
     raw: Camera, rectified: Camera, rotation: Float[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "h w 2"]:
-    x, y = np.meshgrid(
-        np.arange(rectified.width, dtype=np.float64), np.arange(rectified.height, dtype=np.float64)
-    )
-    rays = rectified.rays_from_img(np.column_stack([x.ravel(), y.ravel()])) @ rotation
-    pixels = np.nan_to_num(
-        raw.img_from_cam(rays), nan=-1e4
-    )  # outside of the image, where remap fills black
-    return pixels.reshape(rectified.height, rectified.width, 2).astype(np.float32)
+    shape = rectified.height, rectified.width
+    grid = np.indices(shape, dtype=np.float64)[::-1].reshape(2, -1).T
+    rays = rectified.rays_from_img(grid) @ rotation
+    # Pixels without a ray get a place outside of the image, where remap fills black.
+    pixels = np.nan_to_num(raw.img_from_cam(rays), nan=-1e4)
+    return pixels.reshape(*shape, 2).astype(np.float32)

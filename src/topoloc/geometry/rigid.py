@@ -43,30 +43,19 @@ def log_so3(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
     w, x, y, z = quat_wxyz_from_matrix(rotation)
     v = np.array([x, y, z])
     sin_half = float(np.linalg.norm(v))
-    if sin_half < _SMALL_ANGLE:
-        return 2.0 * v
-    return 2.0 * np.arctan2(sin_half, w) / sin_half * v
+    return 2.0 * v if sin_half < _SMALL_ANGLE else 2.0 * np.arctan2(sin_half, w) / sin_half * v
 
 
 def quat_wxyz_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (Shepperd's method)."""
-    m = rotation
-    four_squares = np.array(
-        [
-            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
-            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
-        ]
+    (a, p, q), (r, b, s), (t, u, c) = rotation.tolist()
+    rows = (  # each times the quaternion component on its diagonal
+        (1.0 + a + b + c, u - s, q - t, r - p),
+        (u - s, 1.0 + a - b - c, p + r, q + t),
+        (q - t, p + r, 1.0 - a + b - c, s + u),
+        (r - p, q + t, s + u, 1.0 - a - b + c),
     )
-    largest = int(np.argmax(four_squares))
-    s = four_squares[largest]
-    quat = (
-        np.array([s, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
-        np.array([m[2, 1] - m[1, 2], s, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]),
-        np.array([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], s, m[1, 2] + m[2, 1]]),
-        np.array([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], s]),
-    )[largest]
+    quat = np.array(rows[max(range(4), key=lambda k: rows[k][k])])
     quat = quat / np.linalg.norm(quat)
     return -quat if quat[0] < 0 else quat
 
@@ -142,10 +131,7 @@ class Rigid3:
 
     def to_json(self) -> dict[str, list[float]]:
         """Return the form ``{"translation": [x, y, z], "quat_wxyz": [w, x, y, z]}``, in metres."""
-        return {
-            "translation": self.translation.tolist(),
-            "quat_wxyz": self.quat_wxyz().tolist(),
-        }
+        return {"translation": self.translation.tolist(), "quat_wxyz": self.quat_wxyz().tolist()}
 
     @staticmethod
     def from_json(data: Any, name: str = "pose") -> Rigid3:
@@ -193,10 +179,8 @@ class Rigid3:
 
     def matrix(self) -> Float[np.ndarray, "4 4"]:
         """Return the homogeneous 4x4 matrix."""
-        m = np.eye(4)
-        m[:3, :3] = self.rotation
-        m[:3, 3] = self.translation
-        return m
+        rows = np.column_stack([self.rotation, self.translation])
+        return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
 
     def quat_wxyz(self) -> Float[np.ndarray, "4"]:
         """Return the rotation as a unit quaternion (w, x, y, z) with w >= 0."""

@@ -158,13 +158,8 @@ def _distances(
     covariances: Float[np.ndarray, "n 6 6"],
 ) -> Float[np.ndarray, " n"]:
     residuals = _residuals(hypothesis, a_from_bs)
-    return np.sqrt(
-        np.einsum(
-            "ni,ni->n",
-            residuals,
-            np.linalg.solve(covariances + covariance, residuals[..., None])[..., 0],
-        )
-    )
+    whitened = np.linalg.solve(covariances + covariance, residuals[..., None])[..., 0]
+    return np.sqrt(np.einsum("ni,ni->n", residuals, whitened))
 
 
 def _residuals(hypothesis: Rigid3, a_from_bs: Sequence[Rigid3]) -> Float[np.ndarray, "n 6"]:
@@ -172,9 +167,8 @@ def _residuals(hypothesis: Rigid3, a_from_bs: Sequence[Rigid3]) -> Float[np.ndar
     axis is not exact, which is sufficient here."""
     inverse = hypothesis.inverse()
     rotations = np.stack([estimate.rotation for estimate in a_from_bs])
-    translations = (
-        np.stack([estimate.translation for estimate in a_from_bs]) + rotations @ inverse.translation
-    )
+    translations = np.stack([estimate.translation for estimate in a_from_bs])
+    translations = translations + rotations @ inverse.translation
     rotations = rotations @ inverse.rotation
     sines = 0.5 * np.stack(
         [rotations[:, k, j] - rotations[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1
@@ -185,9 +179,8 @@ def _residuals(hypothesis: Rigid3, a_from_bs: Sequence[Rigid3]) -> Float[np.ndar
     half = np.maximum(0.5 * angle, 1e-4)
     curvature = (1.0 - half / np.tan(half)) / (2.0 * half) ** 2
     once = np.cross(omega, translations)
-    return np.column_stack(
-        [translations - 0.5 * once + curvature[:, None] * np.cross(omega, once), omega]
-    )
+    twice = np.cross(omega, once)
+    return np.column_stack([translations - 0.5 * once + curvature[:, None] * twice, omega])
 
 
 def select_hypothesis(
@@ -228,15 +221,10 @@ def _count_independent(chosen: Bool[np.ndarray, " n"], image_ids: Int[np.ndarray
     """Return how many of the chosen estimates can be used with no image used twice. Estimates whose
     images have the fewest other estimates are taken first."""
     pairs = image_ids[chosen]
-    partners = sum(
-        (
-            counts[inverse]
-            for _, inverse, counts in (
-                np.unique(side, return_inverse=True, return_counts=True) for side in pairs.T
-            )
-        ),
-        np.zeros(len(pairs), np.int64),
-    )
+    partners = np.zeros(len(pairs), np.int64)
+    for side in pairs.T:
+        _, inverse, counts = np.unique(side, return_inverse=True, return_counts=True)
+        partners += counts[inverse]
     taken: tuple[set[int], set[int]] = set(), set()
     num = 0
     for a, b in pairs[np.argsort(partners, kind="stable")].tolist():

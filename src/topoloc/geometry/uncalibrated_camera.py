@@ -31,15 +31,11 @@ class UncalibratedCamera:
     max_focal: float
 
     def __post_init__(self) -> None:
-        if (
-            self.width < 1
-            or self.height < 1
-            or not 0.0 < self.min_focal <= self.max_focal < math.inf
-        ):
-            size = f"{self.width}x{self.height}"
+        is_range = 0.0 < self.min_focal <= self.max_focal < math.inf
+        if self.width < 1 or self.height < 1 or not is_range:
             raise CalibrationError(
-                f"a camera needs a size and a range of focal lengths, not {size}, f ="
-                f" {self.min_focal:g} to {self.max_focal:g}"
+                "a camera needs a size and a range of focal lengths, not"
+                f" {self.width}x{self.height}, f = {self.min_focal:g} to {self.max_focal:g}"
             )
 
     @staticmethod

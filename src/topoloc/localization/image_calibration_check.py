@@ -19,14 +19,12 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.calibration_check import (
+    CalibrationConsistency,
     ImageCalibration,
+    check_calibration_consistency,
     compute_intrinsics_deviation,
     corrected_camera,
     estimate_image_calibration,
-)
-from topoloc.geometry.calibration_consistency import (
-    CalibrationConsistency,
-    check_calibration_consistency,
 )
 from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.camera import Camera

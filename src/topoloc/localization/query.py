@@ -23,8 +23,8 @@ from topoloc.features.extraction import FeatureConfig, extract_from_normalized, 
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera, nominal_camera
+from topoloc.recordings.frame import to_grey
 from topoloc.recordings.frame_checks import find_image_problem
-from topoloc.recordings.image_io import to_grey
 from topoloc.retrieval.coarse import Image
 
 

@@ -62,7 +62,7 @@ class Localization:
         calibration_doubt: mismatch of the image and its calibration. The covariance and probability
             include it.
         seen_camera: calibration estimate of this image, None if there is none.
-            `calibration_consistency.py` combines those of many images.
+            `calibration_check.py` combines those of many images.
         geopose: the camera's pose on earth, if the map is georeferenced (`topoloc georeference`).
     """
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
+from topoloc.errors import RecordingError
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import depth_sigmas
@@ -59,16 +60,10 @@ def measured_view(frame: StereoFrame) -> MeasuredView:
     `prepare_frame`."""
     view = prepare_frame(frame)
     left = view.grey.astype(np.float32)
+    baseline, right = _DEPTH_BASELINE, None
     if view.right_grey is not None and view.rig is not None:
-        return MeasuredView(
-            view,
-            StereoCamera(view.camera, view.camera.fx * view.rig.baseline),
-            left,
-            view.right_grey.astype(np.float32),
-        )
-    return MeasuredView(
-        view, StereoCamera(view.camera, view.camera.fx * _DEPTH_BASELINE), left, None
-    )
+        baseline, right = view.rig.baseline, view.right_grey.astype(np.float32)
+    return MeasuredView(view, StereoCamera(view.camera, view.camera.fx * baseline), left, right)
 
 
 def measure_disparities(
@@ -89,34 +84,29 @@ def measure_disparities(
     max_second_correlation = 0.95  # at another place, of the best: else the point is ambiguous
     min_sigma_px = 0.15  # that calibration and interpolation leave at perfect correlation
     max_sigma_px = 1.0  # disparities with a larger standard deviation are not used
-    if measured.right is None:
-        return _disparities_from_depth(measured, points_img)
-    rig = measured.view.rig
-    assert rig is not None
+    left, right, rig = measured.left, measured.right, measured.view.rig
+    if measured.view.depth is not None:
+        depth = smooth_depth(measured.view.depth, points_img)
+        sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth)
+        return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_DEPTH_SIGMA_PX)
+    if right is None or rig is None:
+        raise RecordingError("disparities need a stereo pair or a depth image")
     at_infinity = rig.left.cx - rig.right.cx
     largest = int(measured.view.camera.width * max_share_of_width)
     known = np.isfinite(guesses_px)
-    min_disparities = (
-        np.where(known, np.floor(np.nan_to_num(guesses_px) + at_infinity) - search_px, 0.0)
-        .clip(0, largest)
-        .astype(np.int64)
-    )
+    nearest = np.floor(np.nan_to_num(guesses_px) + at_infinity) - search_px
+    min_disparities = np.where(known, nearest, 0.0).clip(0, largest).astype(np.int64)
     range_lengths = np.where(known, 2 * search_px + 2, largest + 1)
     disparities, sigmas = np.empty((2, len(points_img)), np.float32)
     # Distribute the long searches evenly over the threads.
     order = np.argsort(range_lengths, kind="stable")
     order = np.concatenate([order[0::2], order[1::2]])
-    points, min_disparities, range_lengths = (
-        points_img[order],
-        min_disparities[order],
-        range_lengths[order],
-    )
+    points, lows, lengths = points_img[order], min_disparities[order], range_lengths[order]
 
     def run(first: int, last: int) -> None:
         part = slice(first, last)
         match_in_ranges(
-            measured.left, measured.right, points[part],
-            min_disparities[part], range_lengths[part], half_px,
+            left, right, points[part], lows[part], lengths[part], half_px,
             min_correlation, max_second_correlation, disparities[part], sigmas[part],
         )  # fmt: skip
 
@@ -126,12 +116,3 @@ def measure_disparities(
     found_sigmas[order] = np.hypot(sigmas.astype(np.float64), min_sigma_px)
     good = (found > 0.0) & (found_sigmas < max_sigma_px)
     return np.where(good, found, np.nan), np.where(good, found_sigmas, np.nan)
-
-
-def _disparities_from_depth(
-    measured: MeasuredView, points_img: Float32[np.ndarray, "n 2"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    assert measured.view.depth is not None
-    depth = smooth_depth(measured.view.depth, points_img)
-    sigmas = measured.stereo.bf / depth**2 * depth_sigmas(depth)
-    return measured.stereo.bf / depth, np.maximum(sigmas, _MIN_DEPTH_SIGMA_PX)

@@ -6,8 +6,6 @@ points that are not detected in both images. This method takes a few millisecond
 points.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from topoloc.compiled import kernel
@@ -21,10 +19,8 @@ def _sample_row(image, x, y, row):
     that the loop vectorises."""
     left, top = int(np.floor(x)), int(np.floor(y))
     fx, fy = np.float32(x - left), np.float32(y - top)
-    upper, lower = (
-        image[top, left : left + len(row) + 1],
-        image[top + 1, left : left + len(row) + 1],
-    )
+    upper = image[top, left : left + len(row) + 1]
+    lower = image[top + 1, left : left + len(row) + 1]
     for k in range(len(row)):
         row[k] = (1 - fy) * (upper[k] * (1 - fx) + upper[k + 1] * fx) + fy * (
             lower[k] * (1 - fx) + lower[k + 1] * fx
@@ -75,10 +71,8 @@ def _correlations(patch, half, image, x, y, shift_sign, num_disparities, strip, 
     columns, squares = sums[0, begin:end], sums[1, begin:end]
     columns[:], squares[:] = 0.0, 0.0
     for j in range(side):
-        upper, lower = (
-            image[top + j, first + begin : first + end + 1],
-            image[top + j + 1, first + begin : first + end + 1],
-        )
+        upper = image[top + j, first + begin : first + end + 1]
+        lower = image[top + j + 1, first + begin : first + end + 1]
         row = strip[j, begin:end]
         for k in range(len(row)):
             value = (1 - fy) * (upper[k] * (1 - fx) + upper[k + 1] * fx) + fy * (
@@ -113,8 +107,7 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
     side = 2 * half + 1
     width = right.shape[1]
     sigma = np.float32(np.inf)
-    window = np.empty((side, side), np.float32)
-    slope = np.empty((side, side), np.float32)
+    window, slope = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
     samples = np.empty(side + 2, np.float32)  # of a row, and one more at each end
     for _ in range(num_iterations):
         xr = x - disparity
@@ -125,10 +118,8 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
             _sample_row(right, xr - half - 1, y + j - half, samples)
             values, slopes = window[j], slope[j]
             for i in range(side):
-                values[i], slopes[i] = (
-                    samples[i + 1],
-                    np.float32(0.5) * (samples[i + 2] - samples[i]),
-                )
+                values[i] = samples[i + 1]
+                slopes[i] = np.float32(0.5) * (samples[i + 2] - samples[i])
                 mean += values[i]
                 slope_mean += slopes[i]
         mean /= side * side
@@ -161,21 +152,9 @@ def _refine_disparity(patch, half, right, x, y, disparity, num_iterations):
 
 @kernel(**_OPTIONS)
 def _match_point(
-    left,
-    right,
-    x,
-    y,
-    half,
-    min_disparity,
-    num_disparities,
-    min_score,
-    max_ratio,
-    patch,
-    back,
-    strip,
-    sums,
-    scores,
-):
+    left, right, x, y, half, min_disparity, num_disparities, min_score, max_ratio,
+    patch, back, strip, sums, scores,
+):  # fmt: skip
     """Return (disparity, sigma) of one point, searched among min_disparity .. min_disparity +
     num_disparities - 1. Both are NaN under the conditions of `match_in_ranges`."""
     height, width = left.shape
@@ -183,9 +162,8 @@ def _match_point(
     nothing = np.float32(np.nan), np.float32(np.nan)
     if x < half or y < half or x >= width - half - 1 or y >= height - half - 1:
         return nothing
-    if (
-        _normalized_patch(left, x, y, half, patch) < 2.0 * side
-    ):  # standard deviation of less than two grey levels
+    # A standard deviation of less than two grey levels.
+    if _normalized_patch(left, x, y, half, patch) < 2.0 * side:
         return nothing
     _correlations(
         patch, half, right, x - min_disparity, y, -1, num_disparities, strip, sums, scores
@@ -203,12 +181,8 @@ def _match_point(
         patch, half, right, x, y, np.float32(min_disparity + best), 8
     )
     xr = x - disparity
-    if (
-        not np.isfinite(sigma)
-        or abs(disparity - min_disparity - best) > 1.5
-        or xr < half
-        or xr >= width - half - 1
-    ):
+    is_beside = xr < half or xr >= width - half - 1
+    if is_beside or not np.isfinite(sigma) or abs(disparity - min_disparity - best) > 1.5:
         return nothing
     # The search back must return within a pixel. For a point visible in one camera only it does
     # not.
@@ -221,17 +195,9 @@ def _match_point(
 
 @kernel(**_OPTIONS)
 def match_in_ranges(
-    left,
-    right,
-    points,
-    min_disparities,
-    range_lengths,
-    half,
-    min_score,
-    max_ratio,
-    disparities,
-    sigmas,
-):
+    left, right, points, min_disparities, range_lengths, half, min_score, max_ratio,
+    disparities, sigmas,
+):  # fmt: skip
     """Write the disparity and standard deviation of each point (x, y) of `left` in `right` (float32
     images of one size).
 
@@ -248,25 +214,10 @@ def match_in_ranges(
     for n in range(len(points)):
         most = max(most, range_lengths[n])
     patch, back = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
-    strip, sums, scores = (
-        np.empty((side, most + side), np.float32),
-        np.empty((5, most + side), np.float32),
-        np.empty(most, np.float32),
-    )
+    strip, sums = np.empty((side, most + side), np.float32), np.empty((5, most + side), np.float32)
+    scores = np.empty(most, np.float32)
     for n in range(len(points)):
         disparities[n], sigmas[n] = _match_point(
-            left,
-            right,
-            points[n, 0],
-            points[n, 1],
-            half,
-            min_disparities[n],
-            range_lengths[n],
-            min_score,
-            max_ratio,
-            patch,
-            back,
-            strip,
-            sums,
-            scores,
-        )
+            left, right, points[n, 0], points[n, 1], half, min_disparities[n], range_lengths[n],
+            min_score, max_ratio, patch, back, strip, sums, scores,
+        )  # fmt: skip

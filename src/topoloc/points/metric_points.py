@@ -16,12 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from topoloc.errors import RecordingError
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import (
+    StereoRig,
     depth_sigmas,
     depth_sigmas_of_disparity,
     points_from_depth,
@@ -54,9 +55,11 @@ def locate_points(features: Features, view: PreparedFrame) -> MetricPoints:
         RecordingError: the view has neither a right image nor depth.
     """
     if view.right_grey is not None and view.rig is not None:
-        points_cam, sigma_z = _points_from_stereo(features, view)
+        points_cam, sigma_z = _points_from_stereo(features, view.grey, view.right_grey, view.rig)
     elif view.depth is not None:
-        points_cam, sigma_z = _points_from_depth(features, view)
+        depth = smooth_depth(view.depth, features.points_img)
+        points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)
+        sigma_z = depth_sigmas(points_cam[:, 2])
     else:
         raise RecordingError("3-D positions need a stereo pair or a depth image")
     return select_certain_points(points_cam, sigma_z, view.camera, keypoint_sigmas(features))
@@ -78,9 +81,8 @@ def select_certain_points(
             it are dropped.
     """
     with np.errstate(invalid="ignore"):
-        valid = np.isfinite(points_cam).all(axis=1) & (
-            sigma_z < max_relative_sigma * points_cam[:, 2]
-        )
+        valid = sigma_z < max_relative_sigma * points_cam[:, 2]
+    valid &= np.isfinite(points_cam).all(axis=1)
     covariances = np.full((len(points_cam), 3, 3), np.nan)
     covariances[valid] = ray_covariances(
         points_cam[valid], sigma_z[valid], camera, sigmas_px[valid]
@@ -96,41 +98,31 @@ def keypoint_sigmas(features: Features) -> Float[np.ndarray, " n"]:
 
 
 def _points_from_stereo(
-    features: Features, view: PreparedFrame
+    features: Features,
+    left: UInt8[np.ndarray, "h w"],
+    right: UInt8[np.ndarray, "h w"],
+    rig: StereoRig,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     half_px = 5  # half side of the window that is correlated along the row
     min_correlation = 0.8  # minimum normalised correlation of the two images
-    # A point is ambiguous if a second place on the row reaches this fraction of the
-    # best correlation.
-    max_second_correlation = 0.97
-    # Standard deviation that calibration and interpolation leave even at perfect
+    # A point is ambiguous if a second place on the row reaches this fraction of the best
     # correlation.
-    min_sigma_px = 0.12
-    assert view.right_grey is not None
-    assert view.rig is not None
+    max_second_correlation = 0.97
+    min_sigma_px = 0.12  # that calibration and interpolation leave even at perfect correlation
     # Points with a disparity above a quarter of the image width are too near to be visible well in
     # both cameras.
-    max_disparity, num = max(16, view.camera.width // 4), len(features)
+    max_disparity, num = max(16, rig.left.width // 4), len(features)
     disparity, sigma = np.empty(num, np.float32), np.empty(num, np.float32)
     match_in_ranges(
-        view.grey.astype(np.float32), view.right_grey.astype(np.float32), features.points_img, np.zeros(num, np.int64),  # noqa: E501
+        left.astype(np.float32), right.astype(np.float32), features.points_img, np.zeros(num, np.int64),  # noqa: E501
         np.full(num, max_disparity + 1), half_px, min_correlation, max_second_correlation,
         disparity, sigma,
     )  # fmt: skip
     sigma = np.hypot(sigma.astype(np.float64), min_sigma_px)
     points_cam = points_from_disparity(
-        features.points_img.astype(np.float64), disparity.astype(np.float64), view.rig
+        features.points_img.astype(np.float64), disparity.astype(np.float64), rig
     )
-    return points_cam, depth_sigmas_of_disparity(points_cam[:, 2], sigma, view.rig)
-
-
-def _points_from_depth(
-    features: Features, view: PreparedFrame
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    assert view.depth is not None
-    depth = smooth_depth(view.depth, features.points_img)
-    points_cam = points_from_depth(features.points_img.astype(np.float64), depth, view.camera)
-    return points_cam, depth_sigmas(points_cam[:, 2])
+    return points_cam, depth_sigmas_of_disparity(points_cam[:, 2], sigma, rig)
 
 
 def smooth_depth(

@@ -60,9 +60,9 @@ def triangulate_from_motion(
         np.stack([row[k] for row in seen]) if seen else np.zeros((0, len(features)))
         for k in range(3)
     )
-    joined, sigma_joined = _fuse_depths(
-        inverse, sigma, own_sigma * _column_minimum(per_sigma), gate
-    )
+    least = np.nan_to_num(per_sigma, nan=np.inf).min(axis=0, initial=np.inf)
+    own = own_sigma * np.where(np.isfinite(least), least, 0.0)
+    joined, sigma_joined = _fuse_depths(inverse, sigma, own, gate)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = 1.0 / joined
         sigma_z = depth**2 * sigma_joined
@@ -103,12 +103,8 @@ def _estimate_inverse_depths(
         slope = np.linalg.norm(t[:2] - projected * t[2], axis=1) / np.abs(depth_ratio)
         noise = np.hypot(other.sigmas_px[columns], pose_sigma_px) / other.camera.fx
         off_line = np.linalg.norm(projected - found, axis=1)
-        good = (
-            (w > 0.0)
-            & (depth_ratio > 0.0)
-            & (off_line < gate * np.hypot(noise, own_sigma[rows]))
-            & (slope > 0.0)
-        )
+        good = (w > 0.0) & (depth_ratio > 0.0) & (slope > 0.0)
+        good &= off_line < gate * np.hypot(noise, own_sigma[rows])
         inverse[rows[good]] = w[good]
         sigma[rows[good]] = (noise / slope)[good]
         per_sigma[rows[good]] = (1.0 / slope)[good]
@@ -147,12 +143,6 @@ def _fuse_depths(
     return np.where(enough, joined, np.nan), np.where(enough, sigma_joined, np.nan)
 
 
-def _column_minimum(values: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]:
-    """Return the minimum of each column without NaN, or 0 if it has no number."""
-    least = np.nan_to_num(values, nan=np.inf).min(axis=0, initial=np.inf)
-    return np.where(np.isfinite(least), least, 0.0)
-
-
 def select_source_images(world_from_cams: Sequence[Rigid3], index: int, step: float) -> list[int]:
     """Return the images that locate the features of image `index`: at several distances, with
     similar viewing directions.
@@ -160,9 +150,7 @@ def select_source_images(world_from_cams: Sequence[Rigid3], index: int, step: fl
     Args:
         step: typical distance between consecutive images, metres.
     """
-    # Maximum angle between the viewing directions of two images, radians. Beyond it hardly
-    # any feature matches.
-    max_turn = 0.6
+    max_turn = 0.6  # radians between the viewing directions; beyond it hardly any feature matches
     # Distances of the other images, in units of the median distance of consecutive images.
     steps = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
     centres = np.array([pose.translation for pose in world_from_cams])

@@ -9,6 +9,7 @@ of many such steps. It also checks that the point is still the same.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,10 +33,11 @@ def track_points(
         return guesses_img.copy(), np.zeros(0, np.bool_)
     window = (window_px, window_px)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.03)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
+    flow: Any = cv2.calcOpticalFlowPyrLK  # the stubs require the outputs
+    found, status, _ = flow(
         previous, current, points_img[:, None], guesses_img[:, None].copy(),
         winSize=window, maxLevel=levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )  # pyright: ignore[reportCallIssue, reportArgumentType]  # fmt: skip
+    )  # fmt: skip
     found = np.ascontiguousarray(found[:, 0], np.float32)
     return found, (status[:, 0] > 0) & np.isfinite(found).all(axis=1)
 
@@ -97,10 +99,9 @@ def find_corners(
         num_corners: number of grid cells.
         patch_half_px: that of `align_with_reference`. Corners closer to the border are left out.
     """
-    # Minimum corner strength (smaller eigenvalue), as a fraction of the strongest in the
-    # image.
-    min_quality = 0.002
-    min_eigenvalue = 2e-4  # absolute minimum corner strength. Weaker corners are noise
+    # Minimum corner strength (smaller eigenvalue), as a fraction of the strongest in the image, and
+    # absolute: weaker corners are noise.
+    min_quality, min_eigenvalue = 0.002, 2e-4
     height, width = grey.shape
     side = max(8, round(np.sqrt(height * width / num_corners)))
     rows, columns = height // side, width // side
@@ -112,9 +113,5 @@ def find_corners(
     is_free = np.ones((rows, columns), np.bool_)
     is_free[cell_of[inside, 1], cell_of[inside, 0]] = False
     corners = np.empty((rows * columns, 2), np.float32)
-    border = patch_half_px + 3
-    return corners[
-        : select_cell_corners(
-            strength, is_free, side, top, left, border, np.float32(threshold), corners
-        )
-    ]
+    given = side, top, left, patch_half_px + 3, np.float32(threshold), corners
+    return corners[: select_cell_corners(strength, is_free, *given)]

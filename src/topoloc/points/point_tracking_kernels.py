@@ -5,8 +5,6 @@ Point trackers step from frame to frame and drift a little at each step. The pat
 frame does not drift.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from topoloc.compiled import kernel
@@ -79,20 +77,9 @@ def _sample_patch(image, x, y, scale, half, patch, window):
 
 @kernel(**_OPTIONS)
 def refine_tracks(
-    reference,
-    image,
-    points_ref,
-    points,
-    scales,
-    half,
-    num_iterations,
-    max_shift,
-    first,
-    last,
-    refined,
-    scores,
-    sigmas,
-):
+    reference, image, points_ref, points, scales, half, num_iterations, max_shift, first, last,
+    refined, scores, sigmas,
+):  # fmt: skip
     """Fill `refined`, `scores` and `sigmas` for the rows first .. last - 1.
 
     A patch of the image is `scales` times as large as that of the reference. Gauss-Newton estimates
@@ -103,10 +90,8 @@ def refine_tracks(
     (pixels, mean of both directions).
     """
     side = 2 * half + 1
-    patch = np.empty((side, side), np.float32)
-    slope_x = np.empty((side, side), np.float32)
-    slope_y = np.empty((side, side), np.float32)
-    window = np.empty((side, side), np.float32)
+    patch, window = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
+    slope_x, slope_y = np.empty((side, side), np.float32), np.empty((side, side), np.float32)
     height, width = image.shape
     for n in range(first, last):
         scores[n] = np.float32(-1)
@@ -124,9 +109,8 @@ def refine_tracks(
         scale = scales[n]
         margin = int(half * scale) + 2
         for _ in range(num_iterations):
-            if not (
-                x >= margin and y >= margin and x < width - margin - 1 and y < height - margin - 1
-            ):
+            last_x, last_y = width - margin - 1, height - margin - 1
+            if not (x >= margin and y >= margin and x < last_x and y < last_y):
                 scores[n] = np.float32(-1)
                 break
             squares, dot = _sample_patch(image, x, y, scale, half, patch, window)
@@ -153,12 +137,8 @@ def refine_tracks(
             scores[n] = np.float32(-1)
         if scores[n] > 0:
             refined[n, 0], refined[n, 1] = x, y
-            noise = (
-                norm
-                * norm
-                * max(np.float32(1) - scores[n] * scores[n], np.float32(0))
-                / (side * side)
-            )
+            unlike = max(np.float32(1) - scores[n] * scores[n], np.float32(0))
+            noise = norm * norm * unlike / (side * side)
             sigmas[n] = scale * np.sqrt(noise * (a + c) / (2 * determinant))
 
 
@@ -191,12 +171,11 @@ def select_cell_corners(strength, is_free, side, top, left, border, threshold, c
         for column in range(is_free.shape[1]):
             if not is_free[row, column]:
                 continue
+            first_x = max(left + column * side, border)
+            last_x = min(left + (column + 1) * side, width - border)
             best, best_x, best_y = threshold, -1, -1
             for y in range(first_y, last_y):
-                for x in range(
-                    max(left + column * side, border),
-                    min(left + (column + 1) * side, width - border),
-                ):
+                for x in range(first_x, last_x):
                     if strength[y, x] > best and _is_peak(strength, y, x):
                         best, best_x, best_y = strength[y, x], x, y
             if best_x >= 0:

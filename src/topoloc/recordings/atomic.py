@@ -50,20 +50,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
         OSError: the folder or the file cannot be written.
     """
     path = _resolve_link(path)
-    remove_stale_files(path)
-    temporary, lock = _create_locked_file(path)
-    try:
+    with temporary_file(path) as temporary:
         yield temporary
         _fsync(temporary)
         os.replace(temporary, path)
         with suppress(OSError):  # no handle is left: the file is in place
             _fsync(path.parent)
-    finally:
-        with suppress(
-            OSError
-        ):  # already renamed, or the folder is missing and an error is on its way
-            temporary.unlink()
-        os.close(lock)
 
 
 @contextmanager
@@ -82,7 +74,7 @@ def temporary_file(path: Path) -> Iterator[Path]:
     try:
         yield temporary
     finally:
-        with suppress(OSError):
+        with suppress(OSError):  # already renamed, or the folder is missing
             temporary.unlink()
         os.close(lock)
 
@@ -143,14 +135,12 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
     TopolocError."""
     if path.exists() and not path.is_dir():
         raise TopolocError(f"cannot write {path}: it is no folder")
-    found = (
-        one.relative_to(path).as_posix()
-        for one in path.rglob("*")
-        if one.is_symlink() or not one.is_dir()
-    )
-    other = next((name for name in found if name not in files), None)
-    if other is not None:
-        raise TopolocError(f"cannot write {path}: this folder holds other things, such as {other}")
+    for one in path.rglob("*"):
+        name = one.relative_to(path).as_posix()
+        if name not in files and (one.is_symlink() or not one.is_dir()):
+            raise TopolocError(
+                f"cannot write {path}: this folder holds other things, such as {name}"
+            )
 
 
 def _resolve_link(path: Path) -> Path:
@@ -163,12 +153,12 @@ def remove_stale_files(path: Path) -> None:
     path = _resolve_link(path)
     prefix = _temporary_prefix(path)
     try:
-        names = [entry.name for entry in os.scandir(path.parent) if entry.name.startswith(prefix)]
+        names = [name for name in os.listdir(path.parent) if name.startswith(prefix)]
     except OSError:  # no such folder: the writer reports it
         return
-    parts = {name for name in names if name.endswith(".part")}
-    for name in parts:
-        _remove_unlocked(path.parent / name)
+    for name in names:
+        if name.endswith(".part"):
+            _remove_unlocked(path.parent / name)
     for name in names:  # journals of SQLite whose temporary file does not exist any more
         owner = name.removesuffix("-journal")
         if owner != name and owner.endswith(".part") and not (path.parent / owner).exists():
@@ -179,26 +169,18 @@ def remove_stale_files(path: Path) -> None:
 def remove_all_stale_files(folder: Path) -> None:
     """Remove temporary files of any target in a folder, left by killed writers. Files of running
     processes stay."""
-    try:
-        names = [
-            entry.name
-            for entry in os.scandir(folder)
-            if entry.name.startswith(".") and entry.name.endswith(".part")
-        ]
-    except OSError:
-        return
-    for name in names:
-        _remove_unlocked(folder / name)
+    with suppress(OSError):
+        for name in os.listdir(folder):
+            if name.startswith(".") and name.endswith(".part"):
+                _remove_unlocked(folder / name)
 
 
 def _temporary_prefix(path: Path) -> str:
     """Return the prefix of the names of all temporary files of `path`. It is short enough for any
     file system."""
-    name = (
-        path.name
-        if len(os.fsencode(path.name)) <= 200
-        else blake2b(os.fsencode(path.name), digest_size=16).hexdigest()
-    )
+    name, encoded = path.name, os.fsencode(path.name)
+    if len(encoded) > 200:
+        name = blake2b(encoded, digest_size=16).hexdigest()
     return f".{name}."
 
 

@@ -55,9 +55,7 @@ def _parse_intrinsics(text: str) -> CalibrationForSize:
             f"{text[:80]}: neither a file nor four numbers fx,fy,cx,cy"
         ) from None
     Camera.pinhole(1, 1, fx, fy, cx, cy)  # raises errors before the first image is read
-    return lambda width, height: CameraCalibration(
-        camera_from_intrinsics(fx, fy, cx, cy, width, height)
-    )
+    return lambda *size: CameraCalibration(camera_from_intrinsics(fx, fy, cx, cy, *size))
 
 
 def camera_from_intrinsics(
@@ -72,24 +70,21 @@ def camera_from_intrinsics(
     camera = Camera.pinhole(width, height, fx, fy, cx, cy)
     across, down = (2.0 * cx + 1.0) / width, (2.0 * cy + 1.0) / height
     if min(across, down) > 0.0 and max(abs(across - 1.0), abs(down - 1.0)) > _SIZE_TOLERANCE:
-        numbers, picture = (
-            f"fx,fy,cx,cy = {fx:g},{fy:g},{cx:g},{cy:g}",
-            f"this one has {width}x{height}",
+        its_width, its_height = 2.0 * cx + 1.0, 2.0 * cy + 1.0
+        is_turned = _is_close(its_width, height, _SIZE_TOLERANCE) and _is_close(
+            its_height, width, _SIZE_TOLERANCE
         )
-        own = "a camera.json says for which size it is, where this is meant"
-        if _is_close(2.0 * cx + 1.0, height, _SIZE_TOLERANCE) and _is_close(
-            2.0 * cy + 1.0, width, _SIZE_TOLERANCE
-        ):
-            raise CalibrationError(
-                f"{numbers} are those of a picture turned by 90 degrees, of about {height}x{width};"
-                f" {picture} ({own})"
+        is_inside = 0.0 < cx < width and 0.0 < cy < height
+        if is_turned or _is_close(across, down, _SCALE_TOLERANCE) or not is_inside:
+            other = (
+                f"turned by 90 degrees, of about {height}x{width}"
+                if is_turned
+                else f"of about {its_width:.0f}x{its_height:.0f} pixels"
             )
-        if _is_close(across, down, _SCALE_TOLERANCE) or not (
-            0.0 < cx < width and 0.0 < cy < height
-        ):
-            about = f"about {2.0 * cx + 1.0:.0f}x{2.0 * cy + 1.0:.0f} pixels"
             raise CalibrationError(
-                f"{numbers} are those of a picture of {about}; {picture} ({own})"
+                f"fx,fy,cx,cy = {fx:g},{fy:g},{cx:g},{cy:g} are those of a picture {other}; this"
+                f" one has {width}x{height} (a camera.json says for which size it is, where this is"
+                " meant)"
             )
     return camera
 
@@ -124,18 +119,11 @@ def complete_calibration(given: CalibrationForSize, folder: Path) -> Calibration
         calibration = given(width, height)
         with suppress(CalibrationError):
             if own := find_calibration(folder):
-                of_folder = own(width, height)
-                pair = (
-                    of_folder.rig
-                    if of_folder.rig is not None and of_folder.rig.is_rectified
-                    else None
-                )
-                rig = calibration.rig or (
-                    StereoRig.rectified(calibration.camera, pair.baseline) if pair else None
-                )
-                return CameraCalibration(
-                    calibration.camera, rig, calibration.depth_factor or of_folder.depth_factor
-                )
+                of_folder, rig = own(width, height), calibration.rig
+                if rig is None and of_folder.rig is not None and of_folder.rig.is_rectified:
+                    rig = StereoRig.rectified(calibration.camera, of_folder.rig.baseline)
+                units = calibration.depth_factor or of_folder.depth_factor
+                return CameraCalibration(calibration.camera, rig, units)
         return calibration
 
     return for_size
@@ -173,15 +161,13 @@ def with_calibration(sequence: StereoSequence, calibration: CalibrationForSize) 
                 f"{sequence.name}: its stereo pair is not rectified, so that both cameras'"
                 " calibrations are needed"
             )
-        right = replace(
-            right, rig=given.rig or StereoRig.rectified(given.camera, right.rig.baseline)
-        )
+        rig = given.rig or StereoRig.rectified(given.camera, right.rig.baseline)
+        right = replace(right, rig=rig)
     if depth is not None:
         registered = depth.camera is not None and depth.camera == sequence.camera
+        camera = given.camera if registered else depth.camera
         units = given.depth_factor or depth.units_per_metre
-        depth = replace(
-            depth, camera=given.camera if registered else depth.camera, units_per_metre=units
-        )
+        depth = replace(depth, camera=camera, units_per_metre=units)
     return replace(sequence, camera=given.camera, cameras=None, right=right, depth=depth)
 
 

@@ -1,12 +1,20 @@
-"""Define the interface of a recording format."""
+"""Define the interface of a recording format, and lists of images and times that formats share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from topoloc.errors import RecordingError
+from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.image_io import IMAGE_SUFFIXES
+from topoloc.recordings.text_files import parse_times, read_rows
+from topoloc.recordings.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -21,3 +29,93 @@ class RecordingFormat:
     model. `calibration`: a calibration, if recordings of the format may lack one (otherwise
     `open_sequence` replaces the format's own). `calibration_file`: the path of a calibration,
     passed on as `calibration`."""
+
+
+def list_images(folder: Path, suffix: str = "") -> list[Path]:
+    """Return the image files of a folder in natural order (2 before 10). A `suffix` limits them to
+    names that end with it.
+
+    Raises:
+        RecordingError: the folder is missing or contains no image.
+    """
+    try:
+        paths = [
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in IMAGE_SUFFIXES
+            and path.stem.endswith(suffix)
+            and not path.name.startswith(".")
+        ]
+    except OSError as error:
+        raise RecordingError(f"{folder}: {error.strerror}") from None
+    if not paths:
+        raise RecordingError(f"{folder}: no pictures in this folder")
+    return sorted(paths, key=lambda path: natural_key(path.name))
+
+
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Return a sort key that compares numbers inside names as numbers of any length."""
+    return [
+        (len(number := part.lstrip("0")), number) if part.isdigit() else (-1, part)
+        for part in re.split(r"([0-9]+)", name)
+    ]
+
+
+def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
+    """Check that two lists of images correspond frame by frame.
+
+    Raises:
+        RecordingError: the lengths differ, or the last numbers of two corresponding names differ.
+    """
+    if len(left) != len(right):
+        raise RecordingError(
+            f"{left[0].parent}: {len(left)} pictures here but {len(right)} in"
+            f" {right[0].parent.name}; every picture needs its partner"
+        )
+    for path, other in zip(left, right, strict=True):
+        if re.findall(r"\d+", path.stem)[-1:] != re.findall(r"\d+", other.stem)[-1:]:
+            raise RecordingError(
+                f"{path}: its partner in {other.parent.name} is missing (the next there is"
+                f" {other.name})"
+            )
+
+
+def find_nearest_idx(times: np.ndarray, others: np.ndarray) -> list[int]:
+    """Return the row of the nearest of `others` (increasing) for each time."""
+    after = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
+    before, after = after - 1, np.minimum(after, len(others) - 1)
+    return np.where(times - others[before] <= others[after] - times, before, after).tolist()
+
+
+def times_from_rate(num_frames: int, rate_hz: int = 10) -> list[int]:
+    """Return times in nanoseconds at a constant rate, starting at 0."""
+    return [index * 1_000_000_000 // rate_hz for index in range(num_frames)]
+
+
+def read_times(path: Path, num_frames: int) -> list[int]:
+    """Read times in nanoseconds from a file with one time in seconds per line. Without a file the
+    rate is 10 Hz.
+
+    Raises:
+        RecordingError: the file is malformed, times do not increase, or their number differs from
+            `num_frames`.
+    """
+    if not path.is_file():
+        return times_from_rate(num_frames)
+    t_ns = parse_times(read_rows(path, RecordingError), path, RecordingError)
+    if len(t_ns) != num_frames:
+        raise RecordingError(f"{path}: {len(t_ns)} times for {num_frames} pictures")
+    return t_ns
+
+
+def read_ground_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
+    """Return the pose of each frame from the first existing file: TUM by time, KITTI rows by frame.
+    Return None for all frames if no file exists.
+
+    Raises:
+        TrajectoryError: the file is malformed, or matches no frame.
+    """
+    for path in (tum, *kitti_rows):
+        if path.is_file():
+            return Trajectory.read(path).match_frames(t_ns, path)
+    return [None] * len(t_ns)

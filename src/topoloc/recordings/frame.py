@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
@@ -14,6 +15,12 @@ from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 
 Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
+
+
+def to_grey(image: Image) -> UInt8[np.ndarray, "h w"]:
+    """Convert an image to grey with the luma weights of Rec. 601. A grey image is returned
+    unchanged."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Find problems of images, times and frames passed in memory, such as a wrong type, shape or unit.
+"""Use frames in memory as a recording. Find their problems, such as a wrong type, shape or unit.
 
 A float or 16-bit image, seconds instead of nanoseconds, or millimetres instead of metres would not
 cause an error by themselves. Queries would only fail to localize. Swapped red and blue channels
@@ -7,18 +7,26 @@ cannot be detected. Features use grey values, which change little with the swap.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
+from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.depth_images import find_depth_problem
 from topoloc.recordings.frame import DepthImage, StereoFrame
 
+MIN_MEDIAN_DEPTH, MAX_MEDIAN_DEPTH = 0.05, 100.0
+"""Limits of the median depth of an image, in metres. A median outside of them indicates a wrong
+unit."""
+# Metres. The most likely unit is the power of ten that brings the median nearest to this.
+_TYPICAL_MEDIAN_DEPTH = 2.5
+_SAMPLE_STEP = 8  # pixels
 _MIN_SPAN_NS = 1_000_000
 _EXPECTED_IMAGE = "pictures are uint8, grey (height, width) or RGB (height, width, 3)"
 
@@ -32,12 +40,8 @@ def find_image_problem(image: Any) -> str | None:
         return f"a picture of 16 bits; {_EXPECTED_IMAGE}: (image >> 8).astype(np.uint8)"
     if image.dtype.kind == "f":
         is_unit = image.size > 0 and float(np.nanmax(image)) <= 1.0
-        mend = (
-            "(255 * image).round().astype(np.uint8)"
-            if is_unit
-            else "image.round().clip(0, 255).astype(np.uint8)"
-        )
-        return f"a picture of type {image.dtype}; {_EXPECTED_IMAGE}: {mend}"
+        scaled = "(255 * image).round()" if is_unit else "image.round().clip(0, 255)"
+        return f"a picture of type {image.dtype}; {_EXPECTED_IMAGE}: {scaled}.astype(np.uint8)"
     if image.dtype != np.uint8:
         return f"a picture of type {image.dtype}; {_EXPECTED_IMAGE}"
     if 0 in image.shape:
@@ -85,25 +89,21 @@ def find_times_problem(t_ns: Sequence[int]) -> str | None:
 
 def find_frame_problem(frame: StereoFrame) -> str | None:
     """Describe in one line the problem of a frame in memory. Return None if it is consistent."""
-    problem = (
+    return (
         find_image_problem(frame.image)
         or find_time_problem(frame.t_ns)
         or _find_size_problem("the picture", frame.image, frame.camera)
-    )
-    if (
-        problem is None
-        and frame.world_from_cam is not None
-        and not isinstance(frame.world_from_cam, Rigid3)
-    ):
-        problem = (
-            f"world_from_cam is a Rigid3, not {type(frame.world_from_cam).__name__}; of a 4x4"
-            " matrix: Rigid3.from_matrix(matrix)"
-        )
-    return (
-        problem
+        or _find_pose_problem(frame.world_from_cam)
         or _find_stereo_problem(frame.camera, frame.image, frame.right, frame.rig)
         or _find_depth_problem(frame.depth)
     )
+
+
+def _find_pose_problem(pose: Any) -> str | None:
+    if pose is None or isinstance(pose, Rigid3):
+        return None
+    mend = "of a 4x4 matrix: Rigid3.from_matrix(matrix)"
+    return f"world_from_cam is a Rigid3, not {type(pose).__name__}; {mend}"
 
 
 def _find_stereo_problem(
@@ -130,17 +130,91 @@ def _find_depth_problem(depth: Any) -> str | None:
         return f"depth is a DepthImage(depth, camera), not {type(depth).__name__}"
     array = depth.depth
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype != np.float32:
-        what = (
-            f"{array.dtype} of shape {array.shape}"
-            if isinstance(array, np.ndarray)
-            else type(array).__name__
-        )
+        what = type(array).__name__
+        if isinstance(array, np.ndarray):
+            what = f"{array.dtype} of shape {array.shape}"
         meant = "depth is float32 (height, width) in metres, NaN where unknown"
         return f"{meant}, not {what}; of millimetres: depth.astype(np.float32) / 1000"
     return _find_size_problem("the depth image", array, depth.camera) or find_depth_problem(array)
+
+
+def find_depth_problem(depth: Float32[np.ndarray, "h w"]) -> str | None:
+    """Describe the problem if the median depth is implausible, with the likely factor. Return None
+    otherwise."""
+    sample = depth[::_SAMPLE_STEP, ::_SAMPLE_STEP]
+    known = sample[np.isfinite(sample)]
+    if len(known) == 0:
+        return None
+    median = float(np.median(known))
+    if MIN_MEDIAN_DEPTH <= median <= MAX_MEDIAN_DEPTH:
+        return None
+    factor = 10.0 ** round(np.log10(max(median, 1e-30) / _TYPICAL_MEDIAN_DEPTH))
+    by = (
+        f"{factor:g} times the depth_factor"
+        if factor > 1.0
+        else f"the depth_factor divided by {1.0 / factor:g}"
+    )
+    return (
+        f"a median depth of {median:.4g} m is that of no camera; {by} is likely right (depth arrays"
+        " are in metres)"
+    )
 
 
 def _find_size_problem(what: str, image: np.ndarray, camera: Camera | None) -> str | None:
     if camera is None or image.shape[:2] == (camera.height, camera.width):
         return None
     return f"{what} is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}"
+
+
+class MemorySequence:
+    """A recording of frames in memory: stereo pairs, RGB-D or single images, with or without poses.
+
+    All frames are checked at construction, so that a wrong type, size or unit is reported early.
+
+    Raises:
+        RecordingError: there are no frames, or a frame is inconsistent. Names the frame and a
+            remedy.
+    """
+
+    def __init__(self, frames: Iterable[StereoFrame], name: str = "memory") -> None:
+        self.name = name
+        self._frames = list(frames)
+        if not self._frames:
+            raise RecordingError(f"{name}: no frames")
+        for number, frame in enumerate(self._frames):
+            if not isinstance(frame, StereoFrame):
+                raise RecordingError(
+                    f"{name}, frame {number}: a StereoFrame is expected, not {type(frame).__name__}"
+                )
+            problem = find_frame_problem(frame)
+            first_size = self._frames[0].image.shape[:2]
+            if not problem and frame.camera is None and frame.image.shape[:2] != first_size:
+                differs = "its picture is of another size than the first frame's"
+                problem = f"{differs}, and neither has a camera"
+            if problem is not None:
+                raise RecordingError(f"{name}, frame {number} ({frame.name}): {problem}")
+        self._frames = [replace(frame, t_ns=int(frame.t_ns)) for frame in self._frames]
+        if problem := find_times_problem(self.t_ns):
+            raise RecordingError(f"{name}: {problem}")
+
+    @property
+    def names(self) -> list[str]:
+        """Return the name of each frame."""
+        return [frame.name for frame in self._frames]
+
+    @property
+    def t_ns(self) -> list[int]:
+        """Return the time of each frame, in integer nanoseconds."""
+        return [frame.t_ns for frame in self._frames]
+
+    @property
+    def poses(self) -> list[Rigid3 | None]:
+        """Return world_from_cam of each frame, None if unknown."""
+        return [frame.world_from_cam for frame in self._frames]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> StereoFrame:
+        """Return one frame as it was given. Raises IndexError."""
+        return self._frames[index]

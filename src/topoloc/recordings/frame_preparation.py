@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,15 +13,16 @@ from jaxtyping import Float, Float32, UInt8
 
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rig import Rectification, StereoRig, rectify
+from topoloc.geometry.rig import StereoRig, rectify
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import DepthImage, Image, StereoFrame
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import DepthImage, Image, StereoFrame, to_grey
 from topoloc.recordings.registration_kernels import (
     back_project,
     register_undistorted,
     update_z_buffer,
 )
+
+_cached_rectify = lru_cache(maxsize=4)(rectify)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +63,10 @@ def prepare_frame(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
     if frame.rig is not None and (frame.right is not None or not with_depth):
         return _prepare_stereo(frame.image, frame.right if with_depth else None, frame.rig)
     if frame.depth is not None or not with_depth:
-        depth = (
-            register_depth(frame.depth, frame.camera)
-            if with_depth and frame.depth is not None
-            else None
-        )
-        return PreparedFrame(
-            frame.image, to_grey(frame.image), frame.camera, Rigid3.identity(), depth=depth
-        )
+        grey, depth = to_grey(frame.image), None
+        if with_depth and frame.depth is not None:
+            depth = register_depth(frame.depth, frame.camera)
+        return PreparedFrame(frame.image, grey, frame.camera, Rigid3.identity(), depth=depth)
     raise RecordingError(
         f"{frame.name}: stereo pairs or depth images are needed, this recording has single pictures"
         " only"
@@ -87,10 +85,8 @@ def undistort_frame(frame: StereoFrame, max_side_px: int) -> PreparedFrame:
     scale = max_side_px / max(grey.shape)
     if scale < 1.0:
         width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-        grey, camera = (
-            cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA),
-            camera.rescaled(width, height),
-        )
+        grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        camera = camera.rescaled(width, height)
     if camera.is_distorted:
         grey, camera = _remap(grey, _undistortion_map(camera)), camera.undistorted()
     return PreparedFrame(grey, grey, camera, view.view_from_cam)
@@ -98,21 +94,17 @@ def undistort_frame(frame: StereoFrame, max_side_px: int) -> PreparedFrame:
 
 @lru_cache(maxsize=4)
 def _undistortion_map(camera: Camera) -> Float32[np.ndarray, "h w 2"]:
-    pinhole = camera.undistorted()
-    normalized = _normalized_pixels(pinhole, camera.width, camera.height)
+    normalized = _normalized_pixels(camera.undistorted(), camera.width, camera.height)
     points_img = camera.img_from_cam(np.column_stack([normalized, np.ones(len(normalized))]))
-    return (
-        np.nan_to_num(points_img, nan=-1.0)
-        .astype(np.float32)
-        .reshape(camera.height, camera.width, 2)
-    )
+    pixels = np.nan_to_num(points_img, nan=-1.0).astype(np.float32)
+    return pixels.reshape(camera.height, camera.width, 2)
 
 
 def _prepare_stereo(image: Image, right: Image | None, rig: StereoRig) -> PreparedFrame:
     right_grey = None if right is None else to_grey(right)
     if rig.is_rectified:
         return PreparedFrame(image, to_grey(image), rig.left, Rigid3.identity(), right_grey, rig)
-    r = _rectification(rig)
+    r = _cached_rectify(rig)
     picture = _remap(image, r.left_map)
     if right_grey is not None:
         right_grey = _remap(right_grey, r.right_map)
@@ -122,13 +114,9 @@ def _prepare_stereo(image: Image, right: Image | None, rig: StereoRig) -> Prepar
 
 
 def _remap(picture: Image, pixel_map: Float32[np.ndarray, "h w 2"]) -> Image:
-    # None is correct here although the stubs disagree: OpenCV 5 uses an empty second map as a map.
-    return cv2.remap(picture, pixel_map, None, cv2.INTER_LINEAR)  # pyright: ignore[reportCallIssue, reportArgumentType]
-
-
-@lru_cache(maxsize=4)
-def _rectification(rig: StereoRig) -> Rectification:
-    return rectify(rig)
+    # The stubs reject None although it is correct: OpenCV 5 uses an empty second map as a map.
+    remap: Any = cv2.remap
+    return remap(picture, pixel_map, None, cv2.INTER_LINEAR)
 
 
 def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarray, "h w"]:
@@ -138,27 +126,16 @@ def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarra
     if identity and depth_image.camera == camera:
         return depth_image.depth
     height, width = depth_image.depth.shape
-    pose, normalized = (
-        depth_image.cam_from_depth,
-        _normalized_pixels(depth_image.camera, width, height),
-    )
+    pose = depth_image.cam_from_depth
+    normalized = _normalized_pixels(depth_image.camera, width, height)
+    arguments = depth_image.depth, normalized, pose.rotation, pose.translation
     registered = np.full((camera.height, camera.width), np.nan, np.float32)
     if not camera.is_distorted:
         focal, centre = (camera.fx, camera.fy), (camera.cx, camera.cy)
-        register_undistorted(
-            depth_image.depth,
-            normalized,
-            pose.rotation,
-            pose.translation,
-            focal,
-            centre,
-            registered,
-        )
+        register_undistorted(*arguments, focal, centre, registered)
         return registered
     points = np.empty((height * width, 3))
-    points = points[
-        : back_project(depth_image.depth, normalized, pose.rotation, pose.translation, points)
-    ]
+    points = points[: back_project(*arguments, points)]
     update_z_buffer(camera.img_from_cam(points), points, registered)
     return registered
 
@@ -166,7 +143,5 @@ def register_depth(depth_image: DepthImage, camera: Camera) -> Float32[np.ndarra
 @lru_cache(maxsize=4)
 def _normalized_pixels(camera: Camera, width: int, height: int) -> Float[np.ndarray, "n 2"]:
     """Return every pixel of an image, row by row, on the plane z = 1."""
-    columns, rows = np.meshgrid(
-        np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)
-    )
-    return camera.normalized_from_img(np.column_stack([columns.ravel(), rows.ravel()]))
+    pixels = np.indices((height, width), dtype=np.float64)[::-1].reshape(2, -1).T
+    return camera.normalized_from_img(pixels)

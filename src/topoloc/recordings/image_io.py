@@ -16,12 +16,13 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from PIL import (  # importing the readers registers them in Pillow
     BmpImagePlugin,  # noqa: F401
     ExifTags,
@@ -51,16 +52,8 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _TRANSPOSED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 # errors that Pillow raises for damaged files
 _DAMAGE_ERRORS = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    OverflowError,
-    EOFError,
-    struct.error,
-    zlib.error,
+    *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, OverflowError),
+    *(EOFError, struct.error, zlib.error),
 )
 
 
@@ -95,12 +88,6 @@ def read_image(path: Path | EncodedImage) -> Image:
         return np.array(picture.convert("RGB"))
 
 
-def to_grey(image: Image) -> UInt8[np.ndarray, "h w"]:
-    """Convert an image to grey with the luma weights of Rec. 601. A grey image is returned
-    unchanged."""
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
 def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
     """Read a 16-bit depth image in metres. Unknown depth is NaN (0 and 65535 in the file).
 
@@ -132,11 +119,8 @@ def image_size(path: Path | EncodedImage) -> tuple[int, int]:
     """
     with _open_image(path) as picture:
         width, height = picture.size
-        return (
-            (height, width)
-            if picture.getexif().get(ExifTags.Base.Orientation) in _TRANSPOSED_ORIENTATIONS
-            else (width, height)
-        )
+        is_turned = picture.getexif().get(ExifTags.Base.Orientation) in _TRANSPOSED_ORIENTATIONS
+        return (height, width) if is_turned else (width, height)
 
 
 def exif_focal_length(path: Path | EncodedImage, width: int, height: int) -> float | None:
@@ -157,15 +141,10 @@ def exif_focal_length(path: Path | EncodedImage, width: int, height: int) -> flo
     if not focal > 0.0:
         mm_a_unit = _MM_PER_UNIT.get(int(tags[ExifTags.Base.FocalPlaneResolutionUnit]), 25.4)
         exif_width = tags[ExifTags.Base.ExifImageWidth]
-        scale = (
-            max(width, height) / exif_width if exif_width > 0.0 else 1.0
-        )  # the original width, before rotation
-        focal = (
-            tags[ExifTags.Base.FocalLength]
-            * tags[ExifTags.Base.FocalPlaneXResolution]
-            / mm_a_unit
-            * scale
-        )
+        # The original width, before rotation.
+        scale = max(width, height) / exif_width if exif_width > 0.0 else 1.0
+        pixels_per_unit = tags[ExifTags.Base.FocalPlaneXResolution]
+        focal = tags[ExifTags.Base.FocalLength] * pixels_per_unit / mm_a_unit * scale
     side = max(width, height)
     return focal if 0.1 * side < focal < 50.0 * side else None
 
@@ -183,9 +162,8 @@ def _read_bytes(path: Path | EncodedImage) -> bytes:
     try:
         if isinstance(path, EncodedImage):
             return path.data
-        if (
-            not stat.S_ISREG(path.stat().st_mode) and not path.is_dir()
-        ):  # reading a FIFO would block
+        # Reading a FIFO would block.
+        if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():
             raise UnreadableImageError(f"{path}: not a file")
         data = path.read_bytes()
     except FileNotFoundError:
@@ -213,13 +191,11 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
     except Pillow.UnidentifiedImageError:
         raise UnreadableImageError(f"{path}: {_unreadable_reason(data)}") from None
     except Pillow.DecompressionBombError:
-        raise UnreadableImageError(
-            f"{path}: more than {MAX_PIXELS // 1_000_000} megapixels"
-        ) from None
+        fault = f"more than {MAX_PIXELS // 1_000_000} megapixels"
+        raise UnreadableImageError(f"{path}: {fault}") from None
     except _DAMAGE_ERRORS as error:
-        raise UnreadableImageError(
-            f"{path}: not a picture, or damaged ({_one_line(error)})"
-        ) from None
+        fault = f"not a picture, or damaged ({_one_line(error)})"
+        raise UnreadableImageError(f"{path}: {fault}") from None
     with picture:
         width, height = picture.size
         if width * height > MAX_PIXELS:
@@ -249,7 +225,7 @@ def _supported_types(path: Path | EncodedImage) -> tuple[str, ...]:
     if path.suffix.lower() not in (".heic", ".heif"):
         return _IMAGE_TYPES
     try:
-        import pi_heif  # pyright: ignore[reportMissingImports]
+        pi_heif = import_module("pi_heif")
     except ImportError:
         raise UnreadableImageError(
             f"{path}: HEIC pictures need the extra heic: pip install 'topoloc[heic]'"
@@ -263,14 +239,8 @@ def _one_line(error: Exception) -> str:
 
 
 def _unreadable_reason(data: bytes) -> str:
-    starts = {
-        b"\x89PNG": "PNG",
-        b"\xff\xd8": "JPEG",
-        b"BM": "BMP",
-        b"RIFF": "WebP",
-        b"II*\0": "TIFF",
-        b"MM\0*": "TIFF",
-    }
+    starts = {b"\x89PNG": "PNG", b"\xff\xd8": "JPEG", b"BM": "BMP", b"RIFF": "WebP"}
+    starts |= {b"II*\0": "TIFF", b"MM\0*": "TIFF"}
     known = next((name for start, name in starts.items() if data.startswith(start)), None)
     if known is not None:
         return f"damaged or truncated {known} file"

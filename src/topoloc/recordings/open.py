@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -13,7 +14,7 @@ from topoloc.recordings.calibration import parse_calibration, with_calibration
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.recording import parse_selection, recording_notes, sequence_subset
+from topoloc.recordings.recording import recording_notes, sequence_subset
 
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
 # accepts any other folder with images. A format's module is imported when the format is tried.
@@ -32,6 +33,12 @@ FORMATS = {
     "video": "topoloc.recordings.formats.video:FORMAT",
     "folder": "topoloc.recordings.formats.folder:FORMAT",
 }
+
+
+# Numbers have up to 18 digits. Python refuses to parse numbers of thousands of digits.
+_SLICE = re.compile(r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?")
+_BLOCK = re.compile(r"(\d{1,18})-(\d{1,18})/([1-9]\d{0,17})")
+_INDEX = re.compile(r"-?\d{1,18}")
 
 
 @cache
@@ -72,9 +79,8 @@ def open_sequence(
     folder, selection = split_selection(str(path))
     is_side_by_side = format is None and str(camera).endswith(".conf") and Video.can_open(folder)
     name = "zed" if is_side_by_side else find_format(path, format)
-    sequence = _open_recording(
-        folder, name, camera, {"images": images and Path(images), "topics": topics}
-    )
+    options = {"images": images and Path(images), "topics": topics}
+    sequence = _open_recording(folder, name, camera, options)
     if warn is not None:
         for note in recording_notes(sequence):
             warn(note)
@@ -89,10 +95,8 @@ def open_sequence(
 def _open_recording(
     folder: Path, name: str, camera: str | Path | None, options: Mapping[str, object]
 ) -> StereoSequence:
-    recording_format, given = (
-        load_format(name),
-        {key: value for key, value in options.items() if value is not None},
-    )
+    recording_format = load_format(name)
+    given = {key: value for key, value in options.items() if value is not None}
     if unused := [key for key in given if key not in recording_format.open_options]:
         raise RecordingError(f"{folder}: a recording of format {name} takes no {unused[0]}")
     if camera is None:
@@ -117,23 +121,49 @@ def find_format(path: str | Path, format: str | None = None) -> str:
     folder, _ = split_selection(str(path))
     if not os.path.exists(folder):  # os.path.exists raises no error if the name is too long
         raise RecordingError(f"{folder}: no such file or folder")
-    return format or _detect_format(folder)
+    if format is not None:
+        return format
+    if found := next((name for name in FORMATS if load_format(name).can_open(folder)), None):
+        return found
+    if folder.is_dir() and not any(folder.iterdir()):
+        raise UnknownFormatError(f"{folder}: no known recording: the folder is empty")
+    looked_for = "; ".join(f"{name}: {load_format(name).expected_files}" for name in FORMATS)
+    raise UnknownFormatError(f"{folder}: no known recording. Looked for {looked_for}")
 
 
 def split_selection(path: str) -> tuple[Path, str | None]:
     """Split a path into the recording's folder or file and the selection after an @. The selection
     is None if there is none."""
     folder, at, selection = path.rpartition("@")
-    if not at or os.path.exists(path):
-        return Path(path), None
-    return Path(folder), selection
+    return (Path(path), None) if not at or os.path.exists(path) else (Path(folder), selection)
 
 
-def _detect_format(path: Path) -> str:
-    for name in FORMATS:
-        if load_format(name).can_open(path):
-            return name
-    if path.is_dir() and not any(path.iterdir()):
-        raise UnknownFormatError(f"{path}: no known recording: the folder is empty")
-    looked_for = "; ".join(f"{name}: {load_format(name).expected_files}" for name in FORMATS)
-    raise UnknownFormatError(f"{path}: no known recording. Looked for {looked_for}")
+def parse_selection(text: str, num_frames: int) -> list[int]:
+    """Return the frame numbers of a selection such as ``0::2``, ``0:10,50:60``, ``-1`` or
+    ``0-59/100``.
+
+    The numbers are increasing and unique. A slice is Python's, with a positive step.
+    ``FIRST-LAST/PERIOD`` selects the frames whose number modulo PERIOD is in FIRST to LAST, both
+    included.
+
+    Raises:
+        RecordingError: the text is none of these, or a single number is outside of the recording.
+    """
+    chosen: set[int] = set()
+    for part in text.split(","):
+        part = part.strip()
+        if bounds := _SLICE.fullmatch(part):
+            limits = (int(bound) if bound else None for bound in bounds.groups())
+            chosen.update(range(num_frames)[slice(*limits)])
+        elif block := _BLOCK.fullmatch(part):
+            first, last, period = (int(number) for number in block.groups())
+            chosen.update(index for index in range(num_frames) if first <= index % period <= last)
+        elif _INDEX.fullmatch(part):
+            if not -num_frames <= int(part) < num_frames:
+                raise RecordingError(f"frame {part} of a recording of {num_frames}")
+            chosen.add(int(part) % num_frames)
+        else:
+            raise RecordingError(
+                f"{part!r} chooses no frames; write START:STOP:STEP, a number, or FIRST-LAST/PERIOD"
+            )
+    return sorted(chosen)

@@ -1,7 +1,5 @@
 """Numba kernels of depth registration. Each makes one pass over the pixels or points."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from topoloc.compiled import kernel

@@ -4,6 +4,9 @@ ROS.
 OpenCV: `M1 D1 M2 D2 R T` as in its stereo sample, or the longer names of other programs. `R` and
 `T` may be in an extrinsics.yml beside it. They transform points from the left camera to the right
 one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`. Lengths are in metres.
+
+The files come with or without OpenCV's header and in several styles of YAML. So only words and
+numbers after the needed keys are read. Tags and aliases are ignored.
 """
 
 from __future__ import annotations
@@ -19,8 +22,10 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.camera_json import CameraCalibration
-from topoloc.recordings.yaml_numbers import read_yaml, require_numbers, yaml_numbers, yaml_word
+from topoloc.recordings.text_files import read_text
 
+_MAX_CHARS = 1_000_000
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 YAML_SUFFIXES = frozenset({".yaml", ".yml"})
 _MAX_BASELINE = 5.0  # metres; a larger baseline is probably in millimetres
 # COLMAP's camera model for each distortion model of Kalibr, with its number of coefficients
@@ -32,34 +37,62 @@ _DISTORTIONS = {
 }
 _FISHEYE_WORDS = ("equidistant", "fisheye", "KANNALA_BRANDT")
 # names of the camera matrix and the distortion of the left, the right, and a single camera
-_LEFT_KEYS = (
-    (
-        "M1",
-        "K1",
-        "cameraMatrix1",
-        "camera_matrix_1",
-        "camera_matrix_left",
-        "left_camera_matrix",
-        "K_left",
-    ),
-    (
-        "D1",
-        "distCoeffs1",
-        "dist_coeffs_1",
-        "distortion_coefficients_left",
-        "dist_coeffs_left",
-        "left_distortion_coefficients",
-        "D_left",
-    ),
+_LEFT_KEYS = tuple(
+    names.split()
+    for names in (
+        "M1 K1 cameraMatrix1 camera_matrix_1 camera_matrix_left left_camera_matrix K_left",
+        "D1 distCoeffs1 dist_coeffs_1 distortion_coefficients_left dist_coeffs_left"
+        " left_distortion_coefficients D_left",
+    )
 )
-_RIGHT_KEYS = (
-    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT_KEYS[0]),
-    tuple(name.replace("1", "2").replace("left", "right") for name in _LEFT_KEYS[1]),
+_RIGHT_KEYS = tuple(
+    [name.replace("1", "2").replace("left", "right") for name in names] for names in _LEFT_KEYS
 )
 _MONO_KEYS = (
     ("camera_matrix", "cameraMatrix", "K"),
     ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D"),
 )
+
+
+def read_yaml(path: Path) -> str:
+    """Return the text of a calibration without comments. Raises CalibrationError with the file
+    name."""
+    text = read_text(path, CalibrationError, "no calibration here")
+    if len(text) > _MAX_CHARS:
+        raise CalibrationError(f"{path}: {len(text)} characters are no calibration")
+    return re.sub(r"#.*", "", text)
+
+
+def yaml_word(text: str, key: str, default: str) -> str:
+    """Return the word after a key, or `default`."""
+    found = re.search(rf"^\s*{key}:\s*[\"']?([\w-]+)", text, re.MULTILINE)
+    return found[1] if found else default
+
+
+def yaml_numbers(text: str, *keys: str) -> list[float]:
+    """Return all numbers after the first existing key, up to the next key other than `cols`,
+    `rows`, `dt` or `data`."""
+    for key in keys:
+        found = re.search(
+            rf"^[ \t]*{key}:(.*?)(?=^[ \t]*(?!(?:cols|rows|dt|data)\b)[A-Za-z_]\w*:|\Z)",
+            text,
+            re.MULTILINE | re.DOTALL,
+        )
+        if found:
+            return [
+                float(number)
+                for number in _NUMBER.findall(re.sub(r"\b(?:cols|rows|dt):.*", "", found[1]))
+            ]
+    return []
+
+
+def require_numbers(path: Path, text: str, count: int, *keys: str) -> list[float]:
+    """Return the first `count` numbers after one of these keys. Raises CalibrationError with the
+    file name."""
+    numbers = yaml_numbers(text, *keys)
+    if len(numbers) < count:
+        raise CalibrationError(f"{path}: {' or '.join(keys[:3])} with {count} numbers is missing")
+    return numbers[:count]
 
 
 def is_calibration(path: Path) -> bool:
@@ -89,15 +122,10 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraCalibrat
     left, right = (_opencv_camera(path, text, names, size) for names in (_LEFT_KEYS, _RIGHT_KEYS))
     beside = path.with_name("extrinsics.yml")
     motion = read_yaml(beside) if not yaml_numbers(text, "R") and beside.is_file() else text
-    rotation = np.array(
-        require_numbers(path, motion, 9, "R", "rotation_matrix", "R_right_left")
-    ).reshape(3, 3)
-    translation = np.array(
-        require_numbers(path, motion, 3, "T", "translation_vector", "T_right_left")
-    )
-    return CameraCalibration(
-        left, rig=_rig(path, left, right, np.column_stack([rotation, translation]))
-    )
+    rotation = require_numbers(path, motion, 9, "R", "rotation_matrix", "R_right_left")
+    translation = require_numbers(path, motion, 3, "T", "translation_vector", "T_right_left")
+    right_from_left = np.column_stack([np.reshape(rotation, (3, 3)), translation])
+    return CameraCalibration(left, rig=_rig(path, left, right, right_from_left))
 
 
 def kalibr_camera(path: Path, section: str) -> Camera:
@@ -113,9 +141,8 @@ def kalibr_camera(path: Path, section: str) -> Camera:
     width, height = require_numbers(path, section, 2, "resolution")
     params = require_numbers(path, section, 4, "intrinsics")
     if count:
-        params += require_numbers(
-            path, section, count, "distortion_coefficients", "distortion_coeffs"
-        )
+        names = "distortion_coefficients", "distortion_coeffs"
+        params += require_numbers(path, section, count, *names)
     return _camera(path, model, (width, height), params)
 
 
@@ -135,7 +162,7 @@ def _read_kalibr(path: Path, text: str) -> CameraCalibration:
 
 
 def _opencv_camera(
-    path: Path, text: str, names: tuple[Sequence[str], Sequence[str]], size: tuple[float, float]
+    path: Path, text: str, names: Sequence[Sequence[str]], size: tuple[float, float]
 ) -> Camera:
     """Read the camera whose matrix and distortion have one of these names."""
     matrix, distortion = names
@@ -146,9 +173,8 @@ def _opencv_camera(
         )
     coefficients = yaml_numbers(text, *distortion)
     if yaml_word(text, "distortion_model", "") in _FISHEYE_WORDS:
-        return _camera(
-            path, "OPENCV_FISHEYE", size, [fx, fy, cx, cy, *(coefficients + [0.0] * 4)[:4]]
-        )
+        four = (coefficients + [0.0] * 4)[:4]
+        return _camera(path, "OPENCV_FISHEYE", size, [fx, fy, cx, cy, *four])
     if any(coefficients[8:]):
         raise CalibrationError(
             f"{path}: {distortion[0]} has {len(coefficients)} numbers; thin prism and tilted models"
@@ -177,9 +203,7 @@ def _image_size(text: str) -> tuple[float, float] | None:
 
 def _rig(path: Path, left: Camera, right: Camera, right_from_left: np.ndarray) -> StereoRig:
     try:
-        rig = StereoRig(
-            left, right, Rigid3.from_matrix(np.vstack([right_from_left, [0.0, 0.0, 0.0, 1.0]]))
-        )
+        rig = StereoRig(left, right, Rigid3.from_matrix(right_from_left))
     except (CalibrationError, TrajectoryError) as error:
         raise CalibrationError(f"{path}: {error}") from None
     if rig.baseline > _MAX_BASELINE:

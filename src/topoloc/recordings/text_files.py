@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path, PurePath
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from topoloc.errors import TopolocError
+from topoloc.errors import TopolocError, TrajectoryError
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
 # Larger times are nanoseconds (as ORB-SLAM3 writes them for EuRoC). In seconds they would be 30 000
@@ -19,6 +18,10 @@ _MAX_SECONDS = 10**12
 # Maximum number of digits before the decimal point. Parsing an integer of a million digits takes
 # minutes.
 _MAX_DIGITS = 25
+
+
+Rows = Sequence[tuple[int, list[str]]]
+"""Line numbers and columns."""
 
 
 def read_text(path: Path, error: type[TopolocError], missing: str = "no such file") -> str:
@@ -52,25 +55,15 @@ def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str
 
 def _read_lines(path: Path, error: type[TopolocError]) -> list[str]:
     """Return the lines without comments, with spaces instead of commas."""
-    text = read_text(path, error).replace(",", " ")
-    return (
-        text.splitlines()
-        if "#" not in text
-        else [line.partition("#")[0] for line in text.splitlines()]
-    )
+    lines = read_text(path, error).replace(",", " ").splitlines()
+    return [line.partition("#")[0] for line in lines]
 
 
-@dataclass(frozen=True, eq=False)
-class NumericTable:
-    """Hold the numbers of a table with equally long rows, and its lines."""
-
-    numbers: Float[np.ndarray, "n c"]
-    lines: list[str]
-
-
-def read_numeric_table(path: Path, error: type[TopolocError]) -> NumericTable | None:
+def read_numeric_table(
+    path: Path, error: type[TopolocError]
+) -> tuple[Float[np.ndarray, "n c"], list[str]] | None:
     """Read a file that contains only finite numbers, equally many per line, in one pass. Comments
-    are skipped. Return None for any other file.
+    are skipped. Return the numbers and the lines, or None for any other file.
 
     Raises:
         error: the file is missing or not text.
@@ -82,23 +75,18 @@ def read_numeric_table(path: Path, error: type[TopolocError]) -> NumericTable | 
         numbers = np.loadtxt(lines, comments=None, ndmin=2)
     except ValueError:
         return None
-    return (
-        NumericTable(numbers, lines)
-        if len(numbers) == len(lines) and np.isfinite(numbers).all()
-        else None
-    )
+    is_good = len(numbers) == len(lines) and np.isfinite(numbers).all()
+    return (numbers, lines) if is_good else None
 
 
 def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
     """Parse times as `parse_times`, if all are written alike, such as ``1403636579.763555584``.
     Return None otherwise."""
     width = len(lines[0].split(None, 1)[0])
-    try:
-        characters = np.frombuffer(
-            "".join([line[: width + 1] for line in lines]).encode("ascii"), np.uint8
-        )
-    except UnicodeEncodeError:
+    text = "".join([line[: width + 1] for line in lines])
+    if not text.isascii():
         return None
+    characters = np.frombuffer(text.encode("ascii"), np.uint8)
     if characters.size != len(lines) * (width + 1):
         return None
     *columns, last = np.ascontiguousarray(characters.reshape(len(lines), -1).T)
@@ -107,9 +95,9 @@ def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
     dots = [number for number, column in enumerate(columns) if column[0] == ord(".")]
     at = dots[0] if dots else width
     digits = columns[:at] + columns[at + 1 :]
-    if (
-        (dots and (columns[at] != ord(".")).any()) or not 1 <= at <= 10 or len(digits) - at > 9
-    ):  # up to ten digits: seconds, not nanoseconds
+    is_aligned = not dots or (columns[at] == ord(".")).all()
+    # Up to ten digits are seconds, not nanoseconds.
+    if not is_aligned or not 1 <= at <= 10 or len(digits) - at > 9:
         return None
     t_ns = np.zeros(len(lines), dtype=np.int64)
     for column in digits:
@@ -120,9 +108,7 @@ def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
     return t_ns.tolist() if (np.diff(t_ns) > 0).all() else None
 
 
-def parse_times(
-    rows: Sequence[tuple[int, list[str]]], path: Path, error: type[TopolocError]
-) -> list[int]:
+def parse_times(rows: Rows, path: Path, error: type[TopolocError]) -> list[int]:
     """Parse the first column to integer nanoseconds, exact to the last decimal. Times are in
     seconds, or in nanoseconds if one is above 1e12.
 
@@ -170,3 +156,25 @@ def parse_relative_path(name: str, where: str, error: type[TopolocError]) -> str
     if not path.parts or path.is_absolute() or ".." in path.parts or {"\0", "\\"} & set(name):
         raise error(f"{where}: {name[:80]!r} is no picture below this folder")
     return path.as_posix()
+
+
+def parse_numbers(path: Path, rows: Rows, columns: Sequence[int]) -> Float[np.ndarray, "n c"]:
+    """Return these columns of the rows as finite numbers. Raises TrajectoryError."""
+    numbers = np.empty((len(rows), len(columns)))
+    for row, (line, tokens) in enumerate(rows):
+        for at, column in enumerate(columns):
+            try:
+                numbers[row, at] = float(tokens[column])
+            except ValueError:
+                token = tokens[column][:40]
+                raise TrajectoryError(f"{path}, line {line}: {token!r} is not a number") from None
+    is_finite = np.array([np.isfinite(row).all() for row in numbers])
+    check_rows(is_finite, "NaN or infinite numbers", path, rows)
+    return numbers
+
+
+def check_rows(is_good: Bool[np.ndarray, " n"], fault: str, path: Path, rows: Rows) -> None:
+    """Raise TrajectoryError with the first bad row and its fault, if there is one."""
+    if not is_good.all():
+        line, tokens = rows[int(np.argmin(is_good))]
+        raise TrajectoryError(f"{path}, line {line}: {fault} in {' '.join(tokens)[:120]}")

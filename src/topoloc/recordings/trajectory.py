@@ -16,15 +16,23 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from topoloc.errors import RecordingError, TrajectoryError
-from topoloc.geometry.lazy_poses import LazyPoses, pose_from_quaternion, poses_from_matrices
-from topoloc.geometry.pose_conventions import PoseConventions
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.alignment import align_scaled_poses
+from topoloc.geometry.pose_conventions import (
+    LazyPoses,
+    PoseConventions,
+    pose_from_quaternion,
+    poses_from_matrices,
+)
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.atomic import write_text
 from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.recording import SequenceView, times_from_rate
+from topoloc.recordings.recording import SequenceView, scale_poses, with_poses
 from topoloc.recordings.text_files import (
     NANOSECONDS_PER_SECOND,
+    Rows,
+    check_rows,
+    parse_numbers,
     parse_times,
     parse_uniform_times,
     read_numeric_table,
@@ -36,7 +44,6 @@ _TIME_TOLERANCE_NS = 1_000_000
 _ROTATION_TOLERANCE = 1e-2
 _MIN_OVERLAP_SHARE = 0.8  # minimum overlap of two clocks, as a share of the frames' duration
 TUM_HEADER = "# t tx ty tz qx qy qz qw (s, m; world_from_cam)"
-_Rows = Sequence[tuple[int, list[str]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,41 +119,30 @@ class Trajectory:
         return poses
 
     def to_tum(self, header: bool = True) -> str:
-        """Return the lines of a TUM file.
-
-        Args:
-            header: begin with the comment that names the columns.
-
-        Raises:
-            TrajectoryError: the trajectory has no times.
-        """
+        """Return the lines of a TUM file, first the `header` that names the columns. Raises
+        TrajectoryError if the trajectory has no times."""
         if self.t_ns is None:
             raise TrajectoryError("a TUM file needs times, and these poses have none")
         rows = map(tum_line, self.t_ns, self.world_from_cam)
         return "".join(f"{line}\n" for line in [*([TUM_HEADER] if header else []), *rows])
 
     def write_tum(self, path: Path) -> None:
-        """Write a TUM file atomically.
-
-        Raises:
-            TrajectoryError: the trajectory has no times.
-            TopolocError: the file cannot be written.
-        """
+        """Write a TUM file atomically. Raises TrajectoryError if the trajectory has no times, and
+        TopolocError if the file cannot be written."""
         write_text(path, self.to_tum())
 
 
 def _read_numeric_trajectory(path: Path) -> Trajectory | None:
     """Read a valid file of numbers in one pass. Return None for any other file, which is then read
     line by line."""
-    table = read_numeric_table(path, TrajectoryError)
-    if table is None or table.numbers.shape[1] not in (8, 12):
-        return None
-    if table.numbers.shape[1] == 12:
-        poses, is_rotation = poses_from_matrices(table.numbers, _ROTATION_TOLERANCE)
+    numbers, lines = read_numeric_table(path, TrajectoryError) or (np.zeros((0, 0)), [])
+    if numbers.shape[1] == 12:
+        poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
         return Trajectory(poses) if is_rotation.all() else None
-    t_ns, rows = parse_uniform_times(table.lines), table.numbers[:, 1:]
-    is_good = t_ns is not None and _is_unit_quaternion(rows[:, 3:]).all()
-    return Trajectory.from_quaternions(rows, t_ns) if t_ns is not None and is_good else None
+    t_ns, rows = parse_uniform_times(lines) if numbers.shape[1] == 8 else None, numbers[:, 1:]
+    if t_ns is None or not _is_unit_quaternion(rows[:, 3:]).all():
+        return None
+    return Trajectory.from_quaternions(rows, t_ns)
 
 
 def _trajectory_from_rows(path: Path) -> Trajectory:
@@ -161,19 +157,18 @@ def _trajectory_from_rows(path: Path) -> Trajectory:
             raise TrajectoryError(
                 f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}"
             )
-    if num_columns == 12:
-        poses, is_rotation = poses_from_matrices(
-            _parse_numbers(path, rows, range(12)), _ROTATION_TOLERANCE
-        )
-        _check_rows(is_rotation, "not a rotation", path, rows)
-        return Trajectory(poses)
-    return _timed_trajectory(path, rows, range(1, 8))
+    if num_columns == 8:
+        return _timed_trajectory(path, rows, range(1, 8))
+    numbers = parse_numbers(path, rows, range(12))
+    poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
+    check_rows(is_rotation, "not a rotation", path, rows)
+    return Trajectory(poses)
 
 
-def _timed_trajectory(path: Path, rows: _Rows, columns: Iterable[int]) -> Trajectory:
+def _timed_trajectory(path: Path, rows: Rows, columns: Sequence[int]) -> Trajectory:
     """Read rows of a time and the given columns: x, y, z (metres) and a quaternion (x, y, z, w)."""
-    t_ns, numbers = parse_times(rows, path, TrajectoryError), _parse_numbers(path, rows, columns)
-    _check_rows(_is_unit_quaternion(numbers[:, 3:]), "not a rotation", path, rows)
+    t_ns, numbers = parse_times(rows, path, TrajectoryError), parse_numbers(path, rows, columns)
+    check_rows(_is_unit_quaternion(numbers[:, 3:]), "not a rotation", path, rows)
     return Trajectory.from_quaternions(numbers, t_ns)
 
 
@@ -195,12 +190,8 @@ def read_asl_poses(path: Path) -> Trajectory:
 def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:
     """Return one line of a TUM file without the line break."""
     w, x, y, z = world_from_cam.quat_wxyz()
-    return " ".join(
-        [
-            f"{Decimal(t_ns).scaleb(-9):.9f}",
-            *(f"{value:.12g}" for value in (*world_from_cam.translation, x, y, z, w)),
-        ]
-    )
+    numbers = [f"{value:.12g}" for value in (*world_from_cam.translation, x, y, z, w)]
+    return " ".join([f"{Decimal(t_ns).scaleb(-9):.9f}", *numbers])
 
 
 def with_trajectory(
@@ -223,7 +214,7 @@ def with_trajectory(
         poses = [rows[index] for index in sequence.indices]
     else:
         poses = _to_frame_clock(trajectory, conventions).match_frames(sequence.t_ns, path)
-    return _with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
+    return with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
 
 
 def with_pose_conventions(sequence: StereoSequence, conventions: PoseConventions) -> StereoSequence:
@@ -234,44 +225,46 @@ def with_pose_conventions(sequence: StereoSequence, conventions: PoseConventions
     """
     if conventions == PoseConventions():
         return sequence
-    posed = [
-        (pose, t_ns)
-        for pose, t_ns in zip(sequence.poses, sequence.t_ns, strict=True)
-        if pose is not None
-    ]
-    poses = sequence.poses
-    if posed and (conventions.shift_s or conventions.time_scale != 1.0):
-        trajectory = Trajectory([pose for pose, _ in posed], [t_ns for _, t_ns in posed])
-        on_frame_clock = _to_frame_clock(trajectory, conventions)
-        poses = on_frame_clock.match_frames(sequence.t_ns, Path(sequence.name))
-    return _with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
+    poses, t_ns = sequence.poses, sequence.t_ns
+    trajectory = Trajectory.of_frames(poses, t_ns)
+    if len(trajectory) and (conventions.shift_s or conventions.time_scale != 1.0):
+        poses = _to_frame_clock(trajectory, conventions).match_frames(t_ns, Path(sequence.name))
+    return with_poses(sequence, [pose and conventions.undo_conventions(pose) for pose in poses])
 
 
-def _with_poses(sequence: StereoSequence, poses: list[Rigid3 | None]) -> StereoSequence:
-    return SequenceView(sequence, list(range(len(sequence))), poses)
+def align_to_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
+    """Return the recording in the world of a trajectory file, in metres: its own poses, moved and
+    scaled to fit best.
+
+    Raises:
+        TrajectoryError: the file is malformed, fits no frame, or its positions fix no scale.
+    """
+    theirs = Trajectory.read(path).match_frames(sequence.t_ns, path)
+    pairs = zip(sequence.poses, theirs, strict=True)
+    both = [(a, b) for a, b in pairs if a is not None and b is not None]
+    if not both:
+        raise TrajectoryError(f"{path}: no frame has a pose in it and in {sequence.name}")
+    try:
+        scale, world_from_model = align_scaled_poses([b for _, b in both], [a for a, _ in both])
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+    scaled = scale_poses(sequence, scale).poses
+    return with_poses(sequence, [pose and world_from_model @ pose for pose in scaled])
 
 
 def _to_frame_clock(trajectory: Trajectory, conventions: PoseConventions) -> Trajectory:
-    if trajectory.t_ns is None or (conventions.time_scale == 1.0 and conventions.shift_s == 0.0):
-        return trajectory
-    shift_ns = round(conventions.shift_s * NANOSECONDS_PER_SECOND)
-    return replace(
-        trajectory,
-        t_ns=[
-            (time if conventions.time_scale == 1.0 else round(time * conventions.time_scale))
-            - shift_ns
-            for time in trajectory.t_ns
-        ],
-    )
+    t_ns, shift_ns = trajectory.t_ns, round(conventions.shift_s * NANOSECONDS_PER_SECOND)
+    if t_ns is not None and conventions.time_scale != 1.0:  # floats would round unscaled times
+        t_ns = [round(time * conventions.time_scale) for time in t_ns]
+    return replace(trajectory, t_ns=t_ns and [time - shift_ns for time in t_ns])
 
 
 def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
     """Describe the likely difference between the clocks of poses and frames: another unit or
     another start."""
     for factor in (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9):
-        overlap = min(of_poses[-1] * factor, of_frames[-1]) - max(
-            of_poses[0] * factor, of_frames[0]
-        )
+        last = min(of_poses[-1] * factor, of_frames[-1])
+        overlap = last - max(of_poses[0] * factor, of_frames[0])
         if overlap > _MIN_OVERLAP_SHARE * (of_frames[-1] - of_frames[0]):
             return f"; its times seem to be in another unit: --poses clock={factor:g}"
     lasts, frames_last = of_poses[-1] - of_poses[0], of_frames[-1] - of_frames[0]
@@ -279,35 +272,6 @@ def _clock_hint(of_poses: Sequence[int], of_frames: Sequence[int]) -> str:
         shift = (of_poses[0] - of_frames[0]) / NANOSECONDS_PER_SECOND
         return f"; if both began at the same moment: --poses shift={shift:.9g}"
     return ""
-
-
-def read_ground_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
-    """Return the pose of each frame from the first existing file: TUM by time, KITTI rows by frame.
-    Return None for all frames if no file exists.
-
-    Raises:
-        TrajectoryError: the file is malformed, or matches no frame.
-    """
-    for path in (tum, *kitti_rows):
-        if path.is_file():
-            return Trajectory.read(path).match_frames(t_ns, path)
-    return [None] * len(t_ns)
-
-
-def read_times(path: Path, num_frames: int) -> list[int]:
-    """Read times in nanoseconds from a file with one time in seconds per line. Without a file the
-    rate is 10 Hz.
-
-    Raises:
-        RecordingError: the file is malformed, times do not increase, or their number differs from
-            `num_frames`.
-    """
-    if not path.is_file():
-        return times_from_rate(num_frames)
-    t_ns = parse_times(read_rows(path, RecordingError), path, RecordingError)
-    if len(t_ns) != num_frames:
-        raise RecordingError(f"{path}: {len(t_ns)} times for {num_frames} pictures")
-    return t_ns
 
 
 def _interpolate_pose(
@@ -319,48 +283,13 @@ def _interpolate_pose(
     if 0 < after < len(times) and times[after] - times[after - 1] <= max_gap_ns:
         fraction = (time - times[after - 1]) / (times[after] - times[after - 1])
         return poses[after - 1].interpolate(poses[after], fraction)
-    neighbours = [index for index in (after - 1, after) if 0 <= index < len(times)]
-    nearest = min(neighbours, key=lambda index: abs(times[index] - time), default=None)
-    return (
-        poses[nearest]
-        if nearest is not None and abs(times[nearest] - time) <= _TIME_TOLERANCE_NS
-        else None
-    )
-
-
-def _parse_numbers(path: Path, rows: _Rows, columns: Iterable[int]) -> Float[np.ndarray, "n c"]:
-    """Return these columns of the rows as finite numbers. Raises TrajectoryError."""
-    wanted = list(columns)
-    try:
-        numbers = np.array(
-            [float(tokens[column]) for _, tokens in rows for column in wanted]
-        ).reshape(len(rows), -1)
-    except ValueError:
-        for line, tokens in rows:
-            for column in wanted:
-                _parse_number(path, line, tokens[column])
-        raise
-    _check_rows(np.asarray(np.isfinite(numbers).all(axis=1)), "NaN or infinite numbers", path, rows)
-    return numbers
-
-
-def _parse_number(path: Path, line: int, token: str) -> float:
-    try:
-        return float(token)
-    except ValueError:
-        raise TrajectoryError(f"{path}, line {line}: {token[:40]!r} is not a number") from None
+    rows = [row for row in (after - 1, after) if 0 <= row < len(times)]
+    near = [row for row in rows if abs(times[row] - time) <= _TIME_TOLERANCE_NS]
+    return poses[min(near, key=lambda row: abs(times[row] - time))] if near else None
 
 
 def _is_unit_quaternion(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
     """Return which quaternions have length 1 up to rounding."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return (
-            np.abs(np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions)) - 1.0)
-            <= _ROTATION_TOLERANCE
-        )
-
-
-def _check_rows(is_good: Bool[np.ndarray, " n"], fault: str, path: Path, rows: _Rows) -> None:
-    if not is_good.all():
-        line, tokens = rows[int(np.argmin(is_good))]
-        raise TrajectoryError(f"{path}, line {line}: {fault} in {' '.join(tokens)[:120]}")
+        lengths = np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions))
+        return np.abs(lengths - 1.0) <= _ROTATION_TOLERANCE

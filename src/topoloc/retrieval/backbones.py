@@ -1,7 +1,7 @@
 """Define the backbone networks of the learned coarse localizers, in PyTorch.
 
 They are VGG-11, VGG-16 (Simonyan & Zisserman 2014), SqueezeNet 1.1 (Iandola et al. 2016),
-EfficientNet-lite0 (`efficientnet.py`), and a small network for training from scratch.
+EfficientNet-lite0, and a small network for training from scratch.
 
 Layers of the first three have torchvision's names and order, so that torchvision's ImageNet weights
 load unchanged.
@@ -13,9 +13,8 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad, relu6
 
-from topoloc.retrieval.efficientnet import NUM_CHANNELS as EFFICIENTNET_CHANNELS
-from topoloc.retrieval.efficientnet import efficientnet_features
 from topoloc.retrieval.network_config import BackboneName
 
 # Statistics of ImageNet, for the pretrained networks. The input is (RGB in [0, 1] - mean)
@@ -26,33 +25,25 @@ NUM_IMAGENET_CLASSES = 1000
 NUM_CHANNELS = 512
 """Channels of the last feature maps of VGG and SqueezeNet."""
 
-_POOL = "M"
-_VGG_LAYERS: dict[str, tuple[int | str, ...]] = {
-    "vgg11": (64, _POOL, 128, _POOL, 256, 256, _POOL, 512, 512, _POOL, 512, 512, _POOL),
-    "vgg16": (
-        64,
-        64,
-        _POOL,
-        128,
-        128,
-        _POOL,
-        256,
-        256,
-        256,
-        _POOL,
-        512,
-        512,
-        512,
-        _POOL,
-        512,
-        512,
-        512,
-        _POOL,
-    ),
+# Channels of the convolutions. 0 is a pooling.
+_VGG_LAYERS = {
+    "vgg11": (64, 0, 128, 0, 256, 256, 0, 512, 512, 0, 512, 512, 0),
+    "vgg16": (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0),
 }
 _COMPACT_LAYERS = (24, 48, 96, 128, 128)
 VGG_GRID = 7
 """Rows and columns to which VGG's features are pooled before its classifier."""
+# EfficientNet-lite0: channels of the last feature maps and of the first ones.
+_EFFICIENTNET_CHANNELS = 1280
+_STEM, _EXPANSION = 32, 6
+# For each stage: blocks, kernel, stride of the first block, channels.
+_STAGES = (
+    *((1, 3, 1, 16), (2, 3, 2, 24), (2, 5, 2, 40), (3, 3, 2, 80)),
+    *((3, 5, 1, 112), (4, 5, 2, 192), (1, 3, 1, 320)),
+)
+# The network's input is (RGB bytes - 127) / 128. Here images are normalised by ImageNet's mean and
+# deviation.
+_MEAN, _DEVIATION = 127.0, 128.0
 
 
 class Backbone(nn.Module):
@@ -72,9 +63,8 @@ class Backbone(nn.Module):
         super().__init__()
         self.name: BackboneName = name
         self.features = nn.Sequential(*list(_features(name))[:depth])
-        self.num_channels = max(
-            _num_channels(layer) for layer in self.features.children()
-        )  # they never decrease
+        # They never decrease.
+        self.num_channels = max(_num_channels(layer) for layer in self.features.children())
         self.classifier = None if num_outputs is None else _classifier(name, num_outputs)
 
     def forward(self, images: Tensor, first: int = 0) -> Tensor:
@@ -117,9 +107,8 @@ class _Fire(nn.Module):
 
     def forward(self, maps: Tensor) -> Tensor:
         squeezed = torch.relu(self.squeeze(maps))
-        return torch.cat(
-            [torch.relu(self.expand1x1(squeezed)), torch.relu(self.expand3x3(squeezed))], dim=1
-        )
+        expanded = [torch.relu(self.expand1x1(squeezed)), torch.relu(self.expand3x3(squeezed))]
+        return torch.cat(expanded, dim=1)
 
 
 def _num_channels(layer: nn.Module) -> int:
@@ -134,7 +123,7 @@ def _features(name: BackboneName) -> nn.Sequential:
     if name == "compact":
         return _compact_features()
     if name == "efficientnet_lite0":
-        return efficientnet_features(IMAGENET_MEAN, IMAGENET_DEVIATION)
+        return _efficientnet_features()
     return _squeezenet_features() if name == "squeezenet1_1" else _vgg_features(_VGG_LAYERS[name])
 
 
@@ -152,32 +141,21 @@ def _compact_features() -> nn.Sequential:
 
 
 def _squeezenet_features() -> nn.Sequential:
-    def pool() -> nn.MaxPool2d:
-        return nn.MaxPool2d(3, stride=2, ceil_mode=True)
-
-    fires = [
-        _Fire(*sizes) for sizes in ((64, 16, 64), (128, 16, 64), (128, 32, 128), (256, 32, 128))
-    ]
-    last = [
-        _Fire(*sizes) for sizes in ((256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256))
-    ]
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 3, stride=2),
-        nn.ReLU(True),
-        pool(),
-        *fires[:2],
-        pool(),
-        *fires[2:],
-        pool(),
-        *last,
-    )
+    modules: list[nn.Module] = [nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(True)]
+    for pooled in (
+        ((64, 16, 64), (128, 16, 64)),
+        ((128, 32, 128), (256, 32, 128)),
+        ((256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256)),
+    ):
+        modules += [nn.MaxPool2d(3, stride=2, ceil_mode=True), *(_Fire(*one) for one in pooled)]
+    return nn.Sequential(*modules)
 
 
-def _vgg_features(layers: Sequence[int | str]) -> nn.Sequential:
+def _vgg_features(layers: Sequence[int]) -> nn.Sequential:
     modules: list[nn.Module] = []
     num_channels = 3
     for layer in layers:
-        if isinstance(layer, int):
+        if layer > 0:
             modules += [nn.Conv2d(num_channels, layer, 3, padding=1), nn.ReLU(True)]
             num_channels = layer
         else:
@@ -186,30 +164,85 @@ def _vgg_features(layers: Sequence[int | str]) -> nn.Sequential:
 
 
 def _classifier(name: BackboneName, num_outputs: int) -> nn.Sequential:
+    mean = nn.AdaptiveAvgPool2d(1)
     if name == "squeezenet1_1":
-        return nn.Sequential(
-            nn.Dropout(0.5),
-            nn.Conv2d(NUM_CHANNELS, num_outputs, 1),
-            nn.ReLU(True),
-            nn.AdaptiveAvgPool2d(1),
-        )
+        convolution = nn.Conv2d(NUM_CHANNELS, num_outputs, 1)
+        return nn.Sequential(nn.Dropout(0.5), convolution, nn.ReLU(True), mean)
     if name == "compact":
-        return nn.Sequential(
-            nn.Dropout(0.5), nn.Conv2d(_COMPACT_LAYERS[-1], num_outputs, 1), nn.AdaptiveAvgPool2d(1)
-        )
+        convolution = nn.Conv2d(_COMPACT_LAYERS[-1], num_outputs, 1)
+        return nn.Sequential(nn.Dropout(0.5), convolution, mean)
     if name == "efficientnet_lite0":
-        return nn.Sequential(
-            nn.Dropout(0.2),
-            nn.Conv2d(EFFICIENTNET_CHANNELS, num_outputs, 1),
-            nn.AdaptiveAvgPool2d(1),
-        )
+        convolution = nn.Conv2d(_EFFICIENTNET_CHANNELS, num_outputs, 1)
+        return nn.Sequential(nn.Dropout(0.2), convolution, mean)
     wide = 4096
-    hidden = [
-        nn.Linear(512 * VGG_GRID**2, wide),
-        nn.ReLU(True),
-        nn.Dropout(0.5),
-        nn.Linear(wide, wide),
-        nn.ReLU(True),
-        nn.Dropout(0.5),
-    ]
-    return nn.Sequential(*hidden, nn.Linear(wide, num_outputs))
+    first = [nn.Linear(512 * VGG_GRID**2, wide), nn.ReLU(True), nn.Dropout(0.5)]
+    second = [nn.Linear(wide, wide), nn.ReLU(True), nn.Dropout(0.5)]
+    return nn.Sequential(*first, *second, nn.Linear(wide, num_outputs))
+
+
+def _efficientnet_features() -> nn.Sequential:
+    """Return the stem, 16 blocks and the last convolution of EfficientNet-lite0 (Tan & Le 2019, the
+    variant without squeeze and excitation).
+
+    Batch normalisation is folded into the convolutions, as in inference. The weights are read in
+    this form.
+    """
+    layers: list[nn.Module] = [_Stem()]
+    num_channels = _STEM
+    for num_blocks, kernel, stride, width in _STAGES:
+        for number in range(num_blocks):
+            expansion = 1 if len(layers) == 1 else _EXPANSION
+            own_stride = stride if number == 0 else 1
+            layers.append(_Block(num_channels, width, kernel, own_stride, expansion))
+            num_channels = width
+    last = nn.Sequential(nn.Conv2d(num_channels, _EFFICIENTNET_CHANNELS, 1), nn.ReLU6())
+    return nn.Sequential(*layers, last)
+
+
+class SameConv(nn.Conv2d):
+    """Convolve with TensorFlow's padding: if the padding is odd, the larger half comes after."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Return the convolution of the padded input."""
+        sizes = zip(input.shape[-2:], self.kernel_size, self.stride, strict=True)
+        rows, columns = (
+            max((-(-length // stride) - 1) * stride + kernel - length, 0)
+            for length, kernel, stride in sizes
+        )
+        sides = columns // 2, columns - columns // 2, rows // 2, rows - rows // 2
+        return super().forward(pad(input, sides))
+
+
+class _Stem(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.convolution = SameConv(3, _STEM, 3, stride=2)
+        self._scale = [255.0 * value / _DEVIATION for value in IMAGENET_DEVIATION]
+        self._shift = [(255.0 * value - _MEAN) / _DEVIATION for value in IMAGENET_MEAN]
+
+    def forward(self, images: Tensor) -> Tensor:
+        scale, shift = (
+            torch.tensor(values, dtype=images.dtype, device=images.device)[:, None, None]
+            for values in (self._scale, self._shift)
+        )
+        return relu6(self.convolution(images * scale + shift))
+
+
+class _Block(nn.Module):
+    """Expand the channels, filter each one separately, and project them. The input is added if it
+    has the shape of the output."""
+
+    def __init__(
+        self, num_inputs: int, num_outputs: int, kernel: int, stride: int, expansion: int
+    ) -> None:
+        super().__init__()
+        width = expansion * num_inputs
+        self.expand = None if expansion == 1 else nn.Conv2d(num_inputs, width, 1)
+        self.depthwise = SameConv(width, width, kernel, stride=stride, groups=width)
+        self.project = nn.Conv2d(width, num_outputs, 1)
+        self.out_channels, self._has_skip = num_outputs, stride == 1 and num_inputs == num_outputs
+
+    def forward(self, maps: Tensor) -> Tensor:
+        spread = maps if self.expand is None else relu6(self.expand(maps))
+        drawn = self.project(relu6(self.depthwise(spread)))
+        return maps + drawn if self._has_skip else drawn

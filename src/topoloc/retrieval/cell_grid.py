@@ -21,9 +21,8 @@ from topoloc.retrieval.descriptor_kernels import max_shifted_products
 
 DIMENSION = 32
 """Maximum length of a cell's vector after PCA."""
-_VARIANCE_REGULARIZATION = (
-    0.1  # this fraction of the mean variance is added to each axis: the weakest axes are noise
-)
+# This fraction of the mean variance is added to each axis: the weakest axes are noise.
+_VARIANCE_REGULARIZATION = 0.1
 _MAX_SHIFT = 1  # columns
 _MAX_VALUE = 1e6  # far above the values of any network
 _SCALE = np.float32(127.0)  # of a cell's components, which are stored as signed bytes
@@ -54,37 +53,26 @@ class CellGrid:
         by_column = np.ascontiguousarray(cells.transpose(0, 2, 1, 3))
         mean, channels = by_column.mean(axis=0), by_column.shape[3]
         centred = (by_column - mean).reshape(-1, channels)
-        if (
-            float(np.abs(centred).max()) < 1e-6
-        ):  # one image, or all alike: without the common part nothing would remain
+        # One image, or all alike: without the common part nothing would remain.
+        if float(np.abs(centred).max()) < 1e-6:
             mean, centred = np.zeros_like(mean), by_column.reshape(-1, channels)
         variances, axes = np.linalg.eigh(centred.T.astype(np.float64) @ centred / len(centred))
         variances, axes = variances[::-1][:dimension], axes[:, ::-1][:, :dimension]
-        regularized = np.sqrt(
-            np.maximum(variances, 0.0) / max(float(variances.mean()), 1e-12)
-            + _VARIANCE_REGULARIZATION
-        )
+        relative = np.maximum(variances, 0.0) / max(float(variances.mean()), 1e-12)
+        regularized = np.sqrt(relative + _VARIANCE_REGULARIZATION)
         # rounded as in the map file, so that results do not change when the map is stored
         projection = (axes / regularized).T.astype(np.float16).astype(np.float32)
-        vectors = np.concatenate(
-            [
-                _normalize_cells(part, mean, projection)
-                for part in np.array_split(by_column, -(-len(cells) // 256))
-            ]
-        )
+        parts = np.array_split(by_column, -(-len(cells) // 256))
+        vectors = np.concatenate([_normalize_cells(part, mean, projection) for part in parts])
         return CellGrid(mean, projection, np.rint(_SCALE * vectors).astype(np.int8))
 
     def with_cells(self, cells: Float32[np.ndarray, "n rows columns c"]) -> CellGrid:
         """Return the grid with the cells of further mapping images. Mean and projection are
         unchanged."""
-        added = _normalize_cells(
-            np.ascontiguousarray(cells.transpose(0, 2, 1, 3)), self._mean, self._projection
-        )
-        return CellGrid(
-            self._mean,
-            self._projection,
-            np.concatenate([self._stored, np.rint(_SCALE * added).astype(np.int8)]),
-        )
+        by_column = np.ascontiguousarray(cells.transpose(0, 2, 1, 3))
+        added = _normalize_cells(by_column, self._mean, self._projection)
+        stored = np.concatenate([self._stored, np.rint(_SCALE * added).astype(np.int8)])
+        return CellGrid(self._mean, self._projection, stored)
 
     def compute_similarity(
         self, cells: Float32[np.ndarray, "rows columns c"], images: Int[np.ndarray, " k"]
@@ -99,17 +87,10 @@ class CellGrid:
         by_column = np.ascontiguousarray(cells.transpose(1, 0, 2)[None])
         if by_column.shape[1:] != self._mean.shape:
             raise MapError("the map's cells are not of the form that its features have")
-        vector, products = (
-            _normalize_cells(by_column, self._mean, self._projection)[0],
-            np.empty(len(images), np.float32),
-        )
+        vector = _normalize_cells(by_column, self._mean, self._projection)[0]
+        products, max_shift = np.empty(len(images), np.float32), min(_MAX_SHIFT, columns - 1)
         max_shifted_products(
-            self._vectors,
-            images,
-            vector,
-            len(vector) // columns,
-            min(_MAX_SHIFT, columns - 1),
-            products,
+            self._vectors, images, vector, len(vector) // columns, max_shift, products
         )
         return products / np.float32(rows)
 
@@ -127,22 +108,15 @@ class CellGrid:
         if the arrays are inconsistent."""
         if "cell_vectors" not in model.arrays:
             return None
-        mean = model_array(model, "cell_mean", "f", (None, None, None)).astype(
-            np.float32, copy=False
-        )
-        projection = model_array(model, "cell_projection", "f", (None, mean.shape[2])).astype(
-            np.float32
-        )
+        mean = model_array(model, "cell_mean", "f", (None, None, None)).astype(np.float32)
+        shape = None, mean.shape[2]
+        projection = model_array(model, "cell_projection", "f", shape).astype(np.float32)
         if not max(float(np.abs(mean).max()), float(np.abs(projection).max())) < _MAX_VALUE:
             raise MapError(
                 f"the map's coarse localizer {model.name!r} is damaged: cells beyond {_MAX_VALUE:g}"
             )
-        vectors = model_array(
-            model,
-            "cell_vectors",
-            "i",
-            (num_images, mean.shape[0] * mean.shape[1] * len(projection)),
-        )
+        length = mean.shape[0] * mean.shape[1] * len(projection)
+        vectors = model_array(model, "cell_vectors", "i", (num_images, length))
         return CellGrid(mean, projection, vectors.astype(np.int8))
 
 

@@ -39,9 +39,8 @@ class NodeClassifier(nn.Module):
         super().__init__()
         wide = has_wide_classifier(backbone)
         self.backbone = Backbone(backbone, num_outputs=num_nodes if wide else None)
-        self.head = (
-            nn.Identity() if wide else _grid_pooling_head(self.backbone.num_channels, num_nodes)
-        )
+        num_channels = self.backbone.num_channels
+        self.head = nn.Identity() if wide else _grid_pooling_head(num_channels, num_nodes)
 
     def forward(self, images: Tensor, first: int = 0) -> Tensor:
         """Return one score per node. Arguments are those of `Backbone.forward`."""
@@ -58,32 +57,20 @@ class CnnFc:
     def __init__(self, model: CoarseModel) -> None:
         self._input_config = read_setting(model, "config", ClassifierNetworkConfig).picture
         self._shape = ImageShape(*read_setting(model, "picture_shape", tuple[int, int]))
-        self._temperature, num_outputs = (
-            read_setting(model, "temperature", float),
-            read_setting(model, "num_nodes", int),
-        )
+        self._temperature = read_setting(model, "temperature", float)
+        num_outputs = read_setting(model, "num_nodes", int)
+        damaged = f"the map's coarse localizer {NAME!r} is damaged:"
         if not 0 < num_outputs <= MAX_OUTPUTS or self._temperature <= 0.0:
-            raise MapError(
-                f"the map's coarse localizer {NAME!r} is damaged: {num_outputs} outputs,"
-                f" temperature {self._temperature}"
-            )
+            raise MapError(f"{damaged} {num_outputs} outputs, temperature {self._temperature}")
         try:
-            self._predict = Predictor(
-                load_network_weights(
-                    NodeClassifier(read_setting(model, "backbone", BackboneName), num_outputs),
-                    model.arrays,
-                )
-            )
+            network = NodeClassifier(read_setting(model, "backbone", BackboneName), num_outputs)
+            self._predict = Predictor(load_network_weights(network, model.arrays))
         except (KeyError, RuntimeError, ValueError) as error:
-            raise MapError(
-                f"the map's coarse localizer {NAME!r} is damaged:"
-                f" {' '.join(str(error).split())[:200]}"
-            ) from error
+            raise MapError(f"{damaged} {' '.join(str(error).split())[:200]}") from error
         # row in the map of each output's node, -1 for removed nodes
-        has_rows = "node_ids" in model.arrays
         self._rows = (
             model_array(model, "node_ids", "iu", (num_outputs,))
-            if has_rows
+            if "node_ids" in model.arrays
             else np.arange(num_outputs)
         )
 
@@ -98,16 +85,13 @@ class CnnFc:
         for row in self.probabilities(images):
             outputs = np.argsort(-row, kind="stable")
             outputs = outputs[self._rows[outputs] >= 0][:num_candidates]
-            ranked.append(
-                [NodeScore(Row(int(self._rows[output])), float(row[output])) for output in outputs]
-            )
+            ranked.append([NodeScore(Row(int(self._rows[k])), float(row[k])) for k in outputs])
         return ranked
 
     def probabilities(self, images: Sequence[Image]) -> Float32[np.ndarray, "n nodes"]:
         """Return the probability of each output's node for each image."""
-        outputs = self._predict(
-            prepare_network_images(images, self._shape, self._input_config)
-        ) / np.float32(self._temperature)
+        rgb_images = prepare_network_images(images, self._shape, self._input_config)
+        outputs = self._predict(rgb_images) / np.float32(self._temperature)
         powers = np.exp(outputs - outputs.max(axis=1, keepdims=True))
         return powers / powers.sum(axis=1, keepdims=True)
 
@@ -116,12 +100,7 @@ open_model = CnnFc
 
 
 def _grid_pooling_head(num_channels: int, num_nodes: int) -> nn.Sequential:
-    squeeze = [
-        nn.Conv2d(num_channels, _SQUEEZED, 1),
-        nn.ReLU(True),
-        nn.AdaptiveAvgPool2d((_ROWS, _COLUMNS)),
-        nn.Flatten(),
-    ]
-    return nn.Sequential(
-        *squeeze, nn.Dropout(0.3), nn.Linear(_SQUEEZED * _ROWS * _COLUMNS, num_nodes)
-    )
+    squeeze = nn.Conv2d(num_channels, _SQUEEZED, 1), nn.ReLU(True)
+    pool = nn.AdaptiveAvgPool2d((_ROWS, _COLUMNS)), nn.Flatten()
+    linear = nn.Linear(_SQUEEZED * _ROWS * _COLUMNS, num_nodes)
+    return nn.Sequential(*squeeze, *pool, nn.Dropout(0.3), linear)

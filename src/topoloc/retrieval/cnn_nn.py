@@ -39,20 +39,15 @@ class PooledFeatures(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return unit vectors (n, channels * rows * columns) of normalised images (n, 3, h, w)."""
         maps = self.backbone(images).float().clamp(min=1e-4)
-        pooled = nn.functional.adaptive_avg_pool2d(maps**self.power, (self.rows, self.columns)) ** (
-            1.0 / self.power
-        )
-        return nn.functional.normalize(pooled.flatten(1))
+        pooled = nn.functional.adaptive_avg_pool2d(maps**self.power, (self.rows, self.columns))
+        return nn.functional.normalize((pooled ** (1.0 / self.power)).flatten(1))
 
 
 def open_model(model: CoarseModel) -> NetworkDescriptorLocalizer:
     """Return the localizer of a stored model. Raises MapError and ConfigError."""
     config = read_setting(model, "config", PooledNetworkConfig)
-    return NetworkDescriptorLocalizer(
-        model,
-        create_pooled_network(read_setting(model, "backbone", BackboneName), config),
-        config.picture,
-    )
+    network = create_pooled_network(read_setting(model, "backbone", BackboneName), config)
+    return NetworkDescriptorLocalizer(model, network, config.picture)
 
 
 def create_pooled_network(backbone: BackboneName, config: PooledNetworkConfig) -> PooledFeatures:

@@ -70,24 +70,20 @@ def model_array(
         MapError: the array is missing, not finite, or has another shape or type.
     """
     array = model.arrays.get(name)
-    fits = array is not None and array.dtype.kind in kinds and array.ndim == len(shape)
+    damaged = f"the map's coarse localizer {model.name!r} is damaged: {name} is"
     if (
         array is None
-        or not fits
-        or any(
-            n == 0 or (m is not None and n != m) for n, m in zip(array.shape, shape, strict=True)
+        or array.dtype.kind not in kinds
+        or not (
+            array.ndim == len(shape)
+            and all(n > 0 and m in (None, n) for n, m in zip(array.shape, shape, strict=True))
         )
     ):
         found = "missing" if array is None else f"{array.dtype} {array.shape}"
         expected = " x ".join("any" if length is None else str(length) for length in shape)
-        raise MapError(
-            f"the map's coarse localizer {model.name!r} is damaged: {name} is {found}, not"
-            f" {expected} numbers"
-        )
+        raise MapError(f"{damaged} {found}, not {expected} numbers")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise MapError(
-            f"the map's coarse localizer {model.name!r} is damaged: {name} is not finite"
-        )
+        raise MapError(f"{damaged} not finite")
     return array
 
 
@@ -137,9 +133,8 @@ def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
             f" {', '.join(COARSE_NAMES)})"
         )
     try:
-        return importlib.import_module(f"topoloc.retrieval.{_MODULES[model.name]}").open_model(
-            model
-        )
+        module = importlib.import_module(f"topoloc.retrieval.{_MODULES[model.name]}")
+        return module.open_model(model)
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise

@@ -45,12 +45,9 @@ class DescriptorIndex:
         max_exact: int = MAX_EXACT_VECTORS,
     ) -> None:
         self._node_rows = node_rows
-        self._vectors = np.ascontiguousarray(vectors) if len(vectors) <= max_exact else None
-        self._cells = (
-            None
-            if len(vectors) <= max_exact
-            else _build_inverted_file(np.ascontiguousarray(vectors))
-        )
+        vectors, is_exact = np.ascontiguousarray(vectors), len(vectors) <= max_exact
+        self._vectors = vectors if is_exact else None
+        self._cells: Any = None if is_exact else _build_inverted_file(vectors)
 
     def rank_nodes(self, vector: Float32[np.ndarray, " d"], num_candidates: int) -> list[NodeScore]:
         """Return the distinct nodes of the nearest images with the similarity of their best image.
@@ -61,9 +58,8 @@ class DescriptorIndex:
         while True:
             rows, similarities = self._search_inverted_file(vector, num_images)
             ranking = self._best_image_per_node(rows, similarities, num_candidates)
-            if (
-                len(ranking) == num_candidates or len(rows) < num_images
-            ):  # enough nodes, or no more images in the searched cells
+            # Enough nodes, or no more images in the searched cells.
+            if len(ranking) == num_candidates or len(rows) < num_images:
                 return ranking
             num_images *= 8
 
@@ -91,10 +87,8 @@ class DescriptorIndex:
     def _search_inverted_file(
         self, vector: Float32[np.ndarray, " d"], num_images: int
     ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-        assert self._cells is not None
-        similarities, rows = self._cells.search(
-            np.ascontiguousarray(vector[None]), min(num_images, len(self._node_rows))
-        )
+        num_images = min(num_images, len(self._node_rows))
+        similarities, rows = self._cells.search(np.ascontiguousarray(vector[None]), num_images)
         found = rows[0] >= 0
         return rows[0][found], similarities[0][found]
 
@@ -114,17 +108,12 @@ def _build_inverted_file(vectors: Float32[np.ndarray, "n d"]) -> Any:
     half floats, half a kilobyte each at 256 dimensions."""
     num_cells = max(1, min(round(math.sqrt(len(vectors))), len(vectors) // 40))
     dimension = vectors.shape[1]
-    index = faiss.IndexIVFScalarQuantizer(
-        faiss.IndexFlatIP(dimension),
-        dimension,
-        num_cells,
-        faiss.ScalarQuantizer.QT_fp16,
-        faiss.METRIC_INNER_PRODUCT,
-        False,
-    )
+    kind, metric = faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT
+    centres = faiss.IndexFlatIP(dimension)
+    index: Any = faiss.IndexIVFScalarQuantizer(centres, dimension, num_cells, kind, metric, False)
     index.cp.niter, index.cp.seed, index.cp.max_points_per_centroid = 8, 1, IMAGES_PER_CELL
-    index.train(vectors)  # pyright: ignore[reportCallIssue]
-    index.add(vectors)  # pyright: ignore[reportCallIssue]
+    index.train(vectors)
+    index.add(vectors)
     index.nprobe = NUM_PROBES
     return index
 
@@ -139,10 +128,8 @@ class Whitening:
     def apply(self, raw: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n p"]:
         """Return the whitened unit vectors."""
         projected = (raw - self.mean) @ self.projection.T
-        return np.ascontiguousarray(
-            projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6),
-            np.float32,
-        )
+        lengths = np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-6)
+        return np.ascontiguousarray(projected / lengths, np.float32)
 
 
 def learn_whitening(
@@ -158,9 +145,8 @@ def learn_whitening(
     centred = np.stack([raw[k] for k in rows])
     mean = centred.mean(axis=0)
     centred -= mean
-    by_image = (
-        len(centred) < centred.shape[1]
-    )  # use the smaller matrix: products of images or products of dimensions
+    # Use the smaller matrix: products of images or products of dimensions.
+    by_image = len(centred) < centred.shape[1]
     products = centred @ centred.T if by_image else centred.T @ centred
     eigenvalues, vectors = np.linalg.eigh(products)
     order = np.argsort(-eigenvalues, kind="stable")[:dimension]
@@ -169,13 +155,12 @@ def learn_whitening(
     if len(keep) == 0:  # one image, or all alike
         direction = mean / max(float(np.linalg.norm(mean)), 1e-6)
         return Whitening(np.zeros_like(mean), direction[None].astype(np.float32))
-    axes = (
-        centred.T @ vectors[:, keep] / np.sqrt(eigenvalues[keep]) if by_image else vectors[:, keep]
-    )
+    axes = vectors[:, keep]
+    if by_image:
+        axes = centred.T @ axes / np.sqrt(eigenvalues[keep])
     regularized = np.sqrt(eigenvalues[keep] + eigenvalues[keep].mean())
-    return Whitening(
-        mean.astype(np.float32), np.ascontiguousarray((axes / regularized).T, np.float32)
-    )
+    projection = np.ascontiguousarray((axes / regularized).T, np.float32)
+    return Whitening(mean.astype(np.float32), projection)
 
 
 def learn_visual_words(
@@ -184,7 +169,7 @@ def learn_visual_words(
     """Return the k-means centres of descriptors, fewer than `num_words` if there are few
     descriptors."""
     num_words = max(1, min(num_words, len(descriptors) // 40))
-    kmeans = faiss.Kmeans(
+    kmeans: Any = faiss.Kmeans(
         descriptors.shape[1], num_words, niter=20, seed=seed + 1, min_points_per_centroid=1
     )
     # One thread needs a tenth of a second. Several threads wait for each other in busy loops, at
@@ -195,5 +180,4 @@ def learn_visual_words(
         kmeans.train(np.ascontiguousarray(descriptors))
     finally:
         faiss.omp_set_num_threads(before)
-    assert kmeans.centroids is not None
     return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)

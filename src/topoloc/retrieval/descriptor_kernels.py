@@ -5,8 +5,6 @@ BLAS and FAISS would start threads for these products, which take a fraction of 
 Waking the threads costs more than they save, and many times more on a busy machine.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from topoloc.compiled import kernel
@@ -31,9 +29,8 @@ def add_residuals(descriptors, words, half_squares, sums):
         descriptor = descriptors[n]
         nearest, best = 0, np.float32(-np.inf)
         for k in range(len(words)):
-            score = (
-                _dot(descriptor, words[k]) - half_squares[k]
-            )  # the part of |d - w|^2 that depends on the word
+            # The part of |d - w|^2 that depends on the word.
+            score = _dot(descriptor, words[k]) - half_squares[k]
             if score > best:
                 nearest, best = k, score
         word, total = words[nearest], sums[nearest]
@@ -62,15 +59,8 @@ def max_shifted_products(rows, chosen, vector, column, max_shift, products):
     for k in range(len(chosen)):
         best, row = np.float32(-np.inf), rows[chosen[k]]
         for shift in range(-max_shift, max_shift + 1):
-            left, right, both = (
-                max(shift, 0) * column,
-                max(-shift, 0) * column,
-                length - abs(shift) * column,
-            )
-            product = (
-                _dot(row[left : left + both], vector[right : right + both])
-                * np.float32(column)
-                / np.float32(both)
-            )
-            best = max(best, product)
+            left, right = max(shift, 0) * column, max(-shift, 0) * column
+            both = length - abs(shift) * column
+            product = _dot(row[left : left + both], vector[right : right + both])
+            best = max(best, product * np.float32(column) / np.float32(both))
         products[k] = best

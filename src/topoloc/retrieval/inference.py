@@ -50,13 +50,10 @@ class Predictor:
         rows = []
         with torch.inference_mode():
             for start in range(0, len(rgb_images), BATCH_SIZE):
-                images = normalize_images(
-                    torch.from_numpy(rgb_images[start : start + BATCH_SIZE])
-                ).to(self._dtype)
-                outputs = (
-                    self._predict_single(images) if len(images) == 1 else self._network(images)
-                )
-                rows.append(outputs.float().numpy())
+                batch = torch.from_numpy(rgb_images[start : start + BATCH_SIZE])
+                images = normalize_images(batch).to(self._dtype)
+                predict = self._predict_single if len(images) == 1 else self._network
+                rows.append(predict(images).float().numpy())
         return np.concatenate(rows)
 
     def _predict_single(self, image: Tensor) -> Tensor:
@@ -139,10 +136,6 @@ def load_network_weights(network: nn.Module, arrays: Mapping[str, np.ndarray]) -
         for name, value in arrays.items()
         if name.startswith("network.")
     }
-    network.load_state_dict(
-        {
-            name: value.float() if value.is_floating_point() else value
-            for name, value in state.items()
-        }
-    )
+    is_real = {name: value.is_floating_point() for name, value in state.items()}
+    network.load_state_dict({k: v.float() if is_real[k] else v for k, v in state.items()})
     return network

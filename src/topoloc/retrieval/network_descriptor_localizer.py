@@ -31,27 +31,21 @@ class NetworkDescriptorLocalizer:
     def __init__(
         self, model: CoarseModel, network: nn.Module, input_config: NetworkInputConfig
     ) -> None:
+        self._model, self._input_config = model, input_config
         try:
-            self._input_config, self._shape = (
-                input_config,
-                ImageShape(*read_setting(model, "picture_shape", tuple[int, int])),
-            )
+            self._shape = ImageShape(*read_setting(model, "picture_shape", tuple[int, int]))
             self._predict = Predictor(load_network_weights(network, model.arrays))
         except (KeyError, RuntimeError, ValueError) as error:
             raise MapError(
                 f"the map's coarse localizer {model.name!r} is damaged:"
                 f" {' '.join(str(error).split())[:200]}"
             ) from error
-        self._model, mean = (
-            model,
-            model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False),
-        )
+        mean = model_array(model, "mean", "f", (None,)).astype(np.float32, copy=False)
         projection = model_array(model, "projection", "f", (None, len(mean))).astype(np.float32)
         vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
         self._whitening = Whitening(mean, projection)
-        self._index = DescriptorIndex(
-            vectors, model_array(model, "node_ids", "iu", (len(vectors),))
-        )
+        node_rows = model_array(model, "node_ids", "iu", (len(vectors),))
+        self._index = DescriptorIndex(vectors, node_rows)
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """Rank nodes as in `CoarseLocalizer.rank`. Scores are cosines. The local features are not
@@ -69,9 +63,8 @@ class NetworkDescriptorLocalizer:
         The whitening is unchanged."""
         known = self._model.arrays
         parts = [self.vectors(images[k : k + _CHUNK]) for k in range(0, len(images), _CHUNK)]
-        vectors = np.concatenate(
-            [known["vectors"], *(part.astype(known["vectors"].dtype) for part in parts)]
-        )
+        dtype = known["vectors"].dtype
+        vectors = np.concatenate([known["vectors"], *(part.astype(dtype) for part in parts)])
         all_node_ids = np.concatenate([known["node_ids"], node_ids.astype(known["node_ids"].dtype)])
         return replace(self._model, arrays={**known, "vectors": vectors, "node_ids": all_node_ids})
 

@@ -51,10 +51,9 @@ def prepare_network_images(
 ) -> RgbImages:
     """Return images as network input: cropped to the shape of the mapping images and stretched to
     the network's size."""
-    size = (config.width_px, config.height_px)
-    return np.stack([_resize_image(shape.fit(image), size) for image in images])
-
-
-def _resize_image(image: RgbImage, size: tuple[int, int]) -> RgbImage:
-    shrinks = image.shape[1] >= size[0] and image.shape[0] >= size[1]
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    size, resized = (config.width_px, config.height_px), []
+    for image in map(shape.fit, images):
+        shrinks = image.shape[1] >= size[0] and image.shape[0] >= size[1]
+        method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        resized.append(cv2.resize(image, size, interpolation=method))
+    return np.stack(resized)

@@ -68,17 +68,10 @@ class SharedVocabulary:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays stored in the file, as half floats."""
-        arrays = {
-            "words": self.words,
-            "mean": self.whitening.mean,
-            "projection": self.whitening.projection,
-        }
-        about = np.array(
-            json.dumps(
-                self.about | {"kind": self.kind, "position_weight": self.config.position_weight}
-            )
-        )
-        return {name: array.astype(np.float16) for name, array in arrays.items()} | {"about": about}
+        arrays = {"words": self.words, **vars(self.whitening)}
+        own = {"kind": self.kind, "position_weight": self.config.position_weight}
+        about = {"about": np.array(json.dumps(self.about | own))}
+        return {name: array.astype(np.float16) for name, array in arrays.items()} | about
 
 
 @cache
@@ -92,7 +85,5 @@ def shared_vocabulary(kind: str) -> SharedVocabulary | None:
             stored[name].astype(np.float32) for name in ("words", "mean", "projection")
         )
         about = json.loads(str(stored["about"]))
-    config = VladConfig(
-        num_words=len(words), position_weight=about["position_weight"], dimension=len(projection)
-    )
+    config = VladConfig(len(words), about["position_weight"], len(projection))
     return SharedVocabulary(kind, words, Whitening(mean, projection), config, about)

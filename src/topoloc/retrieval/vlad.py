@@ -70,18 +70,15 @@ class SurfVlad:
             node_ids: node of each mapping image.
             cells: cells of each mapping image, or None if the feature type has none.
         """
-        whitening, known = (
-            learn_whitening(vlads, config.dimension),
-            [one for one in cells if one is not None],
-        )
+        whitening = learn_whitening(vlads, config.dimension)
+        known = [one for one in cells if one is not None]
         grid = CellGrid.fit(np.stack(known)) if len(known) == len(vlads) else None
         starts = range(0, len(vlads), _BLOCK)
         vectors = np.concatenate(
             [whitening.apply(np.stack([*vlads[start : start + _BLOCK]])) for start in starts]
         )
-        return SurfVlad(
-            words, whitening.mean, whitening.projection, vectors, node_ids, config, grid
-        )
+        mean, projection = whitening.mean, whitening.projection
+        return SurfVlad(words, mean, projection, vectors, node_ids, config, grid)
 
     def rank(self, image: Image, features: Features, num_candidates: int) -> list[NodeScore]:
         """Rank nodes as in `CoarseLocalizer.rank`. Only the size of the image is used. Features
@@ -91,11 +88,8 @@ class SurfVlad:
         if self._grid is None or features.cells is None:
             return self._index.rank_nodes(vector, num_candidates)
         images, similarities = self._index.nearest(vector)
-        return self._index.rank_images(
-            images,
-            0.5 * (similarities + self._grid.compute_similarity(features.cells, images)),
-            num_candidates,
-        )
+        of_cells = self._grid.compute_similarity(features.cells, images)
+        return self._index.rank_images(images, 0.5 * (similarities + of_cells), num_candidates)
 
     def _global_descriptor(
         self, features: Features, width: int, height: int
@@ -123,27 +117,17 @@ class SurfVlad:
             images_with_features: features, width and height (pixels) of each image.
             node_ids: node of each image.
         """
-        vectors = np.stack(
-            [self._global_descriptor(*image_features) for image_features in images_with_features]
-        )
-        cells = [
-            features.cells for features, _, _ in images_with_features if features.cells is not None
-        ]
+        vectors = np.stack([self._global_descriptor(*image) for image in images_with_features])
+        cells = [one.cells for one, _, _ in images_with_features if one.cells is not None]
         grid = (
             self._grid.with_cells(np.stack(cells))
             if self._grid is not None and len(cells) == len(images_with_features)
             else None
         )
-        all_ids = np.concatenate([self._node_ids, node_ids.astype(self._node_ids.dtype)])
-        return SurfVlad(
-            self._words,
-            self._mean,
-            self._projection,
-            np.concatenate([self._vectors, vectors]),
-            all_ids,
-            self._config,
-            grid,
-        )
+        vectors = np.concatenate([self._vectors, vectors])
+        node_ids = np.concatenate([self._node_ids, node_ids.astype(self._node_ids.dtype)])
+        axes = self._mean, self._projection
+        return SurfVlad(self._words, *axes, vectors, node_ids, self._config, grid)
 
     def suppress_group_differences(self, group_of_node: Int[np.ndarray, " nodes"]) -> SurfVlad:
         """Return a localizer with reduced differences between groups of nodes, such as the light of
@@ -158,24 +142,20 @@ class SurfVlad:
         """
         groups = group_of_node[self._node_ids]
         numbers, counts = np.unique(groups, return_counts=True)
-        means = [
-            self._vectors[groups == number].mean(axis=0)
-            for number in numbers[counts >= _MIN_GROUP_SIZE]
-        ]
+        large = numbers[counts >= _MIN_GROUP_SIZE]
+        means = [self._vectors[groups == number].mean(axis=0) for number in large]
         if len(means) < 2:
             return self
         _, lengths, axes = np.linalg.svd(np.stack(means[1:]) - means[0], full_matrices=False)
         axes = axes[lengths > 1e-4].astype(np.float32)
+        share = _SUPPRESSED_SHARE
         projection = np.ascontiguousarray(
-            self._projection - _SUPPRESSED_SHARE * axes.T @ (axes @ self._projection)
+            self._projection - share * axes.T @ (axes @ self._projection)
         )
-        vectors = self._vectors - _SUPPRESSED_SHARE * (self._vectors @ axes.T) @ axes
-        vectors = np.ascontiguousarray(
-            vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6)
-        )
-        return SurfVlad(
-            self._words, self._mean, projection, vectors, self._node_ids, self._config, self._grid
-        )
+        vectors = self._vectors - share * (self._vectors @ axes.T) @ axes
+        lengths = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6)
+        vectors, own = np.ascontiguousarray(vectors / lengths), (self._node_ids, self._config)
+        return SurfVlad(self._words, self._mean, projection, vectors, *own, self._grid)
 
     def to_model(self) -> CoarseModel:
         """Return the model stored in the map file. Vectors are half floats of a quarter to half a
@@ -184,16 +164,12 @@ class SurfVlad:
             "words": self._words,
             "mean": self._mean,
             "projection": self._projection.astype(np.float16),
-        }
-        arrays |= {
             "vectors": self._vectors.astype(np.float16),
             "node_ids": self._node_ids.astype(np.int32),
         }
-        return CoarseModel(
-            self.name,
-            asdict(self._config),
-            arrays | (self._grid.to_arrays() if self._grid is not None else {}),
-        )
+        if self._grid is not None:
+            arrays |= self._grid.to_arrays()
+        return CoarseModel(self.name, asdict(self._config), arrays)
 
     @staticmethod
     def from_model(model: CoarseModel) -> SurfVlad:
@@ -206,15 +182,8 @@ class SurfVlad:
         mean = model_array(model, "mean", "f", (words.size,)).astype(np.float32, copy=False)
         vectors = model_array(model, "vectors", "f", (None, len(projection))).astype(np.float32)
         node_ids = model_array(model, "node_ids", "iu", (len(vectors),))
-        return SurfVlad(
-            words,
-            mean,
-            projection,
-            vectors,
-            node_ids,
-            config,
-            CellGrid.from_model(model, len(vectors)),
-        )
+        grid = CellGrid.from_model(model, len(vectors))
+        return SurfVlad(words, mean, projection, vectors, node_ids, config, grid)
 
 
 open_model = SurfVlad.from_model
@@ -237,9 +206,7 @@ def vlad(
     """Return the VLAD of descriptors over `words`, zero for an image without features."""
     sums = np.zeros(words.shape, np.float32)
     half_squares = 0.5 * np.sum(words**2, axis=1)
-    add_residuals(
-        np.ascontiguousarray(descriptors), np.ascontiguousarray(words), half_squares, sums
-    )
+    add_residuals(*map(np.ascontiguousarray, (descriptors, words)), half_squares, sums)
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-6)
     flat = sums.reshape(-1)
     return flat / max(float(np.linalg.norm(flat)), 1e-6)
@@ -269,9 +236,8 @@ def learn_words_from_parts(
     ends = np.cumsum(num_rows)
     chosen, total = np.arange(ends[-1]), int(ends[-1])
     if total > max_descriptors:
-        chosen = np.sort(
-            np.random.default_rng(config.seed).choice(total, max_descriptors, replace=False)
-        )
+        generator = np.random.default_rng(config.seed)
+        chosen = np.sort(generator.choice(total, max_descriptors, replace=False))
     rows_by_part = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
     rows = [
         part(k)[rows - (ends[k] - num_rows[k])]

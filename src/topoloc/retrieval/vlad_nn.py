@@ -43,10 +43,8 @@ class NetVlad(nn.Module):
         """Return the unit vectors of feature maps."""
         maps = nn.functional.normalize(maps.float(), dim=1)
         shares = torch.softmax(self.conv(maps.to(self.conv.weight.dtype)).float(), dim=1).flatten(2)
-        sums = (
-            torch.bmm(shares, maps.flatten(2).transpose(1, 2))
-            - shares.sum(dim=2, keepdim=True) * self.centroids.float()
-        )
+        sums = torch.bmm(shares, maps.flatten(2).transpose(1, 2))
+        sums = sums - shares.sum(dim=2, keepdim=True) * self.centroids.float()
         return nn.functional.normalize(nn.functional.normalize(sums, dim=2).flatten(1))
 
 
@@ -66,11 +64,8 @@ class VladNetwork(nn.Module):
 def open_model(model: CoarseModel) -> NetworkDescriptorLocalizer:
     """Return the localizer of a stored model. Raises MapError and ConfigError."""
     config = read_setting(model, "config", VladNetworkConfig)
-    backbone, num_clusters = (
-        read_setting(model, "backbone", BackboneName),
-        read_setting(model, "num_clusters", int),
-    )
+    backbone = read_setting(model, "backbone", BackboneName)
+    num_clusters = min(read_setting(model, "num_clusters", int), 4096)
     depth = config.depth if config.depth is not None else DEPTHS[backbone]
-    return NetworkDescriptorLocalizer(
-        model, VladNetwork(backbone, depth, min(num_clusters, 4096)), config.picture
-    )
+    network = VladNetwork(backbone, depth, num_clusters)
+    return NetworkDescriptorLocalizer(model, network, config.picture)

@@ -65,7 +65,7 @@ class FrameTracker:
         """Continue tracking from a key frame, which is the last frame."""
         seen = keyframe.observations
         points = np.ascontiguousarray(seen.measured[seen.active, :2], np.float32)
-        self._tracks = Tracks.from_points(seen.landmark_ids[seen.active], points)
+        self._tracks = Tracks.from_points(seen.active_ids, points)
         self._reference, self._reference_image = keyframe, measured.left
         if self._last_frame is not None:
             self._last_frame.cam_from_world = keyframe.cam_from_world

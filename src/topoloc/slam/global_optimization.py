@@ -6,18 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Int
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import diagonal_covariance
 from topoloc.slam.bundle.bundle_adjustment import adjust_bundle
-from topoloc.slam.keyframes import KeyFrame, Landmarks, Observations
+from topoloc.slam.keyframes import KeyFrame, Landmarks, Motion, Observations
 from topoloc.slam.loop_closure import Link
-from topoloc.slam.pose_graph import (
-    Edge,
-    compute_normalized_residuals,
-    optimize_pose_graph,
-)
+from topoloc.slam.pose_graph import Edge, compute_normalized_residuals, optimize_pose_graph
 
 
 def join_submaps(
@@ -39,37 +34,21 @@ def join_submaps(
         )
         if crossing is None:
             return joined
-        source, target = keyframes[crossing.source], keyframes[crossing.target]
-        target_from_source = crossing.match.target_from_source
-        if source.submap in joined:
-            world_from_new = (
-                source.cam_from_world.inverse()
-                @ target_from_source.inverse()
-                @ target.cam_from_world
-            )
-            new = target.submap
-        else:
-            world_from_new = (
-                target.cam_from_world.inverse() @ target_from_source @ source.cam_from_world
-            )
-            new = source.submap
-        _move_submap([k for k in keyframes if k.submap == new], world_from_new, landmarks)
-        joined.append(new)
-
-
-def _move_submap(
-    keyframes: Sequence[KeyFrame], world_from_new: Rigid3, landmarks: Landmarks
-) -> None:
-    ids = np.unique(np.concatenate([k.observations.landmark_ids for k in keyframes]))
-    landmarks.positions[ids] = world_from_new.apply(landmarks.positions[ids])
-    for keyframe in keyframes:
-        keyframe.cam_from_world = keyframe.cam_from_world @ world_from_new.inverse()
+        known, new = keyframes[crossing.source], keyframes[crossing.target]
+        known_from_new = crossing.match.target_from_source.inverse()
+        if new.submap in joined:
+            known, new, known_from_new = new, known, crossing.match.target_from_source
+        world_from_new = known.cam_from_world.inverse() @ known_from_new @ new.cam_from_world
+        moved = [k for k in keyframes if k.submap == new.submap]
+        ids = np.unique(np.concatenate([k.observations.landmark_ids for k in moved]))
+        landmarks.positions[ids] = world_from_new.apply(landmarks.positions[ids])
+        for keyframe in moved:
+            keyframe.cam_from_world = keyframe.cam_from_world @ world_from_new.inverse()
+        joined.append(new.submap)
 
 
 def close_loops(
-    keyframes: Sequence[KeyFrame],
-    links: Sequence[Link],
-    landmarks: Landmarks,
+    keyframes: Sequence[KeyFrame], links: Sequence[Link], landmarks: Landmarks
 ) -> list[Link]:
     """Optimise the pose graph of joined key frames, and move the landmarks with them.
 
@@ -79,9 +58,7 @@ def close_loops(
         return []
     max_residual = 8.0  # of a link that is kept, in standard deviations
     index = {id(keyframe): i for i, keyframe in enumerate(keyframes)}
-    motions = [
-        _motion_edge(keyframe, index) for keyframe in keyframes if keyframe.motion is not None
-    ]
+    motions = [_motion_edge(k, k.motion, index) for k in keyframes if k.motion is not None]
     kept, poses = list(links), [keyframe.cam_from_world for keyframe in keyframes]
     for _ in range(2):  # the second round omits the links that the first rejected
         edges = motions + [_link_edge(link) for link in kept]
@@ -97,25 +74,21 @@ def close_loops(
     return kept
 
 
-def _motion_edge(keyframe: KeyFrame, index: dict[int, int]) -> Edge:
+def _motion_edge(keyframe: KeyFrame, given: Motion, index: dict[int, int]) -> Edge:
     sigma_share = 0.004  # sigma of a motion between two key frames, as a share of its length
     # Sigma of a motion between two key frames, degrees, in addition to that of tracking.
     sigma_deg = 0.02
-    assert keyframe.motion is not None
-    source = keyframe.motion.source
-    motion = keyframe.cam_from_world @ source.cam_from_world.inverse()
+    motion = keyframe.cam_from_world @ given.source.cam_from_world.inverse()
     metres = sigma_share * float(np.linalg.norm(motion.translation)) + 1e-3
-    covariance = keyframe.motion.covariance + diagonal_covariance(metres, sigma_deg)
-    return Edge(index[id(source)], index[id(keyframe)], motion, covariance, is_loop=False)
+    covariance = given.covariance + diagonal_covariance(metres, sigma_deg)
+    return Edge(index[id(given.source)], index[id(keyframe)], motion, covariance, is_loop=False)
 
 
 def _link_edge(link: Link) -> Edge:
-    # Factor of the PnP covariance of a link, because matched features of one view have
-    # correlated errors.
+    # Factor of the PnP covariance of a link, because matched features of one view have correlated
+    # errors.
     covariance_scale = 4.0
-    sigma = 0.01  # sigma of a link, metres, in addition to that of PnP
-    sigma_deg = 0.1  # sigma of a link, degrees, in addition to that of PnP
-    covariance = covariance_scale * link.match.covariance + diagonal_covariance(sigma, sigma_deg)
+    covariance = covariance_scale * link.match.covariance + diagonal_covariance(0.01, 0.1)
     return Edge(link.source, link.target, link.match.target_from_source, covariance, is_loop=True)
 
 
@@ -135,9 +108,7 @@ def _move_keyframes(
 
 
 def adjust_global_bundle(
-    keyframes: Sequence[KeyFrame],
-    links: Sequence[Link],
-    landmarks: Landmarks,
+    keyframes: Sequence[KeyFrame], links: Sequence[Link], landmarks: Landmarks
 ) -> None:
     """Adjust all key frames and landmarks. Matches of links become landmarks seen by both key
     frames."""
@@ -154,21 +125,17 @@ def _add_link_landmarks(
     landmark_of: dict[tuple[int, int], int],
 ) -> None:
     source = keyframes[link.source]
-    place = source.place
-    for source_row, target_row in zip(
-        link.match.source_rows.tolist(), link.match.target_rows.tolist(), strict=True
-    ):
-        known = landmark_of.get((link.source, source_row))
+    points_cam = source.place.points.points_cam
+    for rows in zip(link.match.source_rows.tolist(), link.match.target_rows.tolist(), strict=True):
+        known = landmark_of.get((link.source, rows[0]))
         if known is None:
-            point = source.cam_from_world.inverse().apply(place.points.points_cam[source_row][None])
+            point = source.cam_from_world.inverse().apply(points_cam[rows[0]][None])
             known = int(landmarks.add(point)[0])
-            landmark_of[link.source, source_row] = known
-            source.observations.append(_feature_observation(source, source_row, known))
-        if (link.target, target_row) not in landmark_of:
-            landmark_of[link.target, target_row] = known
-            keyframes[link.target].observations.append(
-                _feature_observation(keyframes[link.target], target_row, known)
-            )
+        for end, row in zip((link.source, link.target), rows, strict=True):
+            if (end, row) not in landmark_of:
+                landmark_of[end, row] = known
+                keyframe = keyframes[end]
+                keyframe.observations.append(_feature_observation(keyframe, row, known))
 
 
 def _feature_observation(keyframe: KeyFrame, row: int, landmark_id: int) -> Observations:
@@ -176,11 +143,9 @@ def _feature_observation(keyframe: KeyFrame, row: int, landmark_id: int) -> Obse
     sigma_px = 0.8  # standard deviation of a feature's pixel in the global bundle adjustment
     place, stereo = keyframe.place, keyframe.stereo
     measured = np.array([[*place.features.points_img[row].astype(np.float64), np.nan]])
-    weights = np.full((1, 3), 1.0 / sigma_px)
-    weights[0, 2] = 0.0
+    weights = np.array([[1.0 / sigma_px, 1.0 / sigma_px, 0.0]])
     if place.points.valid[row]:
         depth = place.points.points_cam[row, 2]
         measured[0, 2] = stereo.bf / depth
         weights[0, 2] = depth**2 / (stereo.bf * np.sqrt(place.points.covariances[row, 2, 2]))
-    ids: Int[np.ndarray, "1"] = np.array([landmark_id])
-    return Observations(ids, measured, weights, np.ones(1, np.bool_))
+    return Observations(np.array([landmark_id]), measured, weights, np.ones(1, np.bool_))

@@ -35,19 +35,14 @@ class InputChecks:
         Raises:
             CalibrationError: the baseline cannot be in metres.
         """
-        # Maximum baseline of a stereo rig, metres. A larger one is assumed to be in
-        # millimetres.
-        max_baseline = 5.0
+        max_baseline = 5.0  # metres; a larger one is assumed to be in millimetres
         if frame.rig is not None and frame.rig.baseline > max_baseline:
             raise CalibrationError(
                 f"{self._recording}: a baseline of {frame.rig.baseline:g} m; is it in millimetres?"
             )
 
     def can_start(
-        self,
-        frame: StereoFrame,
-        measured: MeasuredView,
-        corners: Float32[np.ndarray, "n 2"],
+        self, frame: StereoFrame, measured: MeasuredView, corners: Float32[np.ndarray, "n 2"]
     ) -> bool:
         """Return whether enough corners have a disparity to start tracking.
 
@@ -56,29 +51,23 @@ class InputChecks:
         """
         min_start_points = 40  # minimum number of points with disparity to start tracking
         num_found = _count_disparities(measured, corners)
-        if measured.right is None or self._has_started:
+        right_grey = measured.view.right_grey
+        if measured.right is None or right_grey is None or self._has_started:
             return num_found >= min_start_points
         # A point farther right in the right image is farther left if both images are mirrored.
-        mirrored = replace(
-            measured, left=_mirror_image(measured.left), right=_mirror_image(measured.right)
+        left, right = (
+            np.ascontiguousarray(image[:, ::-1]) for image in (measured.left, measured.right)
         )
-        mirrored_corners = (np.array([measured.left.shape[1] - 1, 0]) + corners * [-1, 1]).astype(
-            np.float32
-        )
+        mirrored = replace(measured, left=left, right=right)
+        mirrored_corners = (np.array([left.shape[1] - 1, 0]) + corners * [-1, 1]).astype(np.float32)
         if _count_disparities(mirrored, mirrored_corners) > max(min_start_points, 2 * num_found):
             raise RecordingError(
                 f"{self._recording}: left and right pictures are swapped: {frame.name} shows points"
                 " further right in right"
             )
         if num_found < min_start_points:
-            assert measured.view.right_grey is not None
-            coarse, _ = track_points(
-                measured.view.grey,
-                measured.view.right_grey,
-                corners,
-                corners,
-            )
-            self._match_in_right_image(measured, corners, coarse)
+            coarse, _ = track_points(measured.view.grey, right_grey, corners, corners)
+            self._match_in_right_image(measured.left, measured.right, corners, coarse)
         self._has_started = num_found >= min_start_points
         return self._has_started
 
@@ -87,8 +76,7 @@ class InputChecks:
     ) -> None:
         """Match landmarks of a new key frame in the right image and compare them with their
         predictions."""
-        # Number of points of a key frame at which the vertical distance is measured.
-        sampled_points = 80
+        sampled_points = 80  # points of a key frame at which the vertical distance is measured
         if measured.right is None or measured.view.rig is None:
             return
         seen = keyframe.observations
@@ -99,8 +87,9 @@ class InputChecks:
         at_infinity = measured.view.rig.left.cx - measured.view.rig.right.cx
         to_right = np.column_stack([-seen.measured[rows, 2] - at_infinity, np.zeros(len(rows))])
         points = seen.measured[rows, :2]
+        guesses = (points + to_right).astype(np.float32)
         found = self._match_in_right_image(
-            measured, points.astype(np.float32), (points + to_right).astype(np.float32)
+            measured.left, measured.right, points.astype(np.float32), guesses
         )
         expected = keyframe.stereo.project(
             keyframe.cam_from_world.apply(landmarks.positions[seen.landmark_ids[rows]])
@@ -132,7 +121,8 @@ class InputChecks:
 
     def _match_in_right_image(
         self,
-        measured: MeasuredView,
+        left: Float32[np.ndarray, "h w"],
+        right: Float32[np.ndarray, "h w"],
         points: Float32[np.ndarray, "n 2"],
         guesses: Float32[np.ndarray, "n 2"],
     ) -> Float[np.ndarray, "n 2"]:
@@ -141,26 +131,14 @@ class InputChecks:
 
         Return their pixels, NaN if not found.
         """
-        assert measured.right is not None
-        found = align_with_reference(
-            measured.left,
-            measured.right,
-            points,
-            guesses,
-            np.ones(len(points), np.float32),
-            max_shift_px=5.0,
-        )
+        scales = np.ones(len(points), np.float32)
+        found = align_with_reference(left, right, points, guesses, scales, max_shift_px=5.0)
         places = np.where(found.is_matched[:, None], found.points_img, np.nan).astype(np.float64)
         if np.count_nonzero(found.is_matched) >= max(10, len(points) // 3):
             self._vertical_px.append(float(np.nanmedian(np.abs(places[:, 1] - points[:, 1]))))
         return places
 
 
-def _mirror_image(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    return np.ascontiguousarray(image[:, ::-1])
-
-
 def _count_disparities(measured: MeasuredView, corners: Float32[np.ndarray, "n 2"]) -> int:
-    return int(
-        np.isfinite(measure_disparities(measured, corners, np.full(len(corners), np.nan))[0]).sum()
-    )
+    disparities, _ = measure_disparities(measured, corners, np.full(len(corners), np.nan))
+    return int(np.isfinite(disparities).sum())

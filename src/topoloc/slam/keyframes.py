@@ -66,17 +66,18 @@ class Observations:
 
     def __post_init__(self) -> None:
         self.landmark_ids = np.asarray(self.landmark_ids, np.int32)
-        self.measured, self.weights = (
-            np.asarray(self.measured, np.float32),
-            np.asarray(self.weights, np.float32),
-        )
+        self.measured = np.asarray(self.measured, np.float32)
+        self.weights = np.asarray(self.weights, np.float32)
+
+    @property
+    def active_ids(self) -> Int[np.ndarray, " k"]:
+        """Return the landmarks that are no outliers."""
+        return self.landmark_ids[self.active]
 
     def append(self, other: Observations) -> None:
         """Append the rows of other observations."""
-        self.landmark_ids = np.concatenate([self.landmark_ids, other.landmark_ids])
-        self.measured = np.concatenate([self.measured, other.measured])
-        self.weights = np.concatenate([self.weights, other.weights])
-        self.active = np.concatenate([self.active, other.active])
+        for name, rows in vars(other).items():
+            setattr(self, name, np.concatenate([getattr(self, name), rows]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +134,8 @@ class KeyFrame:
         """
         if self.pending_place is not None:
             self.place, self.pending_place = self.pending_place.result(), None
-        assert self.place_idx is not None, "a key frame without place features"
+        if self.place_idx is None:
+            raise ValueError("a key frame without place features")
         return self.places[self.place_idx]
 
     @place.setter

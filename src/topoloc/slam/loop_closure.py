@@ -41,32 +41,31 @@ def find_links(
     if len(places) < 2:
         return []
     proposals = _propose_pairs(keyframes, places)
-    links = []
-    for done, link in enumerate(
-        parallel_map(lambda pair: match_keyframes(pair[1], pair[0], keyframes), proposals)
-    ):
+    links: list[Link] = []
+    found = parallel_map(lambda pair: match_keyframes(pair[1], pair[0], keyframes), proposals)
+    for done, link in enumerate(found, 1):
         if link is not None:
             links.append(link)
-        progress("loops", done + 1, len(proposals))
+        progress("loops", done, len(proposals))
     rank = {keyframe: place for place, keyframe in enumerate(places)}
+
+    def select_supported(links: list[Link]) -> list[Link]:
+        return [
+            k for k in links if any(_is_supporting(other, k, keyframes, rank) for other in links)
+        ]
+
     plausible = [link for link in links if _is_within_drift(link, keyframes)]
-    clear = [
-        link
-        for link in plausible
-        if not any(_is_contradicting(other, link, keyframes) for other in plausible)
-    ]
-    supported = [
-        link
-        for link in clear
-        if any(_is_supporting(other, link, keyframes, rank) for other in clear)
-    ]
-    are_rivalled = parallel_map(lambda link: _has_rival(link, keyframes, places), supported)
-    sure = [
-        link for link, is_rivalled in zip(supported, are_rivalled, strict=True) if not is_rivalled
-    ]
-    return [
-        link for link in sure if any(_is_supporting(other, link, keyframes, rank) for other in sure)
-    ]
+    supported = select_supported(
+        [
+            link
+            for link in plausible
+            if not any(_is_contradicting(other, link, keyframes) for other in plausible)
+        ]
+    )
+    has_rivals = parallel_map(lambda link: _has_rival(link, keyframes, places), supported)
+    return select_supported(
+        [link for link, has_rival in zip(supported, has_rivals, strict=True) if not has_rival]
+    )
 
 
 def _propose_pairs(keyframes: Sequence[KeyFrame], places: list[int]) -> list[tuple[int, int]]:
@@ -78,14 +77,12 @@ def _propose_pairs(keyframes: Sequence[KeyFrame], places: list[int]) -> list[tup
         return a != b and (not same or abs(a - b) >= min_places_between)
 
     num_candidates = 4  # number of most similar places that each place is compared with
-    pairs, num = (
-        set(),
-        num_candidates + 2 * min_places_between,
-    )  # itself and its neighbours may come first
-    for number, ranked in enumerate(rank_places([keyframes[i] for i in places], num)):
-        others = (other for other in ranked if is_candidate(other, number))
-        for _, other in zip(range(num_candidates), others, strict=False):
-            pairs.add((places[max(number, other)], places[min(number, other)]))
+    num = num_candidates + 2 * min_places_between  # itself and its neighbours may come first
+    pairs = {
+        (places[max(number, other)], places[min(number, other)])
+        for number, ranked in enumerate(rank_places([keyframes[i] for i in places], num))
+        for other in [row for row in ranked if is_candidate(row, number)][:num_candidates]
+    }
     return sorted(pairs)
 
 
@@ -103,8 +100,7 @@ def rank_places(keyframes: Sequence[KeyFrame], num: int | None = None) -> Iterat
         num_features, lambda row: keyframes[row].place.features.descriptors, config
     )
     vlads = DiskList(
-        (vlad(keyframe.place.features.descriptors, words) for keyframe in keyframes),
-        _MAX_VLAD_BYTES,
+        (vlad(k.place.features.descriptors, words) for k in keyframes), _MAX_VLAD_BYTES
     )
     localizer = SurfVlad.fit(words, vlads, np.arange(len(keyframes)), config)
     blank = np.zeros((1, 1), np.uint8)
@@ -133,11 +129,8 @@ def is_reachable(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
     # Maximum speed between two sub-maps of a recording, relative to the maximum speed within
     # them, in addition to half a metre.
     max_speedup = 2.0
-    source, target, target_from_source = (
-        keyframes[link.source],
-        keyframes[link.target],
-        link.match.target_from_source,
-    )
+    source, target = keyframes[link.source], keyframes[link.target]
+    target_from_source = link.match.target_from_source
     if source.submap > target.submap:
         source, target, target_from_source = target, source, target_from_source.inverse()
     before, after = ([k for k in keyframes if k.submap == end.submap] for end in (source, target))
@@ -153,12 +146,8 @@ def _max_speed(submap: Sequence[KeyFrame]) -> float:
     """Return the maximum speed within a sub-map, metres per second."""
     positions = np.array([k.cam_from_world.inverse().translation for k in submap])
     seconds = 1e-9 * np.diff([k.t_ns for k in submap])
-    return float(
-        np.max(
-            np.linalg.norm(np.diff(positions, axis=0), axis=1) / np.maximum(seconds, 1e-9),
-            initial=0.0,
-        )
-    )
+    metres = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return float(np.max(metres / np.maximum(seconds, 1e-9), initial=0.0))
 
 
 def _max_drift(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
@@ -183,35 +172,29 @@ def _is_contradicting(other: Link, link: Link, keyframes: Sequence[KeyFrame]) ->
         return False
     if len(other.match.source_rows) < rival_share * len(link.match.source_rows):
         return False
-    ends = (
-        (link.source, other.source) if other.target == link.target else (link.target, other.target)
-    )
-    drift = _max_drift(keyframes, min(ends), max(ends))
+    end = "source" if other.target == link.target else "target"
+    drift = _max_drift(keyframes, getattr(link, end), getattr(other, end))
     return _are_consistent(other, link, keyframes, drift) is False
 
 
 def _has_rival(link: Link, keyframes: Sequence[KeyFrame], places: list[int]) -> bool:
     """Return whether the target also matches a neighbour of the source, at another relative
     pose."""
-    # Number of places before and after the link's own that are searched for contradicting
-    # links.
-    rival_places = 15
+    rival_places = 15  # before and after the link's own that are searched for contradicting links
     at = places.index(link.source)
     around = places[max(at - rival_places, 0) : at + rival_places + 1]
-    for source in (
-        i
-        for i in around
-        if i not in (link.source, link.target)
-        and keyframes[i].submap == keyframes[link.source].submap
-    ):
-        match = match_keyframes(source, link.target, keyframes)
-        if (
-            match is not None
-            and _is_within_drift(match, keyframes)
-            and _is_contradicting(match, link, keyframes)
-        ):
-            return True
-    return False
+    submap = keyframes[link.source].submap
+    rivals = (
+        match_keyframes(source, link.target, keyframes)
+        for source in around
+        if source not in (link.source, link.target) and keyframes[source].submap == submap
+    )
+    return any(
+        rival is not None
+        and _is_within_drift(rival, keyframes)
+        and _is_contradicting(rival, link, keyframes)
+        for rival in rivals
+    )
 
 
 def match_keyframes(
@@ -232,14 +215,12 @@ def _is_supporting(
 ) -> bool:
     """Return whether a link of other key frames nearby agrees."""
     near = 5  # A link supports another one if its ends are within this many places
-    if other is link or other.target == link.target:
-        return False
-    if (
-        abs(rank[other.target] - rank[link.target]) > near
-        or abs(rank[other.source] - rank[link.source]) > near
-    ):
-        return False
-    return _are_consistent(other, link, keyframes) is True
+    return (
+        other.target != link.target
+        and abs(rank[other.target] - rank[link.target]) <= near
+        and abs(rank[other.source] - rank[link.source]) <= near
+        and _are_consistent(other, link, keyframes) is True
+    )
 
 
 def _are_consistent(
@@ -250,25 +231,16 @@ def _are_consistent(
     Args:
         drift: allowed error of the odometry between them, metres.
     """
-    # Maximum difference between two supporting links, metres, plus this share of the distance
-    # between their ends.
-    max_disagreement = 0.05
-    max_disagreement_deg = 2.0  # maximum rotation difference between two supporting links, degrees
+    # Maximum difference between two supporting links: metres, plus this share of the distance
+    # between their ends, and degrees.
+    max_disagreement, max_disagreement_deg = 0.05, 2.0
     a, b, c, d = (keyframes[i] for i in (link.source, link.target, other.source, other.target))
     if a.submap != c.submap or b.submap != d.submap:
         return None
-    sources, targets = (
-        c.cam_from_world @ a.cam_from_world.inverse(),
-        d.cam_from_world @ b.cam_from_world.inverse(),
-    )
+    sources = c.cam_from_world @ a.cam_from_world.inverse()
+    targets = d.cam_from_world @ b.cam_from_world.inverse()
     expected = targets.inverse() @ other.match.target_from_source @ sources
-    way = float(
-        np.linalg.norm(sources.translation)
-        + np.linalg.norm(targets.translation)
-        + np.linalg.norm(expected.translation)
-    )
+    way = sum(float(np.linalg.norm(one.translation)) for one in (sources, targets, expected))
     return link.match.target_from_source.is_same(
-        expected,
-        max_disagreement * (1.0 + way) + drift,
-        np.deg2rad(max_disagreement_deg),
+        expected, max_disagreement * (1.0 + way) + drift, np.deg2rad(max_disagreement_deg)
     )

@@ -5,6 +5,7 @@ A trajectory can be compared with these steps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,8 @@ from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
 from topoloc.features.matching import match_features
 from topoloc.features.parallel import parallel_map
-from topoloc.geometry.absolute_pose import AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.geometry.absolute_pose import estimate_absolute_pose
+from topoloc.geometry.alignment import normalized_pose_error, rotation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.relative_pose import estimate_relative_pose
 from topoloc.geometry.rigid import Rigid3
@@ -23,6 +25,12 @@ from topoloc.points.metric_points import MetricPoints, locate_points
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import read_left_frame
+
+_MIN_ROTATION, ROTATION_TOLERANCE = math.radians(5.0), math.radians(1.5)
+_TRANSLATION_TOLERANCE, _RELATIVE_TOLERANCE = 0.02, 0.15  # m, share of the step
+_DEPTH_TOLERANCE = 0.01  # error of a measured translation, as a share of the depth
+_MIN_TRANSLATION_RATIO = 3.0  # times the tolerance
+_DIRECTION_TOLERANCE = math.radians(12.0)  # of a translation without scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +46,30 @@ class MeasuredStep:
     first_from_last: Rigid3
     median_depth: float
     has_scale: bool = True
+
+    @property
+    def translation_tolerance(self) -> float:
+        """Return the error of the measured translation, metres."""
+        return _TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * self.median_depth
+
+    def is_informative(self) -> bool:
+        """Return whether the step is long enough to be compared with poses."""
+        return not self.has_scale or not self.first_from_last.is_same(
+            Rigid3.identity(), _MIN_TRANSLATION_RATIO * self.translation_tolerance, _MIN_ROTATION
+        )
+
+    def normalized_error(self, step: Rigid3) -> float:
+        """Return the error of a step of poses in units of the tolerance. For a single camera only
+        the direction of the translation is compared."""
+        pose, theirs = self.first_from_last, step.translation
+        radians = ROTATION_TOLERANCE + _RELATIVE_TOLERANCE * pose.angle()
+        if self.has_scale:
+            length = float(np.linalg.norm(pose.translation))
+            metres = self.translation_tolerance + _RELATIVE_TOLERANCE * length
+            return normalized_pose_error(step, pose, metres, radians)
+        length = float(np.linalg.norm(theirs))
+        cosine = np.clip(pose.translation @ theirs / length, -1.0, 1.0) if length > 0.0 else -1.0
+        return max(math.acos(cosine) / _DIRECTION_TOLERANCE, rotation_error(step, pose) / radians)
 
 
 def measure_steps(
@@ -70,25 +102,15 @@ def measure_steps(
         if motion is None:
             return start, first, None
         first_from_last = first.view_from_cam.inverse() @ motion[0].inverse() @ last.view_from_cam
-        return (
-            start,
-            first,
-            MeasuredStep(
-                usable_idx[start],
-                usable_idx[other],
-                first_from_last,
-                motion[1],
-                has_scale=first.points is not None,
-            ),
-        )
+        ends, has_scale = (usable_idx[start], usable_idx[other]), first.points is not None
+        return start, first, MeasuredStep(*ends, first_from_last, motion[1], has_scale)
 
     for gap in gaps:  # backwards at the end of the recording
-        pairs = (
+        pairs = [
             (start, start + gap if start + gap < len(usable_idx) else start - gap)
             for start in starts
             if start not in steps
-        )
-        pairs = [pair for pair in pairs if pair[1] >= 0]
+        ]
         read = (
             (
                 a,
@@ -97,6 +119,7 @@ def measure_steps(
                 read_left_frame(sequence, usable_idx[b]),
             )
             for a, b in pairs
+            if b >= 0
         )
         for start, first, step in parallel_map(measure, read):
             firsts[start] = first
@@ -116,13 +139,13 @@ class _ViewFeatures:
 def _extract_view(frame: StereoFrame, is_first: bool) -> _ViewFeatures:
     has_depth = is_first and (frame.right is not None or frame.depth is not None)
     view = prepare_frame(frame, with_depth=has_depth)
-    features = extract_features(view.grey, FeatureConfig())
-    if not has_depth:
-        return _ViewFeatures(view.camera, view.view_from_cam, features, None)
-    located = locate_points(features, view)
-    rows = np.flatnonzero(located.valid)
-    points = MetricPoints(located.points_cam[rows], located.covariances[rows], located.valid[rows])
-    return _ViewFeatures(view.camera, view.view_from_cam, features.select(rows), points)
+    features, points = extract_features(view.grey, FeatureConfig()), None
+    if has_depth:
+        located = locate_points(features, view)
+        rows = np.flatnonzero(located.valid)
+        features = features.select(rows)
+        points = MetricPoints(*(column[rows] for column in vars(located).values()))
+    return _ViewFeatures(view.camera, view.view_from_cam, features, points)
 
 
 def _estimate_motion(first: _ViewFeatures, last: _ViewFeatures) -> tuple[Rigid3, float] | None:
@@ -141,14 +164,15 @@ def _estimate_motion(first: _ViewFeatures, last: _ViewFeatures) -> tuple[Rigid3,
     if first.points is None:
         first_img = first.features.points_img[matches.train_idx].astype(np.float64)
         moved = estimate_relative_pose(first_img, first.camera, points_img, last.camera)
-        is_seen = moved is not None and np.count_nonzero(moved.inliers) >= min_inliers
-        return (moved.second_from_first, 0.0) if is_seen and moved is not None else None
-    points, covariances = (
-        first.points.points_cam[matches.train_idx],
-        first.points.covariances[matches.train_idx],
-    )
+        if moved is None or np.count_nonzero(moved.inliers) < min_inliers:
+            return None
+        return moved.second_from_first, 0.0
+    points = first.points.points_cam[matches.train_idx]
     pose = estimate_absolute_pose(
-        points_img, points, last.camera, AbsolutePoseConfig(), point_covariances=covariances
+        points_img,
+        points,
+        last.camera,
+        point_covariances=first.points.covariances[matches.train_idx],
     )
     if pose is None or np.count_nonzero(pose.inliers) < min_inliers:
         return None

@@ -64,7 +64,7 @@ class MotionHistory:
 
     def __init__(self) -> None:
         num_remembered = 20  # number of recent steps from which the acceleration is estimated
-        self._squared_accelerations: deque[tuple[float, float]] = deque(maxlen=num_remembered)
+        self._squared_accelerations: deque[np.ndarray] = deque(maxlen=num_remembered)
         self._intervals: deque[float] = deque(maxlen=num_remembered)
         self._velocity: np.ndarray | None = None  # twist, left of cam_from_world, per second
         self._t_ns: int | None = None
@@ -79,13 +79,8 @@ class MotionHistory:
             if self._velocity is not None:
                 change = (velocity - self._velocity) * interval
                 between = 0.5 * (interval + self._intervals[-1])
-                rates = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
-                self._squared_accelerations.append(
-                    (
-                        float(rates[0] / (interval * between)) ** 2,
-                        float(rates[1] / (interval * between)) ** 2,
-                    )
-                )
+                rates = np.linalg.norm(change.reshape(2, 3), axis=1) / (interval * between)
+                self._squared_accelerations.append(rates**2)
             self._velocity = velocity
             self._intervals.append(interval)
         self._t_ns, self._cam_from_world = t_ns, cam_from_world
@@ -103,11 +98,9 @@ class MotionHistory:
         max_intervals = 10.0  # maximum number of intervals over which a motion is extrapolated
         gap = 1.5  # A frame follows a gap if it comes later than this many median intervals
         min_remembered = 3  # minimum number of steps for this estimate
-        # Minimum sigma of a prediction after a gap, as a share of its translation and
-        # rotation.
-        way_share = 0.1
-        # The same share for the very next frame, because a camera may stop or turn back.
-        stop_share = 0.7
+        # Minimum sigma of a prediction after a gap, as a share of its translation and rotation. For
+        # the very next frame it is larger, because a camera may stop or turn back.
+        way_share, stop_share = 0.1, 0.7
         if self._t_ns is None or self._cam_from_world is None:
             return None
         time = max(1e-9 * (t_ns - self._t_ns), 0.0)
@@ -118,11 +111,14 @@ class MotionHistory:
         way, turn = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:]))
         is_gap = time > gap * float(np.median(self._intervals))
         motion = Rigid3.exp(step)
+        pose = motion @ self._cam_from_world
         if len(self._squared_accelerations) < min_remembered:
-            return Prediction(motion @ self._cam_from_world, motion, np.inf, np.inf, is_gap)
+            return Prediction(pose, motion, np.inf, np.inf, is_gap)
         growth = 0.5 * time * (time + last)
-        acceleration, turning = np.sqrt(np.mean(np.array(self._squared_accelerations), axis=0))
         share = way_share if is_gap else stop_share
-        sigma = max(float(acceleration) * growth, share * way, 1e-3)
-        sigma_rad = max(float(turning) * growth, share * turn, 1e-3)
-        return Prediction(motion @ self._cam_from_world, motion, sigma, sigma_rad, is_gap)
+        rates = np.sqrt(np.mean(np.array(self._squared_accelerations), axis=0)).tolist()
+        sigma, sigma_rad = (
+            max(rate * growth, share * size, 1e-3)
+            for rate, size in zip(rates, (way, turn), strict=True)
+        )
+        return Prediction(pose, motion, sigma, sigma_rad, is_gap)

@@ -34,7 +34,7 @@ from topoloc.slam.keyframes import (
     Observations,
     PlaceFeatures,
 )
-from topoloc.slam.motion_prediction import select_expected_pose
+from topoloc.slam.motion_prediction import Prediction, select_expected_pose
 from topoloc.slam.place_matching import extract_place_features, match_places
 from topoloc.slam.step_estimation import Step, Tracks
 
@@ -49,17 +49,12 @@ class Odometry(FrameTracker):
     """
 
     def __init__(
-        self,
-        recording: int,
-        keyframes: list[KeyFrame],
-        landmarks: Landmarks,
-        checks: InputChecks,
+        self, recording: int, keyframes: list[KeyFrame], landmarks: Landmarks, checks: InputChecks
     ):
         super().__init__(landmarks, min_tracked=25, patch_half_px=5)
         self._recording, self._keyframes, self._checks = recording, keyframes, checks
-        self._lost_frames: list[
-            tuple[int, StereoFrame]
-        ] = []  # frames since the camera was lost, which may start a sub-map
+        # Frames since the camera was lost, which may start a sub-map.
+        self._lost_frames: list[tuple[int, StereoFrame]] = []
         self._repeated_motions: list[Rigid3] = []  # of the last frame before the camera was lost
         self._place_features = DiskList[PlaceFeatures](max_bytes=_MAX_PLACE_BYTES)
         self._place_executor = ThreadPoolExecutor(1, initializer=mark_worker_thread)
@@ -73,7 +68,10 @@ class Odometry(FrameTracker):
         Return its pose and those of earlier frames that are known only now. The list is empty if
         the pose is unknown. `measured` must be `measured_view(frame)`.
         """
-        self._enable_bias_estimation(measured)
+        # Prior standard deviation of the common disparity bias of a recording, pixels.
+        sigma_bias_px = 1.0
+        if measured.right is not None:
+            self._bias.information = 1.0 / sigma_bias_px**2
         pose = self._track_frame(frame_idx, frame, measured)
         return [pose] if pose is not None else self._handle_lost_frame(frame_idx, frame, measured)
 
@@ -82,12 +80,6 @@ class Odometry(FrameTracker):
         poses = self._restart_submap() if len(self._lost_frames) > 1 else []
         self._place_executor.shutdown()
         return poses
-
-    def _enable_bias_estimation(self, measured: MeasuredView) -> None:
-        # Prior standard deviation of the common disparity bias of a recording, pixels.
-        sigma_bias_px = 1.0
-        if measured.right is not None:
-            self._bias.information = 1.0 / sigma_bias_px**2
 
     def _track_frame(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
@@ -108,49 +100,43 @@ class Odometry(FrameTracker):
         return FramePose(frame_idx, reference, cam_from_keyframe, measured.view.view_from_cam)
 
     def _estimate_step(self, frame: StereoFrame, measured: MeasuredView) -> Step | None:
-        """Estimate the step from the last frame.
-
-        None if there is none, or the motion cannot select one of several.
-        """
+        """Estimate the step from the last frame. None if there is none, or the motion cannot select
+        one of several."""
         # Minimum share of the points found again for an unexpected step after a gap.
         min_gap_share = 0.5
         prediction = self._history.predict(frame.t_ns)
         if self._last_frame is None or self._reference is None or prediction is None:
             return None
-        step_estimator = self._step_estimator(
-            self._last_frame, self._reference, self._tracks, measured
-        )
-        step = step_estimator.estimate_step(
-            prediction.cam_from_world
-        ) or step_estimator.estimate_step(self._last_frame.cam_from_world)
-        is_expected = (
-            step is not None and prediction.distance(step.cam_from_world) < prediction.max_sigmas
-        )
-        if is_expected and not prediction.is_gap:
+        last_pose = self._last_frame.cam_from_world
+        estimator = self._step_estimator(self._last_frame, self._reference, self._tracks, measured)
+        step = estimator.estimate_step(prediction.cam_from_world, last_pose)
+        is_near = step and prediction.distance(step.cam_from_world) < prediction.max_sigmas
+        if is_near and not prediction.is_gap:
             return step
         if self._num_lost == 0:
-            self._repeated_motions = step_estimator.find_repeated_motions(prediction)
+            self._repeated_motions = estimator.find_repeated_motions(prediction)
         if step is None or (
-            prediction.is_gap and not is_expected and step.inlier_ratio < min_gap_share
+            prediction.is_gap and not is_near and step.inlier_ratio < min_gap_share
         ):
             return None
-        expected = select_expected_pose(
-            prediction, self._collect_repeated_poses(step.cam_from_world)
-        )
-        if expected is not None and not step_estimator.is_close(expected, step.cam_from_world):
-            step = step_estimator.estimate_step(expected)
+        expected = self._select_expected_pose(prediction, step.cam_from_world)
+        if expected is not None and not estimator.is_close(expected, step.cam_from_world):
+            step = estimator.estimate_step(expected)
         if (
             expected is None
             or step is None
-            or not step_estimator.is_close(expected, step.cam_from_world)
+            or not estimator.is_close(expected, step.cam_from_world)
         ):
             self._reference = None  # relocalization in the last places would be ambiguous, too
             return None
         return step
 
-    def _collect_repeated_poses(self, cam_from_world: Rigid3) -> list[Rigid3]:
-        """Return all poses that look the same in a repetitive place."""
-        return [cam_from_world, *(repeat @ cam_from_world for repeat in self._repeated_motions)]
+    def _select_expected_pose(
+        self, prediction: Prediction | None, cam_from_world: Rigid3
+    ) -> Rigid3 | None:
+        """Return which of all poses that look the same in a repetitive place is expected."""
+        repeated = [repeat @ cam_from_world for repeat in self._repeated_motions]
+        return select_expected_pose(prediction, [cam_from_world, *repeated])
 
     def _add_keyframe(
         self,
@@ -160,19 +146,15 @@ class Odometry(FrameTracker):
         measured: MeasuredView,
         motion: Motion | None,
     ) -> KeyFrame:
-        """Add the frame as a key frame and return it.
-
-        Disparities are measured, landmarks are added and the window is adjusted. Tracking then
-        continues from this frame.
-        """
+        """Add the frame as a key frame with new landmarks and return it. The window is adjusted.
+        Tracking then continues from this frame."""
         min_disparity_px = 0.5  # minimum disparity of a new landmark, pixels
+        sigma_px = 0.3  # standard deviation of a tracked point, pixels
         points, landmark_ids = self._tracks.points_img, self._tracks.landmark_ids
-        corners = find_corners(measured.view.grey, points)
-        guesses = measured.stereo.project(
-            cam_from_world.apply(self._landmarks.positions[landmark_ids])
-        )[:, 2]
+        corners, bias = find_corners(measured.view.grey, points), self._bias.value_px
+        points_cam = cam_from_world.apply(self._landmarks.positions[landmark_ids])
+        guesses = measured.stereo.project(points_cam)[:, 2]
         all_points = np.concatenate([points, corners])
-        bias = self._bias.value_px
         guesses = np.concatenate([guesses, np.full(len(corners), np.nan)]) + bias
         disparities, sigmas = measure_disparities(measured, all_points, guesses)
         values = np.column_stack([all_points.astype(np.float64), disparities])
@@ -181,7 +163,10 @@ class Odometry(FrameTracker):
         new_points = cam_from_world.inverse().apply(measured.stereo.points_cam(unbiased))
         rows = np.concatenate([np.arange(len(points)), fresh])
         ids = np.concatenate([landmark_ids, self._landmarks.add(new_points)])
-        submap = motion.source.submap if motion is not None else self._next_submap()
+        weights = np.full((len(ids), 3), 1.0 / sigma_px)
+        weights[:, 2] = np.where(np.isfinite(sigmas[rows]), 1.0 / sigmas[rows], 0.0)
+        last_submap = self._keyframes[-1].submap if self._keyframes else -1
+        submap = last_submap + 1 if motion is None else motion.source.submap
         keyframe = KeyFrame(
             self._recording,
             frame_idx,
@@ -189,7 +174,7 @@ class Odometry(FrameTracker):
             submap,
             measured.stereo,
             cam_from_world,
-            self._make_observations(ids, values[rows], sigmas[rows]),
+            Observations(ids, values[rows], weights, np.ones(len(ids), np.bool_)),
             self._bias,
             motion,
             self._place_features,
@@ -200,68 +185,44 @@ class Odometry(FrameTracker):
         self._set_reference(keyframe, measured)
         self._checks.check_keyframe(keyframe, self._landmarks, measured)
         if self._is_new_place(keyframe):
-            self._submit_place_extraction(keyframe, measured)
+            # One extraction is pending in a background thread, so that few images are in memory.
+            if self._pending_keyframe is not None:
+                _ = self._pending_keyframe.place  # waits
+            keyframe.pending_place = self._place_executor.submit(
+                extract_place_features, measured.view
+            )
+            self._pending_keyframe = keyframe
         return keyframe
 
-    def _make_observations(
-        self, ids: np.ndarray, values: np.ndarray, sigmas: np.ndarray
-    ) -> Observations:
-        sigma_px = 0.3  # standard deviation of a tracked point, pixels
-        weights = np.full((len(ids), 3), 1.0 / sigma_px)
-        weights[:, 2] = np.where(np.isfinite(sigmas), 1.0 / sigmas, 0.0)
-        return Observations(ids, values, weights, np.ones(len(ids), np.bool_))
-
-    def _next_submap(self) -> int:
-        return self._keyframes[-1].submap + 1 if self._keyframes else 0
-
     def _is_new_place(self, keyframe: KeyFrame) -> bool:
-        # Minimum distance between key frames with place features (for loops), as a share
-        # of the median depth.
-        min_distance = 0.1
-        # The rotation (degrees) after which a key frame also gets place features.
-        min_angle_deg = 8.0
+        # Minimum distance between key frames with place features (for loops), as a share of the
+        # median depth, or the rotation (degrees) between them.
+        min_distance, min_angle_deg = 0.1, 8.0
         last = self._last_places(1)
         if not last:
             return True
         motion = keyframe.cam_from_world @ last[0].cam_from_world.inverse()
-        seen = keyframe.observations
-        depth = keyframe.cam_from_world.apply(
-            self._landmarks.positions[seen.landmark_ids[seen.active]]
-        )[:, 2]
-        metres = min_distance * float(np.median(depth))
+        points = self._landmarks.positions[keyframe.observations.active_ids]
+        metres = min_distance * float(np.median(keyframe.cam_from_world.apply(points)[:, 2]))
         return not motion.is_same(Rigid3.identity(), metres, np.deg2rad(min_angle_deg))
-
-    def _submit_place_extraction(self, keyframe: KeyFrame, measured: MeasuredView) -> None:
-        """Extract the place features of a key frame in a background thread.
-
-        Only one extraction is pending, so that few images are in memory.
-        """
-        if self._pending_keyframe is not None:
-            _ = self._pending_keyframe.place  # waits
-        keyframe.pending_place = self._place_executor.submit(extract_place_features, measured.view)
-        self._pending_keyframe = keyframe
 
     def _last_places(self, num: int) -> list[KeyFrame]:
         """Return the last key frames of this sub-map with place features, newest first."""
         if self._reference is None:
             return []
-        candidates = (
-            k
-            for k in reversed(self._keyframes)
-            if k.recording == self._recording and k.submap == self._reference.submap
+        ends = self._recording, self._reference.submap
+        places = (
+            k for k in reversed(self._keyframes) if (k.recording, k.submap) == ends and k.has_place
         )
-        return list(islice((keyframe for keyframe in candidates if keyframe.has_place), num))
+        return list(islice(places, num))
 
     def _handle_lost_frame(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
     ) -> list[FramePose]:
         """Relocalize the camera in the last places, or start a new sub-map after a while."""
-        # Number of frames after a loss into which the last tracked points are still
-        # tracked.
-        max_lost_tracked = 3
-        # Number of lost frames after which a new sub-map starts. It begins at the first
-        # of them that the others follow.
-        max_lost_frames = 10
+        # Number of frames after a loss into which the last tracked points are still tracked, and
+        # after which a new sub-map starts. It begins at the first of them that the others follow.
+        max_lost_tracked, max_lost_frames = 3, 10
         self._num_lost += 1
         self._lost_frames.append((frame_idx, frame))
         if self._num_lost > max_lost_tracked:
@@ -275,16 +236,11 @@ class Odometry(FrameTracker):
         return self._restart_submap()
 
     def _restart_submap(self) -> list[FramePose]:
-        """Start a sub-map from the lost frames.
-
-        It begins at the first frame from which all later ones can be tracked.
-        """
+        """Start a sub-map from the lost frames, at the first one from which all later ones can be
+        tracked."""
         missed, self._lost_frames, self._reference = self._lost_frames, [], None
-        num_keyframes, num_landmarks, num_lost = (
-            len(self._keyframes),
-            self._landmarks.num,
-            self._num_lost,
-        )
+        num_keyframes, num_landmarks = len(self._keyframes), self._landmarks.num
+        num_lost = self._num_lost
         poses: list[FramePose] = []
         for frame_idx, frame in missed:
             measured = measured_view(frame)
@@ -321,10 +277,8 @@ class Odometry(FrameTracker):
     def _relocalize(
         self, frame: StereoFrame, measured: MeasuredView
     ) -> tuple[Rigid3, Motion] | None:
-        """Relocalize the camera in one of the last places.
-
-        If the place is repetitive and the motion cannot select a pose, the search ends.
-        """
+        """Relocalize the camera in one of the last places. If the place is repetitive and the
+        motion cannot select a pose, the search ends."""
         num_places = 6  # number of last places in which a lost camera is relocalized
         here = extract_place_features(measured.view)
         prediction = self._history.predict(frame.t_ns)
@@ -333,10 +287,7 @@ class Odometry(FrameTracker):
             if match is None:
                 continue
             cam_from_world = match.target_from_source @ keyframe.cam_from_world
-            expected = select_expected_pose(
-                prediction, self._collect_repeated_poses(cam_from_world)
-            )
-            if expected is cam_from_world:
+            if self._select_expected_pose(prediction, cam_from_world) is cam_from_world:
                 return cam_from_world, Motion(keyframe, match.covariance)
             self._reference = None
             return None

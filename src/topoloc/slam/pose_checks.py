@@ -21,48 +21,33 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
-from topoloc.geometry.alignment import nearest_rotation, normalized_pose_error, rotation_error
+from topoloc.geometry.alignment import nearest_rotation
 from topoloc.geometry.pose_conventions import (
     AXES,
     DIRECTIONS,
     ROTATIONS,
     UNITS,
+    PoseConventions,
     PoseConversion,
     describe_conventions,
-    undo_pose_conventions,
 )
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.trajectory import Trajectory
-from topoloc.slam.measured_steps import MeasuredStep, measure_steps
+from topoloc.slam.measured_steps import ROTATION_TOLERANCE, MeasuredStep, measure_steps
 
 _MIN_INFORMATIVE_STEPS = 5
-_MIN_ACCEPTED_RATIO, _MIN_CONVENTION_RATIO = (
-    0.5,
-    0.7,
-)  # share of informative steps that agree: accepted poses, and a reported convention
-_MIN_ROTATION, _ROTATION_TOLERANCE, _TRANSLATION_TOLERANCE, _RELATIVE_TOLERANCE = (
-    math.radians(5.0),
-    math.radians(1.5),
-    0.02,
-    0.15,
-)  # rad, rad, m, share of the step
-_DEPTH_TOLERANCE = 0.01  # error of a measured translation, as a share of the depth
-_MIN_TRANSLATION_RATIO = 3.0  # times the tolerance
+# Share of informative steps that agree: accepted poses, and a reported convention.
+_MIN_ACCEPTED_RATIO, _MIN_CONVENTION_RATIO = 0.5, 0.7
 _UNIT_TOLERANCE = 0.15
-_DIRECTION_TOLERANCE = math.radians(12.0)  # of a translation without scale
 _MAX_COORDINATE = 1e12  # larger than any place in any unit, and its square is finite
-_MIN_SHIFT_S, _MAX_SHIFT_S, _NUM_SHIFTS, _MAX_GAP_S = (
-    0.02,
-    3.0,
-    60,
-    1.0,
-)  # seconds, seconds, number of shifts in each direction, seconds
+_MIN_SHIFT_S, _MAX_SHIFT_S, _MAX_GAP_S = 0.02, 3.0, 1.0
+_NUM_SHIFTS = 60  # in each direction
 _SUSPICIOUS_ERROR, _MAX_ERROR_RATIO = 0.3, 0.4
 _NUM_MOUNTING_ITERATIONS, _MIN_SINGULAR_RATIO = 5, 0.05
 _BODY_COMPLEXITY = 4.0  # in conventions: a mounting has six parameters
 
-_Poses = Sequence[Rigid3 | None]
+_Ends = Sequence[tuple[Rigid3, Rigid3]]  # the poses at the two ends of each step
 
 
 @dataclass(frozen=True)
@@ -100,20 +85,20 @@ class _PoseInterpretation:
         return int(np.count_nonzero(self.normalized_errors < 1.0))
 
     @property
+    def median_error(self) -> float:
+        return float(np.median(self.normalized_errors))
+
+    @property
     def sort_key(self) -> tuple[float, float]:
         """Return a key that prefers the simpler of two interpretations that fit about as well."""
         complexity = sum(
             _BODY_COMPLEXITY if name.startswith("body") else 1.0 for name in self.conventions
         )
-        return self.num_consistent - 0.5 * complexity, -float(np.median(self.normalized_errors))
+        return self.num_consistent - 0.5 * complexity, -self.median_error
 
 
 def check_pose_coverage(sequence: StereoSequence) -> None:
-    """Check that at least half of the frames have a pose, if any has one.
-
-    Raises:
-        TrajectoryError: fewer have one.
-    """
+    """Raise TrajectoryError if some frames have a pose, but less than half of them."""
     num_posed = sum(pose is not None for pose in sequence.poses)
     if 0 < 2 * num_posed < len(sequence):
         raise TrajectoryError(
@@ -132,15 +117,9 @@ def check_poses(sequence: StereoSequence) -> None:
         RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
     """
     posed = [k for k, pose in enumerate(sequence.poses) if pose is not None]
-    if len(posed) < _MIN_INFORMATIVE_STEPS:
+    if len(posed) < _MIN_INFORMATIVE_STEPS or sequence[posed[0]].camera is None:
         return
-    if sequence[posed[0]].camera is None:
-        return
-    verdict = evaluate_poses(
-        measure_steps(sequence, posed),
-        sequence.poses,
-        sequence.t_ns,
-    )
+    verdict = evaluate_poses(measure_steps(sequence, posed), sequence.poses, sequence.t_ns)
     if verdict.is_accepted:
         return
     differ = (
@@ -160,107 +139,64 @@ def check_poses(sequence: StereoSequence) -> None:
 
 
 def evaluate_poses(
-    steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]
+    steps: Sequence[MeasuredStep], poses: Sequence[Rigid3 | None], t_ns: Sequence[int]
 ) -> PoseCheckResult:
     """Compare the poses (world_from_cam in metres, one for each frame) with the measured steps."""
-    informative_steps = [step for step in steps if _is_informative(step)]
-    informative_steps = [
-        step
-        for step in informative_steps
-        if poses[step.first] is not None and poses[step.last] is not None
-    ]
-    if len(informative_steps) < _MIN_INFORMATIVE_STEPS:
-        return PoseCheckResult(len(informative_steps), len(informative_steps))
+    measured: list[MeasuredStep] = []
+    ends: list[tuple[Rigid3, Rigid3]] = []
+    for step in steps:
+        first, last = poses[step.first], poses[step.last]
+        if first is not None and last is not None and step.is_informative():
+            measured.append(step)
+            ends.append((first, last))
+    num = len(measured)
+    if num < _MIN_INFORMATIVE_STEPS:
+        return PoseCheckResult(num, num)
     if any(pose is not None and np.abs(pose.translation).max() > _MAX_COORDINATE for pose in poses):
-        return PoseCheckResult(len(informative_steps), 0)
-    as_is = _PoseInterpretation(
-        (), _compute_step_errors(informative_steps, _steps_from_poses(informative_steps, poses))
-    )
-    verdict = PoseCheckResult(len(informative_steps), as_is.num_consistent)
-    if verdict.is_accepted and not _is_suspicious(as_is):
+        return PoseCheckResult(num, 0)
+    as_is = _interpret((), measured, _compute_steps(ends))
+    verdict = PoseCheckResult(num, as_is.num_consistent)
+    if verdict.is_accepted and as_is.median_error <= _SUSPICIOUS_ERROR:
         return verdict
-    readings = [
-        *_test_conventions(informative_steps, poses),
-        *_find_time_shift(informative_steps, poses, t_ns),
-    ]
+    readings = [*_test_conventions(measured, ends), *_find_time_shift(measured, poses, t_ns)]
     if verdict.is_accepted:  # wrong poses may be nearly right on a straight and level trajectory
-        better = [
+        max_error = _MAX_ERROR_RATIO * as_is.median_error
+        readings = [
             one
             for one in readings
-            if _has_lower_error(one, as_is) and not any("scale" in name for name in one.conventions)
+            if one.median_error < max_error and not any("scale" in name for name in one.conventions)
         ]
-        return replace(
-            verdict,
-            conventions=(
-                max(better, key=lambda reading: reading.sort_key).conventions if better else ()
-            ),
-        )
-    best = max(
-        [*readings, *_test_body_poses(informative_steps, poses)],
-        key=lambda reading: reading.sort_key,
-    )
-    is_named = best.num_consistent >= max(
-        _MIN_CONVENTION_RATIO * len(informative_steps), as_is.num_consistent + 1
-    )
-    return replace(verdict, conventions=best.conventions if is_named else ())
+    else:
+        readings += _test_body_poses(measured, ends)
+        min_consistent = max(_MIN_CONVENTION_RATIO * num, as_is.num_consistent + 1)
+        readings = [max(readings, key=lambda one: one.sort_key)]
+        readings = [one for one in readings if one.num_consistent >= min_consistent]
+    best = max(readings, key=lambda one: one.sort_key, default=as_is)
+    return replace(verdict, conventions=best.conventions)
 
 
-def _is_informative(step: MeasuredStep) -> bool:
-    tolerance = _TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * step.median_depth
-    return not step.has_scale or not step.first_from_last.is_same(
-        Rigid3.identity(), _MIN_TRANSLATION_RATIO * tolerance, _MIN_ROTATION
-    )
+def _compute_steps(ends: _Ends, conventions: tuple[str, ...] = ()) -> list[Rigid3]:
+    """Return first_from_last of the poses, with these conventions undone."""
+    undo = PoseConventions(conventions).undo_conventions
+    return [undo(first).inverse() @ undo(last) for first, last in ends]
 
 
-def _steps_from_poses(informative_steps: Sequence[MeasuredStep], poses: _Poses) -> list[Rigid3]:
-    """Return first_from_last of the poses."""
-    pairs = ((poses[step.first], poses[step.last]) for step in informative_steps)
-    return [
-        first.inverse() @ last for first, last in pairs if first is not None and last is not None
-    ]
-
-
-def _compute_step_errors(
-    informative_steps: Sequence[MeasuredStep], steps: Sequence[Rigid3]
-) -> Float[np.ndarray, " n"]:
-    """Return the error of each step relative to the measured one, in units of the tolerance."""
-    return np.array(
-        [
-            _compute_step_error(measured, step)
-            for measured, step in zip(informative_steps, steps, strict=True)
-        ]
-    )
-
-
-def _compute_step_error(measured: MeasuredStep, step: Rigid3) -> float:
-    """Return the error of a step. For a single camera only the direction of the translation is
-    compared."""
-    pose, theirs = measured.first_from_last, step.translation
-    radians = _ROTATION_TOLERANCE + _RELATIVE_TOLERANCE * pose.angle()
-    if measured.has_scale:
-        metres = (
-            _TRANSLATION_TOLERANCE
-            + _DEPTH_TOLERANCE * measured.median_depth
-            + _RELATIVE_TOLERANCE * float(np.linalg.norm(pose.translation))
-        )
-        return normalized_pose_error(step, pose, metres, radians)
-    length = float(np.linalg.norm(theirs))
-    cosine = np.clip(pose.translation @ theirs / length, -1.0, 1.0) if length > 0.0 else -1.0
-    return max(math.acos(cosine) / _DIRECTION_TOLERANCE, rotation_error(step, pose) / radians)
+def _interpret(
+    conventions: tuple[str, ...], measured: Sequence[MeasuredStep], steps: Sequence[Rigid3]
+) -> _PoseInterpretation:
+    """Return the interpretation with the error of each step relative to the measured one."""
+    errors = [one.normalized_error(step) for one, step in zip(measured, steps, strict=True)]
+    return _PoseInterpretation(conventions, np.array(errors))
 
 
 def _test_conventions(
-    informative_steps: Sequence[MeasuredStep], poses: _Poses
+    measured: Sequence[MeasuredStep], ends: _Ends
 ) -> Iterator[_PoseInterpretation]:
     for conventions in _combine_conventions(ROTATIONS, DIRECTIONS, AXES):
-        steps = _steps_from_poses(
-            informative_steps, _apply_conventions(informative_steps, poses, conventions)
-        )
-        unit, factor = _estimate_unit(informative_steps, steps)
+        steps = _compute_steps(ends, conventions)
+        unit, factor = _estimate_unit(measured, steps)
         steps = [Rigid3(step.rotation, factor * step.translation) for step in steps]
-        yield _PoseInterpretation(
-            (*conventions, *unit), _compute_step_errors(informative_steps, steps)
-        )
+        yield _interpret((*conventions, *unit), measured, steps)
 
 
 def _combine_conventions(*tables: dict[str, PoseConversion]) -> list[tuple[str, ...]]:
@@ -269,34 +205,17 @@ def _combine_conventions(*tables: dict[str, PoseConversion]) -> list[tuple[str, 
     return [tuple(itertools.chain(*parts)) for parts in itertools.product(*choices)]
 
 
-def _apply_conventions(
-    informative_steps: Sequence[MeasuredStep], poses: _Poses, conventions: tuple[str, ...]
-) -> list[Rigid3 | None]:
-    """Return the poses that the steps need, with these conventions undone."""
-    needed = {step.first for step in informative_steps} | {step.last for step in informative_steps}
-    return [
-        undo_pose_conventions(pose, conventions) if pose is not None and k in needed else None
-        for k, pose in enumerate(poses)
-    ]
-
-
 def _estimate_unit(
-    informative_steps: Sequence[MeasuredStep], steps: Sequence[Rigid3]
+    measured: Sequence[MeasuredStep], steps: Sequence[Rigid3]
 ) -> tuple[tuple[str, ...], float]:
-    """Estimate the unit that gives the steps their measured lengths.
-
-    Return it as a convention, with its length in metres.
-    """
-    if not all(step.has_scale for step in informative_steps):
-        return (), 1.0
-    measured = np.array(
-        [np.linalg.norm(step.first_from_last.translation) for step in informative_steps]
-    )
+    """Return the unit that gives the steps their measured lengths: as a convention, and in
+    metres."""
+    true = np.array([np.linalg.norm(step.first_from_last.translation) for step in measured])
     lengths = np.array([np.linalg.norm(step.translation) for step in steps])
     long = lengths > 1e-9
-    if not long.any() or not measured[long].any():
+    if not all(step.has_scale for step in measured) or not true[long].any():
         return (), 1.0
-    factor = float(np.sum(measured[long]) / np.sum(lengths[long]))
+    factor = float(np.sum(true[long]) / np.sum(lengths[long]))
     for name, metres in {"": 1.0, **UNITS}.items():
         if abs(math.log(factor / metres)) < _UNIT_TOLERANCE:
             return (name,) if name else (), metres
@@ -304,92 +223,54 @@ def _estimate_unit(
 
 
 def _find_time_shift(
-    informative_steps: Sequence[MeasuredStep], poses: _Poses, t_ns: Sequence[int]
+    measured: Sequence[MeasuredStep], poses: Sequence[Rigid3 | None], t_ns: Sequence[int]
 ) -> list[_PoseInterpretation]:
     """Find the time shift between poses and images with the smallest error.
 
-    The list is empty if the recording is too short.
+    The list is empty if the recording is too short. Steps beyond an end get the median error.
     """
-    posed = [k for k, pose in enumerate(poses) if pose is not None]
-    trajectory = Trajectory.of_frames(poses, t_ns)
-    largest = min(_MAX_SHIFT_S, 0.4e-9 * (t_ns[posed[-1]] - t_ns[posed[0]]))
-    shifts = np.linspace(-largest, largest, 2 * _NUM_SHIFTS + 1)
-    readings = (
-        _test_time_shift(informative_steps, trajectory, t_ns, float(seconds))
-        for seconds in shifts
-        if abs(seconds) > _MIN_SHIFT_S
-    )
-    return sorted(
-        (one for one in readings if one is not None),
-        key=lambda one: float(np.median(one.normalized_errors)),
-    )[:1]
-
-
-def _test_time_shift(
-    informative_steps: Sequence[MeasuredStep],
-    trajectory: Trajectory,
-    t_ns: Sequence[int],
-    seconds: float,
-) -> _PoseInterpretation | None:
-    """Test one time shift. None if too few steps have poses at the shifted times."""
-    normalized_errors = []
-    for step in informative_steps:
-        times = [t_ns[k] + round(1e9 * seconds) for k in (step.first, step.last)]
-        first, last = trajectory.interpolate(times, _MAX_GAP_S)
-        if first is not None and last is not None:
-            normalized_errors.append(
-                float(_compute_step_errors([step], [first.inverse() @ last])[0])
-            )
-    if len(normalized_errors) < max(_MIN_INFORMATIVE_STEPS, len(informative_steps) // 2):
-        return None
-    normalized_errors += [float(np.median(normalized_errors))] * (
-        len(informative_steps) - len(normalized_errors)
-    )  # steps beyond an end get the median error
-    return _PoseInterpretation((f"shift={seconds:.3g}",), np.array(normalized_errors))
-
-
-def _has_lower_error(other: _PoseInterpretation, as_is: _PoseInterpretation) -> bool:
-    """Return whether another interpretation explains most of the error."""
-    return _is_suspicious(as_is) and float(
-        np.median(other.normalized_errors)
-    ) < _MAX_ERROR_RATIO * float(np.median(as_is.normalized_errors))
-
-
-def _is_suspicious(as_is: _PoseInterpretation) -> bool:
-    """Return whether the error is large enough for another interpretation to be much better."""
-    return float(np.median(as_is.normalized_errors)) > _SUSPICIOUS_ERROR
+    posed = [(pose, time) for pose, time in zip(poses, t_ns, strict=True) if pose is not None]
+    trajectory = Trajectory([pose for pose, _ in posed], [time for _, time in posed])
+    largest = min(_MAX_SHIFT_S, 0.4e-9 * (posed[-1][1] - posed[0][1]))
+    rows = [k for step in measured for k in (step.first, step.last)]
+    min_steps, readings = max(_MIN_INFORMATIVE_STEPS, len(measured) // 2), []
+    for seconds in np.linspace(-largest, largest, 2 * _NUM_SHIFTS + 1).tolist():
+        times = [t_ns[k] + round(1e9 * seconds) for k in rows]
+        shifted = trajectory.interpolate(times, _MAX_GAP_S)
+        errors = [
+            step.normalized_error(first.inverse() @ last)
+            for step, first, last in zip(measured, shifted[::2], shifted[1::2], strict=True)
+            if first is not None and last is not None
+        ]
+        if abs(seconds) > _MIN_SHIFT_S and len(errors) >= min_steps:
+            errors += [float(np.median(errors))] * (len(measured) - len(errors))
+            readings.append(_PoseInterpretation((f"shift={seconds:.3g}",), np.array(errors)))
+    return sorted(readings, key=lambda one: one.median_error)[:1]
 
 
 def _test_body_poses(
-    informative_steps: Sequence[MeasuredStep], poses: _Poses
+    measured: Sequence[MeasuredStep], ends: _Ends
 ) -> Iterator[_PoseInterpretation]:
-    """Test the poses as those of a body with the best-fitting camera mounting.
-
-    Nothing is tested if the steps have no scale.
-    """
-    if not all(step.has_scale for step in informative_steps):
+    """Test the poses as those of a body with the best-fitting camera mounting, if the steps have a
+    scale."""
+    if not all(step.has_scale for step in measured):
         return
     for conventions in _combine_conventions(ROTATIONS, DIRECTIONS):
-        steps = _steps_from_poses(
-            informative_steps, _apply_conventions(informative_steps, poses, conventions)
-        )
-        pairs = kept = list(zip(informative_steps, steps, strict=True))
-        mounting, normalized_errors = Rigid3.identity(), np.zeros(len(pairs))
-        for _ in range(
-            _NUM_MOUNTING_ITERATIONS
-        ):  # repeated without outliers, which may be measured wrongly
+        steps = _compute_steps(ends, conventions)
+        pairs = kept = list(zip(measured, steps, strict=True))
+        mounting, reading = Rigid3.identity(), _PoseInterpretation((), np.zeros(len(pairs)))
+        for _ in range(_NUM_MOUNTING_ITERATIONS):  # without outliers, which may be measured wrongly
             mounting = _estimate_mounting(kept)
-            normalized_errors = _compute_step_errors(
-                informative_steps, [mounting.inverse() @ step @ mounting for step in steps]
+            w, x, y, z = mounting.quat_wxyz()
+            numbers = ",".join(f"{number:.4g}" for number in (*mounting.translation, x, y, z, w))
+            reading = _interpret(
+                (*conventions, f"body={numbers}"),
+                measured,
+                [mounting.inverse() @ step @ mounting for step in steps],
             )
-            kept = [
-                pair
-                for pair, miss in zip(pairs, normalized_errors, strict=True)
-                if miss <= 1.5 * np.median(normalized_errors)
-            ]
-        w, x, y, z = mounting.quat_wxyz()
-        numbers = ",".join(f"{number:.4g}" for number in (*mounting.translation, x, y, z, w))
-        yield _PoseInterpretation((*conventions, f"body={numbers}"), normalized_errors)
+            is_kept = reading.normalized_errors <= 1.5 * reading.median_error
+            kept = list(itertools.compress(pairs, is_kept))
+        yield reading
 
 
 def _estimate_mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
@@ -404,22 +285,16 @@ def _estimate_mounting(pairs: Sequence[tuple[MeasuredStep, Rigid3]]) -> Rigid3:
         (np.outer(step.log()[3:], measured.first_from_last.log()[3:]) for measured, step in pairs),
         np.zeros((3, 3)),
     )
+    lefts = np.concatenate([step.rotation - np.eye(3) for _, step in pairs])
     for _ in range(_NUM_MOUNTING_ITERATIONS):
-        correlation = of_axes / _ROTATION_TOLERANCE**2
+        correlation = of_axes / ROTATION_TOLERANCE**2
         for measured, step in pairs:
             way = step.translation - (translation - step.rotation @ translation)
-            correlation = (
-                correlation
-                + np.outer(way, measured.first_from_last.translation)
-                / (_TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * measured.median_depth) ** 2
-            )
+            weighted = np.outer(way, measured.first_from_last.translation)
+            correlation = correlation + weighted / measured.translation_tolerance**2
         rotation = nearest_rotation(correlation)
-        lefts = np.concatenate([step.rotation - np.eye(3) for _, step in pairs])
-        rights = np.concatenate(
-            [
-                rotation @ measured.first_from_last.translation - step.translation
-                for measured, step in pairs
-            ]
-        )
-        translation = np.linalg.lstsq(lefts, rights, rcond=_MIN_SINGULAR_RATIO)[0]
+        rights = [
+            rotation @ one.first_from_last.translation - step.translation for one, step in pairs
+        ]
+        translation = np.linalg.lstsq(lefts, np.concatenate(rights), rcond=_MIN_SINGULAR_RATIO)[0]
     return Rigid3(rotation, translation)

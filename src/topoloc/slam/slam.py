@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,14 +24,14 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import MeasuredView, measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.recording import with_poses
 from topoloc.slam.global_optimization import (
     adjust_global_bundle,
     close_loops,
     join_submaps,
 )
 from topoloc.slam.input_checks import InputChecks
-from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceFeatures
+from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks
 from topoloc.slam.loop_closure import Link, find_links
 from topoloc.slam.odometry import Odometry
 from topoloc.slam.place_matching import extract_place_features
@@ -81,23 +81,26 @@ class SlamResult:
                     " alone"
                 )
         return [
-            SequenceView(sequence, list(range(len(sequence))), poses, tuple(apart))
+            with_poses(sequence, poses, tuple(apart))
             for sequence, poses, apart in zip(sequences, self.poses, self.apart, strict=True)
         ]
 
     def to_json(self, sequence: StereoSequence) -> dict[str, Any]:
         """Return statistics of the first recording, and its errors if it has ground truth."""
         poses = self.poses[0]
+        known = [pose for pose in poses if pose is not None]
+        steps = np.diff(np.array([pose.translation for pose in known]).reshape(-1, 3), axis=0)
+        residuals = self.right_residuals_px[np.isfinite(self.right_residuals_px)]
         facts: dict[str, Any] = {
             "num_frames": len(poses),
-            "num_tracked": sum(pose is not None for pose in poses),
+            "num_tracked": len(known),
             "num_keyframes": self.num_keyframes,
             "num_loops": self.num_loops,
             "num_submaps": self.num_submaps,
             "num_joined": self.num_joined,
-            "length_m": round(_length([pose for pose in poses if pose is not None]), 3),
+            "length_m": round(float(np.linalg.norm(steps, axis=1).sum()), 3),
             "disparity_bias_px": round(self.disparity_bias_px[0], 3),
-            "right_residual_px": _median(self.right_residuals_px),
+            "right_residual_px": round(float(np.median(residuals)), 3) if len(residuals) else None,
         }
         both = [
             (true, pose)
@@ -114,19 +117,8 @@ class SlamResult:
         return facts
 
 
-def _length(poses: Sequence[Rigid3]) -> float:
-    positions = np.array([pose.translation for pose in poses]).reshape(-1, 3)
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-
-
-def _median(values: np.ndarray) -> float | None:
-    known = values[np.isfinite(values)]
-    return round(float(np.median(known)), 3) if len(known) else None
-
-
 def run_slam(
-    sequences: StereoSequence | Sequence[StereoSequence],
-    progress: Progress | None = None,
+    sequences: StereoSequence | Sequence[StereoSequence], progress: Progress | None = None
 ) -> SlamResult:
     """Run SLAM on one or several recordings of one place.
 
@@ -154,15 +146,22 @@ def run_slam(
     links += find_joins(
         keyframes,
         links,
-        lambda keyframe: _read_place_features(keyframe, sequences),
+        lambda k: extract_place_features(prepare_frame(sequences[k.recording][k.frame_idx])),
     )
-    joined = join_submaps(
-        keyframes, links, landmarks, _find_largest_submap(keyframes, links, tracked[0])
-    )
+    groups = group_submaps(keyframes, links)
+    of_frames = Counter(groups[pose.keyframe.submap] for pose in tracked[0] if pose is not None)
+    ((largest, _),) = of_frames.most_common(1)  # by frames of the first recording
+    joined = join_submaps(keyframes, links, landmarks, largest)
     links = _optimize_map(keyframes, links, joined, landmarks, progress)
     return SlamResult(
         poses=_to_world_poses(tracked, joined),
-        apart=[_collect_separate_poses(of_recording, joined) for of_recording in tracked],
+        apart=[
+            [
+                _select_poses(one, [submap])
+                for submap in sorted({p.keyframe.submap for p in one if p is not None} - {*joined})
+            ]
+            for one in tracked
+        ],
         num_keyframes=len(keyframes),
         num_loops=len(links),
         num_submaps=len({keyframe.submap for keyframe in keyframes}),
@@ -174,8 +173,7 @@ def run_slam(
 
 
 def estimate_slam_poses(
-    sequences: Sequence[StereoSequence],
-    progress: Progress | None = None,
+    sequences: Sequence[StereoSequence], progress: Progress | None = None
 ) -> list[StereoSequence]:
     """Return the recordings with the poses of `run_slam`.
 
@@ -225,33 +223,18 @@ def _prefetch_frames(
             yield ready
 
 
-def _find_largest_submap(
-    keyframes: list[KeyFrame], links: list[Link], tracked: list[FramePose | None]
-) -> int:
-    """Return the first sub-map of the group with the most frames of the first recording."""
-    groups = group_submaps(keyframes, links)
-    return Counter(
-        groups[pose.keyframe.submap] for pose in tracked if pose is not None
-    ).most_common(1)[0][0]
-
-
-def _read_place_features(keyframe: KeyFrame, sequences: Sequence[StereoSequence]) -> PlaceFeatures:
-    """Extract the place features of a key frame without them, by reading its image again."""
-    return extract_place_features(prepare_frame(sequences[keyframe.recording][keyframe.frame_idx]))
-
-
 def _optimize_map(
     keyframes: list[KeyFrame],
-    links: list,
+    links: list[Link],
     joined: list[int],
     landmarks: Landmarks,
     progress: Progress,
-) -> list:
+) -> list[Link]:
     """Optimise the joined key frames, and return the links that agree with the result."""
     chosen = [i for i, keyframe in enumerate(keyframes) if keyframe.submap in joined]
     row = {i: k for k, i in enumerate(chosen)}
     of_joined = [
-        type(link)(row[link.source], row[link.target], link.match)
+        replace(link, source=row[link.source], target=row[link.target])
         for link in links
         if link.source in row and link.target in row
     ]
@@ -268,23 +251,14 @@ def _to_world_poses(
     tracked: list[list[FramePose | None]], joined: list[int]
 ) -> list[list[Rigid3 | None]]:
     """Return world_from_cam of every frame. The world is the camera frame of the first one."""
-    poses = [
-        [p.world_from_cam() if p is not None and p.keyframe.submap in joined else None for p in one]
-        for one in tracked
-    ]
+    poses = [_select_poses(one, joined) for one in tracked]
     world_from_any = next(pose for one in poses for pose in one if pose is not None).inverse()
     return [[world_from_any @ pose if pose is not None else None for pose in one] for one in poses]
 
 
-def _collect_separate_poses(
-    tracked: list[FramePose | None], joined: list[int]
-) -> list[list[Rigid3 | None]]:
-    """Return the poses of each sub-map that is not joined, in its own world."""
-    submaps = sorted({pose.keyframe.submap for pose in tracked if pose is not None} - set(joined))
+def _select_poses(tracked: list[FramePose | None], submaps: Sequence[int]) -> list[Rigid3 | None]:
+    """Return the poses of some sub-maps, in their own world. Other frames have None."""
     return [
-        [
-            p.world_from_cam() if p is not None and p.keyframe.submap == submap else None
-            for p in tracked
-        ]
-        for submap in submaps
+        p.world_from_cam() if p is not None and p.keyframe.submap in submaps else None
+        for p in tracked
     ]

@@ -15,7 +15,7 @@ from topoloc.features.parallel import parallel_map
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.rig import ray_covariances
 from topoloc.geometry.rigid import Rigid3
-from topoloc.points.disparity import MeasuredView, StereoCamera
+from topoloc.points.disparity import MeasuredView
 from topoloc.points.point_tracking import align_with_reference, track_points
 from topoloc.slam.keyframes import KeyFrame, Landmarks
 from topoloc.slam.motion_prediction import Prediction
@@ -52,12 +52,7 @@ class Tracks:
 
     def select(self, rows: np.ndarray) -> Tracks:
         """Return the given rows."""
-        return Tracks(
-            self.landmark_ids[rows],
-            self.points_img[rows],
-            self.points_ref[rows],
-            self.sigmas_px[rows],
-        )
+        return Tracks(*(column[rows] for column in vars(self).values()))
 
 
 @dataclass(eq=False)
@@ -100,16 +95,30 @@ class StepEstimator:
     min_tracked: int
     patch_half_px: int
 
-    def estimate_step(self, predicted: Rigid3) -> Step | None:
-        """Estimate the step from a predicted cam_from_world. None if too few points agree."""
-        tracks = self.track_points(predicted)
-        pose = self.estimate_pose(tracks)
-        if pose is None:
-            return None
-        should = max(int(np.count_nonzero(self._is_in_image(pose.cam_from_world))), 1)
-        inlier_ratio = min(np.count_nonzero(pose.inliers) / should, 1.0)
-        kept = tracks.select(pose.inliers)
-        return Step(self.reference, pose.cam_from_world, pose.covariance, kept, inlier_ratio)
+    @property
+    def points_world(self) -> Float[np.ndarray, "n 3"]:
+        """Return the landmarks of the points."""
+        return self.landmarks.positions[self.tracks.landmark_ids]
+
+    def estimate_step(self, *predicted: Rigid3) -> Step | None:
+        """Estimate the step from the first predicted cam_from_world from which enough points agree.
+        None if there is none."""
+        for start in predicted:
+            tracks = self.track_points(start)
+            pose = self.estimate_pose(tracks)
+            if pose is not None:
+                stereo, points_world = self.measured.stereo, self.points_world
+                pixels = stereo.project(pose.cam_from_world.apply(points_world))[:, :2]
+                size = np.array([stereo.camera.width, stereo.camera.height])
+                with np.errstate(invalid="ignore"):
+                    is_inside = np.all((pixels > 8.0) & (pixels < size - 9.0), axis=1)
+                should = max(int(np.count_nonzero(is_inside)), 1)
+                inlier_ratio = min(np.count_nonzero(pose.inliers) / should, 1.0)
+                kept = tracks.select(pose.inliers)
+                return Step(
+                    self.reference, pose.cam_from_world, pose.covariance, kept, inlier_ratio
+                )
+        return None
 
     def find_repeated_motions(self, prediction: Prediction) -> list[Rigid3]:
         """Return the motions after which the last image would look the same.
@@ -155,8 +164,7 @@ class StepEstimator:
         # Spacing of the start poses in the search for repetitions, pixels (median over
         # the points).
         spacing_px = 25.0
-        points = self.landmarks.positions[self.tracks.landmark_ids]
-        little = 0.01 * self._median_depth()
+        points, little = self.points_world, 0.01 * self._median_depth()
         poses = (cam_from_world, Rigid3.exp(little * direction) @ cam_from_world)
         here, there = (self.measured.stereo.project(pose.apply(points))[:, :2] for pose in poses)
         moved = np.linalg.norm(there - here, axis=1)
@@ -166,7 +174,7 @@ class StepEstimator:
 
     def _median_depth(self) -> float:
         """Return the median depth of the points in the last frame."""
-        points = self.last.cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids])
+        points = self.last.cam_from_world.apply(self.points_world)
         return float(np.median(points[:, 2])) if len(points) else 1.0
 
     def is_close(self, a: Rigid3, b: Rigid3) -> bool:
@@ -174,67 +182,55 @@ class StepEstimator:
         limit = 0.04  # maximum difference, as a share of the median depth and in radians
         return a.inverse().is_same(b.inverse(), limit * self._median_depth(), limit)
 
-    def _is_in_image(self, cam_from_world: Rigid3) -> np.ndarray:
-        camera = self.measured.stereo.camera
-        points = self.measured.stereo.project(
-            cam_from_world.apply(self.landmarks.positions[self.tracks.landmark_ids])
-        )
-        with np.errstate(invalid="ignore"):
-            return np.all(
-                (points[:, :2] > 8.0) & (points[:, :2] < [camera.width - 9.0, camera.height - 9.0]),
-                axis=1,
-            )
-
     def track_points(self, predicted: Rigid3) -> Tracks:
         """Track the points from a predicted cam_from_world and align them with the last key
         frame."""
         tracks, measured = self.tracks, self.measured
-        points_world = self.landmarks.positions[tracks.landmark_ids]
         before, after = (
-            measured.stereo.project(pose.apply(points_world))[:, :2]
+            measured.stereo.project(pose.apply(self.points_world))[:, :2]
             for pose in (self.last.cam_from_world, predicted)
         )
         limit = np.array([measured.view.camera.width, measured.view.camera.height]) / 2.0
-        guesses = (
-            tracks.points_img + np.clip(np.nan_to_num(after - before), -limit, limit)
-        ).astype(np.float32)
+        moved = np.clip(np.nan_to_num(after - before), -limit, limit)
+        guesses = (tracks.points_img + moved).astype(np.float32)
         found, is_found = track_points(
             self.last.measured.view.grey, measured.view.grey, tracks.points_img, guesses
         )
         tracks = replace(tracks, points_img=found).select(is_found)
-        scales = self._patch_scales(tracks.landmark_ids, predicted)
-        found = align_with_reference(
+        # The scale of each landmark's patch relative to the last key frame, from the depths.
+        before, now = (
+            pose.apply(self.landmarks.positions[tracks.landmark_ids])[:, 2]
+            for pose in (self.reference.cam_from_world, predicted)
+        )
+        aligned = align_with_reference(
             self.reference_image,
             measured.left,
             tracks.points_ref,
             tracks.points_img,
-            scales,
+            np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32),
             patch_half_px=self.patch_half_px,
         )
-        return replace(tracks, points_img=found.points_img, sigmas_px=found.sigmas_px).select(
-            found.is_matched
-        )
-
-    def _patch_scales(
-        self, landmark_ids: Int[np.ndarray, " n"], predicted: Rigid3
-    ) -> Float32[np.ndarray, " n"]:
-        """Return the scale of each landmark's patch relative to the last key frame, from the
-        depths."""
-        points_world = self.landmarks.positions[landmark_ids]
-        before, now = (
-            pose.apply(points_world)[:, 2] for pose in (self.reference.cam_from_world, predicted)
-        )
-        return np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32)
+        tracks = replace(tracks, points_img=aligned.points_img, sigmas_px=aligned.sigmas_px)
+        return tracks.select(aligned.is_matched)
 
     def estimate_pose(self, tracks: Tracks) -> AbsolutePose | None:
         """Estimate the pose that enough points agree on. None if there is none."""
-        # Minimum share of the tracked points that agree on a pose. A frame with fewer is
-        # lost.
+        # Minimum share of the tracked points that agree on a pose. A frame with fewer is lost.
         min_share = 0.35
-        stereo = self.measured.stereo
+        sigma_px = 0.25  # depth uncertainty of a landmark, as a disparity in pixels
+        stereo, reference_from_world = self.measured.stereo, self.reference.cam_from_world
         if len(tracks.landmark_ids) < self.min_tracked:
             return None
         points_world = self.landmarks.positions[tracks.landmark_ids]
+        # The covariances of the landmarks, as measured by the last key frame.
+        points_cam, rotation = (
+            reference_from_world.apply(points_world),
+            reference_from_world.rotation,
+        )
+        sigma_z = sigma_px * points_cam[:, 2] ** 2 / stereo.bf
+        covariances = ray_covariances(
+            points_cam, sigma_z, stereo.camera, np.full(len(points_cam), 0.1)
+        )
         pose = estimate_absolute_pose(
             tracks.points_img.astype(np.float64),
             points_world,
@@ -242,23 +238,10 @@ class StepEstimator:
             AbsolutePoseConfig(
                 max_reprojection_error_px=2.0, sigma_px=0.5, max_iterations=300, min_iterations=20
             ),
-            point_covariances=self._landmark_covariances(points_world, stereo),
+            point_covariances=rotation.T @ covariances @ rotation,
         )
         if pose is None:
             return None
         num_inliers = int(np.count_nonzero(pose.inliers))
         enough = max(self.min_tracked, min_share * len(tracks.landmark_ids))
         return pose if num_inliers >= enough else None
-
-    def _landmark_covariances(
-        self, points_world: Float[np.ndarray, "n 3"], stereo: StereoCamera
-    ) -> Float[np.ndarray, "n 3 3"]:
-        """Return the landmark covariances in world axes, as measured by the last key frame."""
-        sigma_px = 0.25  # depth uncertainty of a landmark, as a disparity in pixels
-        rotation = self.reference.cam_from_world.rotation
-        points_cam = self.reference.cam_from_world.apply(points_world)
-        sigma_z = sigma_px * points_cam[:, 2] ** 2 / stereo.bf
-        covariances = ray_covariances(
-            points_cam, sigma_z, stereo.camera, np.full(len(points_cam), 0.1)
-        )
-        return rotation.T @ covariances @ rotation

@@ -12,8 +12,8 @@ different place hardly any do. Images of repetitive structures are not used.
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -34,30 +34,18 @@ _MIN_INLIERS = 12  # matches of a pair that agree on a pose
 _MIN_ROTATION_TRACE = 1.0  # of a rotation by 90 degrees, beyond which images hardly overlap
 _CANDIDATE_FACTOR = 10  # candidate pairs per checked pair
 
+_Ends = tuple[KeyFrame, KeyFrame]
+"""The best matching key frames of the earlier and the later sub-map. Estimates of the transform
+between the sub-maps refer to these two."""
 PlaceExtractor = Callable[[KeyFrame], PlaceFeatures]
 """A function that extracts the place features of a key frame from its recording."""
 
 
-@dataclass(frozen=True, eq=False)
-class _KeyFramePair:
-    """Hold the best matching key frames of the earlier and the later sub-map.
-
-    Estimates of the transform between the sub-maps refer to these two.
-    """
-
-    first: KeyFrame
-    second: KeyFrame
-
-
 def find_joins(
-    keyframes: Sequence[KeyFrame],
-    links: Sequence[Link],
-    extract_place: PlaceExtractor,
+    keyframes: Sequence[KeyFrame], links: Sequence[Link], extract_place: PlaceExtractor
 ) -> list[Link]:
-    """Return links that join sub-maps which `links` leaves apart.
-
-    Compared key frames get place features.
-    """
+    """Return links that join sub-maps which `links` leaves apart. Compared key frames get place
+    features."""
     num_seeds = 6  # number of best matching pairs whose neighbours are compared, too
     groups = group_submaps(keyframes, links)
     places = [i for i, keyframe in enumerate(keyframes) if keyframe.has_place]
@@ -73,10 +61,8 @@ def find_joins(
             if not keyframes[i].has_place:
                 keyframes[i].place = extract_place(keyframes[i])
         found += _match_pairs(sorted(around), keyframes)
-        joins += _select_consistent(
-            [link for link in found if _is_distinct(link, keyframes, repeated)],
-            keyframes,
-        )
+        distinct = [link for link in found if _is_distinct(link, keyframes, repeated)]
+        joins += _select_consistent(distinct, keyframes)
     return joins
 
 
@@ -95,14 +81,13 @@ def _is_distinct(link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, 
 
 
 def _select_consistent(links: Sequence[Link], keyframes: Sequence[KeyFrame]) -> list[Link]:
-    """Return the agreeing links between two sub-maps.
-
-    The list is empty if too few agree, or other images contradict them.
-    """
+    """Return the agreeing links between two sub-maps, none if too few agree or other images
+    contradict them."""
     if not links:
         return []
     best = max(links, key=lambda link: len(link.match.source_rows))
-    ends = _KeyFramePair(*(keyframes[i] for i in _order_ends(best, keyframes)))
+    first, second = (keyframes[i] for i in _order_ends(best, keyframes))
+    ends = first, second
     estimates, covariances = _compute_estimates(links, keyframes, ends)
     pictures = np.array([_order_ends(link, keyframes) for link in links])
     consensus = find_consensus(estimates, covariances, pictures)
@@ -131,20 +116,15 @@ def _find_similar_places(
     """Return the similar pairs (earlier, later) of each two sub-maps that are apart."""
     # Number of most similar places in each other sub-map that a place is compared with.
     num_candidates = 4
-    pairs: dict[tuple[int, int], set[tuple[int, int]]] = {}
-    for number, ranked in enumerate(rank_places([keyframes[i] for i in places])):
-        own = keyframes[places[number]].submap
-        num_of: dict[int, int] = {}
-        for other in ranked:
-            submap = keyframes[places[other]].submap
-            num_of[submap] = num_of.get(submap, 0) + 1
+    pairs: dict[tuple[int, int], set[tuple[int, int]]] = defaultdict(set)
+    for place, ranked in zip(places, rank_places([keyframes[i] for i in places]), strict=False):
+        num_of: Counter[int] = Counter()
+        for other in (places[row] for row in ranked):
+            own, submap = keyframes[place].submap, keyframes[other].submap
+            num_of[submap] += 1
             if groups[submap] != groups[own] and num_of[submap] <= num_candidates:
-                ends = (
-                    (places[number], places[other])
-                    if own < submap
-                    else (places[other], places[number])
-                )
-                pairs.setdefault((min(own, submap), max(own, submap)), set()).add(ends)
+                ends = (place, other) if own < submap else (other, place)
+                pairs[min(own, submap), max(own, submap)].add(ends)
     return {submaps: sorted(pairs[submaps]) for submaps in sorted(pairs)}
 
 
@@ -154,26 +134,21 @@ def _find_neighbour_pairs(
     """Return the pairs (earlier, later) of key frames around those of the links."""
     # Number of key frames before and after each end of these pairs that are compared.
     num_around = 2
+    rows_of: dict[int, list[int]] = defaultdict(list)  # the key frames of each sub-map
+    for i, keyframe in enumerate(keyframes):
+        rows_of[keyframe.submap].append(i)
     pairs: set[tuple[int, int]] = set()
     for link in links:
-        one, other = (
-            _find_neighbours(end, keyframes, num_around) for end in _order_ends(link, keyframes)
-        )
-        pairs |= set(product(one, other))
+        around = []
+        for end in _order_ends(link, keyframes):
+            rows = rows_of[keyframes[end].submap]
+            at = rows.index(end)
+            around.append(rows[max(at - num_around, 0) : at + num_around + 1])
+        pairs |= set(product(*around))
     return pairs
 
 
-def _find_neighbours(row: int, keyframes: Sequence[KeyFrame], num: int) -> list[int]:
-    """Return the rows of the key frames of one sub-map around one of them, including itself."""
-    own = [i for i, keyframe in enumerate(keyframes) if keyframe.submap == keyframes[row].submap]
-    at = own.index(row)
-    return own[max(at - num, 0) : at + num + 1]
-
-
-def _match_pairs(
-    pairs: Sequence[tuple[int, int]],
-    keyframes: Sequence[KeyFrame],
-) -> list[Link]:
+def _match_pairs(pairs: Sequence[tuple[int, int]], keyframes: Sequence[KeyFrame]) -> list[Link]:
     """Match each pair in both directions.
 
     Links within a recording that exceed the camera's maximum speed are skipped.
@@ -200,72 +175,58 @@ def _order_ends(link: Link, keyframes: Sequence[KeyFrame]) -> list[int]:
 
 
 def _compute_estimates(
-    links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _KeyFramePair
+    links: Sequence[Link], keyframes: Sequence[KeyFrame], ends: _Ends
 ) -> tuple[list[Rigid3], Float[np.ndarray, "n 6 6"]]:
     """Return first_from_second of each link, and the covariances.
 
     The covariance grows with the distance along the sub-maps.
     """
-    # Factor of the PnP covariance, because matched features of one view have correlated
-    # errors.
+    # Factor of the PnP covariance, because matched features of one view have correlated errors.
     covariance_scale = 4.0
-    sigma = 0.03  # sigma of a match, metres, in addition to that of PnP
-    sigma_deg = 1.0  # sigma of a match, degrees, in addition to that of PnP
+    of_match = diagonal_covariance(0.03, 1.0)  # in addition to that of PnP
     estimates, covariances = [], []
     for link in links:
         a, b = _order_ends(link, keyframes)
-        first_from_a = ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse()
-        b_from_second = keyframes[b].cam_from_world @ ends.second.cam_from_world.inverse()
+        first_from_a = ends[0].cam_from_world @ keyframes[a].cam_from_world.inverse()
+        b_from_second = keyframes[b].cam_from_world @ ends[1].cam_from_world.inverse()
         a_from_b = link.match.target_from_source
-        covariance = covariance_scale * link.match.covariance + diagonal_covariance(
-            sigma, sigma_deg
-        )
+        covariance = covariance_scale * link.match.covariance + of_match
         if link.source == a:
             a_from_b, covariance = a_from_b.inverse(), inverse_covariance(a_from_b, covariance)
-        estimate, carried_covariance = propagate_estimate(
-            first_from_a, a_from_b, covariance, b_from_second
-        )
-        estimates.append(estimate)
-        covariances.append(carried_covariance)
+        found = propagate_estimate(first_from_a, a_from_b, covariance, b_from_second)
+        estimates.append(found[0])
+        covariances.append(found[1])
     return estimates, np.stack(covariances)
 
 
 def _is_join_verified(
-    consensus: TransformConsensus,
-    keyframes: Sequence[KeyFrame],
-    ends: _KeyFramePair,
+    consensus: TransformConsensus, keyframes: Sequence[KeyFrame], ends: _Ends
 ) -> bool:
     """Return whether enough of the points that must look the same are matched.
 
     The matches must also be spread over the images.
     """
-    # Minimum share of these points that are matched consistently with the join.
-    min_seen_again = 0.08
-    # Minimum share of these points in image cells with a match, because the same board may
-    # hang in two rooms.
-    min_covered = 0.55
-    # Minimum number of points that must look the same, over all compared views.
+    # Minimum share of these points that are matched consistently with the join, and that are in
+    # image cells with a match, because the same board may hang in two rooms.
+    min_seen_again, min_covered = 0.08, 0.55
     min_seen_points = 100
     min_known_pose = 6  # matches that agree on a known pose
     num_cells = 4  # across and down an image
-    num_seen, num_found, num_covered = 0, 0, 0
+    counts = np.zeros(3, np.int64)  # points that must look the same, matched ones, those in cells
     for source, target, rows in _find_overlapping_views(consensus.a_from_b, keyframes, ends):
         cells = _compute_cells(keyframes[source], num_cells)
-        seen, found = (
-            np.bincount(cells[rows], minlength=num_cells**2),
-            np.zeros(num_cells**2, np.int64),
-        )
+        seen = np.bincount(cells[rows], minlength=num_cells**2)
+        found = np.zeros_like(seen)
         link = match_keyframes(source, target, keyframes, min_known_pose, min_inlier_share=0.0)
-        if link is not None and _is_link_consistent(link, consensus, keyframes, ends):
-            again = np.intersect1d(link.match.source_rows, rows)
-            found = np.bincount(cells[again], minlength=len(seen))
-        num_seen, num_found, num_covered = (
-            num_seen + seen.sum(),
-            num_found + found.sum(),
-            num_covered + seen[found > 0].sum(),
-        )
+        if link is not None:
+            (estimate,), (covariance,) = _compute_estimates([link], keyframes, ends)
+            if consensus.is_consistent(estimate, covariance):
+                again = np.intersect1d(link.match.source_rows, rows)
+                found = np.bincount(cells[again], minlength=len(seen))
+        counts += [seen.sum(), found.sum(), seen[found > 0].sum()]
+    num_seen, num_found, num_covered = counts.tolist()
     enough = num_found >= min_seen_again * num_seen and num_covered >= min_covered * num_seen
-    return bool(num_seen >= min_seen_points and enough)
+    return num_seen >= min_seen_points and enough
 
 
 def _compute_cells(keyframe: KeyFrame, num_cells: int) -> Int[np.ndarray, " n"]:
@@ -277,46 +238,29 @@ def _compute_cells(keyframe: KeyFrame, num_cells: int) -> Int[np.ndarray, " n"]:
     return np.clip(columns_rows, 0, num_cells - 1) @ [1, num_cells]
 
 
-def _is_link_consistent(
-    link: Link,
-    consensus: TransformConsensus,
-    keyframes: Sequence[KeyFrame],
-    ends: _KeyFramePair,
-) -> bool:
-    estimates, covariances = _compute_estimates([link], keyframes, ends)
-    return consensus.is_consistent(estimates[0], covariances[0])
-
-
 def _find_overlapping_views(
-    first_from_second: Rigid3,
-    keyframes: Sequence[KeyFrame],
-    ends: _KeyFramePair,
+    first_from_second: Rigid3, keyframes: Sequence[KeyFrame], ends: _Ends
 ) -> list[tuple[int, int, Int[np.ndarray, " n"]]]:
     """Return source, target and covisible features of the most overlapping pairs, in both
     directions."""
     num_checked = 20  # number of most similar views that are compared to verify a join
     ones, others = (
         [i for i, k in enumerate(keyframes) if k.submap == end.submap and k.has_place]
-        for end in (ends.first, ends.second)
+        for end in (ends[0], ends[1])
     )
-    first_from_ones = [
-        ends.first.cam_from_world @ keyframes[a].cam_from_world.inverse() for a in ones
-    ]
+    first_from_ones = [ends[0].cam_from_world @ keyframes[a].cam_from_world.inverse() for a in ones]
     first_from_others = [
-        first_from_second @ ends.second.cam_from_world @ keyframes[b].cam_from_world.inverse()
+        first_from_second @ ends[1].cam_from_world @ keyframes[b].cam_from_world.inverse()
         for b in others
     ]
-    places, other_places = (
-        np.array([pose.translation for pose in poses])
+    (places, rotations), (other_places, other_rotations) = (
+        (
+            np.array([pose.translation for pose in poses]),
+            np.array([pose.rotation for pose in poses]),
+        )
         for poses in (first_from_ones, first_from_others)
     )
-    turned = np.einsum(
-        "aij,bij->ab",
-        *(
-            np.stack([pose.rotation for pose in poses])
-            for poses in (first_from_ones, first_from_others)
-        ),
-    )
+    turned = np.einsum("aij,bij->ab", rotations, other_rotations)
     apart = np.linalg.norm(places[:, None] - other_places, axis=2)
     nearest = np.argsort(
         np.where(turned > _MIN_ROTATION_TRACE, apart, np.inf), axis=None, kind="stable"
@@ -334,9 +278,9 @@ def _find_covisible_features(
     source: KeyFrame, target: KeyFrame, target_from_source: Rigid3
 ) -> Int[np.ndarray, " n"]:
     """Return the features of `source` in view of `target` from a similar direction and distance."""
-    # Maximum angle between two directions from which a point looks the same, degrees.
-    max_angle_deg = 15.0
-    max_ratio = 1.3  # maximum ratio of two distances from which a point looks the same
+    # Maximum angle (degrees) between two directions, and maximum ratio of two distances, from which
+    # a point looks the same.
+    max_angle_deg, max_ratio = 15.0, 1.3
     place = source.place
     valid = np.flatnonzero(place.points.valid)
     points = target_from_source.apply(place.points.points_cam[valid])

@@ -27,7 +27,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import StageClock
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import to_grey
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.motion import MotionState, update_motion

@@ -28,7 +28,7 @@ from topoloc.localization.walls.upright_pose import estimate_upright_pose
 from topoloc.mapping.build import Progress
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import DepthImage, StereoFrame
-from topoloc.recordings.memory_sequence import MemorySequence
+from topoloc.recordings.frame_checks import MemorySequence
 from topoloc.slam.bundle.block_kernels import solve_factored
 from topoloc.tracking.tracker import Tracker
 

@@ -13,7 +13,7 @@ from built_corridor import WIDE, WalkAhead, back, corridor
 from tiny_world import render, smooth_texture
 from topoloc.errors import RecordingError
 from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.memory_sequence import MemorySequence
+from topoloc.recordings.frame_checks import MemorySequence
 from topoloc_training.net.side_pairs import find_side_pairs
 from topoloc_training.net.slants import slanted
 

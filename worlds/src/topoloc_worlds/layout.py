@@ -23,8 +23,7 @@ from jaxtyping import Float32, UInt16
 from topoloc.errors import TopolocError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.atomic import write_bytes, write_text
-from topoloc.recordings.frame import Image
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import Image, to_grey
 from topoloc.recordings.trajectory import Trajectory
 from topoloc_worlds.shots import Shot
 

@@ -19,10 +19,9 @@ from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.recording import Recording, RightImages
-from topoloc.recordings.stereo_yaml import kalibr_camera
+from topoloc.recordings.stereo_yaml import kalibr_camera, read_yaml, require_numbers
 from topoloc.recordings.text_files import read_file_list
 from topoloc.recordings.trajectory import read_asl_poses
-from topoloc.recordings.yaml_numbers import read_yaml, require_numbers
 
 EXPECTED_FILES = "mav0/ with cam0/data.csv, or cam0/data.csv"
 MAX_TRUTH_GAP = 0.05
@@ -39,7 +38,12 @@ class Sensor:
 
 def can_open(path: Path) -> bool:
     """Return whether this folder is a mav0 or contains one."""
-    return any((path / below / "cam0" / "data.csv").is_file() for below in ("mav0", ""))
+    return _find_mav(path) is not None
+
+
+def _find_mav(path: Path) -> Path | None:
+    folders = (path / "mav0", path)
+    return next((folder for folder in folders if (folder / "cam0" / "data.csv").is_file()), None)
 
 
 def open_euroc(path: Path) -> Recording:
@@ -51,10 +55,7 @@ def open_euroc(path: Path) -> Recording:
         CalibrationError: a sensor.yaml is missing or not usable.
         TrajectoryError: the ground truth is malformed, or matches no frame.
     """
-    mav = next(
-        (folder for folder in (path / "mav0", path) if (folder / "cam0" / "data.csv").is_file()),
-        None,
-    )
+    mav = _find_mav(path)
     if mav is None:
         raise RecordingError(f"{path}: not an EuRoC recording, which has {EXPECTED_FILES}")
     left = _read_csv(mav / "cam0" / "data.csv")
@@ -72,9 +73,8 @@ def open_euroc(path: Path) -> Recording:
         right = RightImages([right_by_time[time] for time in t_ns], _rig(mav, sensor, right_sensor))
     names = [left[time].relative_to(path).as_posix() for time in t_ns]
     name = mav.resolve().parent.name if mav.resolve().name == "mav0" else path.resolve().name
-    return Recording(
-        name, path, names, t_ns, _read_ground_truth(mav, t_ns, sensor), sensor.camera, right
-    )
+    poses = _read_ground_truth(mav, t_ns, sensor)
+    return Recording(name, path, names, t_ns, poses, sensor.camera, right)
 
 
 def read_sensor(path: Path) -> Sensor:
@@ -85,20 +85,17 @@ def read_sensor(path: Path) -> Sensor:
     """
     text = read_yaml(path)
     camera = kalibr_camera(path, text)
+    mounting = np.array(require_numbers(path, text, 16, "T_BS")).reshape(4, 4)
     try:
-        return Sensor(
-            camera,
-            Rigid3.from_matrix(np.array(require_numbers(path, text, 16, "T_BS")).reshape(4, 4)),
-        )
+        return Sensor(camera, Rigid3.from_matrix(mounting))
     except TrajectoryError as error:
         raise CalibrationError(f"{path}: {error}") from None
 
 
 def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:
+    right_from_left = right.body_from_cam.inverse() @ left.body_from_cam
     try:
-        return StereoRig(
-            left.camera, right.camera, right.body_from_cam.inverse() @ left.body_from_cam
-        )
+        return StereoRig(left.camera, right.camera, right_from_left)
     except CalibrationError as error:
         raise CalibrationError(
             f"{mav / 'cam1' / 'sensor.yaml'}: with that of cam0, {error}"
@@ -112,19 +109,14 @@ def _read_csv(path: Path) -> dict[int, Path]:
 
 
 def _read_ground_truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:
-    path = next(
-        (mav / name / "data.csv" for name in _TRUTH_FOLDERS if (mav / name / "data.csv").is_file()),
-        None,
-    )
+    paths = (mav / name / "data.csv" for name in _TRUTH_FOLDERS)
+    path = next((path for path in paths if path.is_file()), None)
     if path is None:
         return [None] * len(t_ns)
     poses = read_asl_poses(path).interpolate(t_ns, MAX_TRUTH_GAP)
     if all(world_from_body is None for world_from_body in poses):
         raise TrajectoryError(f"{path}: none of the {len(t_ns)} frames has a pose")
-    return [
-        world_from_body @ sensor.body_from_cam if world_from_body is not None else None
-        for world_from_body in poses
-    ]
+    return [pose and pose @ sensor.body_from_cam for pose in poses]
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_euroc)

@@ -21,16 +21,15 @@ from topoloc.recordings.calibration import (
     parse_calibration,
 )
 from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.image_io import IMAGE_SUFFIXES
-from topoloc.recordings.recording import (
-    DepthImages,
-    Recording,
-    RightImages,
+from topoloc.recordings.format import (
+    RecordingFormat,
     check_pairs,
     list_images,
+    read_ground_truth,
+    read_times,
 )
-from topoloc.recordings.trajectory import read_ground_truth, read_times
+from topoloc.recordings.image_io import IMAGE_SUFFIXES
+from topoloc.recordings.recording import DepthImages, Recording, RightImages
 
 EXPECTED_FILES = "pictures, or left/ and right/, or rgb/ and depth/ with camera.json"
 _STEREO = (("left", "right"), ("image_0", "image_1"), ("cam0", "cam1"))
@@ -67,70 +66,53 @@ def open_folder(path: Path, calibration: CalibrationForSize | None = None) -> Re
         camera = calibration(*first_image_size([path])).camera if calibration else None
         return Recording(path.name, path.parent, [path.name], [0], [None], camera)
     calibration = complete_calibration(calibration, path) if calibration else find_calibration(path)
-    for left, right in _STEREO:
-        if (path / left).is_dir() and (path / right).is_dir():
-            return _open_stereo(path, left, right, calibration)
-    for colour, depth in _RGBD:
-        if (path / colour).is_dir() and (path / depth).is_dir():
-            return _open_rgbd(path, colour, depth, calibration)
+    for name, other in (*_STEREO, *_RGBD):
+        if (path / name).is_dir() and (path / other).is_dir():
+            return _open_pairs(path, name, other, calibration)
     folder = next((path / name for name in ("", *_MONO) if _has_images(path / name)), None)
     if folder is None:
         raise RecordingError(f"{path}: no pictures in this folder")
     images = list_images(folder)
-    return _make_recording(path, images, _calibration_for_images(calibration, images))
+    return _make_recording(path, images, calibration and calibration(*first_image_size(images)))
 
 
-def _open_stereo(
-    path: Path, left: str, right: str, calibration: CalibrationForSize | None
+def _open_pairs(
+    path: Path, name: str, other: str, calibration: CalibrationForSize | None
 ) -> Recording:
-    left_paths, right_paths = list_images(path / left), list_images(path / right)
-    camera_calibration = _calibration_for_images(calibration, left_paths)
-    if camera_calibration is None or camera_calibration.rig is None:
-        raise CalibrationError(
-            f"{path / FILE_NAME}: a stereo pair ({left}/, {right}/) needs this file, with a"
-            ' "baseline" in metres or two cameras, or the YAML of OpenCV or Kalibr'
+    """Open the images of two folders, the second one with right or depth images."""
+    images, others = list_images(path / name), list_images(path / other)
+    found = calibration and calibration(*first_image_size(images))
+    is_stereo, right, depth = (name, other) in _STEREO, None, None
+    if is_stereo and found and found.rig:
+        right = RightImages(others, found.rig)
+    elif not is_stereo and found and found.depth_factor:
+        depth = DepthImages(others, found.depth_factor, found.camera, Rigid3.identity())
+    else:
+        need = (
+            '"baseline" in metres or two cameras, or the YAML of OpenCV or Kalibr'
+            if is_stereo
+            else '"depth_factor" in units a metre'
         )
-    check_pairs(left_paths, right_paths)
-    return _make_recording(
-        path, left_paths, camera_calibration, right=RightImages(right_paths, camera_calibration.rig)
-    )
-
-
-def _open_rgbd(
-    path: Path, colour: str, depth: str, calibration: CalibrationForSize | None
-) -> Recording:
-    colour_paths, depth_paths = list_images(path / colour), list_images(path / depth)
-    camera_calibration = _calibration_for_images(calibration, colour_paths)
-    if camera_calibration is None or camera_calibration.depth_factor is None:
+        kind = "a stereo pair" if is_stereo else "RGB-D"
         raise CalibrationError(
-            f"{path / FILE_NAME}: RGB-D ({colour}/, {depth}/) needs this file, with a"
-            ' "depth_factor" in units a metre'
+            f"{path / FILE_NAME}: {kind} ({name}/, {other}/) needs this file, with a {need}"
         )
-    check_pairs(colour_paths, depth_paths)
-    images = DepthImages(
-        depth_paths, camera_calibration.depth_factor, camera_calibration.camera, Rigid3.identity()
-    )
-    return _make_recording(path, colour_paths, camera_calibration, depth=images)
+    check_pairs(images, others)
+    return _make_recording(path, images, found, right, depth)
 
 
 def _make_recording(
     path: Path,
     images: list[Path],
-    camera_calibration: CameraCalibration | None,
+    calibration: CameraCalibration | None,
     right: RightImages | None = None,
     depth: DepthImages | None = None,
 ) -> Recording:
     t_ns = read_times(path / "times.txt", len(images))
     poses = read_ground_truth(path / "truth.tum", [path / "poses.txt"], t_ns)
     names = [file.relative_to(path).as_posix() for file in images]
-    camera = camera_calibration.camera if camera_calibration else None
+    camera = calibration and calibration.camera
     return Recording(path.resolve().name, path, names, t_ns, poses, camera, right, depth)
-
-
-def _calibration_for_images(
-    calibration: CalibrationForSize | None, images: list[Path]
-) -> CameraCalibration | None:
-    return None if calibration is None else calibration(*first_image_size(images))
 
 
 def _has_images(folder: Path) -> bool:

@@ -7,6 +7,7 @@ KITTI's own ``poses/<name>.txt`` beside ``sequences/``.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,16 @@ from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.format import (
+    RecordingFormat,
+    check_pairs,
+    list_images,
+    read_ground_truth,
+    read_times,
+)
 from topoloc.recordings.image_io import image_size
-from topoloc.recordings.recording import Recording, RightImages, check_pairs, list_images
+from topoloc.recordings.recording import Recording, RightImages
 from topoloc.recordings.text_files import read_text
-from topoloc.recordings.trajectory import read_ground_truth, read_times
 
 EXPECTED_FILES = "image_0/ and image_1/ (or image_2/ and image_3/) with calib.txt"
 _PAIRS = ((0, 1), (2, 3))
@@ -49,15 +55,24 @@ def open_kitti(path: Path) -> Recording:
     left = list_images(path / f"image_{pair[0]}")
     projections = read_calib(path / "calib.txt")
     size = image_size(left[0])
-    camera = _camera(path, projections, pair[0], size)
+    camera, shift = _camera(path, projections, pair[0], size)
     right = None
     if (path / f"image_{pair[1]}").is_dir():
         right_paths = list_images(path / f"image_{pair[1]}")
         check_pairs(left, right_paths)
-        right = RightImages(right_paths, _rig(path, projections, pair, size))
+        right_camera, right_shift = _camera(path, projections, pair[1], size)
+        # P of the colour cameras has some millimetres in y and z, too. The images are still
+        # rectified to equal rows.
+        baseline = shift[0] - right_shift[0]
+        if baseline <= 0:
+            raise CalibrationError(
+                f"{path / 'calib.txt'}: P{pair[1]} puts the right camera {-baseline:g} m to the"
+                " left of the left one"
+            )
+        rig = replace(StereoRig.rectified(camera, baseline), right=right_camera)
+        right = RightImages(right_paths, rig)
     t_ns = read_times(path / "times.txt", len(left))
-    cam0_from_cam = Rigid3(np.eye(3), -_cam_from_cam0(projections[f"P{pair[0]}"]))
-    poses = _read_ground_truth(path, t_ns, cam0_from_cam)
+    poses = _read_ground_truth(path, t_ns, Rigid3(np.eye(3), -shift))
     names = [f"{file.parent.name}/{file.name}" for file in left]
     return Recording(path.resolve().name, path, names, t_ns, poses, camera, right)
 
@@ -69,12 +84,9 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
         CalibrationError: the file is missing, or a P line is not a projection matrix of 12 finite
             numbers.
     """
-    lines = read_text(
-        path,
-        CalibrationError,
-        "no calibration here; a camera.json with a baseline beside it would do as well",
-    ).splitlines()
+    missing = "no calibration here; a camera.json with a baseline beside it would do as well"
     projections = {}
+    lines = read_text(path, CalibrationError, missing).splitlines()
     for number, line in enumerate(lines, start=1):
         key, _, values = line.partition(":")
         if not (key.startswith("P") and key[1:].isdigit()):
@@ -83,13 +95,8 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
             matrix = np.array([float(value) for value in values.split()]).reshape(3, 4)
         except ValueError:
             raise CalibrationError(f"{path}, line {number}: {key} is not 12 numbers") from None
-        is_finite = np.all(np.isfinite(matrix))
-        if (
-            not is_finite
-            or matrix[0, 0] <= 0
-            or matrix[1, 1] <= 0
-            or np.linalg.matrix_rank(matrix[:, :3]) < 3
-        ):
+        is_valid = np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0
+        if not is_valid or np.linalg.matrix_rank(matrix[:, :3]) < 3:
             raise CalibrationError(f"{path}, line {number}: {key} is not a projection matrix")
         projections[key] = matrix
     return projections
@@ -97,34 +104,13 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
 
 def _camera(
     path: Path, projections: dict[str, np.ndarray], number: int, size: tuple[int, int]
-) -> Camera:
+) -> tuple[Camera, Float[np.ndarray, "3"]]:
+    """Return the camera and the translation t of P = K [I | t]."""
     if f"P{number}" not in projections:
         raise CalibrationError(f"{path / 'calib.txt'}: no line P{number} for image_{number}")
     p = projections[f"P{number}"]
-    return Camera.pinhole(*size, p[0, 0], p[1, 1], p[0, 2], p[1, 2])
-
-
-def _rig(
-    path: Path, projections: dict[str, np.ndarray], pair: tuple[int, int], size: tuple[int, int]
-) -> StereoRig:
-    left, right = (_camera(path, projections, number, size) for number in pair)
-    # P of the colour cameras has some millimetres in y and z, too. The images are still rectified
-    # to equal rows.
-    shift = (
-        _cam_from_cam0(projections[f"P{pair[1]}"])[0]
-        - _cam_from_cam0(projections[f"P{pair[0]}"])[0]
-    )
-    if shift >= 0:
-        raise CalibrationError(
-            f"{path / 'calib.txt'}: P{pair[1]} puts the right camera {shift:g} m to the left of the"
-            " left one"
-        )
-    return StereoRig(left, right, Rigid3(np.eye(3), np.array([shift, 0.0, 0.0])))
-
-
-def _cam_from_cam0(projection: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3"]:
-    """Return the translation t of P = K [I | t]."""
-    return np.linalg.solve(projection[:, :3], projection[:, 3])
+    camera = Camera.pinhole(*size, p[0, 0], p[1, 1], p[0, 2], p[1, 2])
+    return camera, np.linalg.solve(p[:, :3], p[:, 3])
 
 
 def _read_ground_truth(path: Path, t_ns: list[int], cam0_from_cam: Rigid3) -> list[Rigid3 | None]:

@@ -15,8 +15,8 @@ import numpy as np
 from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.recording import DepthImages, Recording, list_images
+from topoloc.recordings.format import RecordingFormat, list_images
+from topoloc.recordings.recording import DepthImages, Recording
 
 EXPECTED_FILES = "frame-*.color.png or .jpg with .pose.txt, or one seq-* folder of these"
 DEPTH_CAMERA = Camera.pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
@@ -30,9 +30,7 @@ RATE_HZ = 30
 
 def can_open(path: Path) -> bool:
     """Return whether this folder is a sequence of 7-Scenes, or a scene with sequences."""
-    return path.is_dir() and (
-        _is_run(path) or any(_is_run(folder) for folder in path.glob("seq-*"))
-    )
+    return path.is_dir() and any(map(_is_run, (path, *path.glob("seq-*"))))
 
 
 def open_seven_scenes(path: Path) -> Recording:
@@ -58,20 +56,14 @@ def open_seven_scenes(path: Path) -> Recording:
     if stems_with_depth:
         depth_paths = [run / f"{stem}.depth.png" for stem in stems]
         depth = DepthImages(depth_paths, UNITS_PER_METRE, DEPTH_CAMERA, COLOUR_FROM_DEPTH)
-    depth_from_colour = COLOUR_FROM_DEPTH.inverse()
     poses = [
-        (
-            _read_pose(run / f"{stem}.pose.txt") @ depth_from_colour
-            if f"{stem}.pose.txt" in files
-            else None
-        )
+        _read_pose(run / f"{stem}.pose.txt") if f"{stem}.pose.txt" in files else None
         for stem in stems
     ]
     t_ns = [_frame_number(run / stem) * 1_000_000_000 // RATE_HZ for stem in stems]
     name = f"{run.resolve().parent.name}/{run.resolve().name}"
-    return Recording(
-        name, run, [file.name for file in colour], t_ns, poses, COLOUR_CAMERA, depth=depth
-    )
+    names = [file.name for file in colour]
+    return Recording(name, run, names, t_ns, poses, COLOUR_CAMERA, depth=depth)
 
 
 def _is_run(path: Path) -> bool:
@@ -81,7 +73,7 @@ def _is_run(path: Path) -> bool:
 def _find_run(path: Path) -> Path:
     if _is_run(path):
         return path
-    runs = sorted(folder for folder in path.glob("seq-*") if _is_run(folder))
+    runs = sorted(filter(_is_run, path.glob("seq-*")))
     if not runs:
         raise RecordingError(f"{path}: not a run of 7-Scenes, which has {EXPECTED_FILES}")
     if len(runs) > 1:
@@ -99,11 +91,10 @@ def _frame_number(path: Path) -> int:
 
 
 def _read_pose(path: Path) -> Rigid3:
-    """Read world_from_depth of one frame."""
+    """Read world_from_cam of the colour camera of one frame."""
     try:
-        return Rigid3.from_matrix(
-            np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(4, 4)
-        )
+        numbers = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64)
+        return Rigid3.from_matrix(numbers.reshape(4, 4)) @ COLOUR_FROM_DEPTH.inverse()
     except ValueError:
         raise TrajectoryError(f"{path}: not a matrix of 4x4 numbers") from None
     except TrajectoryError as error:

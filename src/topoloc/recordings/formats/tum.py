@@ -17,28 +17,17 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import CalibrationForSize, first_image_size
 from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration, read_camera_json
-from topoloc.recordings.format import RecordingFormat
-from topoloc.recordings.recording import DepthImages, Recording, find_nearest_idx
+from topoloc.recordings.format import RecordingFormat, find_nearest_idx, read_ground_truth
+from topoloc.recordings.recording import DepthImages, Recording
 from topoloc.recordings.text_files import read_file_list
-from topoloc.recordings.trajectory import read_ground_truth
 
 EXPECTED_FILES = "rgb.txt and depth.txt"
 DEPTH_FACTOR = 5000.0
 MAX_DEPTH_DELAY = 0.02
 _FREIBURG = {
-    "1": Camera(
-        "FULL_OPENCV",
-        640,
-        480,
-        (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633, 0.0, 0.0, 0.0),
-    ),
-    "2": Camera(
-        "FULL_OPENCV",
-        640,
-        480,
-        (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0.0, 0.0, 0.0),
-    ),
-    "3": Camera.pinhole(640, 480, 535.4, 539.2, 320.1, 247.6),
+    "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633, 0.0, 0.0, 0.0),
+    "2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0.0, 0.0, 0.0),
+    "3": (535.4, 539.2, 320.1, 247.6),
 }
 
 
@@ -60,11 +49,10 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
         TrajectoryError: the ground truth is malformed or matches no frame.
     """
     colour_times, colour = read_file_list(path / "rgb.txt", RecordingError)
-    camera_calibration = (
-        calibration(*first_image_size([path / name for name in colour]))
-        if calibration
-        else _calibration(path)
-    )
+    if calibration:
+        found = calibration(*first_image_size([path / name for name in colour]))
+    else:
+        found = _calibration(path)
     depth_times, depth = read_file_list(path / "depth.txt", RecordingError)
     nearest = find_nearest_idx(np.array(colour_times), np.array(depth_times))
     kept = [
@@ -79,21 +67,10 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
         )
     t_ns = [colour_times[row] for row in kept]
     poses = read_ground_truth(path / "groundtruth.txt", [], t_ns)
-    images = DepthImages(
-        [path / depth[nearest[row]] for row in kept],
-        camera_calibration.depth_factor or DEPTH_FACTOR,
-        camera_calibration.camera,
-        Rigid3.identity(),
-    )
-    return Recording(
-        path.resolve().name,
-        path,
-        [colour[row] for row in kept],
-        t_ns,
-        poses,
-        camera_calibration.camera,
-        depth=images,
-    )
+    paths, units = [path / depth[nearest[row]] for row in kept], found.depth_factor or DEPTH_FACTOR
+    images = DepthImages(paths, units, found.camera, Rigid3.identity())
+    names = [colour[row] for row in kept]
+    return Recording(path.resolve().name, path, names, t_ns, poses, found.camera, depth=images)
 
 
 def _calibration(path: Path) -> CameraCalibration:
@@ -105,7 +82,9 @@ def _calibration(path: Path) -> CameraCalibration:
             f"{path / FILE_NAME}: no calibration here, and the folder's name does not say"
             " freiburg1, 2 or 3"
         )
-    return CameraCalibration(_FREIBURG[number[1]])
+    params = _FREIBURG[number[1]]
+    model = "PINHOLE" if len(params) == 4 else "FULL_OPENCV"
+    return CameraCalibration(Camera(model, 640, 480, params))
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_tum, ("calibration",))

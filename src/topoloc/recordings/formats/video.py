@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,8 @@ from topoloc.errors import CalibrationError, RecordingError, UnreadableImageErro
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
-from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.format import RecordingFormat, read_ground_truth
 from topoloc.recordings.frame import Image, StereoFrame
-from topoloc.recordings.trajectory import read_ground_truth
 
 # Suppress FFmpeg's messages about broken files on stderr, because an error reports them. FFmpeg
 # reads the variable once per process.
@@ -114,8 +114,8 @@ class Video:
             if not grabbed:
                 self._reader = None
                 raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
-        decoded, picture = reader.capture.retrieve()
-        if not decoded or picture is None:
+        _, picture = reader.capture.retrieve()
+        if picture is None:
             raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
         height, width = picture.shape[:2]
         if (width, height) != self.size:
@@ -152,8 +152,8 @@ def _read_frame_size(path: Path) -> tuple[tuple[int, int], float]:
     """Return width and height of the first frame in pixels, and the frame rate of the container.
     Raises RecordingError."""
     capture = _open_capture(path)
-    decoded, first = capture.read()
-    if not decoded or first is None:
+    _, first = capture.read()
+    if first is None:
         raise RecordingError(f"{path}: no frame of this video can be decoded")
     return (first.shape[1], first.shape[0]), capture.get(cv2.CAP_PROP_FPS)
 
@@ -177,11 +177,11 @@ def _read_times(path: Path, rate: float) -> list[int]:
         if not rate > 0:
             raise RecordingError(f"{path}: neither its frames have times, nor does it name a rate")
         return [round(index * 1e9 / rate) for index in range(len(t_ns))]
-    for index in range(1, len(t_ns)):
-        if t_ns[index] <= t_ns[index - 1]:
+    for index, (before, after) in enumerate(pairwise(t_ns), start=1):
+        if after <= before:
             raise RecordingError(
-                f"{path}, frame {index}: at {t_ns[index] / 1e9:.3f} s, but the frame before is at"
-                f" {t_ns[index - 1] / 1e9:.3f} s"
+                f"{path}, frame {index}: at {after / 1e9:.3f} s, but the frame before is at"
+                f" {before / 1e9:.3f} s"
             )
     return t_ns
 
@@ -189,9 +189,8 @@ def _read_times(path: Path, rate: float) -> list[int]:
 @contextmanager
 def silence_opencv() -> Iterator[None]:
     """Suppress OpenCV's messages on stderr, because an error reports the problem."""
-    logging: Any = getattr(
-        cv2.utils, "logging", cv2
-    )  # OpenCV 4 has these functions in the module cv2
+    # OpenCV 4 has these functions in the module cv2.
+    logging: Any = getattr(cv2.utils, "logging", cv2)
     with _LOG_LEVEL_LOCK:
         level = logging.getLogLevel()
         logging.setLogLevel(0)

@@ -1,7 +1,5 @@
-"""Numba kernels of `block_system.py`: Cholesky factorisation of a matrix of 6x6 blocks, and
-solution."""
-
-from __future__ import annotations
+"""Numba kernels of `block_system.py`: Cholesky factorisation of a matrix of 6x6 blocks, solution,
+and the pairs of key frames that its blocks connect."""
 
 import numpy as np
 
@@ -97,3 +95,29 @@ def solve_factored(starts, rows, blocks, vector):
                 for s in range(6):
                     vector[p, s] -= blocks[k, r, s] * vector[rows[k], r]
         _solve_upper(blocks[starts[p]], vector[p])
+
+
+@kernel(**_OPTIONS)
+def count_covisible_pairs(starts, keyframe_idx, slots):
+    """Count the pairs of free key frames that `find_covisible_pairs` writes, including
+    repetitions."""
+    total = 0
+    for n in range(len(starts) - 1):
+        free = 0
+        for k in range(starts[n], starts[n + 1]):
+            free += slots[keyframe_idx[k]] >= 0
+        total += free * (free - 1) // 2
+    return total
+
+
+@kernel(**_OPTIONS)
+def find_covisible_pairs(starts, keyframe_idx, slots, num_free, keys):
+    """Write i * num_free + j to `keys` for each pair of slots i, j and each point that both see."""
+    at = 0
+    for n in range(len(starts) - 1):
+        for k in range(starts[n], starts[n + 1]):
+            for other in range(starts[n], k):
+                i, j = slots[keyframe_idx[k]], slots[keyframe_idx[other]]
+                if i >= 0 and j >= 0:
+                    keys[at] = max(i, j) * num_free + min(i, j)
+                    at += 1

@@ -53,17 +53,10 @@ class BlockPattern:
                 tied[other] -= {i, other}
                 heappush(waiting, (len(tied[other]), other))
         starts = np.cumsum([0, *(1 + len(column) for column in columns)])
-        rows = [
-            np.sort(elimination_idx[[*column]]) if column else np.zeros(0, np.int64)
-            for column in columns
-        ]
-        return BlockPattern(
-            elimination_idx,
-            starts,
-            np.concatenate([np.r_[p, r] for p, r in enumerate(rows)])
-            if rows
-            else np.zeros(0, np.int64),
-        )
+        rows = [np.sort(elimination_idx[np.array([*column], np.int64)]) for column in columns]
+        nothing = np.zeros(0, np.int64)
+        of_columns = [np.r_[p, r] for p, r in enumerate(rows)]
+        return BlockPattern(elimination_idx, starts, np.concatenate([nothing, *of_columns]))
 
     def empty(self) -> Float[np.ndarray, "b 6 6"]:
         """Return zero blocks for a matrix of this pattern."""
@@ -79,10 +72,9 @@ class BlockPattern:
 
         If i is its column, i is the row in the upper half.
         """
-        low, high = sorted((int(self.elimination_idx[i]), int(self.elimination_idx[j])))
-        return int(find_block_idx(self.starts, self.rows, high, low)), bool(
-            low == self.elimination_idx[i]
-        )
+        own, other = int(self.elimination_idx[i]), int(self.elimination_idx[j])
+        block_idx = find_block_idx(self.starts, self.rows, max(own, other), min(own, other))
+        return int(block_idx), own <= other
 
 
 def solve_blocks(

@@ -16,14 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.slam.bundle.block_kernels import count_covisible_pairs, find_covisible_pairs
 from topoloc.slam.bundle.block_system import BlockPattern, solve_blocks
 from topoloc.slam.bundle.bundle_kernels import (
-    count_covisible_pairs,
     eliminate_points,
-    find_covisible_pairs,
     robust_cost,
     squared_residuals,
-    update_points,
 )
 from topoloc.slam.bundle.observation_chunks import ObservationChunk, ObservationChunks
 from topoloc.slam.keyframes import DisparityBias, KeyFrame, Landmarks
@@ -81,13 +79,8 @@ class _Problem:
             bias.information * (state.cameras[k, 5] - bias.value_px) ** 2
             for bias, k in self.find_bias_keyframes()
         )
-        return float(
-            of_biases
-            + sum(
-                scale_squared * np.log1p(square / scale_squared)
-                for *_, square in self.compute_prior_residuals(state)
-            )
-        )
+        squares = [square for *_, square in self.compute_prior_residuals(state)]
+        return float(of_biases + sum(scale_squared * np.log1p(k / scale_squared) for k in squares))
 
     def compute_prior_residuals(
         self, state: _State
@@ -95,10 +88,8 @@ class _Problem:
         """Generate the key frame, prior, pose error and squared error (in sigma) of each pose
         prior."""
         for k, pose_prior in self.pose_priors:
-            off = (
-                Rigid3(state.rotations[k], state.translations[k])
-                @ pose_prior.cam_from_world.inverse()
-            ).log()
+            pose = Rigid3(state.rotations[k], state.translations[k])
+            off = (pose @ pose_prior.cam_from_world.inverse()).log()
             yield k, pose_prior, off, float(off @ pose_prior.information @ off)
 
     def find_bias_keyframes(self) -> list[tuple[DisparityBias, int]]:
@@ -128,9 +119,7 @@ def adjust_bundle(
         cauchy_scale: scale of Cauchy's loss. Larger residuals have less and less weight.
         chunk_size: approximate number of observations that are processed at once.
     """
-    # Squared residual, summed over x, y and disparity, above which an observation is
-    # deactivated.
-    outlier_square = 25.0
+    outlier_square = 25.0  # squared residual above which an observation is deactivated
     if not fixed and not pose_priors:
         free, fixed = free[1:], free[:1]
     if not free:
@@ -141,16 +130,13 @@ def adjust_bundle(
     if chunks.num_observations == 0:
         return
     number_of = {id(keyframe): k for k, keyframe in enumerate(keyframes)}
-    problem = _build_problem(
-        chunks,
-        keyframes,
-        len(free),
-        [(number_of[id(pose_prior.keyframe)], pose_prior) for pose_prior in pose_priors],
-    )
+    priors = [(number_of[id(pose_prior.keyframe)], pose_prior) for pose_prior in pose_priors]
+    problem = _build_problem(chunks, keyframes, len(free), priors)
+    own = [(k.stereo.camera, k.stereo.bf, k.bias.value_px) for k in keyframes]
     state = _State(
         rotations=np.array([k.cam_from_world.rotation for k in keyframes]),
         translations=np.array([k.cam_from_world.translation for k in keyframes]),
-        cameras=np.array([_to_camera_row(k) for k in keyframes]),
+        cameras=np.array([(c.fx, c.fy, c.cx, c.cy, bf, bias) for c, bf, bias in own]),
         points=landmarks.positions[ids],
     )
     state = _optimize(problem, state, max_steps, min_decrease, cauchy_scale)
@@ -161,18 +147,12 @@ def adjust_bundle(
         bias.value_px = float(state.cameras[k, 5])
     for chunk in chunks:
         wrong = np.flatnonzero(state.squares(chunk) > outlier_square)
-        for k, row in zip(
-            chunk.keyframe_idx[wrong].tolist(), chunk.sources[wrong].tolist(), strict=True
-        ):
+        for k, row in zip(chunk.keyframe_idx[wrong], chunk.sources[wrong], strict=True):
             keyframes[k].observations.active[row] = False
 
 
 def adjust_window(
-    keyframes: list[KeyFrame],
-    landmarks: Landmarks,
-    num_free: int,
-    num_fixed: int,
-    max_steps: int,
+    keyframes: list[KeyFrame], landmarks: Landmarks, num_free: int, num_fixed: int, max_steps: int
 ) -> None:
     """Adjust the last `num_free` key frames, with up to `num_fixed` fixed ones before them.
 
@@ -188,19 +168,13 @@ def _collect_landmark_ids(keyframes: Sequence[KeyFrame]) -> Int[np.ndarray, " n"
 
     It never concatenates all observations of a long trajectory.
     """
-    of_each = [k.observations.landmark_ids[k.observations.active] for k in keyframes]
-    first = min((int(ids.min()) for ids in of_each if len(ids)), default=0)
-    is_seen = np.zeros(
-        max((int(ids.max()) + 1 - first for ids in of_each if len(ids)), default=0), np.bool_
-    )
+    of_each = [ids for k in keyframes if len(ids := k.observations.active_ids)]
+    first = min((int(ids.min()) for ids in of_each), default=0)
+    last = max((int(ids.max()) for ids in of_each), default=-1)
+    is_seen = np.zeros(last + 1 - first, np.bool_)
     for ids in of_each:
         is_seen[ids - first] = True
     return np.flatnonzero(is_seen) + first
-
-
-def _to_camera_row(keyframe: KeyFrame) -> list[float]:
-    camera = keyframe.stereo.camera
-    return [camera.fx, camera.fy, camera.cx, camera.cy, keyframe.stereo.bf, keyframe.bias.value_px]
 
 
 def _build_problem(
@@ -235,7 +209,7 @@ def _optimize(
     damping = 1e-4
     for _ in range(max_steps):
         steps, bias_steps = _solve_steps(problem, state, scale, damping)
-        moved, new_cost = _apply_steps(problem, state, (steps, bias_steps), scale, damping)
+        moved, new_cost = _apply_steps(problem, state, steps, bias_steps, scale, damping)
         if not new_cost < cost:
             damping *= 10.0
             continue
@@ -256,11 +230,12 @@ def _solve_steps(
     p, pattern = problem, problem.pattern
     blocks, vector = pattern.empty(), np.zeros((len(pattern.elimination_idx), 6))
     border, corner = np.zeros((len(p.biases), *vector.shape)), np.zeros((len(p.biases), 2))
+    unused = np.empty(0), np.empty((0, 3))
     for chunk in p.chunks:
         eliminate_points(
             state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[chunk.first : chunk.last],  # noqa: E501
             chunk.starts, chunk.keyframe_idx, chunk.measured, chunk.weights, scale, damping,
-            pattern.starts, pattern.rows, blocks, vector, border, corner,
+            pattern.starts, pattern.rows, blocks, vector, border, corner, *unused,
         )  # fmt: skip
     for k, pose_prior, off, square in p.compute_prior_residuals(state):
         pull = pose_prior.information / (1.0 + square / scale)
@@ -273,10 +248,7 @@ def _solve_steps(
     blocks[pattern.diagonal[:, None], along, along] += 1e-9
     own = np.diag((1.0 + damping) * corner[:, 0] + 1e-9)
     solved = solve_blocks(pattern, blocks, np.concatenate([vector[None], border]))
-    flat, of_border = (
-        border.reshape(len(border), vector.size),
-        solved[1:].reshape(len(border), vector.size),
-    )
+    flat, of_border = (k.reshape(len(border), vector.size) for k in (border, solved[1:]))
     bias_steps = np.linalg.solve(own - flat @ of_border.T, corner[:, 1] - flat @ solved[0].ravel())
     return solved[0] - np.tensordot(bias_steps, solved[1:], 1), bias_steps
 
@@ -284,30 +256,28 @@ def _solve_steps(
 def _apply_steps(
     problem: _Problem,
     state: _State,
-    steps: tuple[Float[np.ndarray, "f 6"], Float[np.ndarray, " c"]],
+    of_poses: Float[np.ndarray, "f 6"],
+    of_biases: Float[np.ndarray, " c"],
     scale: float,
     damping: float,
 ) -> tuple[_State, float]:
     """Return the state after these steps, and its cost."""
-    p, (of_poses, of_biases) = problem, steps
-    rotations, translations, cameras = (
-        state.rotations.copy(),
-        state.translations.copy(),
-        state.cameras.copy(),
-    )
+    p, points = problem, np.empty_like(state.points)
+    rotations, translations = state.rotations.copy(), state.translations.copy()
+    cameras = state.cameras.copy()
     for k in np.flatnonzero(p.slots >= 0).tolist():
         new = Rigid3.exp(of_poses[p.slots[k]]) @ Rigid3(rotations[k], translations[k])
         rotations[k], translations[k] = new.rotation, new.translation
     cameras[p.columns >= 0, 5] += of_biases[p.columns[p.columns >= 0]]
-    moved = _State(rotations, translations, cameras, np.empty_like(state.points))
+    moved = _State(rotations, translations, cameras, points)
     cost = p.prior_cost(moved, scale)
-    nothing = np.empty((0, 6, 6)), np.empty((0, *of_poses.shape)), np.empty((0, 2))
+    unused = np.empty((0, 6, 6)), of_poses, np.empty((0, *of_poses.shape)), np.empty((0, 2))
     for chunk in p.chunks:
         rows = slice(chunk.first, chunk.last)
-        update_points(
+        eliminate_points(
             state.rotations, state.translations, state.cameras, p.slots, p.columns, state.points[rows],  # noqa: E501
             chunk.starts, chunk.keyframe_idx, chunk.measured, chunk.weights, scale, damping,
-            p.pattern.starts, *nothing, of_poses, of_biases, moved.points[rows],
+            p.pattern.starts, p.pattern.rows, *unused, of_biases, points[rows],
         )  # fmt: skip
         cost += float(robust_cost(moved.squares(chunk), scale))
     return moved, cost

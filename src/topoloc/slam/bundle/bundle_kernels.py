@@ -5,8 +5,6 @@ updated by left perturbations ``exp(xi) @ cam_from_world``, xi = (translation, r
 are rows (fx, fy, cx, cy, bf, bias).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from topoloc.compiled import kernel
@@ -51,17 +49,10 @@ def squared_residuals(
     """
     residual, point_cam = np.empty(3), np.empty(3)
     for k in range(len(keyframe_idx)):
-        f = keyframe_idx[k]
+        f, point = keyframe_idx[k], points[rows[k]]
         square = _residual(
-            rotations[f],
-            translations[f],
-            cameras[f],
-            points[rows[k]],
-            measured[k],
-            weights[k],
-            residual,
-            point_cam,
-        )
+            rotations[f], translations[f], cameras[f], point, measured[k], weights[k], residual, point_cam  # noqa: E501
+        )  # fmt: skip
         squares[k] = square if square >= 0.0 else np.inf
 
 
@@ -114,32 +105,6 @@ def _invert_symmetric(m, inverse):
 
 
 @kernel(**_OPTIONS)
-def count_covisible_pairs(starts, keyframe_idx, slots):
-    """Count the pairs of free key frames that `find_covisible_pairs` writes, including
-    repetitions."""
-    total = 0
-    for n in range(len(starts) - 1):
-        free = 0
-        for k in range(starts[n], starts[n + 1]):
-            free += slots[keyframe_idx[k]] >= 0
-        total += free * (free - 1) // 2
-    return total
-
-
-@kernel(**_OPTIONS)
-def find_covisible_pairs(starts, keyframe_idx, slots, num_free, keys):
-    """Write i * num_free + j to `keys` for each pair of slots i, j and each point that both see."""
-    at = 0
-    for n in range(len(starts) - 1):
-        for k in range(starts[n], starts[n + 1]):
-            for other in range(starts[n], k):
-                i, j = slots[keyframe_idx[k]], slots[keyframe_idx[other]]
-                if i >= 0 and j >= 0:
-                    keys[at] = max(i, j) * num_free + min(i, j)
-                    at += 1
-
-
-@kernel(**_OPTIONS)
 def _linearize_point(
     point, rotations, translations, cameras, slots, column, keyframe_idx, measured, weights, scale_squared, damping, is_accumulating,  # noqa: E501
     pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,
@@ -158,15 +123,8 @@ def _linearize_point(
         f = keyframe_idx[k]
         couplings[k] = 0.0
         square = _residual(
-            rotations[f],
-            translations[f],
-            cameras[f],
-            point,
-            measured[k],
-            weights[k],
-            residual,
-            point_cam,
-        )
+            rotations[f], translations[f], cameras[f], point, measured[k], weights[k], residual, point_cam  # noqa: E501
+        )  # fmt: skip
         if square < 0.0:
             continue
         robust = 1.0 / (1.0 + square / scale_squared)
@@ -196,18 +154,8 @@ def _linearize_point(
 
 @kernel(**_OPTIONS)
 def _add_observation(
-    slot,
-    column,
-    robust,
-    disparity_weight,
-    residual,
-    jacobian_pose,
-    pattern_starts,
-    blocks,
-    vector,
-    border,
-    corner,
-):
+    slot, column, robust, disparity_weight, residual, jacobian_pose, pattern_starts, blocks, vector, border, corner  # noqa: E501
+):  # fmt: skip
     """Add the terms of one observation for the pose in `slot` and the bias in `column`.
 
     They are -1 if fixed.
@@ -261,10 +209,8 @@ def _eliminate_point(
             j = slots[keyframe_idx[other]]
             if j < 0 or j > i:
                 continue
-            block, coupled = (
-                blocks[find_block_idx(pattern_starts, pattern_rows, i, j)],
-                couplings[other],
-            )
+            block = blocks[find_block_idx(pattern_starts, pattern_rows, i, j)]
+            coupled = couplings[other]
             for r in range(6):
                 for s in range(6):
                     block[r, s] -= (
@@ -277,7 +223,7 @@ def _eliminate_point(
 @kernel(**_OPTIONS)
 def eliminate_points(
     rotations, translations, cameras, slots, columns, points, starts, keyframe_idx, measured, weights, scale_squared, damping,  # noqa: E501
-    pattern_starts, pattern_rows, blocks, vector, border, corner,
+    pattern_starts, pattern_rows, blocks, vector, border, corner, bias_steps, moved,
 ):  # fmt: skip
     """Add the observations of some points to the reduced system, with these points eliminated.
 
@@ -288,60 +234,50 @@ def eliminate_points(
     The system consists of the pattern's `blocks` (b, 6, 6) and the right-hand side `vector` (k, 6)
     of the poses. `border` (c, k, 6) couples them with the biases. `corner` (c, 2) holds the
     information and the right-hand side of each bias.
+
+    If `moved` is not empty, the system is not changed. `vector` then holds the steps of the poses
+    and `bias_steps` those of the biases, and `moved` is filled with the points after their steps.
     """
     longest = 0
     for n in range(len(points)):
         longest = max(longest, starts[n + 1] - starts[n])
-    couplings = np.empty((longest, 6, 3))
+    couplings, is_updating = np.empty((longest, 6, 3)), len(moved) > 0
     inverse, gradient, bias_coupling = np.empty((3, 3)), np.empty(3), np.empty(3)
     for n in range(len(points)):
         first, last = starts[n], starts[n + 1]
         column = columns[keyframe_idx[first]] if last > first else -1
         _linearize_point(
             points[n], rotations, translations, cameras, slots, column, keyframe_idx[first:last], measured[first:last], weights[first:last],  # noqa: E501
-            scale_squared, damping, True, pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,  # noqa: E501
+            scale_squared, damping, not is_updating, pattern_starts, blocks, vector, border, corner, couplings, inverse, gradient, bias_coupling,  # noqa: E501
         )  # fmt: skip
-        _eliminate_point(
-            slots, column, keyframe_idx[first:last], couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows,  # noqa: E501
-            blocks, vector, border, corner,
-        )  # fmt: skip
+        if is_updating:
+            _move_point(
+                slots, column, keyframe_idx[first:last], couplings, inverse, gradient, bias_coupling, vector, bias_steps, points[n], moved[n],  # noqa: E501
+            )  # fmt: skip
+        else:
+            _eliminate_point(
+                slots, column, keyframe_idx[first:last], couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows,  # noqa: E501
+                blocks, vector, border, corner,
+            )  # fmt: skip
 
 
 @kernel(**_OPTIONS)
-def update_points(
-    rotations, translations, cameras, slots, columns, points, starts, keyframe_idx, measured, weights, scale_squared, damping,  # noqa: E501
-    pattern_starts, blocks, border, corner, steps, bias_steps, moved,
+def _move_point(
+    slots, column, keyframe_idx, couplings, inverse, rest, bias_coupling, steps, bias_steps, point, moved  # noqa: E501
 ):  # fmt: skip
-    """Write the points after the `steps` (k, 6) of the poses and those of the biases to `moved`.
-
-    The other arguments are as in `eliminate_points`.
-    """
-    longest = 0
-    for n in range(len(points)):
-        longest = max(longest, starts[n + 1] - starts[n])
-    couplings = np.empty((longest, 6, 3))
-    inverse, rest, bias_coupling = np.empty((3, 3)), np.empty(3), np.empty(3)
-    for n in range(len(points)):
-        first, last = starts[n], starts[n + 1]
-        column = columns[keyframe_idx[first]] if last > first else -1
-        _linearize_point(
-            points[n], rotations, translations, cameras, slots, column, keyframe_idx[first:last], measured[first:last], weights[first:last],  # noqa: E501
-            scale_squared, damping, False, pattern_starts, blocks, steps, border, corner, couplings, inverse, rest, bias_coupling,  # noqa: E501
-        )  # fmt: skip
-        if column >= 0:
-            for s in range(3):
-                rest[s] -= bias_coupling[s] * bias_steps[column]
-        for k in range(first, last):
-            slot = slots[keyframe_idx[k]]
-            if slot < 0:
-                continue
-            for s in range(3):
-                for r in range(6):
-                    rest[s] -= couplings[k - first, r, s] * steps[slot, r]
-        for r in range(3):
-            moved[n, r] = (
-                points[n, r]
-                + inverse[r, 0] * rest[0]
-                + inverse[r, 1] * rest[1]
-                + inverse[r, 2] * rest[2]
-            )
+    """Write a point after the steps of its poses and bias to `moved`. `rest`, its gradient, is
+    changed."""
+    if column >= 0:
+        for s in range(3):
+            rest[s] -= bias_coupling[s] * bias_steps[column]
+    for k in range(len(keyframe_idx)):
+        slot = slots[keyframe_idx[k]]
+        if slot < 0:
+            continue
+        for s in range(3):
+            for r in range(6):
+                rest[s] -= couplings[k, r, s] * steps[slot, r]
+    for r in range(3):
+        moved[r] = (
+            point[r] + inverse[r, 0] * rest[0] + inverse[r, 1] * rest[1] + inverse[r, 2] * rest[2]
+        )

@@ -69,11 +69,8 @@ class ObservationChunks:
         return sum(map(len, self._observation_orders))
 
     def __iter__(self) -> Iterator[ObservationChunk]:
-        if len(self._chunk_bounds) == 2:
-            yield self._single_chunk
-            return
-        for number in range(len(self._chunk_bounds) - 1):
-            yield self._make_chunk(number)
+        num = len(self._chunk_bounds) - 1
+        yield from [self._single_chunk] if num == 1 else map(self._make_chunk, range(num))
 
     @cached_property
     def _single_chunk(self) -> ObservationChunk:
@@ -81,34 +78,25 @@ class ObservationChunks:
 
     def _make_chunk(self, number: int) -> ObservationChunk:
         first, last = self._chunk_bounds[number : number + 2].tolist()
-        seeing = np.flatnonzero(
-            self._observation_offsets[:, number + 1] > self._observation_offsets[:, number]
-        ).tolist()
-        sources = [
-            self._observation_orders[k][
-                self._observation_offsets[k, number] : self._observation_offsets[k, number + 1]
-            ]
-            for k in seeing
+        begins, ends = self._observation_offsets[:, number : number + 2].T
+        seeing = np.flatnonzero(ends > begins).tolist()
+        sources = [self._observation_orders[k][begins[k] : ends[k]] for k in seeing]
+        seen = [
+            (one.landmark_ids[rows], one.measured[rows], one.weights[rows])
+            for one, rows in zip(
+                (self._keyframes[k].observations for k in seeing), sources, strict=True
+            )
         ]
-        seen = [self._keyframes[k].observations for k in seeing]
-        ids = np.concatenate(
-            [one.landmark_ids[rows] for one, rows in zip(seen, sources, strict=True)]
-        )
+        ids, measured, weights = map(np.concatenate, zip(*seen, strict=True))
         rows = np.searchsorted(self._ids[first:last], ids)
         order = np.argsort(rows, kind="stable")
-        weights = np.concatenate(
-            [one.weights[rows] for one, rows in zip(seen, sources, strict=True)]
-        )[order]
-        measured = np.concatenate(
-            [one.measured[rows] for one, rows in zip(seen, sources, strict=True)]
-        )[order]
+        measured, weights = measured[order], weights[order]
+        keyframe_idx = np.repeat(np.array(seeing, np.int32), [len(rows) for rows in sources])
         return ObservationChunk(
             first,
             last,
             starts=np.searchsorted(rows[order], np.arange(last - first + 1)),
-            keyframe_idx=np.repeat(np.array(seeing, np.int32), [len(rows) for rows in sources])[
-                order
-            ],
+            keyframe_idx=keyframe_idx[order],
             sources=np.concatenate(sources)[order],
             measured=np.where(weights > 0.0, measured, 0.0).astype(np.float64),
             weights=weights.astype(np.float64),

@@ -18,8 +18,7 @@ from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.formats.folder import open_folder
 from topoloc.recordings.formats.kitti import open_kitti
-from topoloc.recordings.frame import StereoFrame
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import StereoFrame, to_grey
 
 _NEAREST = 3  # day's pictures for one of the others
 _REACH = 2.0  # metres

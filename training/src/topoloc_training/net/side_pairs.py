@@ -17,8 +17,7 @@ from PIL import Image
 from topoloc.errors import RecordingError
 from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
-from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.image_io import to_grey
+from topoloc.recordings.frame import StereoFrame, StereoSequence, to_grey
 from topoloc_training.net.pairs import Pair, located_pixels, seen_by
 from topoloc_training.net.teacher import HEIGHT, WIDTH
 

@@ -13,8 +13,9 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, Float32, Int8, UInt8
 
-from topoloc.recordings.image_io import read_image, to_grey
-from topoloc.recordings.recording import list_images
+from topoloc.recordings.format import list_images
+from topoloc.recordings.frame import to_grey
+from topoloc.recordings.image_io import read_image
 
 WIDTH, HEIGHT = 640, 384
 STRIDE = 4
