@@ -27,9 +27,11 @@ from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.evidence import EvidenceConfig, compute_translation_tolerance
+from topoloc.localization.config import EvidenceConfig
+from topoloc.localization.evidence import compute_translation_tolerance
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.nodes import NodeConfig
@@ -182,7 +184,7 @@ def answer(
     localizer: Localizer, image: np.ndarray, camera: Camera | UncalibratedCamera
 ) -> tuple[Localization | NotLocalized, float]:
     """The result, and the median distance (metres) of the points that it stands on."""
-    result, named = localizer.localize_with_inliers(image, camera, None)
+    result, named = localizer.localize_query(QueryImage(image, camera))
     if not isinstance(result, Localization):
         return result, 0.0
     ((_, seen),) = named

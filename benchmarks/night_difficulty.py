@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from topoloc.evaluation.metrics import summarize
 from topoloc.evaluation.query_localization import localize_queries
 from topoloc.features.extraction import FeatureConfig
-from topoloc.localization.evidence import EvidenceConfig
+from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map

@@ -20,8 +20,8 @@ from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization import query
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query_session import QuerySession
 from topoloc.localization.result import Localization, NotLocalized, result_from_json
+from topoloc.localization.schedule import TileQuery
 from topoloc.mapping.topomap import TopoMetricMap
 
 BUDGET = 100_000_000
@@ -108,11 +108,11 @@ def test_where_no_tile_looks_like_the_picture_only_the_likeliest_is_asked_by_all
     atlas: Path, monkeypatch: pytest.MonkeyPatch, min_similarity: float, num_asked: int
 ):
     asked = list[str]()
-    localize_exhaustive = QuerySession.localize_exhaustive
+    exhaustive = TileQuery.exhaustive
     monkeypatch.setattr(
-        QuerySession,
-        "localize_exhaustive",
-        lambda self: asked.append(self.features) or localize_exhaustive(self),
+        TileQuery,
+        "exhaustive",
+        lambda self: asked.append(self.opened.map_id) or exhaustive(self),
     )
     monkeypatch.setattr(Wide, "min_similarity", min_similarity)
     config = Wide()
@@ -138,11 +138,11 @@ def test_a_look_alike_that_cannot_come_near_is_left_at_that(
 ):
     """Neither does it cost a glance, nor is it named."""
     asked = list[str]()
-    glance = QuerySession.localize_coarse_only
+    glance = TileQuery.coarse_only
     monkeypatch.setattr(
-        QuerySession,
-        "localize_coarse_only",
-        lambda self: asked.append(self.features) or glance(self),
+        TileQuery,
+        "coarse_only",
+        lambda self: asked.append(self.opened.first.map.kind.name) or glance(self),
     )
     monkeypatch.setattr(Wide, "max_rival_gap", 2.0)
     wide = Wide(num_glanced=1)

@@ -20,7 +20,7 @@ from topoloc.localization.pose_fit import PointObservations
 from topoloc.localization.provenance import Evidence, Provenance
 from topoloc.localization.result import CandidateNode, Localization, NotLocalized
 from topoloc.localization.tiles.atlas_tiles import AtlasTiles
-from topoloc.localization.tiles.tile_results import TileResult, merge_tile_results
+from topoloc.localization.tiles.tiles import TileResult, merge_tile_results
 
 STRONG = Evidence(200, 150, 400, 500, 20, 0.9, 0.05, 0.7)
 FAIR = Evidence(100, 30, 80, 400, 20, 0.5, 0.15, 0.15)
@@ -69,8 +69,7 @@ def _merge(*found: Found, coarse: int = -1) -> Localization | NotLocalized:
         )
         for number, (tile, result) in enumerate(found)
     ]
-    tile_id, result, _ = merge_tile_results(tiles, results)
-    return tiles.with_tile(result, tile_id)
+    return merge_tile_results(tiles, results)[0]
 
 
 def test_the_only_tile_that_vouches_answers():

@@ -15,14 +15,12 @@ from made_hypotheses import CANDIDATES, WEIGHTS, believed, made_features, made_f
 from msgspec import structs
 
 from topoloc.localization.belief import (
-    MIN_LOG_ODDS_MARGIN,
     Belief,
     Hypothesis,
     is_same_fit,
     log_odds_margin,
 )
-from topoloc.localization.config import LocalizerConfig
-from topoloc.localization.evidence import EvidenceConfig
+from topoloc.localization.config import EvidenceConfig, LocalizerConfig
 from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.result_decision import decide_result
@@ -135,7 +133,7 @@ def test_an_answer_leads_all_others(hypotheses: list[Hypothesis]):
         )
         others = [one for one in search.belief.hypotheses if one is not search.best]
         assert all(
-            log_odds_margin(search.best, other, WEIGHTS.rivals) >= MIN_LOG_ODDS_MARGIN
+            log_odds_margin(search.best, other, WEIGHTS.rivals) >= WEIGHTS.rivals.lead
             for other in others
         )
 
@@ -186,7 +184,7 @@ def test_another_hypothesis_far_behind_takes_a_little_of_the_probability():
     assert isinstance(alone, Localization)
     assert isinstance(beside, Localization)
     behind = log_odds_margin(best, other, WEIGHTS.rivals)
-    assert behind > MIN_LOG_ODDS_MARGIN
+    assert behind > WEIGHTS.rivals.lead
     assert beside.probability == pytest.approx(1.0 / (1.0 + math.exp(-4.0) + math.exp(-behind)))
     assert beside.probability < alone.probability
 
@@ -278,14 +276,14 @@ def test_walls_need_not_lead_as_an_unclear_pose_of_nodes_must():
         search = believed(
             [
                 made_hypothesis(2.5, x=-9.0, walls=walls),
-                made_hypothesis(2.5 - MIN_LOG_ODDS_MARGIN - 0.1),
+                made_hypothesis(2.5 - WEIGHTS.rivals.lead - 0.1),
             ]
         )
         assert isinstance(decide_result(replace(search, weights=strict))[0], Localization) == walls
 
 
 def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
-    behind = 3.0 - MIN_LOG_ODDS_MARGIN - 0.1
+    behind = 3.0 - WEIGHTS.rivals.lead - 0.1
     assert _along(
         _answered(made_hypothesis(behind), made_hypothesis(3.0, x=-9.0, walls=True))
     ) == pytest.approx(-9.0)
@@ -297,7 +295,7 @@ def test_of_walls_and_nodes_the_one_with_much_more_for_it_is_believed():
 @pytest.mark.parametrize("ahead", [-0.9, 0.0, 0.9])
 def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(ahead: float):
     result = _answered(
-        made_hypothesis(2.0), made_hypothesis(2.0 + ahead * MIN_LOG_ODDS_MARGIN, x=-9.0, walls=True)
+        made_hypothesis(2.0), made_hypothesis(2.0 + ahead * WEIGHTS.rivals.lead, x=-9.0, walls=True)
     )
     assert isinstance(result, NotLocalized)
     assert result.reason == "ambiguous"
@@ -313,7 +311,7 @@ def test_a_pose_of_the_nodes_that_the_walls_contradict_is_ambiguous(ahead: float
 def test_two_walls_that_look_alike_are_no_answer(of_nodes: list[Hypothesis]):
     walls = [
         made_hypothesis(3.0, x=-9.0, walls=True),
-        made_hypothesis(3.0 - 0.9 * MIN_LOG_ODDS_MARGIN, x=4.0, walls=True),
+        made_hypothesis(3.0 - 0.9 * WEIGHTS.rivals.lead, x=4.0, walls=True),
     ]
     result = _answered(*of_nodes, *walls)
     assert isinstance(result, NotLocalized)

@@ -117,7 +117,7 @@ def test_around_an_expected_pose_the_second_kind_is_heard_on_what_the_first_is_n
     """A twin of the place is no less likely where a stream that was placed wrongly expects it."""
     changed("sift", _useless)
     monkeypatch.setattr(
-        "topoloc.localization.query_session.cross_check_hypothesis",
+        "topoloc.localization.refine.cross_check_hypothesis",
         lambda search, hypothesis: (says, None),
     )
     assert _is_right(Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)), (
@@ -140,7 +140,7 @@ def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
         assert of_last is not None
         return said, replace(of_last, log_odds=hypothesis.log_odds + more)
 
-    monkeypatch.setattr("topoloc.localization.query_session.cross_check_hypothesis", says)
+    monkeypatch.setattr("topoloc.localization.refine.cross_check_hypothesis", says)
     monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
     result = Localizer(topomap).localize(PICTURE, CAMERA, TRUTH)
     assert _is_right(result)

@@ -11,12 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.evidence import (
-    EvidenceConfig,
     compute_inlier_spread,
-    compute_log_odds,
     compute_normalized_uncertainty,
-    compute_precision_probability,
     compute_translation_tolerance,
     compute_uniform_inlier_ratio,
     is_only_imprecise,
@@ -65,12 +63,12 @@ evidences = st.builds(
 
 def _probability(evidence: Evidence, weights: FittedWeights) -> float:
     """Of "here" against "nowhere"."""
-    return 1.0 / (1.0 + math.exp(-compute_log_odds(evidence, weights)))
+    return 1.0 / (1.0 + math.exp(-weights.log_odds(evidence)))
 
 
 @given(evidences)
 def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence):
-    log_odds = compute_log_odds(evidence, WEIGHTS)
+    log_odds = WEIGHTS.log_odds(evidence)
     assert math.isfinite(log_odds)
     for better in (
         replace(evidence, num_found=evidence.num_found + 5),
@@ -78,13 +76,13 @@ def test_what_speaks_for_a_pose_never_makes_it_less_probable(evidence: Evidence)
         replace(evidence, even_share=min(evidence.even_share + 0.01, 1.0)),
         replace(evidence, num_inliers=evidence.num_inliers + 1),
     ):
-        assert compute_log_odds(better, WEIGHTS) >= log_odds
+        assert WEIGHTS.log_odds(better) >= log_odds
     for worse in (
         replace(evidence, num_by_chance=evidence.num_by_chance + 5),
         replace(evidence, num_matches=evidence.num_matches + 5),
         replace(evidence, doubt=evidence.doubt * 2.0),
     ):
-        assert compute_log_odds(worse, WEIGHTS) <= log_odds
+        assert WEIGHTS.log_odds(worse) <= log_odds
 
 
 def test_strong_evidence_is_believed():
@@ -189,26 +187,24 @@ MORE = {
 
 @pytest.mark.parametrize("evidence", MORE.values(), ids=MORE.keys())
 def test_more_evidence_of_walls_means_better_odds(evidence: Evidence):
-    assert compute_log_odds(evidence, WEIGHTS) > compute_log_odds(OF_WALLS, WEIGHTS) + 0.1
+    assert WEIGHTS.log_odds(evidence) > WEIGHTS.log_odds(OF_WALLS) + 0.1
 
 
 def test_both_walls_say_more_than_one_of_them():
     weights = load_fitted_weights("topoloc-net-sides")
-    by_both, by_one = (
-        compute_log_odds(replace(OF_WALLS, num_lesser_side=num), weights) for num in (30, 1)
-    )
+    by_both, by_one = (weights.log_odds(replace(OF_WALLS, num_lesser_side=num)) for num in (30, 1))
     assert by_both > by_one + 1.0
 
 
 def test_no_evidence_of_walls_at_all_is_odds_all_the_same():
     nothing = Evidence(0, 0, 0, 0, 0, spread=0.0, doubt=50.0, even_share=0.0, num_distinct=0)
-    assert compute_log_odds(nothing, WEIGHTS) < -5.0
+    assert WEIGHTS.log_odds(nothing) < -5.0
 
 
 def test_only_a_pose_by_the_walls_is_asked_for_its_precision_beside_its_odds():
-    assert compute_precision_probability(replace(STRONG, doubt=8.0)) == 1.0
-    assert compute_precision_probability(replace(OF_WALLS, doubt=1.0)) == pytest.approx(
+    assert replace(STRONG, doubt=8.0).precision_probability == 1.0
+    assert replace(OF_WALLS, doubt=1.0).precision_probability == pytest.approx(
         0.6827, abs=1e-4
     )  # one standard deviation
-    assert compute_precision_probability(replace(OF_WALLS, doubt=0.3)) > 0.99
-    assert compute_precision_probability(replace(OF_WALLS, doubt=8.0)) < 0.11
+    assert replace(OF_WALLS, doubt=0.3).precision_probability > 0.99
+    assert replace(OF_WALLS, doubt=8.0).precision_probability < 0.11

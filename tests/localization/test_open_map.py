@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.open_map import roll_invariant_distances
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import NodePoses, node_distances, node_distances_for_any_roll
 
 NODES = NodePoses.of(
     [Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.5, 0.0])), np.array([1.0, 0.0, 0.0]))]
@@ -17,7 +16,7 @@ NODES = NodePoses.of(
 def test_upright_cameras_are_as_far_as_eq_1_says():
     camera = Rigid3(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.0, 0.0, 2.0]))
     np.testing.assert_array_equal(
-        roll_invariant_distances(camera, NODES, 3.0), node_distances(camera, NODES, 3.0)
+        node_distances_for_any_roll(camera, NODES, 3.0), node_distances(camera, NODES, 3.0)
     )
 
 
@@ -26,7 +25,7 @@ def test_quarter_turns_change_nothing(num_quarters: int):
     camera = Rigid3(exp_so3(np.array([0.1, -0.3, 0.0])), np.array([0.0, 0.0, 2.0]))
     roll = Rigid3(exp_so3(np.array([0.0, 0.0, num_quarters * np.pi / 2])), np.zeros(3))
     np.testing.assert_allclose(
-        roll_invariant_distances(camera @ roll, NODES, 3.0),
-        roll_invariant_distances(camera, NODES, 3.0),
+        node_distances_for_any_roll(camera @ roll, NODES, 3.0),
+        node_distances_for_any_roll(camera, NODES, 3.0),
         atol=1e-7,
     )

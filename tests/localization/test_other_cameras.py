@@ -15,6 +15,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 
 INDICES = (2.5, 5.5, 8.5)
@@ -91,7 +92,7 @@ def test_a_camera_of_many_more_pixels_is_as_good_as_the_map_s_own(
 def test_the_points_seen_by_a_finer_camera_are_in_its_own_pixels(localizer: Localizer):
     camera = CAMERA.rescaled(3 * CAMERA.width, 3 * CAMERA.height)
     truth = path_pose(5.5)
-    result, named = localizer.localize_with_inliers(render(room(), truth, camera)[0], camera, None)
+    result, named = localizer.localize_query(QueryImage(render(room(), truth, camera)[0], camera))
     assert isinstance(result, Localization)
     ((_, seen),) = named
     expected = camera.img_from_cam(truth.inverse().apply(seen.points_world))

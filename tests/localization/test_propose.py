@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,14 +16,16 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import propose, query_session, refine
+from topoloc.localization import localizer as localizer_module
+from topoloc.localization import propose
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, SimilarPlacesConfig
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.pose_fit import PoseFit
+from topoloc.localization.pose_fit import PointMatches, PoseFit
+from topoloc.localization.refine import NodeProposal, is_already_found
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Proposal, Search, Trace
+from topoloc.localization.search import Proposal, Trace, verify
 from topoloc.mapping.topomap import TopoMetricMap
 
 LIGHTS = (0.055, 0.05, 0.045)
@@ -187,21 +190,21 @@ def test_only_so_many_viewpoints_are_followed_up(room: TopoMetricMap):
 
 
 @pytest.fixture
-def fits(monkeypatch: pytest.MonkeyPatch) -> list[PoseFit]:
-    """The first poses that were sought by RANSAC since."""
-    found: list[PoseFit] = []
-    fit_pose = propose.fit_pose
+def fits(monkeypatch: pytest.MonkeyPatch) -> list[PointMatches]:
+    """The fits to enough matches, found by RANSAC since."""
+    found, fit_pose = list[PointMatches](), propose.fit_pose
 
-    def told(*arguments: object) -> PoseFit:
-        found.append(fit_pose(*arguments))  # pyright: ignore[reportArgumentType]
-        return found[-1]
+    def told(*arguments: Any, min_matches: float = 4.0) -> PointMatches:
+        fit = fit_pose(*arguments, min_matches=min_matches)
+        found.extend([fit] * (len(fit.matches) >= min_matches))
+        return fit
 
     monkeypatch.setattr(propose, "fit_pose", told)
     return found
 
 
 def test_an_image_from_elsewhere_is_refused_after_the_first_pose(
-    room: TopoMetricMap, fits: list[PoseFit]
+    room: TopoMetricMap, fits: list[PointMatches]
 ):
     """Neither look-alikes nor RANSAC on what viewpoints show: refusing is as quick as answering."""
     localizer = Localizer(room)
@@ -214,7 +217,7 @@ def test_an_image_from_elsewhere_is_refused_after_the_first_pose(
         assert len(fits) <= 1
 
 
-def test_a_clear_image_is_compared_with_no_viewpoint(room: TopoMetricMap, fits: list[PoseFit]):
+def test_a_clear_image_is_compared_with_no_viewpoint(room: TopoMetricMap, fits: list[PointMatches]):
     trace = Trace()
     result = Localizer(room).localize(unseen_views()[2][0], CAMERA, trace=trace)
     assert isinstance(result, Localization)
@@ -260,24 +263,25 @@ def test_a_prior_that_is_wrong_makes_no_place_of_an_image_from_elsewhere(room: T
 def test_a_pose_that_was_found_already_is_not_followed_up_again(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
-    followed = list[tuple[Search, Proposal]]()
+    followed = list[Proposal]()
 
-    def evaluate_proposal(search: Search, proposal: Proposal) -> Hypothesis | None:
-        followed.append((search, proposal))
-        return refine.evaluate_proposal(search, proposal)
+    def follow(proposal: Proposal) -> Hypothesis | None:
+        followed.append(proposal)
+        return verify(proposal)
 
-    monkeypatch.setattr(query_session, "evaluate_proposal", evaluate_proposal)
+    monkeypatch.setattr(localizer_module, "verify", follow)
     for picture, _ in unseen_views():
         followed.clear()
         assert isinstance(Localizer(room).localize(picture, CAMERA), Localization)
-        search, proposal = followed[0]
-        assert refine.is_already_found(search, proposal)
+        proposal = followed[0]
+        assert isinstance(proposal, NodeProposal)
+        assert is_already_found(proposal)
+        assert proposal.refine() is None
         assert isinstance(proposal.fit, PoseFit)
         pose = proposal.fit.pose
         beside = replace(
             pose, cam_from_world=Rigid3(np.eye(3), np.array([0.3, 0.0, 0.0])) @ pose.cam_from_world
         )
-        assert not refine.is_already_found(
-            search, replace(proposal, fit=replace(proposal.fit, pose=beside))
-        )
-        assert not refine.is_already_found(replace(search, belief=Belief()), proposal)
+        assert not is_already_found(replace(proposal, fit=replace(proposal.fit, pose=beside)))
+        before = replace(proposal.search, belief=Belief())
+        assert not is_already_found(replace(proposal, search=before))

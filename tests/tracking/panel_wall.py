@@ -7,14 +7,14 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.pose_fit import PointObservations
+from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.localization.result_decision import LocalizationWithInliers
 from topoloc.localization.search import Trace
-from topoloc.localization.tiles.tiles import OneMap
+from topoloc.localization.tiles.tiles import Tiles
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
@@ -38,13 +38,12 @@ class PanelWall(Localizer):
         self.xs: list[float] = []
         self.num_asked, self.probability = 0, 0.99
         opened = MapContext(TopoMetricMap([], {}, [], []), LocalizerConfig(), (), {})
-        self._tiles = OneMap(opened)
+        self._tiles = Tiles(opened)
 
-    def localize_with_inliers(
+    def localize_query(
         self,
-        image: np.ndarray,
-        camera: Camera | UncalibratedCamera,
-        prior: Rigid3 | None,
+        query_image: QueryImage,
+        prior: Rigid3 | None = None,
         max_ms: float | None = None,
         trace: Trace | None = None,
         tile_id: str | None = None,

@@ -20,6 +20,11 @@ class MatchingConfig:
     mutual: bool = True
     """Require that the query feature is also the nearest one of its train feature."""
 
+    @staticmethod
+    def nearest() -> MatchingConfig:
+        """Return the settings that match each feature with its nearest one."""
+        return MatchingConfig(ratio=0.0, mutual=False)
+
     def resolved(self, ratio: float) -> MatchingConfig:
         """Return this configuration with `ratio`, unless its own is set."""
         return self if self.ratio is not None else replace(self, ratio=ratio)

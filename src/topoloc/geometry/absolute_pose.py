@@ -149,11 +149,12 @@ def estimate_pose_ransac(
     Args:
         is_sorted: the matches are sorted, most likely right first.
     """
+    params = camera.intrinsics
     pinhole = {
         "model": "PINHOLE",
         "width": camera.width,
         "height": camera.height,
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "params": list(params),
     }
     ransac = {
         "max_reproj_error": config.max_reprojection_error_px,
@@ -173,7 +174,7 @@ def estimate_pose_ransac(
     if not np.isfinite(matrix).all():
         return None
     # PoseLib's score is on the plane z = 1.
-    loss = float(ransac_info["model_score"]) * ((camera.fx + camera.fy) / 2) ** 2
+    loss = float(ransac_info["model_score"]) * ((params[0] + params[1]) / 2) ** 2
     return Rigid3(matrix[:, :3].copy(), matrix[:, 3].copy()), int(ransac_info["num_inliers"]), loss
 
 

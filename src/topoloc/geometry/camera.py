@@ -118,6 +118,11 @@ class Camera:
         return self._param("cy")
 
     @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """Return (fx, fy, cx, cy), pixels."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
     def is_fisheye(self) -> bool:
         """Return whether the model is OpenCV's fisheye."""
         return self.model == "OPENCV_FISHEYE"

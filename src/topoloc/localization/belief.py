@@ -20,17 +20,11 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.evidence import (
-    EvidenceConfig,
-    compute_precision_probability,
-    compute_rival_score,
-)
+from topoloc.localization.config import EvidenceConfig
 from topoloc.localization.fitted_weights import RivalWeights
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.provenance import Evidence
 
-MIN_LOG_ODDS_MARGIN = 2.0
-"""Minimum log-odds margin of the best hypothesis over each other one to be reported."""
 _CHI_SQUARE_6_AT_95 = 12.592
 
 
@@ -57,12 +51,7 @@ class Hypothesis:
     @property
     def probability(self) -> float:
         """Return the probability of this pose if "not in the map" is the only alternative."""
-        return compute_precision_probability(self.evidence) / (1.0 + math.exp(-self.log_odds))
-
-    @property
-    def is_from_virtual_views(self) -> bool:
-        """Return whether the pose was found by virtual views."""
-        return self.evidence.is_from_virtual_views
+        return self.evidence.precision_probability / (1.0 + math.exp(-self.log_odds))
 
 
 def log_odds_margin(a: Hypothesis, b: Hypothesis, weights: RivalWeights) -> float:
@@ -77,13 +66,10 @@ def _log_odds_margins(
 
     It is the difference of scores, or of log-odds if one of the two comes from virtual views.
     """
-    scores = np.array(
-        [compute_rival_score(one.evidence, one.log_odds, weights) for one in hypotheses]
-    )
+    scores = np.array([weights.score(one.evidence, one.log_odds) for one in hypotheses])
     log_odds = np.array([one.log_odds for one in hypotheses])
-    from_walls = np.array([one.is_from_virtual_views for one in hypotheses])
-    by_odds = from_walls[:, None] | from_walls
-    return np.where(by_odds, log_odds[:, None] - log_odds, scores[:, None] - scores)
+    margins = scores[:, None] - scores
+    return np.where(np.isnan(margins), log_odds[:, None] - log_odds, margins)
 
 
 def is_same_fit(a: PoseFit, b: PoseFit, config: EvidenceConfig) -> bool:
@@ -145,6 +131,14 @@ class Belief:
             if not any(min(k, other) in same_pose[max(k, other)] for other in kept):
                 kept.append(k)
         return Belief(tuple(all_hypotheses[k] for k in kept), all_hypotheses, same_pose)
+
+    @property
+    def of_nodes(self) -> list[Hypothesis]:
+        """Return the hypotheses found by the map's nodes, not by virtual views.
+
+        Other proposals of nodes may repeat, confirm or find these again.
+        """
+        return [one for one in self.hypotheses if not one.evidence.is_from_virtual_views]
 
     def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
         """Return the hypotheses, sorted by their least margin over the others.

@@ -9,8 +9,24 @@ from topoloc.bounds import AtLeast, Between
 from topoloc.features.config import MatchingConfig
 from topoloc.features.feature_types import FeatureType
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
-from topoloc.localization.evidence import EvidenceConfig
 from topoloc.localization.guided import GuidedConfig
+
+
+@dataclass(frozen=True)
+class EvidenceConfig:
+    """Configure the tolerance of a right pose and the conditions for reporting one."""
+
+    max_translation: ClassVar[float] = 0.25
+    """Maximum position error of a right pose, metres. `depth_share` of the distance of the seen
+    points replaces it if that is less."""
+    max_rotation_deg: ClassVar[float] = 2.0
+    """Maximum rotation error of a right pose, degrees."""
+    min_inliers: Annotated[int, AtLeast(4)] = 5
+    """Minimum number of inliers of a pose proposal. Proposals with fewer are not tested."""
+    min_found: Annotated[int, AtLeast(4)] = 12
+    """Minimum number of map points found at their predicted pixels."""
+    min_probability: Annotated[float, Between(0, 1)] = 0.5
+    """Minimum probability of a reported pose."""
 
 
 @dataclass(frozen=True)

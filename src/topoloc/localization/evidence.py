@@ -1,56 +1,37 @@
-"""Weigh the evidence for a pose as odds.
+"""Measure the evidence for a pose. Its weights are in `fitted_weights.py`.
 
 An inlier count alone is not a test. RANSAC finds a dozen inliers in any image, and poses in
 repeated patterns collect many more. A wrong pose does not agree with data that it was not fitted
 to. Most visible map points are then missing at their predicted pixels in some part of the image. Or
 no more of them are found than a third of the image away, where only chance matches are found.
 
-So the regression uses these two ratios and the number and ratio of inliers among the unguided
-matches. It also uses the share of the image that the found points cover. A pose at the right place
-may still be imprecise. The last feature is therefore the covariance relative to the tolerance.
-
-The weights come from a logistic regression on right and wrong poses. Each feature type has its own
-(`fitted_weights.py`). The weight of the normalized uncertainty is set by hand: wrong places in a
-corridor of many doors have precise poses, and a free weight would go to zero.
-
-Virtual views (`walls/`) have weights of their own. Walls repeat more than rooms do, and fewer of
-their points are recognised at a slant. Two more features count there. The first is the number of
-found key points that match here better than anywhere else in the map. The second is the agreement
-of both side views, because one wall alone may match a similar place.
+So these two ratios are measured, the number and ratio of inliers among the unguided matches, and
+the share of the image that the found points cover. A pose at the right place may still be
+imprecise. The last measure is therefore the covariance relative to the tolerance.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.bounds import AtLeast, Between
-from topoloc.localization.fitted_weights import EvidenceWeights, FittedWeights, RivalWeights
+from topoloc.features.features import Matches
+from topoloc.features.matching import Matcher
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.config import EvidenceConfig
+from topoloc.localization.fitted_weights import FittedWeights
+from topoloc.localization.guided import count_chance_matches, select_visible_points
+from topoloc.localization.map_facts.repetition import fold_repetitions, shifted_copies
+from topoloc.localization.pose_fit import PointMatches, PoseFit
 from topoloc.localization.provenance import Evidence
+from topoloc.localization.search import Search
 
-COLUMNS, ROWS = 8, 6
+_GRID = np.array([8, 6])
 """Grid of cells over the image. The inlier spread is the share of cells with an inlier."""
-
-
-@dataclass(frozen=True)
-class EvidenceConfig:
-    """Configure the tolerance of a right pose and the conditions for reporting one."""
-
-    max_translation: ClassVar[float] = 0.25
-    """Maximum position error of a right pose, metres. `depth_share` of the distance of the seen
-    points replaces it if that is less."""
-    max_rotation_deg: ClassVar[float] = 2.0
-    """Maximum rotation error of a right pose, degrees."""
-    min_inliers: Annotated[int, AtLeast(4)] = 5
-    """Minimum number of inliers of a pose proposal. Proposals with fewer are not tested."""
-    min_found: Annotated[int, AtLeast(4)] = 12
-    """Minimum number of map points found at their predicted pixels."""
-    min_probability: Annotated[float, Between(0, 1)] = 0.5
-    """Minimum probability of a reported pose."""
 
 
 def compute_translation_tolerance(median_depth: float, config: EvidenceConfig) -> float:
@@ -78,9 +59,46 @@ def compute_normalized_uncertainty(
     )
 
 
+def sample_rows(count: int) -> Int[np.ndarray, " k"]:
+    """Return at most 512 evenly spaced rows of this many, which bounds the time of a check."""
+    return np.unique(np.linspace(0, count - 1, 512).astype(int))
+
+
+def measure_evidence(
+    fit: PoseFit,
+    covariance: Float[np.ndarray, "6 6"],
+    num_visible: int,
+    found_img: Float[np.ndarray, "f 2"] | None,
+    visible_img: Float[np.ndarray, "v 2"],
+    config: EvidenceConfig,
+) -> Evidence:
+    """Measure the evidence of a pose in its inliers. The counts of other matches are 0.
+
+    Args:
+        covariance: that of the left perturbation of cam_from_world (metres, radians).
+        num_visible: number of map points in view.
+        found_img: pixels of the visible points that are found. None: those of the inliers.
+        visible_img: pixels of points that must be found.
+    """
+    width, height = fit.camera.width, fit.camera.height
+    depths = fit.cam_from_world.apply(fit.local_map.points_world[fit.inlier_point_idx])[:, 2]
+    points_img = fit.features.points_img[fit.inlier_query_idx].astype(np.float64)
+    found_img = points_img if found_img is None else found_img
+    return Evidence(
+        num_matches=0,
+        num_inliers=0,
+        num_found=fit.num_inliers,
+        num_visible=num_visible,
+        num_by_chance=0,
+        spread=compute_inlier_spread(points_img, width, height),
+        doubt=compute_normalized_uncertainty(covariance, float(np.median(depths)), config),
+        even_share=compute_uniform_inlier_ratio(found_img, visible_img, width, height),
+    )
+
+
 def compute_inlier_spread(points_img: Float[np.ndarray, "n 2"], width: int, height: int) -> float:
     """Compute `Evidence.spread` from the inliers' pixels."""
-    return len(np.unique(_cells(points_img, width, height))) / (COLUMNS * ROWS)
+    return len(np.unique(_cells(points_img, width, height))) / int(_GRID.prod())
 
 
 def compute_uniform_inlier_ratio(
@@ -97,8 +115,8 @@ def compute_uniform_inlier_ratio(
     """
     if len(visible_img) == 0:
         return 0.0
-    num_visible = np.bincount(_cells(visible_img, width, height), minlength=COLUMNS * ROWS)
-    num_found = np.bincount(_cells(found_img, width, height), minlength=COLUMNS * ROWS)
+    num_visible = np.bincount(_cells(visible_img, width, height), minlength=int(_GRID.prod()))
+    num_found = np.bincount(_cells(found_img, width, height), minlength=int(_GRID.prod()))
     return float(
         np.exp(
             np.sum(num_visible * np.log((num_found + 0.5) / (num_visible + 4.0))) / len(visible_img)
@@ -107,91 +125,163 @@ def compute_uniform_inlier_ratio(
 
 
 def _cells(points_img: Float[np.ndarray, "n 2"], width: int, height: int) -> Int[np.ndarray, " n"]:
-    columns = np.clip((points_img[:, 0] + 0.5) * COLUMNS / width, 0, COLUMNS - 1).astype(int)
-    rows = np.clip((points_img[:, 1] + 0.5) * ROWS / height, 0, ROWS - 1).astype(int)
-    return rows * COLUMNS + columns
-
-
-def compute_score_features(evidence: Evidence) -> tuple[float, ...]:
-    """Return the inputs of the regression, as logarithms.
-
-    The added constants reduce the influence of small counts.
-    """
-    e = evidence
-    return (
-        math.log(e.even_share + 0.002),
-        math.log((e.num_found + 1) / (e.num_by_chance + 5)),
-        math.log(e.num_inliers + 1),
-        math.log((e.num_inliers + 1) / (e.num_matches + 10)),
-        math.log(e.spread + 0.02),
-        math.log(max(e.doubt, 0.01)),
-    )
-
-
-def compute_log_odds(evidence: Evidence, weights: FittedWeights) -> float:
-    """Compute the log-odds that the pose is right."""
-    if evidence.is_from_virtual_views:
-        features, walls = compute_virtual_view_features(evidence), weights.walls
-        return (
-            sum(weight * x for weight, x in zip(walls.as_vector, features, strict=True))
-            + walls.bias
-        )
-    return compute_node_log_odds(evidence, weights.evidence)
-
-
-def compute_node_log_odds(evidence: Evidence, weights: EvidenceWeights) -> float:
-    """Compute the log-odds of a pose found by the map's nodes."""
-    return (
-        sum(
-            weight * x
-            for weight, x in zip(weights.as_vector, compute_score_features(evidence), strict=True)
-        )
-        + weights.bias
-    )
-
-
-def compute_rival_score(evidence: Evidence, log_odds: float, rivals: RivalWeights) -> float:
-    """Compute the score of a pose found by nodes. The difference of two scores is a log-odds
-    margin."""
-    even, doubt = math.log(evidence.even_share + 0.002), math.log(max(evidence.doubt, 0.01))
-    return rivals.odds * log_odds + rivals.even_share * even + rivals.doubt * doubt
-
-
-def compute_virtual_view_features(evidence: Evidence) -> tuple[float, ...]:
-    """Return the inputs of the regression for a pose found by virtual views."""
-    e = evidence
-    assert e.num_distinct is not None
-    return (
-        math.log((e.num_found + 1) / (e.num_visible + 20)),
-        math.log((e.num_found + 1) / (e.num_by_chance + 5)),
-        math.log(e.num_inliers + 1),
-        math.log((e.num_inliers + 1) / (e.num_matches + 10)),
-        math.log(e.spread + 0.02),
-        math.log(e.num_distinct + 1),
-        math.log((e.num_lesser_side or 0) + 2),
-        math.log(e.even_share + 0.002),
-        math.log(max(e.doubt, 0.01)),
-    )
-
-
-def compute_precision_probability(evidence: Evidence) -> float:
-    """Return the probability that a pose at the right place is within the tolerance.
-
-    It is 1 for a pose of the nodes, whose log-odds include the precision already. A single wall may
-    leave a pose imprecise although the place is certain.
-    """
-    return probability_within_tolerance(evidence.doubt) if evidence.is_from_virtual_views else 1.0
-
-
-def probability_within_tolerance(doubt: float) -> float:
-    """Return the probability that a normal error is within the tolerance.
-
-    `doubt` is the standard deviation divided by the tolerance.
-    """
-    return math.erf(1.0 / (math.sqrt(2.0) * doubt))
+    cells = np.clip((points_img + 0.5) * _GRID / [width, height], 0, _GRID - 1).astype(int)
+    return cells[:, 1] * _GRID[0] + cells[:, 0]
 
 
 def is_only_imprecise(evidence: Evidence, weights: FittedWeights, config: EvidenceConfig) -> bool:
     """Return whether the pose would be accepted if it were more precise."""
-    log_odds = compute_log_odds(replace(evidence, doubt=min(evidence.doubt, 0.3)), weights)
+    log_odds = weights.log_odds(replace(evidence, doubt=min(evidence.doubt, 0.3)))
     return 1.0 / (1.0 + math.exp(-log_odds)) >= config.min_probability
+
+
+def compute_evidence(
+    search: Search,
+    final: PoseFit,
+    covariance: Float[np.ndarray, "6 6"],
+    unguided: PointMatches | None,
+    repeats: Evidence | None,
+) -> Evidence | None:
+    """Compute the evidence for a refined pose, None if it cannot become probable.
+
+    The matches `unguided` are enough if they make the pose clear. Otherwise, or if they are None,
+    the nodes around the final pose are matched. They are often nearer than those of the coarse
+    search. If the pose repeats another one, its unguided matches support both.
+
+    Args:
+        covariance: that of the left perturbation of cam_from_world (metres, radians).
+        unguided: the proposal's matches, if no pose guided them.
+        repeats: the evidence for the pose that is repeated.
+    """
+    weights, may_be_hopeless = search.weights, True
+    hopeless = weights.evidence.hopeless_log_odds
+    counted = _count_found_points(search, final, covariance)
+    if repeats is not None:
+        return replace(
+            counted,
+            num_by_chance=repeats.num_by_chance,
+            num_matches=repeats.num_matches,
+            num_inliers=repeats.num_inliers,
+        )
+    counted = _with_chance_matches(search, counted, final)
+    if unguided is not None:
+        evidence = _with_unguided(search, counted, unguided, final)
+        log_odds = weights.log_odds(evidence)
+        if weights.evidence.is_clear(log_odds):
+            return evidence
+        may_be_hopeless = log_odds < 2.0 * hopeless
+    if weights.log_odds(_assume_all_agree(counted, final)) < hopeless:  # for any unguided matches
+        return None
+    matcher = create_unguided_matcher(search, final)
+    if may_be_hopeless:
+        strongest = _unguided(final, matcher.match_first(search.config.num_first_features))
+        of_strongest = _with_unguided(search, counted, strongest, final)
+        if weights.log_odds(of_strongest) < 2.0 * hopeless:  # for any matches of other features
+            return None
+    return _with_unguided(search, counted, _unguided(final, matcher.match_first()), final)
+
+
+def compute_best_case_evidence(
+    search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"]
+) -> Evidence:
+    """Compute the evidence for a refined pose if all unguided matches agreed with it."""
+    counted = _count_found_points(search, final, covariance)
+    return _assume_all_agree(_with_chance_matches(search, counted, final), final)
+
+
+def _count_found_points(
+    search: Search, final: PoseFit, covariance: Float[np.ndarray, "6 6"]
+) -> Evidence:
+    """Count the points found at their predicted pixels.
+
+    If the feature type has dense descriptors, a point is found for `Evidence.even_share` if they
+    agree. Otherwise it is found if it has a key point match. `covariance` is that of the left
+    perturbation of cam_from_world.
+    """
+    dense, agreeing_img, points = final.features.dense, None, final.local_map
+    visible, visible_img = select_visible_points(points, final.cam_from_world, final.camera)
+    num_visible = len(visible_img)
+    if dense is not None and num_visible > 0:
+        sampled = sample_rows(num_visible)  # more points do not change the ratio
+        visible_img = visible_img[sampled]
+        agreeing = dense.check_agreement(visible_img, points.descriptors[visible[sampled]])
+        agreeing_img = visible_img[agreeing]
+    config = search.config.evidence
+    return measure_evidence(final, covariance, num_visible, agreeing_img, visible_img, config)
+
+
+def _with_chance_matches(search: Search, evidence: Evidence, final: PoseFit) -> Evidence:
+    """Return the evidence with the number of matches that a wrong pose would give."""
+    around = final.local_map, final.cam_from_world, final.camera
+    num_by_chance = count_chance_matches(final.features, *around, search.config.guided)
+    return replace(evidence, num_by_chance=num_by_chance)
+
+
+def _assume_all_agree(counted: Evidence, final: PoseFit) -> Evidence:
+    """Return the evidence with all unguided matches assumed to agree with the pose."""
+    return replace(counted, num_matches=final.num_inliers, num_inliers=final.num_inliers)
+
+
+def _with_unguided(
+    search: Search, evidence: Evidence, unguided: PointMatches, final: PoseFit
+) -> Evidence:
+    """Return the evidence with the counts of these unguided matches."""
+    # points with correlated errors differ from node to node, so true matches agree less well
+    # Maximum distance of an unguided match from the final pose's projection, 4 pixels in an image
+    # whose longer side is 640.
+    agreement_px = 4.0 * math.sqrt(1.0 + search.correlated_error_share)
+    num_agreeing = _count_agreeing_matches(
+        unguided,
+        final.cam_from_world,
+        final.camera,
+        agreement_px,
+        _repetition_shifts(search, final),
+    )
+    return replace(evidence, num_matches=len(unguided.matches), num_inliers=num_agreeing)
+
+
+def create_unguided_matcher(search: Search, final: PoseFit) -> Matcher:
+    """Return a matcher of the features with the points around the final pose, not guided by it."""
+    points = final.local_map
+    positions = fold_repetitions(
+        points.points_world, _repetition_shifts(search, final)
+    )  # copies of a point are not its rivals
+    return Matcher(
+        final.features.descriptors,
+        points.descriptors,
+        (positions, points.radii),
+        search.config.matching,
+    )
+
+
+def _unguided(final: PoseFit, matches: Matches) -> PointMatches:
+    """Return unguided matches with the points around a pose."""
+    return PointMatches(final.features, final.input_camera, final.camera, final.local_map, matches)
+
+
+def _count_agreeing_matches(
+    unguided: PointMatches,
+    cam_from_world: Rigid3,
+    camera: Camera,
+    agreement_px: float,
+    shifts: Float[np.ndarray, "k 3"],
+) -> int:
+    """Count the matches that agree with a pose, by their point or one of its copies."""
+    is_near = np.zeros(len(unguided.matches), bool)
+    for points_world in shifted_copies(
+        unguided.local_map.points_world[unguided.matches.train_idx], shifts
+    ):
+        with np.errstate(invalid="ignore"):
+            offsets = (
+                camera.img_from_cam(cam_from_world.apply(points_world))
+                - unguided.features.points_img[unguided.matches.query_idx]
+            )
+            is_near |= np.linalg.norm(offsets, axis=1) < agreement_px * max(
+                max(camera.width, camera.height) / 640.0, 0.5
+            )
+    return int(np.count_nonzero(is_near))
+
+
+def _repetition_shifts(search: Search, final: PoseFit) -> Float[np.ndarray, "k 3"]:
+    """Return the repetition shifts (metres, world) of the pose's node."""
+    return search.map.repeats(search.map.topomap.row_of(final.node_id))

@@ -1,5 +1,10 @@
 """Hold the values fitted to data: the weights of the evidence and the correlated errors of a map.
 
+The weights come from a logistic regression on right and wrong poses, whose inputs are logarithms of
+the evidence (`evidence.py`). Constants added to them reduce the influence of small counts. The
+weight of the normalized uncertainty is set by hand: wrong places in a corridor of many doors have
+precise poses, and a free weight would go to zero.
+
 All probabilities and covariances depend on these values. Each feature type has its own file
 `weights/KIND.json`. It also holds the corpus, the command, and the calibration error on places
 outside the fit. They are not settings. A feature type without a file uses the weights of a similar
@@ -8,6 +13,7 @@ type, and its results are marked as not calibrated.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -19,6 +25,7 @@ from msgspec.structs import astuple
 from topoloc.errors import FeatureTypeError
 from topoloc.features.feature_types import FEATURE_TYPES, LEARNED_TYPES
 from topoloc.json_data import Finite, decode_json
+from topoloc.localization.provenance import Evidence
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FALLBACK_TYPE, LEARNED_FALLBACK_TYPE = "surf", LEARNED_TYPES[0].name
@@ -26,10 +33,10 @@ FALLBACK_TYPE, LEARNED_FALLBACK_TYPE = "surf", LEARNED_TYPES[0].name
 
 
 class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the weights of the evidence for one pose (`evidence.py`), in log-odds.
+    """Hold the weights of the evidence for a pose found by the map's nodes, in log-odds.
 
     A pose with more than `clear_log_odds` is clear. Only very similar places of the map are then
-    searched.
+    searched. A pose with less than `hopeless_log_odds` cannot become probable by more matches.
     """
 
     even_share: Finite
@@ -40,10 +47,11 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     doubt: Finite
     bias: Finite
     clear_log_odds: Finite
+    hopeless_log_odds: Finite = -3.0
 
     @property
     def as_vector(self) -> tuple[float, ...]:
-        """Return the weights in the order of `compute_score_features`, without the bias."""
+        """Return the weights in the order of `features`, without the bias."""
         return (
             self.even_share,
             self.chance,
@@ -53,23 +61,36 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
             self.doubt,
         )
 
+    @staticmethod
+    def features(evidence: Evidence) -> tuple[float, ...]:
+        """Return the inputs of the regression."""
+        e = evidence
+        return (
+            _log_even_share(e),
+            math.log((e.num_found + 1) / (e.num_by_chance + 5)),
+            math.log(e.num_inliers + 1),
+            math.log((e.num_inliers + 1) / (e.num_matches + 10)),
+            math.log(e.spread + 0.02),
+            _log_doubt(e),
+        )
 
-class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the weights that compare two poses of one image (`belief.py`).
+    @property
+    def few_points(self) -> float:
+        """Return 0: the covariance of few points is not inflated."""
+        return 0.0
 
-    They weigh the log-odds, the spatially uniform inlier ratio and the normalized uncertainty, in
-    logarithms. `unclear_lead` is the minimum log-odds margin of a pose that is not clear over each
-    pose elsewhere.
-    """
-
-    odds: Finite
-    even_share: Finite
-    doubt: Finite
-    unclear_lead: Finite
+    def is_clear(self, log_odds: float) -> bool:
+        """Return whether a pose with these log-odds is clear."""
+        return log_odds > self.clear_log_odds
 
 
 class VirtualViewWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the weights of the evidence for a pose from virtual views (`walls/`), in log-odds.
+
+    Walls repeat more than rooms do, and fewer of their points are recognised at a slant. Two more
+    features count here. `distinct` weighs the found key points that match here better than anywhere
+    else in the map. `lesser_side` weighs the agreement of both side views, because one wall alone
+    may match a similar place.
 
     `sigma_px` is the standard deviation (pixels) of a key point found at a slant. `few_points` over
     n is the covariance factor for n points, relative to independent errors. If few points are
@@ -91,9 +112,81 @@ class VirtualViewWeights(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def as_vector(self) -> tuple[float, ...]:
-        """Return the weights in the order of `compute_virtual_view_features`, without the bias."""
+        """Return the weights in the order of `features`, without the bias."""
         shares = (self.found, self.chance, self.inliers, self.inlier_share, self.spread)
         return (*shares, self.distinct, self.lesser_side, self.even_share, self.doubt)
+
+    @staticmethod
+    def features(evidence: Evidence) -> tuple[float, ...]:
+        """Return the inputs of the regression."""
+        e = evidence
+        return (
+            math.log((e.num_found + 1) / (e.num_visible + 20)),
+            math.log((e.num_found + 1) / (e.num_by_chance + 5)),
+            math.log(e.num_inliers + 1),
+            math.log((e.num_inliers + 1) / (e.num_matches + 10)),
+            math.log(e.spread + 0.02),
+            math.log((e.num_distinct or 0) + 1),
+            math.log((e.num_lesser_side or 0) + 2),
+            _log_even_share(e),
+            _log_doubt(e),
+        )
+
+    def is_clear(self, log_odds: float) -> bool:
+        """Return True: this evidence is compared with all other virtual views already."""
+        return True
+
+
+def compute_log_odds(evidence: Evidence, weights: EvidenceWeights | VirtualViewWeights) -> float:
+    """Compute the log-odds that a pose with this evidence is right."""
+    features = weights.features(evidence)
+    return sum(w * x for w, x in zip(weights.as_vector, features, strict=True)) + weights.bias
+
+
+def _log_even_share(evidence: Evidence) -> float:
+    return math.log(evidence.even_share + 0.002)
+
+
+def _log_doubt(evidence: Evidence) -> float:
+    return math.log(max(evidence.doubt, 0.01))
+
+
+class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the weights that compare two poses of one image (`belief.py`).
+
+    They weigh the log-odds, the spatially uniform inlier ratio and the normalized uncertainty, in
+    logarithms. `lead` is the minimum log-odds margin of a reported pose over each other one,
+    `unclear_lead` that of a pose that is not clear over each pose elsewhere.
+    """
+
+    odds: Finite
+    even_share: Finite
+    doubt: Finite
+    unclear_lead: Finite
+    lead: Finite = 2.0
+
+    def score(self, evidence: Evidence, log_odds: float) -> float:
+        """Return the score of a pose. The difference of two scores is a log-odds margin.
+
+        It is NaN for virtual views, whose evidence is of another kind.
+        """
+        if evidence.is_from_virtual_views:
+            return math.nan
+        even_share, doubt = _log_even_share(evidence), _log_doubt(evidence)
+        return self.odds * log_odds + self.even_share * even_share + self.doubt * doubt
+
+
+class ConfirmationWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the weights of a second feature type on a pose of the first one (`refine.py`).
+
+    `max_log_odds` limits the log-odds that it adds, and `half_weight_matches` is the number of its
+    matches that count half. A pose that it confirms has at least `min_log_odds`. Similar places
+    reach 1.2.
+    """
+
+    max_log_odds: Finite = 3.0
+    half_weight_matches: Finite = 30.0
+    min_log_odds: Finite = 1.4
 
 
 class CorrelatedErrorWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -126,15 +219,24 @@ class FittedWeights:
     rivals: RivalWeights
     walls: VirtualViewWeights
     shared_errors: CorrelatedErrorWeights
+    confirmation: ConfirmationWeights
 
     @property
     def is_calibrated(self) -> bool:
         """Return whether the weights were fitted to this feature type."""
         return self.calibration_error is not None
 
+    def of(self, evidence: Evidence) -> EvidenceWeights | VirtualViewWeights:
+        """Return the weights of this evidence: of the map's nodes, or of virtual views."""
+        return self.walls if evidence.is_from_virtual_views else self.evidence
+
+    def log_odds(self, evidence: Evidence) -> float:
+        """Return the log-odds that a pose with this evidence is right."""
+        return compute_log_odds(evidence, self.of(evidence))
+
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object of a file of weights."""
-        groups = ("evidence", "rivals", "walls", "shared_errors")
+        groups = _Groups.__struct_fields__
         weights = {name: to_builtins(getattr(self, name)) for name in groups}
         return {
             "kind": self.kind,
@@ -151,6 +253,7 @@ class _Groups(Struct, frozen=True, forbid_unknown_fields=True):
     rivals: RivalWeights
     walls: VirtualViewWeights
     shared_errors: CorrelatedErrorWeights
+    confirmation: ConfirmationWeights = ConfirmationWeights()
 
 
 class _WeightsFile(Struct, frozen=True, forbid_unknown_fields=True):

@@ -163,9 +163,15 @@ def _project_points(
             np.ascontiguousarray(cam_from_world.rotation),
             np.ascontiguousarray(cam_from_world.translation),
         )
-        intrinsics = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        fx, fy, cx, cy = camera.intrinsics
         return project_undistorted(
-            local_map.points_world, rotation, translation, *intrinsics, camera.width, camera.height
+            local_map.points_world,
+            rotation,
+            translation,
+            (fx, fy),
+            (cx, cy),
+            camera.width,
+            camera.height,
         )
     points_cam = cam_from_world.apply(local_map.points_world)
     pixels = camera.img_from_cam(points_cam)

@@ -3,14 +3,12 @@
 The coarse localizer ranks candidate nodes. The image is patch-normalised and its features are
 matched with those of the nodes. PnP on the matches gives the camera's global pose.
 
-The paper keeps the first pose without a check. This localizer runs one loop over pose hypotheses
-(`query_session.py`) instead. Pose proposals are generated cheapest and likeliest first
-(`propose.py`). Each one is refined and its evidence counted in the same way (`refine.py`). It then
-enters the belief over hypotheses (`belief.py`), until the result is settled. A pose is reported
-only if its evidence is strong and no other place explains the image as well.
-
-A map is an atlas of one tile. Of several tiles, the ones that look like the image are searched in
-the same way, and their poses are compared (`tiles/tile_search.py`).
+The paper keeps the first pose without a check. This localizer runs one loop over pose proposals
+instead. `schedule.py` generates them, cheapest and likeliest first. Each one is verified in the
+same way (`search.py`): it is refined and its evidence counted. It then enters the belief over
+hypotheses (`belief.py`), until the result is settled. A pose is reported only if its evidence is
+strong and no other place explains the image as well. A map is an atlas of one tile. Of several
+tiles, the poses are compared (`tiles/tiles.py`).
 
 These settings give the paper's own behaviour: `num_candidates=1`, `guided.num_nodes=0`,
 `look_alikes.max_groups=0`, `viewpoints.num_nodes=0`, `walls.num_places=0`.
@@ -22,13 +20,13 @@ import copy
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from topoloc.atlas.config import AtlasConfig
 from topoloc.bounds import check_bounds
-from topoloc.errors import AtlasError
+from topoloc.errors import AtlasError, MapError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
@@ -38,9 +36,9 @@ from topoloc.localization.map_context import MapContext
 from topoloc.localization.query import QueryImage, StageClock, unknown_camera
 from topoloc.localization.result import Localization, NotLocalized, R, with_time
 from topoloc.localization.result_decision import ResultWithInliers
-from topoloc.localization.search import Trace
-from topoloc.localization.tiles.tile_search import TileSearch
-from topoloc.localization.tiles.tiles import OneMap, Reach, TileRanking, Tiles
+from topoloc.localization.schedule import Schedule
+from topoloc.localization.search import Trace, verify
+from topoloc.localization.tiles.tiles import Reach, TileRanking, Tiles
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import CoarseLocalizer, Image
@@ -100,7 +98,7 @@ class Localizer:
         self._nothing_in_reach = ""
         if isinstance(source, MapContext):
             self.config, self.source = source.config, source.topomap
-            self._tiles: Tiles = OneMap(source)
+            self._tiles = Tiles(source)
             return
         self.config = config or LocalizerConfig()
         check_bounds(self.config)
@@ -117,22 +115,19 @@ class Localizer:
             source = open_place(str(source)).visit(TopoMetricMap.load, lambda atlas: atlas)
         self.source = source
         if isinstance(source, TopoMetricMap):
-            self._tiles = OneMap(open_map(source))
+            self._tiles = Tiles(open_map(source))
         else:
-            self._tiles = _open_tiles(
-                source,
-                maps,
-                lambda topomap: Localizer(open_map(topomap)),
-                self.tile_config,
-                warn,
-            )
+            # a single map does not need these modules
+            from topoloc.atlas.map_cache import MapCache
+            from topoloc.localization.tiles.atlas_tiles import AtlasTiles
+
+            maps = maps or MapCache.with_memory([], lambda one: Localizer(open_map(one)), 512)
+            self._tiles = AtlasTiles(source, maps, self.tile_config, warn)
 
     @property
     def context(self) -> MapContext:
         """Return the open map. Raises AtlasError: this is an atlas."""
-        if isinstance(self._tiles, OneMap):
-            return self._tiles.opened
-        raise AtlasError("an atlas has many maps: in_tile opens one of them")
+        return self._tiles.opened
 
     @property
     def topomap(self) -> TopoMetricMap:
@@ -169,12 +164,9 @@ class Localizer:
         """
         tile_id = self._tile_id(tile_id)
         with self._tiles.use(tile_id) as opened:
-            if isinstance(self._tiles, OneMap):
-                yield self
-                return
-            other = copy.copy(self)
-            other.source, other._reach = opened.topomap, None
-            other._tiles = OneMap(opened, self._tiles, tile_id)
+            tiles = self._tiles.alone(tile_id, opened)
+            other = self if tiles is self._tiles else copy.copy(self)
+            other._tiles, other._reach, other.source = tiles, None, opened.topomap
             yield other
 
     def near(self, near: LocationPrior | None, georeferenced_only: bool = False) -> Localizer:
@@ -240,24 +232,9 @@ class Localizer:
             AtlasError: there is no such tile, a prior comes without one, or no tile can be read.
             ObjectStoreError: the object store of a required tile does not respond.
         """
-        camera = camera or unknown_camera(image)
-        result = self.localize_with_inliers(image, camera, prior, max_ms, trace, tile_id)[0]
+        query_image = QueryImage(image, camera or unknown_camera(image))
+        result = self.localize_query(query_image, prior, max_ms, trace, tile_id)[0]
         return result if t_ns is None else with_time(result, t_ns)
-
-    def localize_with_inliers(
-        self,
-        image: Image,
-        camera: Camera | UncalibratedCamera,
-        prior: Rigid3 | None,
-        max_ms: float | None = None,
-        trace: Trace | None = None,
-        tile_id: str | None = None,
-    ) -> ResultWithInliers:
-        """Localize as `localize` does, and also return the inliers of each reported pose.
-
-        The reported poses are the result's own pose, or its alternatives.
-        """
-        return self.localize_query(QueryImage(image, camera), prior, max_ms, trace, tile_id)
 
     def localize_query(
         self,
@@ -267,22 +244,29 @@ class Localizer:
         trace: Trace | None = None,
         tile_id: str | None = None,
     ) -> ResultWithInliers:
-        """Localize as `localize_with_inliers` does, with a query image that caches its features.
+        """Localize as `localize` does, and also return the inliers of each reported pose.
 
-        Several maps can share these features.
+        The reported poses are the result's own pose, or its alternatives. The query image caches
+        its features, which several maps can share.
         """
         limit = max_ms if max_ms is not None else self.config.max_ms
         deadline = float("inf") if limit is None else time.perf_counter() + limit / 1e3
-        search = TileSearch(
+        schedule = Schedule(
             self._tiles, self.tile_config, query_image, deadline, self._reach, trace
         )
         if prior is not None or tile_id is not None or len(self.tile_ids) == 1:
-            search.search_tile(self._tile_id(tile_id), prior=prior)
+            proposals = schedule.propose_in_tile(self._tile_id(tile_id), prior=prior)
         elif self._reach is not None and not self._reach:
             return NotLocalized("not_in_map", detail=self._nothing_in_reach), []
         else:
-            search.search_all()
-        return search.outcome()
+            proposals = schedule.propose_all()
+        with closing(proposals):
+            for proposal in proposals:
+                try:
+                    proposal.search.add(verify(proposal))
+                except MapError as error:
+                    proposal.search.failure = error
+        return schedule.outcome()
 
     def rank_tiles(self, image: Image, camera: Camera | UncalibratedCamera) -> TileRanking:
         """Return the tiles by their similarity to an image, followed by those that cannot be
@@ -313,18 +297,3 @@ class Localizer:
         if len(self.tile_ids) > 1:
             raise AtlasError("the atlas has several tiles: name the one that is meant")
         return self.tile_ids[0]
-
-
-def _open_tiles(
-    atlas: Atlas,
-    maps: MapCache[Localizer] | None,
-    open_map: Callable[[TopoMetricMap], Localizer],
-    config: AtlasConfig,
-    warn: Callable[[str], None],
-) -> Tiles:
-    """Return the tiles of an atlas. Their modules are loaded here, because a single map needs
-    none of them."""
-    from topoloc.atlas.map_cache import MapCache
-    from topoloc.localization.tiles.atlas_tiles import AtlasTiles
-
-    return AtlasTiles(atlas, maps or MapCache.with_memory([], open_map, 512), config, warn)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,15 +11,13 @@ from msgspec import structs
 from topoloc.errors import MissingExtraError, WeightsError
 from topoloc.features.feature_types import check_available, select_stored_types
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
 from topoloc.localization.map_facts.correlated_errors import find_correlated_error_share
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.provenance import Provenance
-from topoloc.localization.query import Query, QueryImage, reduce_image
-from topoloc.localization.query_session import QuerySession
+from topoloc.localization.query import Query, QueryImage, StageClock, reduce_image
 from topoloc.localization.result import Localization, NotLocalized, R
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
@@ -120,24 +117,50 @@ class MapContext:
         types = tuple(replace(one, map=one.map.without(rows)) for one in self.types)
         return replace(self, types=types)
 
-    def query_session(
+    def searches(
         self,
         query_image: QueryImage,
-        prior: Rigid3 | None = None,
-        max_ms: float | None = None,
+        clock: StageClock,
+        deadline: float,
         trace: Trace | None = None,
-    ) -> QuerySession:
-        """Return a session for this query, which can run a coarse search before the exhaustive
-        one."""
-        camera = query_image.camera
+    ) -> list[Search]:
+        """Return one search for each feature type. Each one links to the previous one.
 
-        def with_provenance(outcome: ResultWithInliers) -> ResultWithInliers:
-            return self.with_provenance(outcome[0], camera), [
-                (self.with_provenance(one, camera), seen) for one, seen in outcome[1]
-            ]
+        No further hypothesis is tested after the deadline (`time.perf_counter`, seconds).
+        """
+        config, opened, searches = self.config, self.first.map, list[Search]()
+        reduced, camera = reduce_image(
+            query_image.image,
+            query_image.camera,
+            opened.focal,
+            config.max_finer,
+            config.max_side_px,
+        )
+        scale = query_image.image.shape[1] / camera.width
+        for one in self.types:
+            query = Query(
+                reduced,
+                camera,
+                scale,
+                one.map.feature_config,
+                clock,
+                deadline,
+                query_image.features,
+            )
+            search = Search(query, one.map, one.config, one.weights, one.correlated_errors, trace)
+            if searches:
+                search.previous, searches[-1].is_last = searches[-1], False
+            searches.append(search)
+        return searches
 
-        searches = self._searches(self._query(query_image, max_ms), trace)
-        return QuerySession(searches, prior, with_provenance)
+    def name_outcome(
+        self, outcome: ResultWithInliers, camera: Camera | UncalibratedCamera
+    ) -> ResultWithInliers:
+        """Return a result and its poses `with_provenance`."""
+        result, poses = outcome
+        return self.with_provenance(result, camera), [
+            (self.with_provenance(one, camera), seen) for one, seen in poses
+        ]
 
     def with_provenance(
         self, result: R, camera: Camera | UncalibratedCamera | None = None, t_ns: int | None = None
@@ -167,36 +190,6 @@ class MapContext:
             result,
             provenance=provenance,
             geopose=georeference.geopose(result.world_from_cam) if georeference else None,
-        )
-
-    def _searches(self, query: Query, trace: Trace | None) -> list[Search]:
-        """Return one search for each feature type. Each search links to the previous one."""
-        searches = list[Search]()
-        for one in self.types:
-            of_type = replace(query, feature_config=one.map.feature_config)
-            search = Search(of_type, one.map, one.config, one.weights, one.correlated_errors, trace)
-            if searches:
-                search.previous, searches[-1].is_last = searches[-1], False
-            searches.append(search)
-        return searches
-
-    def _query(self, query_image: QueryImage, max_ms: float | None) -> Query:
-        image, opened = query_image.image, self.first.map
-        deadline = float("inf") if max_ms is None else time.perf_counter() + max_ms / 1e3
-        reduced, camera = reduce_image(
-            image,
-            query_image.camera,
-            opened.focal,
-            self.config.max_finer,
-            self.config.max_side_px,
-        )
-        return Query(
-            reduced,
-            camera,
-            image.shape[1] / camera.width,
-            opened.feature_config,
-            deadline=deadline,
-            shared=query_image.features,
         )
 
 

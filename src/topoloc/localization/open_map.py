@@ -29,13 +29,11 @@ from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
 from topoloc.mapping.coarse_models import open_map_coarse_localizer
 from topoloc.mapping.node_cache import CachedNodes
-from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.nodes import node_distances_for_any_roll
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
-
-_NO_MOVES = np.zeros((0, 4, 4))
 
 
 class OpenMap:
@@ -105,7 +103,7 @@ class OpenMap:
 
     def local_map(self, rows: Sequence[Row]) -> LocalMap:
         """Return the points of these nodes, pooled."""
-        return LocalMap.concatenate([self._local_map(row) for row in rows])
+        return LocalMap.concatenate(self._local_map.pool(rows))
 
     def predict_at_node(self, row: Row, camera: Camera) -> Float32[np.ndarray, "n 5"]:
         """Return `predict_key_points` of a node's points for a camera at the node's pose.
@@ -136,7 +134,11 @@ class OpenMap:
         They are read from the map if it stores them, and computed otherwise.
         """
         known = self._stored_moves
-        return self._moves(row) if known is None else known.get(self.node_ids[row], _NO_MOVES)
+        return (
+            self._moves(row)
+            if known is None
+            else known.get(self.node_ids[row], np.zeros((0, 4, 4)))
+        )
 
     def _find_moves(self, row: Row) -> Float[np.ndarray, "k 4 4"]:
         node = self._nodes[row]
@@ -202,7 +204,7 @@ class OpenMap:
 
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll."""
-        distances = roll_invariant_distances(world_from_cam, self.node_poses, self.lambda_rot)
+        distances = node_distances_for_any_roll(world_from_cam, self.node_poses, self.lambda_rot)
         distances[self._masked_rows] = np.inf
         return distances
 
@@ -234,21 +236,3 @@ def _stored_moves(topomap: TopoMetricMap) -> Mapping[NodeId, Float[np.ndarray, "
         if known is not None and known.digest == digest_of(topomap.summaries)
         else None
     )
-
-
-QUARTER_TURN = Rigid3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-"""Rotation by 90 degrees about the optical axis."""
-
-
-def roll_invariant_distances(
-    world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float
-) -> Float[np.ndarray, " nodes"]:
-    """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll.
-
-    It is the minimum over four rolls, 90 degrees apart.
-    """
-    distances = node_distances(world_from_cam, nodes, lambda_rot)
-    for _ in range(3):
-        world_from_cam = world_from_cam @ QUARTER_TURN
-        distances = np.minimum(distances, node_distances(world_from_cam, nodes, lambda_rot))
-    return distances

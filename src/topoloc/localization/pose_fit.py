@@ -12,6 +12,7 @@ from topoloc.features.features import Features, Matches
 from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_matches import MIN_POINTS
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera, nominal_camera
 from topoloc.mapping.topomap import TopoNode
@@ -92,9 +93,6 @@ class PointObservations:
             (self.points_img + np.float32(0.5)) * np.float32(scale) - np.float32(0.5)
         ).astype(np.float32)
         return PointObservations(points_img, self.points_world, self.covariances)
-
-
-_MIN_MATCHES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,14 +190,15 @@ def fit_pose(
     matches: Matches,
     config: AbsolutePoseConfig,
     start: tuple[Rigid3, Camera] | None = None,
+    min_matches: float = float(MIN_POINTS),
 ) -> PointMatches:
     """Fit a pose by robust PnP, or refine `start` (cam_from_world, camera).
 
     The focal length is estimated too if the camera is approximate. The result is a `PoseFit` if
-    enough matches agree on a pose.
+    there are `min_matches` matches and enough of them agree on a pose.
     """
     camera = start[1] if start else nominal_camera(input_camera)
-    if len(matches) < _MIN_MATCHES:
+    if len(matches) < max(min_matches, MIN_POINTS):
         return PointMatches(features, input_camera, camera, local_map, matches)
     points_img = features.points_img[matches.query_idx].astype(np.float64)
     points_world, covariances = (

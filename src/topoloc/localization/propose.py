@@ -29,16 +29,13 @@ import numpy as np
 from topoloc.features.matching import Matcher
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.belief import Hypothesis, is_same_fit
-from topoloc.localization.guided import (
-    count_consistent_displacements,
-    match_guided,
-    match_predicted,
-)
+from topoloc.localization.belief import is_same_fit
+from topoloc.localization.guided import count_consistent_displacements, match_predicted
 from topoloc.localization.map_facts.repetition import MIN_SHIFT
-from topoloc.localization.pose_fit import LocalMap, PointMatches, PoseFit, fit_pose
-from topoloc.localization.search import Proposal, Search, Source
-from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
+from topoloc.localization.pose_fit import LocalMap, PoseFit, fit_pose
+from topoloc.localization.provenance import Evidence
+from topoloc.localization.refine import NodeProposal, fit_around
+from topoloc.localization.search import Search, Source
 from topoloc.mapping.nodes import node_distances
 from topoloc.node_ids import Row
 from topoloc.retrieval.coarse import NodeScore
@@ -46,43 +43,24 @@ from topoloc.retrieval.coarse import NodeScore
 _MAX_SAME_POSE_ANGLE = 0.25  # radians
 
 
-def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
-    """Generate the pose proposals lazily.
+def propose_first(search: Search, prior: Rigid3 | None) -> NodeProposal:
+    """Propose a pose from the nodes nearest to an approximate pose (world_from_cam).
 
-    With a prior there is one proposal. If another feature type follows and the pose is not clear,
-    only retrieval is used.
+    If it is None, propose one from the nodes that the coarse localizer ranks first.
     """
-    if prior is not None:
-        rows = [candidate.row for candidate in _nearest_nodes(search, prior)]
-        yield _propose_from_nodes(search, "prior", rows, float(search.config.num_chance_inliers))
-        return
-    rows = _rank_nodes(search)
-    retrieved = _propose_from_nodes(
-        search, "retrieval", rows, float(search.config.num_chance_inliers)
-    )
-    search.retrieved = retrieved.fit
-    yield retrieved
-    if search.is_last or search.is_clear:
-        yield from _propose_from_other_features(search)
-        yield from propose_more(search)
+    least = float(search.config.num_chance_inliers)
+    if prior is None:
+        proposal = _propose_from_nodes(search, "retrieval", _rank_nodes(search), least)
+    else:
+        distances = search.map.distances(prior)
+        rows = search.map.nearest(prior, search.config.num_candidates)
+        search.ranked = [NodeScore(row, -float(distances[row])) for row in rows]  # by Eq. 1
+        proposal = _propose_from_nodes(search, "prior", rows, least)
+    search.num_retrieved = proposal.fit.num_inliers
+    return proposal
 
 
-def propose_more(search: Search) -> Iterator[Proposal]:
-    """Generate the proposals that follow retrieval."""
-    viewpoints = [] if search.is_clear else list(_propose_node_viewpoints(search))
-    yield from viewpoints
-    assert search.retrieved is not None
-    if (
-        search.is_clear
-        or viewpoints
-        or search.retrieved.num_inliers >= search.config.num_chance_inliers
-    ):
-        yield from _propose_similar_places(search)
-    yield from _propose_repetitions(search)
-    yield from propose_virtual_views(search)
-
-
-def propose_quick(search: Search, least: float) -> Proposal | None:
+def propose_quick(search: Search, least: float) -> NodeProposal | None:
     """Return the proposal of retrieval with the strongest features only.
 
     None if fewer than `least` of them agree.
@@ -106,16 +84,9 @@ def _rank_nodes(search: Search) -> list[Row]:
     return [candidate.row for candidate in search.candidates]
 
 
-def _nearest_nodes(search: Search, world_from_cam: Rigid3) -> list[NodeScore]:
-    """Return `num_candidates` nodes nearest to a pose. The score is the negative distance (Eq.
-    1)."""
-    distances = search.map.distances(world_from_cam)
-    rows = search.map.nearest(world_from_cam, search.config.num_candidates)
-    search.ranked = [NodeScore(row, -float(distances[row])) for row in rows]
-    return search.ranked
-
-
-def _propose_from_nodes(search: Search, source: Source, rows: list[Row], least: float) -> Proposal:
+def _propose_from_nodes(
+    search: Search, source: Source, rows: list[Row], least: float
+) -> NodeProposal:
     """Propose a pose from the pooled points of these nodes.
 
     The strongest features are matched first. All are matched if at least `least` of these agree but
@@ -146,29 +117,21 @@ def _match_and_fit(
     points_and_matcher: tuple[LocalMap, Matcher],
     least: float,
     max_features: int | None = None,
-) -> Proposal:
+) -> NodeProposal:
     """Match the points of nodes and fit a pose by robust PnP.
 
     The pose is None if there are fewer than `least` or `min_matches` matches.
     """
-    query, (local_map, matcher) = search.query, points_and_matcher
+    query, config, (local_map, matcher) = search.query, search.config, points_and_matcher
     with query.clock.stage("matching"):
         matches = matcher.match_first(max_features)
-    if len(matches) < max(search.config.min_matches, least):
-        return Proposal(
-            source,
-            PointMatches(query.features, query.input_camera, query.camera, local_map, matches),
-            is_guided=False,
-        )
+    matched = query.features, query.input_camera, local_map, matches
     with query.clock.stage("pnp"):
-        return Proposal(
-            source,
-            fit_pose(query.features, query.input_camera, local_map, matches, search.config.pose),
-            is_guided=False,
-        )
+        fit = fit_pose(*matched, config.pose, min_matches=max(float(config.min_matches), least))
+    return NodeProposal(search, source, fit, is_guided=False)
 
 
-def _propose_similar_places(search: Search) -> Iterator[Proposal]:
+def propose_similar_places(search: Search) -> Iterator[NodeProposal]:
     """Propose poses in similar places, far from the best pose.
 
     They are groups of nodes with nearly the best coarse score.
@@ -219,7 +182,7 @@ def min_rival_inliers(search: Search) -> float:
     return max(least, min_share * best.evidence.num_inliers * share_of_strongest)
 
 
-def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
+def propose_node_viewpoints(search: Search) -> Iterator[NodeProposal]:
     """Propose poses from node viewpoints, most consistent first.
 
     Each node predicts its own points at its own pose. Nodes with consistent displacements are
@@ -237,20 +200,15 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
     # fitted.
     max_fits = 6
     max_poses = 4  # number of fitted poses, those with the most inliers, that become proposals
-    config, query = search.config.viewpoints, search.query
-    found = []
+    config, query, found = search.config.viewpoints, search.query, []
+    features, camera = query.features, query.camera
     with query.clock.stage("matching"):
         for candidate in search.ranked[: config.num_nodes]:
-            row = candidate.row
-            local_map, predicted = (
-                search.map.local_map([row]),
-                search.map.predict_at_node(row, query.camera),
-            )
-            matches = match_predicted(
-                query.features, local_map, predicted, query.camera, config.matching
-            )
+            local_map = search.map.local_map([candidate.row])
+            predicted = search.map.predict_at_node(candidate.row, camera)
+            matches = match_predicted(features, local_map, predicted, camera, config.matching)
             num_alike = count_consistent_displacements(
-                query.features, matches, predicted, query.camera, shift_px
+                features, matches, predicted, camera, shift_px
             )
             if num_alike >= min_alike + chance_share * len(matches):
                 found.append((num_alike, local_map, matches))
@@ -269,32 +227,25 @@ def _propose_node_viewpoints(search: Search) -> Iterator[Proposal]:
             is_same_fit(fit, other, search.config.evidence) for other in kept
         ):
             kept.append(fit)
-            yield Proposal("viewpoints", fit, is_guided=True)
+            yield NodeProposal(search, "viewpoints", fit)
         if len(kept) == more * max_poses:
             return
 
 
-def _propose_from_other_features(search: Search) -> Iterator[Proposal]:
+def propose_from_other_features(search: Search) -> Iterator[NodeProposal]:
     """Propose the poses of the preceding feature type if this one is not clear."""
     config, previous = search.config, search.previous
     if previous is None or search.is_clear or config.guided.num_nodes == 0:
         return
-    likeliest = previous.belief.ranked(previous.weights.rivals)[:3]
-    for hypothesis in likeliest:
-        fit = _fit_around_pose(
-            search,
-            hypothesis.world_from_cam,
-            hypothesis.fit.camera,
-            float(config.evidence.min_found),
-        )
-        if fit is not None:
-            yield Proposal("other features", fit, is_guided=True)
+    for hypothesis in previous.belief.ranked(previous.weights.rivals)[:3]:
+        fit, least = hypothesis.fit, float(config.evidence.min_found)
+        yield from _propose_around(search, "other features", fit.world_from_cam, fit.camera, least)
 
 
-def _propose_repetitions(search: Search) -> Iterator[Proposal]:
+def propose_repetitions(search: Search) -> Iterator[NodeProposal]:
     """Propose the repeated poses of the probable hypotheses, and the repetitions of new ones."""
     config, tried, num_asked = search.config, list[Rigid3](), 0
-    waiting = [one for one in search.belief.hypotheses if not one.is_from_virtual_views]
+    waiting = search.belief.of_nodes
     while waiting and config.guided.num_nodes > 0:
         hypothesis = waiting.pop(0)
         if hypothesis.probability < config.evidence.min_probability:
@@ -311,46 +262,27 @@ def _propose_repetitions(search: Search) -> Iterator[Proposal]:
                 return
             num_asked, search.is_repetitive = num_asked + 1, True
             tried.append(world_from_cam)
-            fit = _fit_moved_pose(search, world_from_cam, hypothesis)
-            if fit is None:
-                continue
-            previous = set(map(id, search.belief.hypotheses))
-            yield Proposal("repetition", fit, is_guided=True, repeats=hypothesis.evidence)
-            waiting += [other for other in search.belief.hypotheses if id(other) not in previous]
+            least = 0.2 * hypothesis.evidence.num_found  # far fewer points refute a repetition
+            previous, camera = search.belief.hypotheses, hypothesis.fit.camera
+            yield from _propose_around(
+                search, "repetition", world_from_cam, camera, least, hypothesis.evidence
+            )
+            waiting += [other for other in search.belief.hypotheses if other not in previous]
 
 
-def _fit_moved_pose(
-    search: Search, world_from_cam: Rigid3, hypothesis: Hypothesis
-) -> PoseFit | None:
-    """Fit a pose around a repeated pose, which is accurate to a few centimetres.
+def _propose_around(
+    search: Search,
+    source: Source,
+    world_from_cam: Rigid3,
+    camera: Camera,
+    least: float,
+    repeats: Evidence | None = None,
+) -> Iterator[NodeProposal]:
+    """Propose the pose of guided matches around a pose, which is accurate to a few centimetres.
 
-    None if far fewer points are found than at the original pose.
+    There is no proposal if fewer than `least` matches agree.
     """
-    return _fit_around_pose(
-        search,
-        world_from_cam,
-        hypothesis.fit.camera,
-        0.2 * hypothesis.evidence.num_found,  # far fewer points refute a repetition
-    )
-
-
-def _fit_around_pose(
-    search: Search, world_from_cam: Rigid3, camera: Camera, least: float
-) -> PoseFit | None:
-    """Fit a pose to guided matches around a pose. None if fewer than `least` agree."""
-    query, config, start = search.query, search.config, (world_from_cam.inverse(), camera)
-    with query.clock.stage("matching"):
-        local_map = search.map.local_map(
-            search.map.nearest(world_from_cam, config.guided.num_nodes)
-        )
-        matches = match_guided(
-            query.features,
-            local_map,
-            *start,
-            replace(config.guided, radius_px=2.0 * config.guided.radius_px),
-        )
-    if len(matches) < least:
-        return None
-    with query.clock.stage("pnp"):
-        fit = fit_pose(query.features, query.input_camera, local_map, matches, config.pose, start)
-    return fit if isinstance(fit, PoseFit) and fit.num_inliers >= least else None
+    radius_px = 2.0 * search.config.guided.radius_px
+    fit = fit_around(search, world_from_cam.inverse(), camera, radius_px, least)
+    if isinstance(fit, PoseFit) and fit.num_inliers >= least:
+        yield NodeProposal(search, source, fit, repeats=repeats)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -50,6 +51,23 @@ class Evidence:
     def is_from_virtual_views(self) -> bool:
         """Return whether the pose was found by virtual views, not by the map's nodes."""
         return self.num_distinct is not None
+
+    @property
+    def precision_probability(self) -> float:
+        """Return the probability that a pose at the right place is within the tolerance.
+
+        It is 1 for a pose of the nodes, whose log-odds include the precision already. A single wall
+        may leave a pose imprecise although the place is certain.
+        """
+        return probability_within_tolerance(self.doubt) if self.is_from_virtual_views else 1.0
+
+
+def probability_within_tolerance(doubt: float) -> float:
+    """Return the probability that a normal error is within the tolerance.
+
+    `doubt` is the standard deviation divided by the tolerance.
+    """
+    return math.erf(1.0 / (math.sqrt(2.0) * doubt))
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ class Query:
     deadline: float = float("inf")
     shared: SharedFeatures = field(default_factory=SharedFeatures)
 
-    @property
+    @cached_property
     def camera(self) -> Camera:
         """Return the calibrated camera, or the nominal one if the camera is only approximate."""
         return nominal_camera(self.input_camera)

@@ -11,21 +11,19 @@ from jaxtyping import Float
 from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.belief import MIN_LOG_ODDS_MARGIN, Hypothesis, log_odds_margin
+from topoloc.localization.belief import Hypothesis, log_odds_margin
 from topoloc.localization.evidence import (
     compute_normalized_uncertainty,
-    compute_precision_probability,
     is_only_imprecise,
-    probability_within_tolerance,
 )
 from topoloc.localization.image_calibration_check import check_image_calibration
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.localization.provenance import Provenance
+from topoloc.localization.provenance import Provenance, probability_within_tolerance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
 
 _MIN_DISTANT_ANGLE_DEG = 10.0
-_MIN_ALTERNATIVE_RATIO = 0.01  # relative to the best probability; less probable ones are dropped
+MIN_ALTERNATIVE_RATIO = 0.01  # relative to the best probability; less probable ones are dropped
 
 
 LocalizationWithInliers = tuple[Localization, PointObservations]
@@ -45,7 +43,7 @@ def decide_result(search: Search) -> ResultWithInliers:
         [_log_odds_margin(search, ranked[0], other) for other in ranked[1:]],
     )
     others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in log_odds_margins)
-    probability = compute_precision_probability(best.evidence) / (1.0 + others)
+    probability = best.evidence.precision_probability / (1.0 + others)
     is_leading = all(
         by >= _min_log_odds_margin(search, best, other)
         for by, other in zip(log_odds_margins, ranked[1:], strict=True)
@@ -117,18 +115,13 @@ def _min_log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) ->
     return (
         search.weights.rivals.unclear_lead
         if _is_unclear_and_distant(search, best, other)
-        else MIN_LOG_ODDS_MARGIN
+        else search.weights.rivals.lead
     )
 
 
 def _is_unclear_and_distant(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
-    """Return whether the best hypothesis is not clear and the other is at another place.
-
-    It is False for virtual views, whose evidence is already compared with all other virtual views.
-    """
-    if best.is_from_virtual_views:
-        return False
-    return best.log_odds <= search.weights.evidence.clear_log_odds and not (
+    """Return whether the best hypothesis is not clear and the other is at another place."""
+    return not search.weights.of(best.evidence).is_clear(best.log_odds) and not (
         best.world_from_cam.is_same(
             other.world_from_cam,
             2.0 * search.config.evidence.max_translation,
@@ -166,7 +159,7 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
     The errors common to the whole image and those common to parts add up. The factor is n rho +
     coherence^2, relative to independent errors. Virtual views have an inflation of their own.
     """
-    if best.is_from_virtual_views:
+    if search.weights.of(best.evidence).few_points:
         return best
     seen = best.fit.inlier_observations(1.0)
     parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
@@ -189,7 +182,7 @@ def _ambiguous_result(
     probable = [
         pair
         for pair in zip(ranked, shares, strict=True)
-        if pair[1] >= _MIN_ALTERNATIVE_RATIO * shares[0]
+        if pair[1] >= MIN_ALTERNATIVE_RATIO * shares[0]
     ]
     named = [
         _build_localization(search, one, share)

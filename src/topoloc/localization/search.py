@@ -1,17 +1,18 @@
-"""Hold the state of the search for one query image: image, map, settings, proposals and belief."""
+"""Hold the state of the search for one query image, and verify its pose proposals."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Literal
 
+from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PointMatches, PoseFit
-from topoloc.localization.provenance import Evidence
 from topoloc.localization.query import Query
 from topoloc.localization.result import CandidateNode
 from topoloc.retrieval.coarse import NodeScore
@@ -62,18 +63,24 @@ Source = Literal[
 
 
 @dataclass(frozen=True, eq=False)
-class Proposal:
-    """Hold a pose proposal and its source.
+class Proposal(ABC):
+    """Hold a pose proposal: its search, which is a feature type of a tile, and its source.
 
-    `fit` is a `PoseFit` if the matches agree on a pose. `is_guided` is True if a pose guided the
-    matches, which are then no evidence for it. `repeats` is the evidence for the pose that this
-    proposal repeats elsewhere. The unguided matches support both.
+    `fit` is a `PoseFit` if the matches agree on a pose. The view of the map that a proposal comes
+    from, the nodes or the virtual views, knows how to refine and to score it.
     """
 
+    search: Search
     source: Source
     fit: PointMatches
-    is_guided: bool
-    repeats: Evidence | None = None
+
+    @abstractmethod
+    def refine(self) -> PointMatches | None:
+        """Return the refined pose. None if it was found already or too few points agree."""
+
+    @abstractmethod
+    def score(self, final: PointMatches) -> Hypothesis | None:
+        """Return the refined pose as a hypothesis. None if too few points were found."""
 
 
 @dataclass(eq=False)
@@ -94,10 +101,12 @@ class Search:
     """The search with the preceding feature type, which left the pose unclear."""
     is_last: bool = True
     """True if no other feature type follows."""
+    failure: MapError | None = None
+    """The reason why the map cannot be read any more."""
     belief: Belief = field(default_factory=Belief)
     ranked: list[NodeScore] = field(default_factory=list)
-    retrieved: PointMatches | None = None
-    """The fit to the retrieved candidates."""
+    num_retrieved: int = 0
+    """The number of inliers of the fit to the retrieved candidates."""
     first: PointMatches | None = None
     """The first fit tried. It gives the reason if there is no hypothesis."""
     is_repetitive: bool = False
@@ -140,3 +149,29 @@ class Search:
             log_odds_margin(best, other, self.weights.rivals) > self.weights.evidence.clear_log_odds
             for other in others
         )
+
+    def add(self, hypothesis: Hypothesis | None) -> None:
+        """Add a hypothesis to the belief, unless it is None."""
+        if hypothesis is not None:
+            self.belief = self.belief.with_hypothesis(
+                hypothesis, self.config.evidence, self.weights.rivals
+            )
+
+
+def verify(proposal: Proposal) -> Hypothesis | None:
+    """Refine a proposal and score it.
+
+    Returns:
+        The hypothesis. None if too few points were found, or the pose was found already.
+    """
+    search, final = proposal.search, proposal.refine()
+    hypothesis = None if final is None else proposal.score(final)
+    if search.first is None:
+        search.first = final if isinstance(final, PoseFit) else proposal.fit
+    if search.trace is not None:
+        milliseconds = search.query.clock.times_ms()["total"]
+        kind = search.query.feature_config.kind
+        search.trace.tried.append(
+            TriedProposal(proposal.source, proposal.fit, final, hypothesis, milliseconds, kind)
+        )
+    return hypothesis

@@ -6,7 +6,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
 
 from topoloc.disk_list import bytes_of
@@ -98,6 +98,10 @@ class CachedNodes(Generic[T]):
             self._owner = CachedNodes._next_owner
         self._read, self._cache = read, cache
         weakref.finalize(self, cache.remove_owner, self._owner)
+
+    def pool(self, rows: Iterable[Row]) -> list[T]:
+        """Return the values of several rows."""
+        return [self(row) for row in rows]
 
     def __call__(self, row: Row) -> T:
         value = self._cache.get(self._owner, row)

@@ -72,8 +72,30 @@ def node_distances(
     world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float
 ) -> Float[np.ndarray, " nodes"]:
     """Return D_total of Eq. 1 (metres) between a camera and each node."""
-    d_translation = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
-    traces = np.einsum("nij,ij->n", nodes.rotations, world_from_cam.rotation)
+    return _distances(world_from_cam.rotation, world_from_cam.translation, nodes, lambda_rot)
+
+
+def node_distances_for_any_roll(
+    world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float
+) -> Float[np.ndarray, " nodes"]:
+    """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll.
+
+    It is the minimum over four rolls, 90 degrees apart.
+    """
+    x, y, z = world_from_cam.rotation.T
+    rolls = (np.column_stack(axes) for axes in ((x, y, z), (y, -x, z), (-x, -y, z), (-y, x, z)))
+    centre = world_from_cam.translation
+    return np.min([_distances(roll, centre, nodes, lambda_rot) for roll in rolls], axis=0)
+
+
+def _distances(
+    rotation: Float[np.ndarray, "3 3"],
+    centre: Float[np.ndarray, " 3"],
+    nodes: NodePoses,
+    lambda_rot: float,
+) -> Float[np.ndarray, " nodes"]:
+    d_translation = np.linalg.norm(nodes.centres - centre, axis=1)
+    traces = np.einsum("nij,ij->n", nodes.rotations, rotation)
     d_rot = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
     return d_translation + lambda_rot * d_rot
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.evidence import compute_precision_probability
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
+from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.tracking.motion import is_same_place
 from topoloc.tracking.pose_hypotheses import Candidate, PoseHypotheses
@@ -25,15 +25,15 @@ class ExpectedPose:
     `pose_covariance` is the error that the filter does not include (left perturbation of
     cam_from_world). A search around the expected pose finds only that place. `is_unique` is True if
     no other place is likely. `is_tracked` is True if the pose comes from tracked points.
-    `is_from_virtual_views` is True if nearby nodes have another viewing direction, so they cannot
-    confirm or reject the image.
+    `is_refutable` is False if nearby nodes have another viewing direction, so they cannot confirm
+    or reject the image.
     """
 
     world_from_cam: Rigid3
     pose_covariance: Float[np.ndarray, "6 6"]
     is_unique: bool
     is_tracked: bool = False
-    is_from_virtual_views: bool = False
+    is_refutable: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class StreamLocalizer:
         if expected is not None and expected.is_unique:
             refusal, found = self._query_localizer(frame, expected.world_from_cam)
             if refusal is not None and expected.is_tracked:
-                if not expected.is_from_virtual_views:
+                if expected.is_refutable:
                     self._hypotheses.update_weights(frame.t_ns, [])
                 return refusal
         candidates = [one.as_candidate(pose_covariance) for one in found]
@@ -137,7 +137,8 @@ class StreamLocalizer:
     ) -> tuple[NotLocalized | None, list[LocalizedPose]]:
         """Return the possible poses of the image: one, the alternatives, or none with the
         reason."""
-        result, named = self._localizer.localize_with_inliers(frame.image, frame.camera, near)
+        query_image = QueryImage(frame.image, frame.camera)
+        result, named = self._localizer.localize_query(query_image, near)
         refusal, found = result if isinstance(result, NotLocalized) else None, list[LocalizedPose]()
         for one, points in named:
             probability = one.probability
@@ -156,7 +157,7 @@ def _place_probability(found: Localization) -> float:
     """
     if found.evidence is None:
         return found.probability
-    return min(found.probability / compute_precision_probability(found.evidence), 1.0)
+    return min(found.probability / found.evidence.precision_probability, 1.0)
 
 
 def _is_known_pose(world_from_cam: Rigid3, found: list[LocalizedPose]) -> bool:

@@ -41,14 +41,12 @@ from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.query import Query, QueryImage
-from topoloc.localization.refine import evaluate_proposal
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.localization.search import Search
+from topoloc.localization.search import Search, verify
 from topoloc.localization.walls import propose_virtual_views as propose_walls_module
-from topoloc.localization.walls.propose_virtual_views import (
-    VirtualViewSearch,
-    propose_virtual_views,
-)
+from topoloc.localization.walls import virtual_view_matching
+from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
+from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap, VirtualNodes
 
@@ -131,7 +129,7 @@ def test_an_answer_by_the_walls_says_what_it_stands_on(localizer: Localizer):
 def test_the_points_seen_are_handed_on(localizer: Localizer):
     """Streams follow them: each is a point of the walls, at the pixel of the picture."""
     picture, truth = seen_on_the_way_back()[2]
-    result, named = localizer.localize_with_inliers(picture, WIDE, None)
+    result, named = localizer.localize_query(QueryImage(picture, WIDE))
     assert isinstance(result, Localization)
     ((_, seen),) = named
     assert len(seen.points_img) == result.num_inliers
@@ -145,9 +143,9 @@ def test_the_walls_are_looked_at_once_for_all_maps(
     localizer: Localizer, monkeypatch: pytest.MonkeyPatch
 ):
     extracted = list[tuple[int, ...]]()
-    extract = propose_walls_module.extract_from_normalized
+    extract = virtual_view_matching.extract_from_normalized
     monkeypatch.setattr(
-        propose_walls_module,
+        virtual_view_matching,
         "extract_from_normalized",
         lambda grey, config: extracted.append(grey.shape) or extract(grey, config),
     )
@@ -263,11 +261,7 @@ def _by_the_walls(
     """What the walls let expect, whatever the nodes say; the likeliest first."""
     search = _search(topomap, picture, config)
     for proposal in propose_virtual_views(search):
-        hypothesis = evaluate_proposal(search, proposal)
-        if hypothesis is not None:
-            search.belief = search.belief.with_hypothesis(
-                hypothesis, search.config.evidence, search.weights.rivals
-            )
+        search.add(verify(proposal))
     return search.belief.ranked(search.weights.rivals)
 
 
@@ -324,7 +318,7 @@ def test_walls_that_look_alike_elsewhere_have_less_for_them():
     )
     assert _is_pose(once[0].world_from_cam, truth)
     assert len(twice) >= 2
-    assert all(hypothesis.is_from_virtual_views for hypothesis in (*once, *twice))
+    assert all(hypothesis.evidence.is_from_virtual_views for hypothesis in (*once, *twice))
     assert once[0].log_odds > twice[0].log_odds + 0.5
     assert twice[0].log_odds >= twice[1].log_odds
     ways = [hypothesis.world_from_cam.translation[1] for hypothesis in twice]

@@ -16,14 +16,12 @@ from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided import GuidedConfig
-from topoloc.localization.pose_fit import LocalMap
+from topoloc.localization.pose_fit import LocalMap, PoseFit, fit_pose
 from topoloc.localization.walls.virtual_view_matching import (
     QueryVirtualView,
     count_virtual_views,
-    estimate_pose,
     match_virtual_views,
     select_nearest_virtual_nodes,
-    with_node_id,
 )
 from topoloc.mapping.topomap import VirtualNodes
 
@@ -94,7 +92,7 @@ def test_no_side_node_is_near_a_pose_elsewhere():
 
 
 def test_matches_of_both_sides_lie_where_the_pose_puts_the_points():
-    found = match_virtual_views(_around(), TRUTH.inverse(), GUIDED)
+    found = match_virtual_views(_around(), TRUTH.inverse(), WIDE, GUIDED)
     assert found is not None
     assert len(found.features) == sum(len(side.features) for side in _seen())
     assert len(found.local_map.radii) == sum(len(local_map.radii) for _, local_map in _around())
@@ -121,9 +119,9 @@ def test_matches_of_both_sides_lie_where_the_pose_puts_the_points():
 
 
 def test_at_a_wrong_pose_little_more_is_found_than_by_chance():
-    at_truth = match_virtual_views(_around(), TRUTH.inverse(), GUIDED)
+    at_truth = match_virtual_views(_around(), TRUTH.inverse(), WIDE, GUIDED)
     shifted = Rigid3(TRUTH.rotation, TRUTH.translation + np.array([0.0, 0.9, 0.0]))
-    elsewhere = match_virtual_views(_around(), shifted.inverse(), GUIDED)
+    elsewhere = match_virtual_views(_around(), shifted.inverse(), WIDE, GUIDED)
     assert at_truth is not None
     assert elsewhere is not None
     assert len(elsewhere.matches) < 0.5 * len(at_truth.matches)
@@ -161,24 +159,18 @@ def test_the_pose_of_both_sides_is_refined_round_by_round_from_one_that_is_near(
     world_from_cam = Rigid3(TRUTH.rotation, TRUTH.translation + np.array([0.03, -0.06, 0.02]))
     config = AbsolutePoseConfig(max_reprojection_error_px=6.0, sigma_px=2.0)
     for _ in range(3):
-        found = match_virtual_views(_around(), world_from_cam.inverse(), GUIDED)
+        found = match_virtual_views(_around(), world_from_cam.inverse(), WIDE, GUIDED)
         assert found is not None
-        pose = estimate_pose(found, WIDE, config, world_from_cam.inverse())
-        assert pose is not None
-        world_from_cam = pose.cam_from_world.inverse()
+        start = world_from_cam.inverse(), WIDE
+        fit = fit_pose(found.features, WIDE, found.local_map, found.matches, config, start)
+        assert isinstance(fit, PoseFit)
+        world_from_cam = fit.world_from_cam
     assert translation_error(world_from_cam, TRUTH) < 0.02
     assert rotation_error(world_from_cam, TRUTH) < np.deg2rad(0.3)
 
 
 def test_nothing_matched_is_none():
-    assert match_virtual_views([], TRUTH.inverse(), GUIDED) is None
+    assert match_virtual_views([], TRUTH.inverse(), WIDE, GUIDED) is None
     side, points = _around()[0]
     nothing = QueryVirtualView(side.view, Features.empty(64), Features.empty(64))
-    assert match_virtual_views([(nothing, points)], TRUTH.inverse(), GUIDED) is None
-
-
-def test_points_are_those_of_the_ordinary_node():
-    points = LocalMap.of_node(_sides().nodes[3])
-    renamed = with_node_id(points, 17)
-    assert set(renamed.node_ids.tolist()) == {17}
-    assert renamed.points_world is points.points_world
+    assert match_virtual_views([(nothing, points)], TRUTH.inverse(), WIDE, GUIDED) is None

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from topoloc.localization.evidence import compute_log_odds, compute_node_log_odds
 from topoloc.localization.fitted_weights import (
     CorrelatedErrorWeights,
     EvidenceWeights,
     FittedWeights,
     RivalWeights,
+    compute_log_odds,
     load_fitted_weights,
     read_weights,
 )
@@ -99,7 +99,7 @@ def _drawn(num: int, seed: int = 0) -> list[TriedPose]:
     rng, poses = np.random.default_rng(seed), []
     for k in range(num):
         evidence = _evidence(rng)
-        is_right = rng.random() < 1.0 / (1.0 + math.exp(-compute_node_log_odds(evidence, TRUE)))
+        is_right = rng.random() < 1.0 / (1.0 + math.exp(-compute_log_odds(evidence, TRUE)))
         poses.append(_pose(RIGHT if is_right else WRONG, evidence, k, MAPS[k % 3]))
     return poses
 
@@ -130,10 +130,10 @@ def test_a_picture_from_elsewhere_lowers_the_bias_until_it_is_not_believed():
     poses = _drawn(1500)
     strongest = max(
         (pose.evidence for pose in poses),
-        key=lambda evidence: compute_node_log_odds(evidence, TRUE),
+        key=lambda evidence: compute_log_odds(evidence, TRUE),
     )
     fitted = fit_evidence([*poses, _pose(None, strongest)], PRIOR, 0.1)
-    assert 1.0 / (1.0 + math.exp(-compute_node_log_odds(strongest, fitted))) == pytest.approx(
+    assert 1.0 / (1.0 + math.exp(-compute_log_odds(strongest, fitted))) == pytest.approx(
         0.35, abs=1e-6
     )
     assert fitted.bias < fit_evidence(poses, PRIOR, 0.1).bias - 1.0
@@ -258,7 +258,7 @@ def _on_walls(num: int, weights: FittedWeights, seed: int = 0) -> list[TriedPose
             num_distinct=int(rng.integers(0, 60)),
             num_lesser_side=int(rng.integers(0, 40)),
         )
-        is_right = rng.random() < 1.0 / (1.0 + math.exp(-compute_log_odds(evidence, weights)))
+        is_right = rng.random() < 1.0 / (1.0 + math.exp(-weights.log_odds(evidence)))
         poses.append(_pose(RIGHT if is_right else WRONG, evidence, k))
     return poses
 
@@ -275,10 +275,10 @@ def test_the_weights_of_walls_are_found_again_and_left_alone_where_poses_are_few
     assert num == 4000
     told = _on_walls(500, true, seed=1)
     there, here = (
-        np.array([compute_log_odds(pose.evidence, weights) for pose in told])
+        np.array([weights.log_odds(pose.evidence) for pose in told])
         for weights in (true, replace(before, walls=fitted))
     )
     assert np.mean(np.abs(there - here)) < 0.4
-    assert np.mean(np.abs(there - [compute_log_odds(pose.evidence, before) for pose in told])) > 1.0
+    assert np.mean(np.abs(there - [before.log_odds(pose.evidence) for pose in told])) > 1.0
     assert fitted.doubt == before.walls.doubt
     assert fit_walls(_on_walls(MIN_POSES, true), before.walls) == (before.walls, 0)

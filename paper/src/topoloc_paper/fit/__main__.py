@@ -31,8 +31,12 @@ import numpy as np
 
 from topoloc.errors import TopolocError
 from topoloc.features.feature_types import find_feature_type
-from topoloc.localization.evidence import compute_log_odds
-from topoloc.localization.fitted_weights import FALLBACK_TYPE, FittedWeights, load_fitted_weights
+from topoloc.localization.fitted_weights import (
+    FALLBACK_TYPE,
+    FittedWeights,
+    compute_log_odds,
+    load_fitted_weights,
+)
 from topoloc_paper.fit.corpus import FAMILIES, PLACES, AskedPlace, family_of, open_recordings
 from topoloc_paper.fit.evidence import (
     Judged,
@@ -164,6 +168,7 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
         rivals,
         walls,
         fit_shared_errors(poses, load_fitted_weights(FALLBACK_TYPE).shared_errors),
+        before.confirmation,
     )
     report(poses, before, fitted, held_out)
     print(f"{walls}, fitted to {num_walls} poses ({before.walls})")
@@ -177,9 +182,7 @@ def fit_walls_alone(kind: str, poses: list[TriedPose]) -> FittedWeights:
     walls, num = fit_walls(poses, before.walls)
     told = told_by_walls(poses)
     for name, weights in (("in use", before.walls), ("fitted", walls)):
-        log_odds = np.array(
-            [compute_log_odds(pose.evidence, replace(before, walls=weights)) for pose in told]
-        )
+        log_odds = np.array([compute_log_odds(pose.evidence, weights) for pose in told])
         part = Judged("walls", log_odds, np.array([pose.is_right for pose in told], dtype=bool))
         clearest = max(log_odds[~part.is_right], default=-99.0)
         print(

@@ -17,8 +17,11 @@ from jaxtyping import Bool, Float
 from msgspec.structs import replace
 from scipy.optimize import minimize
 
-from topoloc.localization.evidence import compute_node_log_odds, compute_score_features
-from topoloc.localization.fitted_weights import CorrelatedErrorWeights, EvidenceWeights
+from topoloc.localization.fitted_weights import (
+    CorrelatedErrorWeights,
+    EvidenceWeights,
+    compute_log_odds,
+)
 from topoloc_paper.fit.corpus import family_of
 from topoloc_paper.fit.tried_poses import TriedPose
 
@@ -76,7 +79,7 @@ def _logistic_regression(
     poses: list[TriedPose], prior: EvidenceWeights, strength: float
 ) -> EvidenceWeights:
     x, is_right = (
-        np.array([compute_score_features(pose.evidence) for pose in poses]),
+        np.array([EvidenceWeights.features(pose.evidence) for pose in poses]),
         np.array([pose.is_right for pose in poses]),
     )
     signs, given = 2.0 * is_right - 1.0, prior.doubt * x[:, -1]
@@ -145,7 +148,7 @@ def best_strength(
 def judged(family: str, poses: list[TriedPose], weights: EvidenceWeights) -> Judged:
     """What these weights say of these poses."""
     odds, is_right = (
-        [compute_node_log_odds(pose.evidence, weights) for pose in poses],
+        [compute_log_odds(pose.evidence, weights) for pose in poses],
         [pose.is_right for pose in poses],
     )
     return Judged(family, np.array(odds, dtype=float), np.array(is_right, dtype=bool))

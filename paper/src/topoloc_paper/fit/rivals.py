@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float
 from msgspec import structs
 from scipy.optimize import minimize
 
-from topoloc.localization.evidence import compute_node_log_odds, compute_score_features
-from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights
+from topoloc.localization.fitted_weights import EvidenceWeights, RivalWeights, compute_log_odds
 from topoloc_paper.fit.tried_poses import TriedPose
 
 MIN_HARD_PAIRS = 80
@@ -84,5 +83,5 @@ def num_mistaken(differences: Float[np.ndarray, "n 3"], weights: RivalWeights) -
 
 def _terms(pose: TriedPose, weights: EvidenceWeights) -> np.ndarray:
     """What is weighed between two poses, in the order of the weights."""
-    features = compute_score_features(pose.evidence)
-    return np.array([compute_node_log_odds(pose.evidence, weights), features[0], features[-1]])
+    features = EvidenceWeights.features(pose.evidence)
+    return np.array([compute_log_odds(pose.evidence, weights), features[0], features[-1]])

@@ -16,7 +16,8 @@ import numpy as np
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.evidence import EvidenceConfig, compute_translation_tolerance
+from topoloc.localization.config import EvidenceConfig
+from topoloc.localization.evidence import compute_translation_tolerance
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.provenance import Evidence

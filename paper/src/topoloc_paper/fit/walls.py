@@ -2,7 +2,7 @@
 
 As those of the nodes: a logistic regression in which nothing that speaks for a pose may count
 against it, drawn to the weights in use, for there are few such poses. Whether a pose is precise
-enough is asked apart (`evidence.compute_precision_probability`), so a wrong one is one of another
+enough is asked apart (`Evidence.precision_probability`), so a wrong one is one of another
 place; the weight of the doubt is given.
 """
 
@@ -12,7 +12,6 @@ import numpy as np
 from msgspec.structs import replace
 from scipy.optimize import minimize
 
-from topoloc.localization.evidence import compute_virtual_view_features
 from topoloc.localization.fitted_weights import VirtualViewWeights
 from topoloc_paper.fit.evidence import decided
 from topoloc_paper.fit.tried_poses import TriedPose
@@ -50,7 +49,7 @@ def fit_walls(poses: list[TriedPose], before: VirtualViewWeights) -> tuple[Virtu
     is_right = np.array([pose.is_right for pose in told], dtype=bool)
     if min(np.count_nonzero(is_right), np.count_nonzero(~is_right)) < MIN_POSES:
         return before, 0
-    x = np.array([compute_virtual_view_features(pose.evidence) for pose in told])
+    x = np.array([before.features(pose.evidence) for pose in told])
     signs, given = 2.0 * is_right - 1.0, before.doubt * x[:, -1]
     x, start = (
         np.column_stack([x[:, :-1], np.ones(len(x))]),

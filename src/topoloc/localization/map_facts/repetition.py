@@ -38,7 +38,6 @@ _CELL = 0.1  # metres
 _MIN_VOTES, _MIN_SELF_SHARE = 12, 0.15
 _MAX_SHIFTS = 6
 _MIN_COPIED, _MIN_COPIED_SHARE = 20, 0.3
-_NEAREST_NEIGHBOR = MatchingConfig(ratio=0.0, mutual=False)
 _POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=500)
 _METHOD = 1  # part of the digest: increase if the same nodes give other repetitions
 _MAX_CELL_OFFSET = 1000  # cells in each direction, larger than any shift
@@ -98,7 +97,7 @@ def find_copy_transform(node: TopoNode, others: LocalMap) -> Rigid3 | None:
     None if there is no copy, or the copy is the node itself.
     """
     features = node.features.select(np.arange(min(_NUM_POINTS, len(node.features))))
-    matches = match_features(features.descriptors, others.descriptors, _NEAREST_NEIGHBOR)
+    matches = match_features(features.descriptors, others.descriptors, MatchingConfig.nearest())
     alike = 1.0 - matches.distances**2 / 2.0 >= _MIN_SIMILARITY
     rows, columns = matches.query_idx[alike], matches.train_idx[alike]
     least = max(_MIN_COPIED, _MIN_COPIED_SHARE * len(features))

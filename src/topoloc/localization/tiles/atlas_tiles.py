@@ -27,8 +27,7 @@ from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.query import Query, QueryImage, StageClock, reduce_image
 from topoloc.localization.result import Localization, NotLocalized, R, with_time
-from topoloc.localization.tiles.tile_search import ranking_margin
-from topoloc.localization.tiles.tiles import Reach, TileRanking
+from topoloc.localization.tiles.tiles import Reach, TileRanking, Tiles, ranking_margin
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ _SAME_METRES, _SAME_DEG = 1.0, 5.0
 _SIGMAS = 3.0  # sigmas of a join, added to these limits, at most doubling them
 
 
-class AtlasTiles:
+class AtlasTiles(Tiles):
     """Search the tiles of a snapshot of an atlas.
 
     Args:
@@ -68,6 +67,15 @@ class AtlasTiles:
         for tile_id, problem in atlas.problems.items():
             warn(f"tile {tile_id} is searched after all others: {problem}")
         self._focal = max(tile.focal_px for tile in atlas.manifest.tiles)
+
+    @property
+    def opened(self) -> MapContext:
+        """Raise AtlasError, because there is no single map."""
+        raise AtlasError("an atlas has many maps: in_tile opens one of them")
+
+    def alone(self, tile_id: str, opened: MapContext) -> Tiles:
+        """Return a tile, whose map is open, as the only one."""
+        return Tiles(opened, self, tile_id)
 
     @contextmanager
     def use(self, tile_id: str) -> Iterator[MapContext]:

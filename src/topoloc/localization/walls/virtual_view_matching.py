@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import chain
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
+from topoloc.features.extraction import extract_from_normalized, normalize_image
+from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features, Matches
-from topoloc.features.virtual_views import VirtualView
-from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
+from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.evidence import sample_rows
 from topoloc.localization.guided import (
     GuidedConfig,
     count_chance_matches,
     match_guided,
     select_visible_points,
 )
-from topoloc.localization.pose_fit import LocalMap
-from topoloc.node_ids import NodeId, Row
+from topoloc.localization.pose_fit import LocalMap, PointMatches
+from topoloc.localization.search import Search
+from topoloc.localization.walls.virtual_view_index import (
+    CandidatePlaces,
+    VirtualViewIndex,
+    select_likeliest_places,
+)
+from topoloc.node_ids import Row
 
 _CELL_PX = 8
 
@@ -36,13 +46,8 @@ class QueryVirtualView:
     features_in_image: Features
 
 
-@dataclass(frozen=True, eq=False)
-class VirtualViewMatches:
-    """Hold the features of both side views, at image pixels, matched with points around a pose."""
-
-    features: Features
-    local_map: LocalMap
-    matches: Matches
+Sides = list[tuple[QueryVirtualView, LocalMap]]
+"""Side views of an image, each with the points around a pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +67,8 @@ class VirtualViewCounts:
 
 
 def match_virtual_views(
-    sides: list[tuple[QueryVirtualView, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig
-) -> VirtualViewMatches | None:
+    sides: Sides, cam_from_world: Rigid3, camera: Camera, config: GuidedConfig
+) -> PointMatches | None:
     """Return the guided matches of both sides, each with its own points. None if there are none."""
     guided = [
         match_guided(
@@ -71,90 +76,59 @@ def match_virtual_views(
         )
         for side, m in sides
     ]
-    return merge_matches(sides, guided)
+    return merge_matches(sides, guided, camera)
 
 
-def merge_matches(
-    sides: list[tuple[QueryVirtualView, LocalMap]], matches: list[Matches]
-) -> VirtualViewMatches | None:
-    """Merge the matches of each side with its own points. None if there are none."""
+def merge_matches(sides: Sides, matches: list[Matches], camera: Camera) -> PointMatches | None:
+    """Merge the matches of each side with its own points, at pixels of the image of `camera`.
+
+    None if there are none.
+    """
     if sum(map(len, matches)) == 0:
         return None
     first_features = np.cumsum([0, *(len(side.features) for side, _ in sides)])
     first_points = np.cumsum([0, *(len(local_map.radii) for _, local_map in sides)])
+    rows = [one.query_idx + first for one, first in zip(matches, first_features, strict=False)]
+    columns = [one.train_idx + first for one, first in zip(matches, first_points, strict=False)]
     joined = Matches(
-        np.concatenate(
-            [one.query_idx + first for one, first in zip(matches, first_features, strict=False)]
-        ).astype(np.int32),
-        np.concatenate(
-            [one.train_idx + first for one, first in zip(matches, first_points, strict=False)]
-        ).astype(np.int32),
+        np.concatenate(rows).astype(np.int32),
+        np.concatenate(columns).astype(np.int32),
         np.concatenate([one.distances for one in matches]).astype(np.float32),
     )
     features = Features.concatenate([side.features_in_image for side, _ in sides])
-    return VirtualViewMatches(
-        features, LocalMap.concatenate([local_map for _, local_map in sides]), joined
-    )
+    local_map = LocalMap.concatenate([local_map for _, local_map in sides])
+    return PointMatches(features, camera, camera, local_map, joined)
 
 
 def count_virtual_views(
-    sides: list[tuple[QueryVirtualView, LocalMap]], cam_from_world: Rigid3, config: GuidedConfig
+    sides: Sides, cam_from_world: Rigid3, config: GuidedConfig
 ) -> VirtualViewCounts:
     """Count the predicted and the agreeing points of both sides."""
-    num_visible, num_by_chance, visible_img, agreeing_img = (
-        0,
-        0,
-        [np.zeros((0, 2))],
-        [np.zeros((0, 2))],
-    )
+    num_visible, num_by_chance = 0, 0
+    visible_img, agreeing_img = [np.zeros((0, 2))], [np.zeros((0, 2))]
     for side, local_map in sides:
         view, side_from_world = side.view, side.view.virtual_from_world(cam_from_world)
         rows, visible = select_visible_points(local_map, side_from_world, view.camera)
-        columns, lines = np.clip(
-            np.rint(visible).astype(int), 0, [view.camera.width - 1, view.camera.height - 1]
-        ).T
+        last = [view.camera.width - 1, view.camera.height - 1]
+        columns, lines = np.clip(np.rint(visible).astype(int), 0, last).T
         seen = np.flatnonzero(view.inside[lines, columns])
         cells = (lines[seen] // _CELL_PX) * view.camera.width + columns[seen] // _CELL_PX
         num_visible += len(np.unique(cells))
         num_by_chance += count_chance_matches(
             side.features, local_map, side_from_world, view.camera, config
         )
-        seen = (
-            seen[np.unique(np.linspace(0, len(seen) - 1, 512).astype(int))]  # bounds the time
-            if len(seen)
-            else seen
-        )
+        if len(seen):
+            seen = seen[sample_rows(len(seen))]
         visible_img.append(view.points_img[lines[seen], columns[seen]].astype(np.float64))
         if (dense := side.features.dense) is not None and len(seen):
-            agreeing_img.append(
-                visible_img[-1][
-                    dense.check_agreement(visible[seen], local_map.descriptors[rows[seen]])
-                ]
-            )
+            is_alike = dense.check_agreement(visible[seen], local_map.descriptors[rows[seen]])
+            agreeing_img.append(visible_img[-1][is_alike])
     has_dense = any(side.features.dense is not None for side, _ in sides)
     return VirtualViewCounts(
         num_visible,
         num_by_chance,
         np.concatenate(visible_img),
         np.concatenate(agreeing_img) if has_dense else None,
-    )
-
-
-def estimate_pose(
-    found: VirtualViewMatches, camera: Camera, config: AbsolutePoseConfig, start: Rigid3 | None
-) -> AbsolutePose | None:
-    """Estimate cam_from_world of the image from the matches of both sides.
-
-    The pose is refined from `start`, or estimated by RANSAC if it is None.
-    """
-    rows = found.matches.train_idx
-    return estimate_absolute_pose(
-        found.features.points_img[found.matches.query_idx].astype(np.float64),
-        found.local_map.points_world[rows],
-        camera,
-        config,
-        point_covariances=found.local_map.covariances[rows],
-        start=start,
     )
 
 
@@ -188,6 +162,82 @@ def select_nearest_virtual_nodes(
     ]
 
 
-def with_node_id(local_map: LocalMap, node_id: NodeId) -> LocalMap:
-    """Return the same points with the id of the node whose image shows them."""
-    return replace(local_map, node_ids=np.full_like(local_map.node_ids, node_id))
+@dataclass(frozen=True, eq=False)
+class VirtualViewSearch:
+    """Hold both side views of a query image and the candidate places (world_from_cam), likeliest
+    first."""
+
+    search: Search
+    index: VirtualViewIndex
+    seen: list[QueryVirtualView]
+    places: list[Rigid3]
+
+    @staticmethod
+    def of(search: Search, index: VirtualViewIndex) -> VirtualViewSearch:
+        """Extract both side views of the query image and select the candidate places."""
+        num_d_thresh = 2.0  # minimum distance between these places, in D_thresh
+        query, seen, named = search.query, list[QueryVirtualView](), list[CandidatePlaces]()
+        assert isinstance(query.input_camera, Camera)
+        for view in make_virtual_views(query.input_camera):
+            picture = view.picture(query.grey)
+            seen_by = (view.name, index.feature_config)
+            features = query.shared.get_or_extract(
+                query, seen_by, partial(_extract_view_features, index.feature_config, view, picture)
+            )
+            seen.append(
+                QueryVirtualView(view, features, view.to_image_pixels(features, query.input_camera))
+            )
+            named.append(CandidatePlaces.of(view, index, index.similarity(picture, features)))
+        apart = num_d_thresh * search.map.d_thresh
+        return VirtualViewSearch(
+            search,
+            index,
+            seen,
+            select_likeliest_places(named, search.config.walls.num_places, apart),
+        )
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera of the query."""
+        return self.search.query.camera
+
+    def rows_around(self, side: QueryVirtualView, cam_from_world: Rigid3) -> list[Row]:
+        """Return the virtual views of the map that show the content of a side view at a pose."""
+        # Number of virtual views around a pose whose points are searched in each side
+        # view.
+        num_nodes = 4
+        return select_nearest_virtual_nodes(
+            side.view, cam_from_world, self.index.centres, self.index.axes, num_nodes
+        )
+
+    def sides_around(self, cam_from_world: Rigid3) -> Sides:
+        """Return each side view with the points predicted in it."""
+        rows = [(side, self.rows_around(side, cam_from_world)) for side in self.seen]
+        return [(side, self._pool(of)) for side, of in rows if of and len(side.features)]
+
+    def match(self, cam_from_world: Rigid3, radius_px: float) -> PointMatches | None:
+        """Return the guided matches of both views around a pose. None if there are none."""
+        sides, config = self.sides_around(cam_from_world), self.guided(radius_px)
+        return match_virtual_views(sides, cam_from_world, self.camera, config)
+
+    def guided(self, radius_px: float) -> GuidedConfig:
+        """Return the settings of guided matching with this radius."""
+        return replace(self.search.config.walls.guided, radius_px=radius_px)
+
+    @cached_property
+    def local_map_of_places(self) -> LocalMap:
+        """Return the points visible from any of the candidate places."""
+        rows = (
+            self.rows_around(side, place.inverse()) for place in self.places for side in self.seen
+        )
+        return self._pool(sorted(set(chain.from_iterable(rows))))
+
+    def _pool(self, rows: list[Row]) -> LocalMap:
+        return LocalMap.concatenate(self.index.local_map.pool(rows))
+
+
+def _extract_view_features(
+    config: FeatureConfig, view: VirtualView, picture: UInt8[np.ndarray, "a b"]
+) -> Features:
+    """Extract the features of a view."""
+    return view.select_inside(extract_from_normalized(normalize_image(picture, config), config))

@@ -8,8 +8,11 @@ import pytest
 from built_corridor import WIDE, back, built_corridor
 from topoloc.features.virtual_views import VirtualView, make_virtual_views
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.walls.candidate_places import CandidatePlaces, select_likeliest_places
-from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
+from topoloc.localization.walls.virtual_view_index import (
+    CandidatePlaces,
+    VirtualViewIndex,
+    select_likeliest_places,
+)
 
 APART = 1.0
 

@@ -1,0 +1,97 @@
+"""The order of the proposals for one image, and when there are no more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from built_room import unseen_views
+from tiny_world import CAMERA
+from topoloc.errors import MapError
+from topoloc.localization import propose
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.propose import min_rival_inliers, propose_quick
+from topoloc.localization.query import QueryImage, StageClock
+from topoloc.localization.refine import find_best_case_evidence
+from topoloc.localization.result import Localization
+from topoloc.localization.result_decision import ResultWithInliers
+from topoloc.localization.schedule import TileProposals, TileQuery
+from topoloc.localization.search import Search, verify
+from topoloc.mapping.topomap import TopoMetricMap
+
+FOREVER = float("inf")
+
+
+@pytest.fixture(scope="module")
+def localizer(room_map: Path) -> Iterator[Localizer]:
+    with TopoMetricMap.load(room_map) as topomap:
+        yield Localizer(topomap)
+
+
+def _searches(localizer: Localizer, image: np.ndarray, deadline: float = FOREVER) -> list[Search]:
+    return localizer.context.searches(QueryImage(image, CAMERA), StageClock(), deadline)
+
+
+def _result(proposals: TileProposals) -> ResultWithInliers:
+    """Verify the proposals and return the result."""
+    while True:
+        try:
+            proposal = next(proposals)
+        except StopIteration as end:
+            return end.value
+        proposal.search.add(verify(proposal))
+
+
+def test_an_exhaustive_search_continues_from_the_coarse_one(
+    localizer: Localizer, monkeypatch: pytest.MonkeyPatch
+):
+    image = unseen_views()[0][0]
+    at_once = localizer.localize(image, CAMERA)
+    query = TileQuery(localizer.context, _searches(localizer, image))
+    num_matched, matcher = list[int](), propose.Matcher
+    monkeypatch.setattr(propose, "Matcher", lambda *args: num_matched.append(1) or matcher(*args))
+    coarse, _ = _result(query.coarse_only())
+    assert num_matched == [1]
+    result, _ = _result(query.exhaustive())
+    assert num_matched == [1], "retrieval is not repeated"
+    assert isinstance(coarse, Localization)
+    assert isinstance(at_once, Localization)
+    assert isinstance(result, Localization)
+    assert np.array_equal(result.world_from_cam.matrix(), at_once.world_from_cam.matrix())
+    assert result.probability == at_once.probability
+
+
+def test_after_the_deadline_one_proposal_is_finished(localizer: Localizer):
+    (search,) = searches = _searches(localizer, unseen_views(seed=1)[1][0], deadline=0.0)
+    proposals = list(TileQuery(localizer.context, searches).exhaustive())
+    assert [one.source for one in proposals] == ["retrieval"]
+    assert search.is_stopped
+
+
+def test_a_map_that_cannot_be_read_ends_the_search(localizer: Localizer):
+    searches = _searches(localizer, unseen_views()[0][0])
+    proposals = TileQuery(localizer.context, searches).exhaustive()
+    next(proposals).search.failure = MapError("cut off")
+    with pytest.raises(MapError, match="cut off"):
+        next(proposals)
+
+
+def test_the_best_case_is_no_less_than_the_evidence_found(localizer: Localizer):
+    weights = localizer.context.first.weights
+    for image, _ in unseen_views()[::4]:
+        (search,) = _searches(localizer, image)
+        quick = propose_quick(search, min_rival_inliers(search))
+        assert quick is not None
+        best, result = find_best_case_evidence(quick), localizer.localize(image, CAMERA)
+        assert isinstance(result, Localization)
+        assert best is not None
+        assert result.evidence is not None
+        assert weights.log_odds(best) >= weights.log_odds(result.evidence)
+
+
+def test_an_image_of_another_place_has_no_quick_proposal(localizer: Localizer):
+    (search,) = _searches(localizer, unseen_views(seed=1)[1][0])
+    assert propose_quick(search, 20.0) is None
