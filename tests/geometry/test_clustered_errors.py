@@ -39,7 +39,7 @@ def coherence_of(seed: int, moved: float) -> tuple[float, float]:
     xi = pose.cam_from_world.inverse().log()
     rows = pose.inliers
     found = compute_variance_inflation(
-        points_img[rows], points[rows], NO_COVARIANCES[rows], CAMERA, pose.cam_from_world, CONFIG
+        points_img[rows], points[rows], NO_COVARIANCES[rows], CAMERA, pose.cam_from_world, 1.0
     )
     return found, float(xi @ np.linalg.solve(pose.covariance, xi))
 
@@ -64,11 +64,11 @@ def test_what_was_moved_shows_and_widens_as_much_as_it_is_off():
 def test_of_few_matches_nothing_is_said(count: int):
     points_img, points = seen(0, 0.05, max(count, 1))
     arguments = points_img[:count], points[:count], NO_COVARIANCES[:count]
-    assert compute_variance_inflation(*arguments, CAMERA, Rigid3.identity(), CONFIG) == 1.0
+    assert compute_variance_inflation(*arguments, CAMERA, Rigid3.identity(), 1.0) == 1.0
     crowded = np.full((9, 2), 100.0) + np.arange(9)[:, None]
     assert (
         compute_variance_inflation(
-            crowded, np.ones((9, 3)), NO_COVARIANCES[:9], CAMERA, Rigid3.identity(), CONFIG
+            crowded, np.ones((9, 3)), NO_COVARIANCES[:9], CAMERA, Rigid3.identity(), 1.0
         )
         == 1.0
     )

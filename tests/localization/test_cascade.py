@@ -88,7 +88,7 @@ def test_a_clear_picture_is_never_asked_for_the_second_kind(
     topomap: TopoMetricMap, changed: Callable[..., list[int]]
 ):
     asked = {kind: changed(kind, lambda features: features) for kind in ("surf", "sift")}
-    localizer = Localizer(topomap)
+    localizer = Localizer(topomap, LocalizerConfig(exactness="fast"))
     assert all(
         _is_right(localizer.localize(picture, CAMERA), truth) for picture, truth in unseen_views()
     )

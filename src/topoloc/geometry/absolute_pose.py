@@ -130,7 +130,42 @@ def estimate_absolute_pose(
         cam_from_world = start and _refine_on_inliers(start, matches, camera, config)
     if cam_from_world is None:
         return None
-    return _with_covariance(cam_from_world, matches, camera, config, order, len(points_img))
+    active = select_inliers(cam_from_world, matches, camera, config)
+    return _with_covariance(cam_from_world, matches, active, order, len(points_img))
+
+
+def refine_absolute_pose(
+    points_img: Float[np.ndarray, "n 2"],
+    points_world: Float[np.ndarray, "n 3"],
+    point_covariances: Float[np.ndarray, "n 3 3"],
+    sigmas_px: Float[np.ndarray, " n"],
+    camera: Camera,
+    start: Rigid3,
+    max_error_px: float,
+) -> AbsolutePose | None:
+    """Refine cam_from_world on matches that each have a standard deviation of their own (pixels).
+
+    A match is an inlier if its reprojection error is at most `max_error_px`, even if its point is
+    uncertain: `start` must be accurate to about that. None if too few matches are inliers.
+    """
+    normalized = camera.normalized_from_img(points_img)
+    rows = np.flatnonzero(np.isfinite(normalized).all(axis=1))
+    matches = Matches.from_pixels(
+        points_img[rows],
+        points_world[rows],
+        point_covariances[rows],
+        camera,
+        sigmas_px[rows],
+        normalized[rows],
+    )
+    cam_from_world = start
+    for _ in range(2):  # the second pass uses the inliers of the first
+        active = _reprojection_errors(cam_from_world, matches, camera) <= max_error_px
+        if not is_non_collinear(matches.points_world[active]):
+            return None
+        cam_from_world = refine_pose(cam_from_world, matches, active)
+    active = _reprojection_errors(cam_from_world, matches, camera) <= max_error_px
+    return _with_covariance(cam_from_world, matches, active, rows, len(points_img))
 
 
 def estimate_pose_ransac(
@@ -220,12 +255,10 @@ def _solve_with_opencv(
 def _with_covariance(
     cam_from_world: Rigid3,
     matches: Matches,
-    camera: Camera,
-    config: AbsolutePoseConfig,
+    active: Bool[np.ndarray, " m"],
     order: np.ndarray,
     num_points: int,
 ) -> AbsolutePose | None:
-    active = select_inliers(cam_from_world, matches, camera, config)
     if np.count_nonzero(active) < MIN_POINTS or not is_non_collinear(matches.points_world[active]):
         return None
     arguments = matches.kernel_args(cam_from_world)
@@ -274,9 +307,7 @@ def select_inliers(
     cam_from_world: Rigid3, matches: Matches, camera: Camera, config: AbsolutePoseConfig
 ) -> Bool[np.ndarray, " n"]:
     """Return the inliers of a pose. With poselib the threshold is widened for uncertain points."""
-    pixels = camera.img_from_cam(cam_from_world.apply(matches.points_world))
-    # NaN, for points behind the camera or outside its field, is not below the limit.
-    errors_px = np.linalg.norm(pixels - matches.points_img, axis=1)
+    errors_px = _reprojection_errors(cam_from_world, matches, camera)
     limit_px = config.max_reprojection_error_px
     if config.method == "opencv" or len(matches.point_covariances) == 0:
         return errors_px <= limit_px
@@ -286,3 +317,12 @@ def select_inliers(
     return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (
         errors_px <= _MAX_THRESHOLD_SCALE * limit_px
     )
+
+
+def _reprojection_errors(
+    cam_from_world: Rigid3, matches: Matches, camera: Camera
+) -> Float[np.ndarray, " n"]:
+    """Return the errors in pixels: NaN, which is below no limit, for points behind the camera or
+    outside its field."""
+    projected = camera.img_from_cam(cam_from_world.apply(matches.points_world))
+    return np.linalg.norm(projected - matches.points_img, axis=1)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.absolute_pose_kernels import score_outer_products
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.pose_matches import CAUCHY_SCALE, Matches
@@ -28,7 +27,7 @@ def compute_variance_inflation(
     point_covariances: Float[np.ndarray, "n 3 3"],
     camera: Camera,
     cam_from_world: Rigid3,
-    config: AbsolutePoseConfig,
+    sigma_px: float | Float[np.ndarray, " n"],
 ) -> float:
     """Return the ratio of the pose's variance to that under independent errors of the inliers. It
     is averaged over the six directions and at least 1.
@@ -39,9 +38,10 @@ def compute_variance_inflation(
         points_img: pixels of the inliers.
         points_world: world points of the inliers (metres).
         point_covariances: covariances of these points (m^2).
+        sigma_px: standard deviation of the pixels.
     """
     matches = Matches.from_pixels(
-        points_img, points_world, point_covariances, camera, config.key_point_sigma_px
+        points_img, points_world, point_covariances, camera, sigma_px
     )
     grid, size = np.array([_COLUMNS, _ROWS]), [camera.width, camera.height]
     columns, rows = np.clip((points_img + 0.5) * grid / size, 0, grid - 1).astype(np.intp).T

@@ -33,15 +33,16 @@ class Matches:
         points_world: _Array,
         covariances: _Array,
         camera: Camera,
-        sigma_px: float,
+        sigma_px: float | Float[np.ndarray, " n"],
         normalized: Float[np.ndarray, "n 2"] | None = None,
     ) -> Matches:
         """Create matches from pixels, world points (metres) and the points' covariances (m^2).
-        `sigma_px` is the standard deviation of the pixels. `normalized` are the pixels on the plane
-        z = 1, if known."""
+        `sigma_px` is the standard deviation of the pixels, one for all or one for each.
+        `normalized` are the pixels on the plane z = 1, if known."""
         if normalized is None:
             normalized = camera.normalized_from_img(points_img)
-        to_normalized = sigma_px * camera.normalized_jacobian(normalized)
+        sigmas = np.asarray(sigma_px)[..., None, None]
+        to_normalized = sigmas * camera.normalized_jacobian(normalized)
         return Matches(
             points_img=np.ascontiguousarray(points_img, dtype=np.float64),
             normalized=normalized,

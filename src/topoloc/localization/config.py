@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 from topoloc.bounds import AtLeast, Between
 from topoloc.features.config import MatchingConfig
@@ -84,6 +84,9 @@ class LocalizerConfig:
     """Name of the map's coarse localizer (None: the map's default)."""
     max_ms: Annotated[float | None, AtLeast(0)] = None
     """Time limit in milliseconds, after which no further hypothesis is tested (None: no limit)."""
+    exactness: Literal["best", "fast"] = "best"
+    """`best` refines the reported pose with more nodes, all feature types and aligned patches
+    (`last_step.py`). `fast` leaves this out: the query takes about half as long."""
     num_candidates: Annotated[int, Between(1, 10_000)] = 4
     """Number of nodes whose points are pooled. 1 is the paper's single node."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)

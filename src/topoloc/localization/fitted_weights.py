@@ -201,6 +201,49 @@ class CorrelatedErrorWeights(Struct, frozen=True, forbid_unknown_fields=True):
     unknown: Finite
 
 
+class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the numbers of the last step (`last_step.py`).
+
+    - `num_nodes` is the number of nodes nearest to the pose whose points are matched.
+    - `radii_px` and `max_errors_px` are the search radii and inlier limits of the two rounds of
+      matching, in pixels of an image whose longer side is 640. `key_point_sigma_px` is the standard
+      deviation of a key point.
+    - At most `max_aligned` matches are aligned, in rounds that search up to `reaches_px`. At least
+      `min_aligned` must agree within `max_aligned_error_px`. `correlations` and `aligned_sigmas_px`
+      are a table of the standard deviation of an aligned pixel. Matches below the first correlation
+      are dropped.
+    - In maps whose rho is above `max_correlated_error_share` the step is left out.
+    - `shared_error_factor` is the share of the verdict's correlated errors that remain.
+    """
+
+    corpus: str
+    date: str
+    command: str
+    num_nodes: int
+    radii_px: tuple[Finite, Finite]
+    max_errors_px: tuple[Finite, Finite]
+    key_point_sigma_px: Finite
+    min_aligned: int
+    max_aligned: int
+    reaches_px: tuple[int, ...]
+    max_aligned_error_px: Finite
+    correlations: tuple[Finite, ...]
+    aligned_sigmas_px: tuple[Finite, ...]
+    max_correlated_error_share: Finite
+    shared_error_factor: Finite
+
+
+@cache
+def load_last_step_weights() -> LastStepWeights:
+    """Return the shipped numbers of the last step.
+
+    Raises:
+        FeatureTypeError: the file is damaged.
+    """
+    path = Path(__file__).parent / "last_step_weights.json"
+    return decode_json(path.read_bytes(), LastStepWeights, FeatureTypeError, str(path))
+
+
 @dataclass(frozen=True)
 class FittedWeights:
     """Hold the weights of one feature type and their source.

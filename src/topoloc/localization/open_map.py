@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 
-from topoloc.errors import EmptyMapError
+from topoloc.errors import EmptyMapError, UnreadableImageError
 from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
@@ -32,8 +33,29 @@ from topoloc.mapping.node_cache import CachedNodes
 from topoloc.mapping.nodes import node_distances_for_any_roll
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
+from topoloc.recordings.image_io import EncodedImage, read_image, to_grey
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
+
+
+@dataclass(frozen=True, eq=False)
+class NodeTemplate:
+    """Hold the image of a node for correlation. `camera` has the size of the image."""
+
+    image: UInt8[np.ndarray, "h w"]
+    camera: Camera
+    world_from_cam: Rigid3
+
+    @staticmethod
+    def of_node(node: TopoNode) -> NodeTemplate:
+        """Return the stored image of a node in grey, black if it cannot be read."""
+        try:
+            image = to_grey(read_image(EncodedImage(node.summary.name, node.template_jpeg)))
+        except UnreadableImageError:
+            image = np.zeros((2, 2), np.uint8)
+        height, width = image.shape
+        return NodeTemplate(image, node.camera.rescaled(width, height), node.summary.world_from_cam)
+
 
 
 class OpenMap:
@@ -73,6 +95,8 @@ class OpenMap:
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
         self._local_map = CachedNodes(lambda row: LocalMap.of_node(self._nodes[row]))
         self._moves = CachedNodes(self._find_moves)
+        self.template = CachedNodes(lambda row: NodeTemplate.of_node(self._nodes[row]))
+        """The image of a node by its row, for correlation."""
         self._stored_moves = _stored_moves(topomap)
         self.focal = self._max_focal_length()
         self._predicted_at_nodes: tuple[Camera, CachedNodes[Float32[np.ndarray, "n 5"]]] | None = (

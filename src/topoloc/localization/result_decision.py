@@ -165,7 +165,7 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
     parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
     squared = (
         compute_variance_inflation(
-            *parts, best.fit.camera, best.fit.cam_from_world, search.config.pose
+            *parts, best.fit.camera, best.fit.cam_from_world, search.config.pose.key_point_sigma_px
         )
         ** 2
     )

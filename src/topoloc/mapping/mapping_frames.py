@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, groupby, pairwise
 from typing import TypeVar
 
@@ -175,17 +176,17 @@ def create_place_image(
 
 
 def encode_place_image(picture: Image, side_px: int = 160) -> bytes:
-    """Encode a mapping image for the coarse localizers (section III-B), with its shorter side at
-    most `side_px`."""
-    return encode_thumbnail(picture, side_px, quality=60)
+    """Encode a mapping image for the coarse localizers (section III-B) as JPEG, with its shorter
+    side at most `side_px`."""
+    return encode_small(picture, side_px, partial(encode_jpeg, quality=60))
 
 
-def encode_thumbnail(picture: Image, side_px: int, quality: int) -> bytes:
-    """Encode the image as JPEG, with its shorter side at most `side_px`."""
+def encode_small(picture: Image, side_px: int, encode: Callable[[Image], bytes]) -> bytes:
+    """Encode an image with its shorter side at most `side_px`."""
     scale = side_px / min(picture.shape[:2])
     if scale < 1.0:
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return encode_jpeg(picture, quality)
+    return encode(picture)
 
 
 class PointLocator:

@@ -4,6 +4,7 @@ node."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -23,12 +24,13 @@ from topoloc.mapping.mapping_frames import (
     MappingFrame,
     MappingImage,
     PointLocator,
-    encode_thumbnail,
+    encode_small,
 )
 from topoloc.mapping.storage.entries import NodeSummary, TopoNode
 from topoloc.mapping.virtual_nodes import create_virtual_nodes
 from topoloc.node_ids import NodeId, Row
 from topoloc.recordings.frame_preparation import PreparedFrame
+from topoloc.recordings.image_io import encode_webp
 from topoloc.retrieval.vlad import append_positions
 
 MIN_NODE_POINTS = 20  # an image with fewer located features becomes no node
@@ -118,7 +120,8 @@ def create_node_draft(
         rows = np.flatnonzero(located[kind].valid)
         positions, covariances = located[kind].points_cam[rows], located[kind].covariances[rows]
         points[kind] = DraftPoints(features.select(rows), positions, covariances, [])
-    template_jpeg = encode_thumbnail(view.picture, 240, quality=75)
+    # correlation needs 400 pixels; as WebP they take little more than 240 as JPEG
+    template_jpeg = encode_small(view.picture, 400, partial(encode_webp, quality=70))
     summary = NodeSummary(
         NodeId(-1),
         frame.sequence.name,

@@ -107,8 +107,17 @@ def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.
 
 def encode_jpeg(image: Image, quality: int) -> bytes:
     """Encode an image as JPEG. The same image gives the same bytes."""
+    return _encode(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def encode_webp(image: Image, quality: int) -> bytes:
+    """Encode an image as WebP. The same image gives the same bytes."""
+    return _encode(image, ".webp", [cv2.IMWRITE_WEBP_QUALITY, quality])
+
+
+def _encode(image: Image, suffix: str, options: list[int]) -> bytes:
     bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return cv2.imencode(suffix, bgr, options)[1].tobytes()
 
 
 def image_size(path: Path | EncodedImage) -> tuple[int, int]:

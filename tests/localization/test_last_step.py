@@ -1,0 +1,130 @@
+"""The last step makes a reported pose more exact, and leaves it alone if it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from built_room import unseen_views
+from tiny_world import CAMERA
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization import open_map
+from topoloc.localization.last_step_kernels import align_patches
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.result import Localization
+from topoloc.mapping.topomap import TopoMetricMap
+
+
+@pytest.fixture(scope="module")
+def room(room_map: Path) -> Iterator[TopoMetricMap]:
+    with TopoMetricMap.load(room_map) as topomap:
+        yield topomap
+
+
+def _localized(
+    localizer: Localizer, image: np.ndarray, camera: Camera | UncalibratedCamera = CAMERA
+) -> Localization:
+    result = localizer.localize(image, camera)
+    assert isinstance(result, Localization)
+    return result
+
+
+def _error_mm(found: Localization, truth: Rigid3) -> float:
+    return 1e3 * float(np.linalg.norm((truth.inverse() @ found.world_from_cam).translation))
+
+
+def test_poses_become_more_exact_and_stay_inside_their_ellipsoids(room: TopoMetricMap):
+    best, fast = Localizer(room), Localizer(room, LocalizerConfig(exactness="fast"))
+    before, after = list[float](), list[float]()
+    for image, truth in unseen_views(step=0.75):
+        precise, first = _localized(best, image), _localized(fast, image)
+        assert precise.probability == first.probability
+        before.append(_error_mm(first, truth))
+        after.append(_error_mm(precise, truth))
+        off = (precise.world_from_cam.inverse() @ truth).log()
+        assert off @ np.linalg.solve(precise.camera_covariance, off) < 22.5  # 0.1 % of 6 dof
+        assert precise.position_sigma_m < first.position_sigma_m
+    assert np.mean(after) < 0.8 * np.mean(before)
+
+
+def test_strong_distortion_is_part_of_the_warp(room: TopoMetricMap):
+    image, truth = unseen_views()[3]
+    lens = Camera(
+        "OPENCV", 320, 240, (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, -0.2, 0.03, 0.0, 0.0)
+    )
+    pixels = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([lens.normalized_from_img(pixels), np.ones(len(pixels))])
+    source = CAMERA.img_from_cam(rays).reshape(240, 320, 2).astype(np.float32)
+    seen = cv2.remap(image, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    best = _error_mm(_localized(Localizer(room), seen, lens), truth)
+    assert best < 3.0
+
+
+def test_without_images_of_the_nodes_a_pose_is_found_all_the_same(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
+    image, truth = unseen_views()[2]
+    read = open_map.NodeTemplate.of_node
+    for damaged in (b"", b"no image"):
+        monkeypatch.setattr(
+            open_map.NodeTemplate,
+            "of_node",
+            staticmethod(lambda node, jpeg=damaged: read(replace(node, template_jpeg=jpeg))),
+        )
+        assert _error_mm(_localized(Localizer(room), image), truth) < 10.0
+
+
+def test_a_focal_length_that_is_estimated_is_left_alone(room: TopoMetricMap):
+    rough = UncalibratedCamera.unknown(320, 240)
+    image = unseen_views()[2][0]
+    results = [
+        _localized(Localizer(room, LocalizerConfig(exactness=exactness)), image, rough)
+        for exactness in ("best", "fast")
+    ]
+    assert np.array_equal(*(one.world_from_cam.matrix() for one in results))
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (1.3, -0.6), (-2.25, 2.5)])
+def test_a_shifted_patch_is_found_to_a_tenth_of_a_pixel(shift: tuple[float, float]):
+    rng = np.random.default_rng(0)
+    noise = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (80, 100)), None, 2.0)
+    texture = cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX)
+    image = np.clip(ndimage.shift(texture, shift[::-1]), 0.0, 255.0)
+    predicted = np.array([[50.0, 40.0], [48.5, 37.25], [2.0, 2.0]])  # the last: at the border
+    pixels, correlations = align_patches(
+        image.round().astype(np.uint8),
+        texture.round().astype(np.uint8)[None],
+        np.array([texture.shape]),
+        np.zeros(3, np.int64),
+        predicted,
+        predicted.copy(),
+        np.tile(np.eye(2), (3, 1, 1)),
+        4,
+    )
+    assert np.abs(pixels[:2] - predicted[:2] - shift).max() < 0.1
+    assert correlations[:2].min() > 0.98
+    assert correlations[2] == -1.0
+
+
+def test_a_patch_without_texture_matches_nothing():
+    flat = np.full((60, 60), 90, np.uint8)
+    pixels, correlations = align_patches(
+        flat,
+        flat[None],
+        np.array([flat.shape]),
+        np.zeros(1, np.int64),
+        np.array([[30.0, 30.0]]),
+        np.array([[30.0, 30.0]]),
+        np.eye(2)[None],
+        4,
+    )
+    assert correlations[0] == -1.0
+    assert np.isnan(pixels).all()
