@@ -213,7 +213,10 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
       are a table of the standard deviation of an aligned pixel. Matches below the first correlation
       are dropped.
     - In maps whose rho is above `max_correlated_error_share` the step is left out.
-    - `shared_error_factor` is the share of the verdict's correlated errors that remain.
+    - `shared_error_line` (a, b) gives the share of the verdict's correlated covariance that
+      remains, a + b rho, at most 1.
+    - A refused pose with log-odds above `min_log_odds` gets a second look. `crowding_weight` times
+      the crowding of its matches plus `crowding_bias` is added to its log-odds.
     """
 
     corpus: str
@@ -230,7 +233,10 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     correlations: tuple[Finite, ...]
     aligned_sigmas_px: tuple[Finite, ...]
     max_correlated_error_share: Finite
-    shared_error_factor: Finite
+    shared_error_line: tuple[Finite, Finite]
+    min_log_odds: Finite
+    crowding_weight: Finite
+    crowding_bias: Finite
 
 
 @cache

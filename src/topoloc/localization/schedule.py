@@ -31,7 +31,7 @@ from typing import Literal
 from topoloc.atlas.config import AtlasConfig
 from topoloc.errors import MapError, ObjectStoreError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.last_step import refine_result
+from topoloc.localization.last_step import reconsider_refusal, refine_result
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.propose import (
     min_rival_inliers,
@@ -236,6 +236,7 @@ class Schedule:
                     return
                 outcome = yield from query.exhaustive() if is_exhaustive else query.coarse_only()
                 if is_exhaustive:
+                    outcome = reconsider_refusal(query.searches, outcome)
                     outcome = refine_result(query.searches, outcome)
                 result, poses = opened.name_outcome(outcome, self.query_image.camera)
         except ObjectStoreError:  # the tile is fine, but its result is unknown
