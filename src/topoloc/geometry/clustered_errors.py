@@ -40,9 +40,7 @@ def compute_variance_inflation(
         point_covariances: covariances of these points (m^2).
         sigma_px: standard deviation of the pixels.
     """
-    matches = Matches.from_pixels(
-        points_img, points_world, point_covariances, camera, sigma_px
-    )
+    matches = Matches.from_pixels(points_img, points_world, point_covariances, camera, sigma_px)
     grid, size = np.array([_COLUMNS, _ROWS]), [camera.width, camera.height]
     columns, rows = np.clip((points_img + 0.5) * grid / size, 0, grid - 1).astype(np.intp).T
     used, cells = np.unique(rows * _COLUMNS + columns, return_inverse=True)

@@ -33,7 +33,8 @@ from topoloc.mapping.node_cache import CachedNodes
 from topoloc.mapping.nodes import node_distances_for_any_roll
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
-from topoloc.recordings.image_io import EncodedImage, read_image, to_grey
+from topoloc.recordings.frame import to_grey
+from topoloc.recordings.image_io import EncodedImage, read_image
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
 
