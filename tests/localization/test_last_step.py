@@ -17,8 +17,8 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization import open_map
-from topoloc.localization.last_step_kernels import align_patches
 from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.patch_alignment_kernels import align_patches
 from topoloc.localization.result import Localization
 from topoloc.mapping.topomap import TopoMetricMap
 

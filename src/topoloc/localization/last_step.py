@@ -4,10 +4,9 @@ The verdict needs few nodes and one feature type. Once the place is certain, poi
 and of all feature types are matched near their predicted pixels. This is safe only for a pose that
 is accurate to a few pixels: within a small radius few matches are right by chance.
 
-Each match is then aligned by correlation (least-squares matching in its simplest form). The node's
-image around the point is warped as a plane that faces the node, and moved over the query image. A
-key point lies one to three pixels off the described point, an aligned patch a third of a pixel.
-Matches that do not correlate are dropped.
+Each match is then aligned by correlation (`patch_alignment.py`). A key point lies one to three
+pixels off the described point, an aligned patch a third of a pixel. Matches that do not correlate
+are dropped.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from topoloc.geometry.absolute_pose import AbsolutePose, refine_absolute_pose
 from topoloc.geometry.camera import Camera
@@ -26,26 +25,11 @@ from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.fitted_weights import LastStepWeights, load_last_step_weights
 from topoloc.localization.guided import match_guided
-from topoloc.localization.last_step_kernels import align_patches
-from topoloc.localization.open_map import NodeTemplate
-from topoloc.localization.pose_fit import LocalMap, PointObservations
+from topoloc.localization.patch_alignment import PreciseMatches, align
+from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.result import Localization
 from topoloc.localization.result_decision import ResultWithInliers, decide_final_result
 from topoloc.localization.search import Search
-from topoloc.node_ids import NodeId
-
-
-@dataclass(frozen=True, eq=False)
-class PreciseMatches(PointObservations):
-    """Hold matches of all feature types. `sigmas_px` is the standard deviation of each pixel."""
-
-    node_ids: Int[np.ndarray, " n"]
-    similarities: Float[np.ndarray, " n"]
-    sigmas_px: Float[np.ndarray, " n"]
-
-    def select(self, rows: np.ndarray) -> PreciseMatches:
-        """Return the given rows."""
-        return PreciseMatches(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +38,15 @@ class PreciseFit:
 
     pose: AbsolutePose
     matches: PreciseMatches
+
+
+def make_precise(searches: Sequence[Search], outcome: ResultWithInliers) -> ResultWithInliers:
+    """Return the outcome with a second look at a refusal, and with its pose refined.
+
+    Args:
+        searches: the searches of the query, one for each feature type.
+    """
+    return _refine_result(searches, _reconsider_refusal(searches, outcome))
 
 
 def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
@@ -73,7 +66,9 @@ def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
     )
 
 
-def reconsider_refusal(searches: Sequence[Search], outcome: ResultWithInliers) -> ResultWithInliers:
+def _reconsider_refusal(
+    searches: Sequence[Search], outcome: ResultWithInliers
+) -> ResultWithInliers:
     """Return the outcome after a second look at the hypotheses, if a refusal is nearly a pose.
 
     In bad light few unguided matches agree with the right pose, but the guided ones of all nodes
@@ -90,7 +85,7 @@ def reconsider_refusal(searches: Sequence[Search], outcome: ResultWithInliers) -
     for search in searches:
         ordered = [search, *(other for other in searches if other is not search)]
         for one in search.belief.hypotheses:
-            if one.is_from_virtual_views or one.log_odds < weights.min_log_odds:
+            if one.evidence.is_from_virtual_views or one.log_odds < weights.min_log_odds:
                 continue
             around = Surroundings.of(ordered, one.fit.cam_from_world, weights)
             fit = around.refine_by_key_points(one.fit.cam_from_world)
@@ -109,14 +104,11 @@ def reconsider_refusal(searches: Sequence[Search], outcome: ResultWithInliers) -
     return reconsidered if isinstance(reconsidered[0], Localization) else outcome
 
 
-def refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> ResultWithInliers:
+def _refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> ResultWithInliers:
     """Return the outcome with its pose refined, or unchanged if too few points agree.
 
     Nodes near a pose from virtual views show something else, and a calibration in doubt would have
     to be estimated with the pose.
-
-    Args:
-        searches: the searches of the query, one for each feature type.
     """
     result, first = outcome[0], searches[0]
     weights = load_last_step_weights()
@@ -161,7 +153,7 @@ def refine_precisely(
         return None
     chosen, aligned = _spread(fit, around.camera, weights.max_aligned), fit
     for reach_px in weights.reaches_px:
-        moved = _align(searches[0], chosen, aligned.pose.cam_from_world, reach_px, weights)
+        moved = align(searches[0], chosen, aligned.pose.cam_from_world, reach_px, weights)
         better = around.fit(moved, aligned.pose.cam_from_world, weights.max_aligned_error_px)
         if better is None or np.count_nonzero(better.pose.inliers) < weights.min_aligned:
             return fit
@@ -272,66 +264,6 @@ def _spread(fit: PreciseFit, camera: Camera, max_number: int) -> PreciseMatches:
     starts = np.searchsorted(cells[order], cells[order])
     rank = np.arange(len(order)) - starts
     return matches.select(np.sort(order[np.argsort(rank, kind="stable")[:max_number]]))
-
-
-def _align(
-    search: Search,
-    matches: PreciseMatches,
-    cam_from_world: Rigid3,
-    reach_px: int,
-    weights: LastStepWeights,
-) -> PreciseMatches:
-    """Align matches by correlation with the node's images. Matches that do not correlate are
-    dropped."""
-    camera = search.query.camera
-    node_ids, node_of_match = np.unique(matches.node_ids, return_inverse=True)
-    templates = [search.map.template(search.map.topomap.row_of(NodeId(int(k)))) for k in node_ids]
-    size = np.array([template.image.shape for template in templates]).reshape(-1, 2)
-    images = np.zeros((len(templates), *size.max(axis=0, initial=1)), np.uint8)
-    for k, template in enumerate(templates):
-        images[k, : size[k, 0], : size[k, 1]] = template.image
-    predicted, centres, warps = _compute_warps(
-        matches, cam_from_world, camera, templates, node_of_match
-    )
-    pixels, correlations = align_patches(
-        search.query.grey, images, size, node_of_match, predicted, centres, warps, reach_px
-    )
-    rows = np.flatnonzero(correlations > weights.correlations[0])
-    sigmas = np.interp(correlations[rows], weights.correlations, weights.aligned_sigmas_px)
-    return replace(
-        matches.select(rows), points_img=pixels[rows].astype(np.float32), sigmas_px=sigmas
-    )
-
-
-def _compute_warps(
-    matches: PreciseMatches,
-    cam_from_world: Rigid3,
-    camera: Camera,
-    templates: Sequence[NodeTemplate],
-    node_of_match: Int[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Return the pixel of each point in the query and in the node's image, and the derivative of
-    the second by the first on a plane that faces the node."""
-    rotations = np.array([one.world_from_cam.rotation for one in templates])[node_of_match]
-    origins = np.array([one.world_from_cam.translation for one in templates])[node_of_match]
-    in_query = cam_from_world.apply(matches.points_world)
-    in_node = np.einsum("nji,nj->ni", rotations, matches.points_world - origins)
-    step = 0.01 * in_node[:, 2:]  # short enough for the derivative of any lens
-    axes = np.einsum("ij,njk->kni", cam_from_world.rotation, rotations)[:2]
-    predicted = camera.img_from_cam(in_query)
-    by_query = [camera.img_from_cam(in_query + step * axis) - predicted for axis in axes]
-    centres, by_node = np.empty_like(predicted), np.empty((2, *predicted.shape))
-    cameras = [template.camera for template in templates]
-    for node_camera in set(cameras):
-        rows = np.flatnonzero(np.array([one == node_camera for one in cameras])[node_of_match])
-        centres[rows] = node_camera.img_from_cam(in_node[rows])
-        for k in range(2):
-            moved = in_node[rows] + step[rows] * np.eye(3)[k]
-            by_node[k, rows] = node_camera.img_from_cam(moved) - centres[rows]
-    (a, c), (b, d) = (one.T for one in by_query)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a plane seen from its edge
-        inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
-    return predicted, centres, np.einsum("jni,jkn->nik", by_node, inverse)
 
 
 def _compute_noise_covariance(

@@ -5,6 +5,7 @@ Nodes are identified by their rows.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ from topoloc.mapping.nodes import node_distances_for_any_roll
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.recordings.frame import to_grey
-from topoloc.recordings.image_io import EncodedImage, read_image
+from topoloc.recordings.image_io import EncodedImage, image_size, read_image
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
 
@@ -49,14 +50,16 @@ class NodeTemplate:
 
     @staticmethod
     def of_node(node: TopoNode) -> NodeTemplate:
-        """Return the stored image of a node in grey, black if it cannot be read."""
-        try:
-            image = to_grey(read_image(EncodedImage(node.summary.name, node.template_jpeg)))
-        except UnreadableImageError:
-            image = np.zeros((2, 2), np.uint8)
+        """Return the stored image of a node in grey, black if it cannot be read or is larger than
+        the camera's images."""
+        encoded = EncodedImage(node.summary.name, node.template_jpeg)
+        image = np.zeros((2, 2), np.uint8)
+        with contextlib.suppress(UnreadableImageError):
+            width, height = image_size(encoded)
+            if width <= node.camera.width and height <= node.camera.height:
+                image = to_grey(read_image(encoded))
         height, width = image.shape
         return NodeTemplate(image, node.camera.rescaled(width, height), node.summary.world_from_cam)
-
 
 
 class OpenMap:

@@ -31,7 +31,7 @@ from typing import Literal
 from topoloc.atlas.config import AtlasConfig
 from topoloc.errors import MapError, ObjectStoreError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.last_step import reconsider_refusal, refine_result
+from topoloc.localization.last_step import make_precise
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.propose import (
     min_rival_inliers,
@@ -235,10 +235,8 @@ class Schedule:
                 if mode == "rival" and not self._may_be_rival(query):
                     return
                 outcome = yield from query.exhaustive() if is_exhaustive else query.coarse_only()
-                if is_exhaustive:
-                    outcome = reconsider_refusal(query.searches, outcome)
-                    outcome = refine_result(query.searches, outcome)
-                result, poses = opened.name_outcome(outcome, self.query_image.camera)
+                precise = make_precise(query.searches, outcome) if is_exhaustive else outcome
+                result, poses = opened.name_outcome(precise, self.query_image.camera)
         except ObjectStoreError:  # the tile is fine, but its result is unknown
             raise
         except MapError as error:
@@ -253,7 +251,7 @@ class Schedule:
         return replace(result, times_ms=self.clock.times_ms()), poses
 
     def _candidates(self) -> TileRanking:
-        """Return the tiles that are nearly as similar to the image as the best one."""
+        """Return the tiles nearly as similar to the image as the best one."""
         ranking = self._readable(self.ranking)
         least = ranking[0][1] - self.config.max_similarity_gap if ranking else 0.0
         return [one for one in ranking if one[1] >= least or self._is_unranked(one)]
@@ -283,8 +281,7 @@ class Schedule:
         return [one for one in ranking if one[0] not in self.tiles.problems]
 
     def _priority(self, ranked: tuple[str, float]) -> tuple[float, float]:
-        """Return the sort key of a tile: first the probability of its coarse pose, then its
-        similarity."""
+        """Return the sort key of a tile: the probability of its coarse pose, its similarity."""
         known = self.results.get(ranked[0])
         found = [one.probability for one, _ in known.poses] if known else []
         return max(found, default=0.0), ranked[1]

@@ -1,4 +1,4 @@
-"""Numba kernels of the last step: align matches by correlation."""
+"""Numba kernels of `patch_alignment`."""
 
 import numpy as np
 
