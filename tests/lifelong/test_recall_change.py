@@ -12,7 +12,7 @@ import pytest
 
 from topoloc import TopoMetricMap
 from topoloc.apps.cli import main
-from topoloc.apps.cli.maps.history import _describe_recall_change
+from topoloc.apps.cli.maps.history import _format_changes
 from topoloc.lifelong.landmark_pruning import select_landmarks
 from topoloc.lifelong.node_localization import measure_recall_change
 
@@ -31,10 +31,10 @@ def test_a_map_that_lost_its_landmarks_localizes_fewer_of_its_earlier_nodes(room
         "earlier_localized_after": 0,
     }
     assert (
-        _describe_recall_change(counts)
-        == "of 4 earlier nodes, each asked without itself, 4 localized before and 0 after"
+        _format_changes(counts)
+        == ": of 4 earlier nodes, each asked without itself, 4 localized before and 0 after"
     )
-    assert _describe_recall_change({"landmarks_gone": 3}) is None
+    assert _format_changes({"landmarks_gone": 3}) == ": landmarks gone 3"
 
 
 def test_the_history_tells_it(room_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -16,9 +16,9 @@ from tiny_world import CAMERA
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization import open_map
+from topoloc.localization.exact import patch_alignment
+from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.localization.patch_alignment_kernels import align_patches
 from topoloc.localization.result import Localization
 from topoloc.mapping.topomap import TopoMetricMap
 
@@ -72,10 +72,10 @@ def test_without_images_of_the_nodes_a_pose_is_found_all_the_same(
     room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
 ):
     image, truth = unseen_views()[2]
-    read = open_map.NodeTemplate.of_node
+    read = patch_alignment.NodeTemplate.of_node
     for damaged in (b"", b"no image"):
         monkeypatch.setattr(
-            open_map.NodeTemplate,
+            patch_alignment.NodeTemplate,
             "of_node",
             staticmethod(lambda node, jpeg=damaged: read(replace(node, template_jpeg=jpeg))),
         )
@@ -107,7 +107,9 @@ def test_a_shifted_patch_is_found_to_a_tenth_of_a_pixel(shift: tuple[float, floa
         predicted,
         predicted.copy(),
         np.tile(np.eye(2), (3, 1, 1)),
+        11,
         4,
+        2.0,
     )
     assert np.abs(pixels[:2] - predicted[:2] - shift).max() < 0.1
     assert correlations[:2].min() > 0.98
@@ -124,7 +126,9 @@ def test_a_patch_without_texture_matches_nothing():
         np.array([[30.0, 30.0]]),
         np.array([[30.0, 30.0]]),
         np.eye(2)[None],
+        11,
         4,
+        2.0,
     )
     assert correlations[0] == -1.0
     assert np.isnan(pixels).all()

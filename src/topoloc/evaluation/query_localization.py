@@ -16,7 +16,7 @@ from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer
-from topoloc.mapping.build import Progress
+from topoloc.mapping.config import Progress
 from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId

@@ -18,12 +18,12 @@ import poselib
 from jaxtyping import Bool, Float
 
 from topoloc.bounds import Above, Between
-from topoloc.geometry.absolute_pose_kernels import normal_equations, squared_errors
+from topoloc.geometry.absolute_pose_kernels import squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.pose_matches import (
-    CAUCHY_SCALE,
     MIN_POINTS,
     Matches,
+    estimate_pose_covariance,
     is_non_collinear,
     refine_pose,
 )
@@ -34,12 +34,6 @@ _MAX_THRESHOLD_SCALE = 3.0
 # iterations that PoseLib runs in milliseconds.
 _OPENCV_MAX_ITERATIONS = 1000
 _OPENCV_CONFIDENCE = 0.99  # its default
-_MAX_SCALE_STEPS = 30
-# Effect of Cauchy's weights w on Gaussian residuals r of two dimensions, to correct the covariance
-# for it: E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance
-# over the inverse of its information.
-_MEAN_WEIGHTED_SQUARE = 0.6302
-_ESTIMATOR_VARIANCE = 0.8265
 
 
 @dataclass(frozen=True)
@@ -259,48 +253,12 @@ def _with_covariance(
     order: np.ndarray,
     num_points: int,
 ) -> AbsolutePose | None:
-    if np.count_nonzero(active) < MIN_POINTS or not is_non_collinear(matches.points_world[active]):
+    covariance = estimate_pose_covariance(cam_from_world, matches, active)
+    if covariance is None:
         return None
-    arguments = matches.kernel_args(cam_from_world)
-    scale = _estimate_noise_scale(squared_errors(*arguments)[active])
-    information, *_ = normal_equations(*arguments, active, CAUCHY_SCALE * scale, 6)
-    inverse = _invert_information(information)
-    if inverse is None:
-        return None
-    covariance = _ESTIMATOR_VARIANCE * scale**2 * inverse
     inliers = np.zeros(num_points, dtype=np.bool_)
     inliers[order] = active
     return AbsolutePose(cam_from_world, inliers, covariance)
-
-
-def _estimate_noise_scale(squares: Float[np.ndarray, " n"]) -> float:
-    """Return the factor by which the noise exceeds its assumed standard deviation, from squared
-    whitened residuals (Huber's proposal 2, 1964).
-
-    It is at least 1. If few matches fit well, this is due to chance or to the fit itself.
-    """
-    num_free, variance = max(2 * len(squares) - 6, 1), 1.0
-    for _ in range(_MAX_SCALE_STEPS):
-        scaled = squares / variance
-        total = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2)))
-        ratio = total / (_MEAN_WEIGHTED_SQUARE * num_free)
-        if ratio <= 1.001:
-            break
-        variance *= ratio
-    return float(np.sqrt(variance))
-
-
-def _invert_information(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] | None:
-    """Return the inverse of an information matrix, or None if it does not fix all six degrees of
-    freedom."""
-    diagonal = np.sqrt(np.diag(information))
-    if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
-        return None
-    scales = np.outer(diagonal, diagonal)  # makes metres and radians comparable
-    if np.linalg.eigvalsh(information / scales)[0] < 1e-12:
-        return None
-    inverse = np.linalg.inv(information / scales) / scales
-    return (inverse + inverse.T) / 2.0
 
 
 def select_inliers(

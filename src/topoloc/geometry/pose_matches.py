@@ -1,4 +1,5 @@
-"""Hold matches of pixels with world points for the kernels of pose estimation. Refine a pose."""
+"""Hold matches of pixels with world points for the kernels of pose estimation. Refine a pose, and
+estimate its covariance."""
 
 from __future__ import annotations
 
@@ -7,13 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from topoloc.geometry.absolute_pose_kernels import refine
+from topoloc.geometry.absolute_pose_kernels import normal_equations, refine, squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 
 _Array = np.ndarray
 MIN_POINTS = 4
 CAUCHY_SCALE = 2.3849  # 95 % efficiency on Gaussian residuals (Holland and Welsch, 1977)
+_MAX_SCALE_STEPS = 30
+# Effect of Cauchy's weights w on Gaussian residuals r of two dimensions, to correct the covariance
+# for it: E[w r^2] / 2, and E[w] E[w^2 r^2 / 2] / E[w - w^2 r^2 / c^2]^2, the M-estimator's variance
+# over the inverse of its information.
+_MEAN_WEIGHTED_SQUARE = 0.6302
+_ESTIMATOR_VARIANCE = 0.8265
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,3 +88,47 @@ def is_non_collinear(points: Float[np.ndarray, "n 3"]) -> bool:
     # Of variances a <= b <= c, trace^2 - |scatter|^2 is 2 (ab + ac + bc), between 2 bc and 6 bc.
     total = float(np.trace(scatter)) ** 2
     return total - float(np.vdot(scatter, scatter)) > 2e-9 * total
+
+
+def estimate_pose_covariance(
+    cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, "6 6"] | None:
+    """Return the covariance of a pose that was fitted to the active matches: of the left
+    perturbation (translation, rotation; m, rad). None if they do not fix the pose."""
+    if np.count_nonzero(active) < MIN_POINTS or not is_non_collinear(matches.points_world[active]):
+        return None
+    arguments = matches.kernel_args(cam_from_world)
+    scale = _estimate_noise_scale(squared_errors(*arguments)[active])
+    information, *_ = normal_equations(*arguments, active, CAUCHY_SCALE * scale, 6)
+    inverse = _invert_information(information)
+    return None if inverse is None else _ESTIMATOR_VARIANCE * scale**2 * inverse
+
+
+def _estimate_noise_scale(squares: Float[np.ndarray, " n"]) -> float:
+    """Return the factor by which the noise exceeds its assumed standard deviation, from squared
+    whitened residuals (Huber's proposal 2, 1964).
+
+    It is at least 1. If few matches fit well, this is due to chance or to the fit itself.
+    """
+    num_free, variance = max(2 * len(squares) - 6, 1), 1.0
+    for _ in range(_MAX_SCALE_STEPS):
+        scaled = squares / variance
+        total = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2)))
+        ratio = total / (_MEAN_WEIGHTED_SQUARE * num_free)
+        if ratio <= 1.001:
+            break
+        variance *= ratio
+    return float(np.sqrt(variance))
+
+
+def _invert_information(information: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"] | None:
+    """Return the inverse of an information matrix, or None if it does not fix all six degrees of
+    freedom."""
+    diagonal = np.sqrt(np.diag(information))
+    if not (np.isfinite(information).all() and np.all(diagonal > 0.0)):
+        return None
+    scales = np.outer(diagonal, diagonal)  # makes metres and radians comparable
+    if np.linalg.eigvalsh(information / scales)[0] < 1e-12:
+        return None
+    inverse = np.linalg.inv(information / scales) / scales
+    return (inverse + inverse.T) / 2.0

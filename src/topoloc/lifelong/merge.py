@@ -21,7 +21,7 @@ from topoloc.lifelong.session_content import is_well_localized, update_coarse_mo
 from topoloc.lifelong.session_poses import SessionPoses, align_motion_to_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
-from topoloc.mapping.build import Progress
+from topoloc.mapping.config import Progress
 from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.sessions import Edit, today
 from topoloc.mapping.storage.entries import overlay

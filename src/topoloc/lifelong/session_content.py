@@ -18,7 +18,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import position_covariance
 from topoloc.lifelong.session_poses import SessionPoses
 from topoloc.localization.result import Localization
-from topoloc.mapping.build import Progress
+from topoloc.mapping.config import Progress
 from topoloc.mapping.landmarks import NODES_PER_IMAGE, Observations
 from topoloc.mapping.mapping_frames import (
     MappingFrame,

@@ -29,8 +29,7 @@ from topoloc.lifelong.scale_estimation import (
 from topoloc.lifelong.session_checks import check_calibration, check_focal_length
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.build import Progress
-from topoloc.mapping.config import MapConfig
+from topoloc.mapping.config import MapConfig, Progress
 from topoloc.mapping.nodes import select_node_frames
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.recording import SequenceView

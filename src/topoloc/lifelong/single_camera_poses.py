@@ -35,8 +35,7 @@ from topoloc.lifelong.session_poses import (
 )
 from topoloc.lifelong.trajectory_adjustment import adjust_trajectory, correct_trajectory
 from topoloc.localization.result import Localization, NotLocalized
-from topoloc.mapping.build import Progress
-from topoloc.mapping.config import MapConfig
+from topoloc.mapping.config import MapConfig, Progress
 from topoloc.mapping.nodes import select_node_frames
 from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.monocular_odometry import MonocularOdometry

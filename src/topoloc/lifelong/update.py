@@ -25,7 +25,7 @@ from topoloc.lifelong.session_poses import estimate_poses_by_motion
 from topoloc.lifelong.single_camera_poses import estimate_poses_by_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
-from topoloc.mapping.build import Progress
+from topoloc.mapping.config import Progress
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.landmarks import count_session_observations
 from topoloc.mapping.mapping_frames import (

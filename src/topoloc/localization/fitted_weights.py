@@ -204,19 +204,17 @@ class CorrelatedErrorWeights(Struct, frozen=True, forbid_unknown_fields=True):
 class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the numbers of the last step (`last_step.py`).
 
-    - `num_nodes` is the number of nodes nearest to the pose whose points are matched.
-    - `radii_px` and `max_errors_px` are the search radii and inlier limits of the two rounds of
-      matching, in pixels of an image whose longer side is 640. `key_point_sigma_px` is the standard
-      deviation of a key point.
-    - At most `max_aligned` matches are aligned, in rounds that search up to `reaches_px`. At least
-      `min_aligned` must agree within `max_aligned_error_px`. `correlations` and `aligned_sigmas_px`
-      are a table of the standard deviation of an aligned pixel. Matches below the first correlation
-      are dropped.
-    - In maps whose rho is above `max_correlated_error_share` the step is left out.
-    - `shared_error_line` (a, b) gives the share of the verdict's correlated covariance that
-      remains, a + b rho, at most 1.
-    - A refused pose with log-odds above `min_log_odds` gets a second look. `crowding_weight` times
-      the crowding of its matches plus `crowding_bias` is added to its log-odds.
+    - `num_nodes`: nodes nearest to the pose whose points are matched.
+    - `radii_px`, `max_errors_px`: search radii and inlier limits of the two rounds of matching, in
+      pixels of an image whose longer side is 640. `key_point_sigma_px`: error of a key point.
+    - `max_aligned`: matches that are aligned at most, in rounds that search up to `reaches_px`, by
+      patches of `patch_px` squared pixels whose grey levels vary by `min_patch_sigma`. At least
+      `min_aligned` must agree within `max_aligned_error_px`. `correlations`, `aligned_sigmas_px`:
+      table of the error of an aligned pixel. Matches below the first correlation are dropped.
+    - `max_correlated_error_share`: rho of a map above which the step is left out.
+    - `shared_error_line` (a, b): a + b rho of the verdict's correlated covariance remains.
+    - `min_log_odds`: a refused pose above it gets a second look. `crowding_weight` times the
+      crowding of its matches plus `crowding_bias` is added to its log-odds.
     """
 
     corpus: str
@@ -230,6 +228,8 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     max_aligned: int
     reaches_px: tuple[int, ...]
     max_aligned_error_px: Finite
+    patch_px: int
+    min_patch_sigma: Finite
     correlations: tuple[Finite, ...]
     aligned_sigmas_px: tuple[Finite, ...]
     max_correlated_error_share: Finite
@@ -246,7 +246,7 @@ def load_last_step_weights() -> LastStepWeights:
     Raises:
         FeatureTypeError: the file is damaged.
     """
-    path = Path(__file__).parent / "last_step_weights.json"
+    path = Path(__file__).parent / "exact/weights.json"
     return decode_json(path.read_bytes(), LastStepWeights, FeatureTypeError, str(path))
 
 

@@ -5,20 +5,19 @@ Nodes are identified by their rows.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 
-from topoloc.errors import EmptyMapError, UnreadableImageError
+from topoloc.errors import EmptyMapError
 from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.exact.patch_alignment import NodeTemplate
 from topoloc.localization.guided import predict_key_points
 from topoloc.localization.map_facts.repetition import (
     NUM_NEIGHBOURS,
@@ -34,32 +33,8 @@ from topoloc.mapping.node_cache import CachedNodes
 from topoloc.mapping.nodes import node_distances_for_any_roll
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.node_ids import NodeId, Row, as_rows
-from topoloc.recordings.frame import to_grey
-from topoloc.recordings.image_io import EncodedImage, image_size, read_image
 from topoloc.retrieval.coarse import CoarseLocalizer, Image, NodeScore
 from topoloc.retrieval.vlad import SurfVlad
-
-
-@dataclass(frozen=True, eq=False)
-class NodeTemplate:
-    """Hold the image of a node for correlation. `camera` has the size of the image."""
-
-    image: UInt8[np.ndarray, "h w"]
-    camera: Camera
-    world_from_cam: Rigid3
-
-    @staticmethod
-    def of_node(node: TopoNode) -> NodeTemplate:
-        """Return the stored image of a node in grey, black if it cannot be read or is larger than
-        the camera's images."""
-        encoded = EncodedImage(node.summary.name, node.template_jpeg)
-        image = np.zeros((2, 2), np.uint8)
-        with contextlib.suppress(UnreadableImageError):
-            width, height = image_size(encoded)
-            if width <= node.camera.width and height <= node.camera.height:
-                image = to_grey(read_image(encoded))
-        height, width = image.shape
-        return NodeTemplate(image, node.camera.rescaled(width, height), node.summary.world_from_cam)
 
 
 class OpenMap:
@@ -99,8 +74,7 @@ class OpenMap:
         self.lambda_rot, self.d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
         self._local_map = CachedNodes(lambda row: LocalMap.of_node(self._nodes[row]))
         self._moves = CachedNodes(self._find_moves)
-        self.template = CachedNodes(lambda row: NodeTemplate.of_node(self._nodes[row]))
-        """The image of a node by its row, for correlation."""
+        self._template = CachedNodes(lambda row: NodeTemplate.of_node(self._nodes[row]))
         self._stored_moves = _stored_moves(topomap)
         self.focal = self._max_focal_length()
         self._predicted_at_nodes: tuple[Camera, CachedNodes[Float32[np.ndarray, "n 5"]]] | None = (
@@ -132,6 +106,10 @@ class OpenMap:
     def local_map(self, rows: Sequence[Row]) -> LocalMap:
         """Return the points of these nodes, pooled."""
         return LocalMap.concatenate(self._local_map.pool(rows))
+
+    def template(self, node_id: NodeId) -> NodeTemplate:
+        """Return the image of a node."""
+        return self._template(self.topomap.row_of(node_id))
 
     def predict_at_node(self, row: Row, camera: Camera) -> Float32[np.ndarray, "n 5"]:
         """Return `predict_key_points` of a node's points for a camera at the node's pose.

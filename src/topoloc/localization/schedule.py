@@ -31,7 +31,7 @@ from typing import Literal
 from topoloc.atlas.config import AtlasConfig
 from topoloc.errors import MapError, ObjectStoreError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.last_step import make_precise
+from topoloc.localization.exact.last_step import make_precise
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.propose import (
     min_rival_inliers,

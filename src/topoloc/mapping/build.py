@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -18,7 +17,7 @@ from topoloc.bounds import check_bounds
 from topoloc.disk_list import DiskList
 from topoloc.errors import EmptyMapError
 from topoloc.features.parallel import parallel_map
-from topoloc.mapping.config import MapConfig
+from topoloc.mapping.config import MapConfig, Progress
 from topoloc.mapping.landmarks import NODES_PER_IMAGE, Observations
 from topoloc.mapping.mapping_frames import (
     MappingFrame,
@@ -53,15 +52,6 @@ from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
 BuildConfig = MapConfig
-
-
-@runtime_checkable
-class Progress(Protocol):
-    """A callable with a stage's name, steps done and steps in all."""
-
-    def __call__(self, stage: str, done: int, total: int, /) -> None:
-        """Report progress."""
-        ...
 
 
 def build_map(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 from topoloc.bounds import AtLeast, parse_settings
 from topoloc.errors import ConfigError, MissingExtraError, WeightsError
@@ -22,6 +22,15 @@ from topoloc.retrieval.coarse import VladConfig
 
 CONFIG_VERSION = 1
 """Version of the JSON in the map file. It increases if the meaning of a key changes."""
+
+
+@runtime_checkable
+class Progress(Protocol):
+    """A callable with a stage's name, steps done and steps in all."""
+
+    def __call__(self, stage: str, done: int, total: int, /) -> None:
+        """Report progress."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from topoloc.localization.guided_kernels import match_projections
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.walls.upright_pose import estimate_upright_pose
-from topoloc.mapping.build import Progress
+from topoloc.mapping.config import Progress
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import DepthImage, StereoFrame
 from topoloc.recordings.frame_checks import MemorySequence

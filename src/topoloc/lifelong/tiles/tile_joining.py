@@ -27,7 +27,7 @@ from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.lifelong.tiles.tile_comparison import NotJoined, OpenTile, TileTransform, compare_tiles
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
-from topoloc.mapping.build import Progress
+from topoloc.mapping.config import Progress
 from topoloc.recordings.frame import StereoSequence
 
 

@@ -17,6 +17,7 @@ from topoloc.localization.map_facts.correlated_errors import measure_stored_erro
 from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
+from topoloc.mapping.config import Progress
 from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoSequence
@@ -28,7 +29,7 @@ from topoloc.slam.slam import estimate_slam_poses
 def build_map(
     sequences: StereoSequence | str | Path | Sequence[StereoSequence | str | Path],
     config: build.BuildConfig | None = None,
-    progress: build.Progress | None = None,
+    progress: Progress | None = None,
     poses_from: Sequence[str] | None = None,
     are_poses_checked: bool = True,
     is_coverage_checked: bool = True,
@@ -73,9 +74,7 @@ def build_map(
     return with_map_statistics(build.build_map(sequences, config, progress, poses_from), progress)
 
 
-def with_map_statistics(
-    topomap: TopoMetricMap, progress: build.Progress | None = None
-) -> TopoMetricMap:
+def with_map_statistics(topomap: TopoMetricMap, progress: Progress | None = None) -> TopoMetricMap:
     """Return the map with its statistics (correlated errors, repetitions).
 
     A localizer then reads them instead of measuring them.
@@ -99,9 +98,7 @@ def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
     )
 
 
-def with_repetitions(
-    topomap: TopoMetricMap, progress: build.Progress | None = None
-) -> TopoMetricMap:
+def with_repetitions(topomap: TopoMetricMap, progress: Progress | None = None) -> TopoMetricMap:
     """Return the map with the repetition moves of its nodes."""
     opened, moves = OpenMap(topomap), dict[NodeId, Float[np.ndarray, "k 4 4"]]()
     for row, found in enumerate(parallel_map(opened.moves, topomap.rows)):

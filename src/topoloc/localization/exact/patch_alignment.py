@@ -6,20 +6,23 @@ query image. This is adaptive least-squares correlation (Gruen, 1985) with a shi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
+from topoloc.errors import UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.fitted_weights import LastStepWeights
-from topoloc.localization.open_map import NodeTemplate
-from topoloc.localization.patch_alignment_kernels import align_patches
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.localization.search import Search
+from topoloc.mapping.topomap import TopoNode
 from topoloc.node_ids import NodeId
+from topoloc.recordings.frame import to_grey
+from topoloc.recordings.image_io import EncodedImage, image_size, read_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,33 +38,54 @@ class PreciseMatches(PointObservations):
         return PreciseMatches(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
+@dataclass(frozen=True, eq=False)
+class NodeTemplate:
+    """Hold the image of a node. `camera` has the size of the image."""
+
+    image: UInt8[np.ndarray, "h w"]
+    camera: Camera
+    world_from_cam: Rigid3
+
+    @staticmethod
+    def of_node(node: TopoNode) -> NodeTemplate:
+        """Return the stored image of a node in grey, black if it cannot be read or is larger than
+        the camera's images."""
+        encoded = EncodedImage(node.summary.name, node.template_jpeg)
+        image = np.zeros((2, 2), np.uint8)
+        with contextlib.suppress(UnreadableImageError):
+            width, height = image_size(encoded)
+            if width <= node.camera.width and height <= node.camera.height:
+                image = to_grey(read_image(encoded))
+        height, width = image.shape
+        return NodeTemplate(image, node.camera.rescaled(width, height), node.summary.world_from_cam)
+
+
 def align(
-    search: Search,
+    image: UInt8[np.ndarray, "h w"],
+    camera: Camera,
     matches: PreciseMatches,
+    read_template: Callable[[NodeId], NodeTemplate],
     cam_from_world: Rigid3,
     reach_px: int,
     weights: LastStepWeights,
 ) -> PreciseMatches:
-    """Align matches by correlation with the node's images. Matches that do not correlate are
+    """Align matches by correlation with the nodes' images. Matches that do not correlate are
     dropped."""
-    camera = search.query.camera
     node_ids, node_of_match = np.unique(matches.node_ids, return_inverse=True)
-    templates = [search.map.template(search.map.topomap.row_of(NodeId(int(k)))) for k in node_ids]
-    size = np.array([template.image.shape for template in templates]).reshape(-1, 2)
-    images = np.zeros((len(templates), *size.max(axis=0, initial=1)), np.uint8)
+    templates = [read_template(NodeId(int(node_id))) for node_id in node_ids]
+    sizes = np.array([template.image.shape for template in templates]).reshape(-1, 2)
+    images = np.zeros((len(templates), *sizes.max(axis=0, initial=1)), np.uint8)
     for k, template in enumerate(templates):
-        images[k, : size[k, 0], : size[k, 1]] = template.image
-    predicted, centres, warps = _compute_warps(
-        matches, cam_from_world, camera, templates, node_of_match
-    )
+        images[k, : sizes[k, 0], : sizes[k, 1]] = template.image
+    projections = _compute_warps(matches, cam_from_world, camera, templates, node_of_match)
+    numbers = weights.patch_px, reach_px, weights.min_patch_sigma
     pixels, correlations = align_patches(
-        search.query.grey, images, size, node_of_match, predicted, centres, warps, reach_px
+        image, images, sizes, node_of_match, *projections, *numbers
     )
     rows = np.flatnonzero(correlations > weights.correlations[0])
     sigmas = np.interp(correlations[rows], weights.correlations, weights.aligned_sigmas_px)
-    return replace(
-        matches.select(rows), points_img=pixels[rows].astype(np.float32), sigmas_px=sigmas
-    )
+    aligned = pixels[rows].astype(np.float32)
+    return replace(matches.select(rows), points_img=aligned, sigmas_px=sigmas)
 
 
 def _compute_warps(

@@ -23,10 +23,15 @@ from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.fitted_weights import LastStepWeights, load_last_step_weights
+from topoloc.localization.exact.patch_alignment import PreciseMatches, align
+from topoloc.localization.fitted_weights import (
+    EvidenceWeights,
+    LastStepWeights,
+    load_last_step_weights,
+)
 from topoloc.localization.guided import match_guided
-from topoloc.localization.patch_alignment import PreciseMatches, align
 from topoloc.localization.pose_fit import LocalMap
+from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization
 from topoloc.localization.result_decision import ResultWithInliers, decide_final_result
 from topoloc.localization.search import Search
@@ -38,6 +43,11 @@ class PreciseFit:
 
     pose: AbsolutePose
     matches: PreciseMatches
+
+
+def _is_from_nodes(search: Search, evidence: Evidence | None) -> bool:
+    """Return whether nodes, and not virtual views, show what a pose was found by."""
+    return evidence is not None and isinstance(search.weights.of(evidence), EvidenceWeights)
 
 
 def make_precise(searches: Sequence[Search], outcome: ResultWithInliers) -> ResultWithInliers:
@@ -85,7 +95,7 @@ def _reconsider_refusal(
     for search in searches:
         ordered = [search, *(other for other in searches if other is not search)]
         for one in search.belief.hypotheses:
-            if one.evidence.is_from_virtual_views or one.log_odds < weights.min_log_odds:
+            if one.log_odds < weights.min_log_odds or not _is_from_nodes(search, one.evidence):
                 continue
             around = Surroundings.of(ordered, one.fit.cam_from_world, weights)
             fit = around.refine_by_key_points(one.fit.cam_from_world)
@@ -114,7 +124,7 @@ def _refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> Re
     weights = load_last_step_weights()
     if (
         not isinstance(result, Localization)
-        or result.is_from_virtual_views
+        or not _is_from_nodes(first, result.evidence)
         or result.calibration_doubt is not None
         or not _can_refine(searches, weights)
     ):
@@ -153,7 +163,15 @@ def refine_precisely(
         return None
     chosen, aligned = _spread(fit, around.camera, weights.max_aligned), fit
     for reach_px in weights.reaches_px:
-        moved = align(searches[0], chosen, aligned.pose.cam_from_world, reach_px, weights)
+        moved = align(
+            searches[0].query.grey,
+            around.camera,
+            chosen,
+            searches[0].map.template,
+            aligned.pose.cam_from_world,
+            reach_px,
+            weights,
+        )
         better = around.fit(moved, aligned.pose.cam_from_world, weights.max_aligned_error_px)
         if better is None or np.count_nonzero(better.pose.inliers) < weights.min_aligned:
             return fit
