@@ -12,7 +12,7 @@ from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import MapError
 from topoloc.localization import propose
-from topoloc.localization.localizer import Localizer
+from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import QueryImage, StageClock
 from topoloc.localization.refine import find_best_case_evidence
@@ -49,7 +49,8 @@ def test_an_exhaustive_search_continues_from_the_coarse_one(
     localizer: Localizer, monkeypatch: pytest.MonkeyPatch
 ):
     image = unseen_views()[0][0]
-    at_once = localizer.localize(image, CAMERA)
+    fast = Localizer(localizer.topomap, LocalizerConfig(exactness="fast"))
+    at_once = fast.localize(image, CAMERA)
     query = TileQuery(localizer.context, _searches(localizer, image))
     num_matched, matcher = list[int](), propose.Matcher
     monkeypatch.setattr(propose, "Matcher", lambda *args: num_matched.append(1) or matcher(*args))

@@ -214,7 +214,8 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     - `max_correlated_error_share`: rho of a map above which the step is left out.
     - `shared_error_line` (a, b): a + b rho of the verdict's correlated covariance remains.
     - `min_log_odds`: a refused pose above it gets a second look. `crowding_weight` times the
-      crowding of its matches plus `crowding_bias` is added to its log-odds.
+      crowding of its matches plus `crowding_bias` is added to its log-odds, if the matches crowd in
+      all parts of the view: by `min_crowding_share`.
     """
 
     corpus: str
@@ -237,6 +238,7 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     min_log_odds: Finite
     crowding_weight: Finite
     crowding_bias: Finite
+    min_crowding_share: Finite
 
 
 @cache

@@ -86,7 +86,7 @@ def propose_more(search: Search) -> Iterator[Proposal]:
 
 
 def _until_late(search: Search, proposals: Iterable[Proposal]) -> Iterator[Proposal]:
-    """Generate the proposals until the deadline. Raises the error if the map cannot be read."""
+    """Generate the proposals until the deadline. Raises MapError: the map cannot be read."""
     for proposal in proposals:
         yield proposal
         if search.failure is not None:
@@ -212,7 +212,6 @@ class Schedule:
         prior: Rigid3 | None = None,
     ) -> Generator[Proposal, None, None]:
         """Generate the proposals of one tile, and record its result or why it cannot be read.
-
         A rival is searched coarse only, if it may rival a pose that was found.
 
         Raises:
@@ -235,8 +234,9 @@ class Schedule:
                 if mode == "rival" and not self._may_be_rival(query):
                     return
                 outcome = yield from query.exhaustive() if is_exhaustive else query.coarse_only()
-                precise = make_precise(query.searches, outcome) if is_exhaustive else outcome
-                result, poses = opened.name_outcome(precise, self.query_image.camera)
+                if is_exhaustive:
+                    outcome = make_precise(query.searches, outcome, query.prior is not None)
+                result, poses = opened.name_outcome(outcome, self.query_image.camera)
         except ObjectStoreError:  # the tile is fine, but its result is unknown
             raise
         except MapError as error:
@@ -262,8 +262,8 @@ class Schedule:
     def _may_be_rival(self, query: TileQuery) -> bool:
         """Return whether a pose of a further tile may rival one of the found poses.
 
-        It may if the prior pose there is known. Otherwise the best evidence that a coarse search
-        could give, by the strongest features, shows it for much less time.
+        It may if the prior pose there is known. Otherwise the best evidence of a coarse search by
+        the strongest features shows it.
         """
         if query.prior is not None:
             return True

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from topoloc.geometry.absolute_pose import AbsolutePose, refine_absolute_pose
 from topoloc.geometry.camera import Camera
@@ -23,7 +22,7 @@ from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.exact.patch_alignment import PreciseMatches, align
+from topoloc.localization.exact.patch_alignment import PreciseMatches, align, spread
 from topoloc.localization.fitted_weights import (
     EvidenceWeights,
     LastStepWeights,
@@ -39,7 +38,7 @@ from topoloc.localization.search import Search
 
 @dataclass(frozen=True, eq=False)
 class PreciseFit:
-    """Hold the refined pose and the matches that it was fitted to, in the reduced image."""
+    """Hold a pose and the matches that it was fitted to, in the reduced image."""
 
     pose: AbsolutePose
     matches: PreciseMatches
@@ -50,21 +49,26 @@ def _is_from_nodes(search: Search, evidence: Evidence | None) -> bool:
     return evidence is not None and isinstance(search.weights.of(evidence), EvidenceWeights)
 
 
-def make_precise(searches: Sequence[Search], outcome: ResultWithInliers) -> ResultWithInliers:
+def make_precise(
+    searches: Sequence[Search], outcome: ResultWithInliers, has_prior: bool
+) -> ResultWithInliers:
     """Return the outcome with a second look at a refusal, and with its pose refined.
 
     Args:
         searches: the searches of the query, one for each feature type.
+        has_prior: only the surroundings of a prior pose were searched, where a similar place may
+            stand. A refusal then remains.
     """
-    return _refine_result(searches, _reconsider_refusal(searches, outcome))
+    if not has_prior:
+        outcome = _reconsider_refusal(searches, outcome)
+    return _refine_result(searches, outcome)
 
 
 def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
     """Return whether the last step improves poses of this query.
 
-    A focal length that is unknown would have to follow. In a map with strongly correlated errors,
-    such as those of a wrong calibration, the nearest nodes of the verdict are better than many,
-    because the errors of an image from nearly the same place cancel out.
+    An unknown focal length would have to follow. In a map with strongly correlated errors, such as
+    those of a wrong calibration, the nearest nodes are best, because these errors cancel out there.
     """
     first = searches[0]
     return (
@@ -73,6 +77,7 @@ def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
         and first.correlated_error_share <= weights.max_correlated_error_share
         and not isinstance(first.query.input_camera, UncalibratedCamera)
         and not first.query.is_past_deadline
+        and bool(first.query.grey.any())  # not so if only features are known
     )
 
 
@@ -87,29 +92,31 @@ def _reconsider_refusal(
     result, weights = outcome[0], load_last_step_weights()
     if (
         isinstance(result, Localization)
+        or result.reason == "ambiguous"
         or result.seen_camera is not None
         or not _can_refine(searches, weights)
     ):
         return outcome
-    judged = list[tuple[float, Search, Hypothesis]]()
+    crowded, others = list[tuple[Hypothesis, Search]](), list[Hypothesis]()
     for search in searches:
         ordered = [search, *(other for other in searches if other is not search)]
         for one in search.belief.hypotheses:
-            if one.log_odds < weights.min_log_odds or not _is_from_nodes(search, one.evidence):
-                continue
-            around = Surroundings.of(ordered, one.fit.cam_from_world, weights)
-            fit = around.refine_by_key_points(one.fit.cam_from_world)
-            if fit is None:
-                continue
-            crowding = around.compute_crowding(fit.pose.cam_from_world)
-            gain = weights.crowding_weight * crowding + weights.crowding_bias
-            judged.append((one.log_odds + gain, search, replace(one, log_odds=one.log_odds + gain)))
-    if not judged:
+            gain = 0.0
+            if one.log_odds > weights.min_log_odds and _is_from_nodes(search, one.evidence):
+                around = Surroundings.of(ordered, one.fit.cam_from_world, weights)
+                gain = around.compute_gain(one.fit.cam_from_world)
+            if gain > 0.0:
+                crowded.append((replace(one, log_odds=one.log_odds + gain), search))
+            else:
+                others.append(one)
+    if not crowded:
         return outcome
-    _, search, _ = max(judged, key=lambda one: one[0])
+    best, search = max(crowded, key=lambda one: one[0].log_odds)
     belief = Belief()
-    for _, _, one in judged:
+    for one in [*(one for one, _ in crowded), *others]:
         belief = belief.with_hypothesis(one, search.config.evidence, search.weights.rivals)
+    if belief.best(search.weights.rivals) is not best:
+        return outcome
     reconsidered = decide_final_result(replace(search, belief=belief))
     return reconsidered if isinstance(reconsidered[0], Localization) else outcome
 
@@ -136,7 +143,15 @@ def _refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> Re
         if fit is None:
             return outcome
         seen = fit.matches.select(np.flatnonzero(fit.pose.inliers))
-        noise = _compute_noise_covariance(fit, seen, first.query.camera)
+        inflation = compute_variance_inflation(
+            seen.points_img.astype(np.float64),
+            seen.points_world,
+            seen.covariances,
+            first.query.camera,
+            fit.pose.cam_from_world,
+            seen.sigmas_px,
+        )
+        noise = inflation**2 * fit.pose.covariance
     cam_from_world = fit.pose.cam_from_world
     before = inverse_covariance(result.world_from_cam, result.covariance)
     # the less the nodes contradict each other, the more of their errors average out
@@ -161,7 +176,8 @@ def refine_precisely(
     fit = around.refine_by_key_points(cam_from_world)
     if fit is None:
         return None
-    chosen, aligned = _spread(fit, around.camera, weights.max_aligned), fit
+    inliers = fit.matches.select(np.flatnonzero(fit.pose.inliers))
+    chosen, aligned = spread(inliers, around.camera, weights.max_aligned), fit
     for reach_px in weights.reaches_px:
         moved = align(
             searches[0].query.grey,
@@ -219,17 +235,27 @@ class Surroundings:
             cam_from_world = fit.pose.cam_from_world
         return fit
 
-    def compute_crowding(self, cam_from_world: Rigid3) -> float:
-        """Return how far the matches crowd around their predictions, in standard deviations.
+    def compute_gain(self, cam_from_world: Rigid3) -> float:
+        """Return the log-odds to add to a pose around whose predictions the matches crowd.
 
-        Chance matches are spread over the search disc: 9 % of those within 10 pixels lie within 3
-        pixels, and up to 15 % near repeated structure.
+        Of chance matches within 10 pixels, 9 to 15 % lie within 3 pixels. A place that shares only
+        a part with this one, such as another floor, has chance matches in other parts of the view.
         """
-        matches = self.match(cam_from_world, 10.0, len(self.searches))
-        predicted = self.camera.img_from_cam(cam_from_world.apply(matches.points_world))
-        apart = np.linalg.norm(predicted - matches.points_img, axis=1)
-        near, all_found = np.count_nonzero(apart < 3.0 * self.scale), max(len(matches), 1)
-        return float((near - 0.15 * all_found) / np.sqrt(0.13 * all_found))
+        fit = self.refine_by_key_points(cam_from_world)
+        if fit is None:
+            return 0.0
+        matches = self.match(fit.pose.cam_from_world, 10.0, len(self.searches))
+        predicted = self.camera.img_from_cam(fit.pose.cam_from_world.apply(matches.points_world))
+        is_near = np.linalg.norm(predicted - matches.points_img, axis=1) < 3.0 * self.scale
+        columns, rows = (matches.points_img * [4, 3] / [self.camera.width, self.camera.height]).T
+        cells = np.clip(rows, 0, 2).astype(int) * 4 + np.clip(columns, 0, 3).astype(int)
+        counts, num_near = np.bincount(cells, minlength=12), np.bincount(cells, is_near, 12)
+        shares = num_near[counts >= 8] / counts[counts >= 8]
+        if len(shares) == 0 or np.percentile(shares, 25) < self.weights.min_crowding_share:
+            return 0.0
+        expected = 0.15 * len(matches)
+        crowding = (np.count_nonzero(is_near) - expected) / np.sqrt(0.85 * expected)
+        return float(self.weights.crowding_weight * crowding + self.weights.crowding_bias)
 
     def match(self, cam_from_world: Rigid3, radius_px: float, num_searches: int) -> PreciseMatches:
         """Match the key points of the first searches within a radius of the predicted pixels."""
@@ -267,33 +293,3 @@ class Surroundings:
         if pose is None or np.count_nonzero(pose.inliers) < 12:
             return None
         return PreciseFit(pose, matches)
-
-
-def _spread(fit: PreciseFit, camera: Camera, max_number: int) -> PreciseMatches:
-    """Return at most `max_number` inliers: in turn the most similar one of each image cell."""
-    matches = fit.matches.select(np.flatnonzero(fit.pose.inliers))
-    if len(matches) <= max_number:
-        return matches
-    num_columns = 16
-    cell_px = camera.width / num_columns
-    columns, rows = (matches.points_img / np.float32(cell_px)).astype(np.int64).T
-    cells = rows * num_columns + columns
-    order = np.lexsort((-matches.similarities, cells))
-    starts = np.searchsorted(cells[order], cells[order])
-    rank = np.arange(len(order)) - starts
-    return matches.select(np.sort(order[np.argsort(rank, kind="stable")[:max_number]]))
-
-
-def _compute_noise_covariance(
-    fit: PreciseFit, seen: PreciseMatches, camera: Camera
-) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance without the errors that all matches share."""
-    inflation = compute_variance_inflation(
-        seen.points_img.astype(np.float64),
-        seen.points_world,
-        seen.covariances,
-        camera,
-        fit.pose.cam_from_world,
-        seen.sigmas_px,
-    )
-    return inflation**2 * fit.pose.covariance

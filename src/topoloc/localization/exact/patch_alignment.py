@@ -38,6 +38,20 @@ class PreciseMatches(PointObservations):
         return PreciseMatches(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
+def spread(matches: PreciseMatches, camera: Camera, max_number: int) -> PreciseMatches:
+    """Return at most `max_number` matches: in turn the most similar one of each image cell."""
+    if len(matches) <= max_number:
+        return matches
+    num_columns = 16
+    cell_px = camera.width / num_columns
+    columns, rows = (matches.points_img / np.float32(cell_px)).astype(np.int64).T
+    cells = rows * num_columns + columns
+    order = np.lexsort((-matches.similarities, cells))
+    starts = np.searchsorted(cells[order], cells[order])
+    rank = np.arange(len(order)) - starts
+    return matches.select(np.sort(order[np.argsort(rank, kind="stable")[:max_number]]))
+
+
 @dataclass(frozen=True, eq=False)
 class NodeTemplate:
     """Hold the image of a node. `camera` has the size of the image."""
