@@ -28,7 +28,7 @@ from topoloc.apps.report.page_template import (
     svg_text,
 )
 
-STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp")
+STAGES = ("patch_normalization", "features", "coarse", "matching", "pnp", "last_step")
 
 
 def draw_error_curves(answers: Sequence[EvaluatedQuery]) -> tuple[str, str]:
