@@ -3,8 +3,9 @@
     python benchmarks/equality.py OLD_COMMIT [--quick] [--shared ../shared] [--cache FOLDER]
 
 Both sides run the command line in processes of their own on this machine. Reason, tile and node
-must be equal; position, angle and probability may differ by 1e-6 (metres, radians). The old commit
-is unpacked into a temporary folder and compiles its kernels there, which takes about half a minute.
+must be equal; position, angle and probability may differ by 1e-6 (metres, radians). This tree
+answers without its last step (`fast.toml`), which old commits had not. The old commit is unpacked
+into a temporary folder and compiles its kernels there, which takes about half a minute.
 `--cache FOLDER` keeps its answers, by commit. `--only CASE` runs one case and those before it.
 The exit status is 1 on a difference.
 """
