@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from topoloc.errors import UnreadableImageError
+from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
@@ -91,11 +92,18 @@ def align(
     images = np.zeros((len(templates), *sizes.max(axis=0, initial=1)), np.uint8)
     for k, template in enumerate(templates):
         images[k, : sizes[k, 0], : sizes[k, 1]] = template.image
-    projections = _compute_warps(matches, cam_from_world, camera, templates, node_of_match)
-    numbers = weights.patch_px, reach_px, weights.min_patch_sigma
-    pixels, correlations = align_patches(
-        image, images, sizes, node_of_match, *projections, *numbers
+    predicted, centres, warps = _compute_warps(
+        matches, cam_from_world, camera, templates, node_of_match
     )
+    pixels, correlations = np.empty((len(matches), 2)), np.empty(len(matches))
+
+    def align_band(first: int, last: int) -> None:
+        band = slice(first, last)
+        projected = node_of_match[band], predicted[band], centres[band], warps[band]
+        numbers = weights.patch_px, reach_px, weights.min_patch_sigma
+        pixels[band], correlations[band] = align_patches(image, images, sizes, *projected, *numbers)
+
+    parallel_for_rows(align_band, len(matches))
     rows = np.flatnonzero(correlations > weights.correlations[0])
     sigmas = np.interp(correlations[rows], weights.correlations, weights.aligned_sigmas_px)
     aligned = pixels[rows].astype(np.float32)
