@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image as Pillow
 
 from tiny_recordings import picture, write
 from topoloc.errors import UnreadableImageError
@@ -106,9 +107,17 @@ def test_heic_is_read_where_its_decoder_is(tmp_path: Path):
 
 def test_heic_without_its_decoder_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "pi_heif", None)
-    (tmp_path / "a.heic").write_bytes(b"x" * 100)
-    with pytest.raises(UnreadableImageError, match=r"a\.heic.*topoloc\[heic\]"):
-        read_image(tmp_path / "a.heic")
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypmif1" + b"x" * 100)
+    (tmp_path / "a.heic").rename(tmp_path / "a.jpg")
+    with pytest.raises(UnreadableImageError, match=r"a\.jpg.*topoloc\[heic\]"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_depth_in_floats(tmp_path: Path):
+    metres = np.array([[0.5, 0.0, np.nan], [65535.0, np.inf, 2.25]], np.float32)
+    Pillow.fromarray(metres).save(tmp_path / "depth.tiff")
+    expected = [[0.5, np.nan, np.nan], [65535.0, np.nan, 2.25]]
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.tiff", 1.0), expected)
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "tiff", "webp", "ppm"])

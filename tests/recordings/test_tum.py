@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tiny_recordings import assert_same_pose, picture, pose
+from tiny_recordings import assert_same_pose, picture, pose, write
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.recordings.formats.tum import open_tum
 
@@ -41,6 +41,37 @@ def test_other_recordings_need_a_camera(tum: Path):
     frame = open_tum(other)[0]
     assert frame.camera.fx == 600
     assert frame.depth.depth[0, 0] == 5.0
+
+
+def test_names_with_spaces_decimal_commas_and_more_columns(tum: Path):
+    name = "colour image 1, #2.png"
+    (tum / "rgb" / "1305031102.175304.png").rename(tum / "rgb" / name)
+    (tum / "rgb.txt").write_text(
+        f"# a list\n1305031102,175304 rgb/{name}\n1305031102,275326 rgb\\1305031102.275326.png 7\n"
+    )
+    (tum / "groundtruth.txt").write_text("1305031102,175304 1,5 0,5 -2 0,0 0,0 0,0 1\n")
+    sequence = open_tum(tum)
+    assert sequence.names == [f"rgb/{name}", "rgb/1305031102.275326.png"]
+    assert sequence.t_ns == [1305031102175304000, 1305031102275326000]
+    np.testing.assert_array_equal(sequence.poses[0].translation, [1.5, 0.5, -2.0])
+    assert sequence[0].image.shape == (480, 640, 3)
+
+
+@pytest.mark.parametrize(
+    "name", ["../a.png", "C:\\a.png", "\\\\host\\a.png", "/a.png", "..\\a.png"]
+)
+def test_names_outside_of_the_folder(tum: Path, name: str):
+    (tum / "rgb.txt").write_text(f"1 {name}\n")
+    with pytest.raises(RecordingError, match=r"line 1: .* below this folder"):
+        open_tum(tum)
+
+
+def test_coarser_depth(tum: Path):
+    for path in (tum / "depth").iterdir():
+        write(path, np.full((120, 160), 5000, np.uint16))
+    depth = open_tum(tum)[0].depth
+    assert depth.camera == open_tum(tum).camera
+    np.testing.assert_array_equal(depth.depth, np.ones((480, 640), np.float32))
 
 
 def test_no_truth(tum: Path):

@@ -144,7 +144,12 @@ def test_a_clock_that_does_not_advance_is_an_error_with_the_frame(
 
 def test_a_container_without_times_goes_by_its_rate(film: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(video, "_open_capture", lambda _: _Clock([0.0, 0.0, 0.0]))
-    assert video._read_times(film, 50.0) == [0, 20_000_000, 40_000_000]
+    assert video._read_times(film, 50.0) == ([0, 20_000_000, 40_000_000], ())
+    # the decoder holds two frames back
+    monkeypatch.setattr(video, "_open_capture", lambda _: _Clock([40.0, 60.0, 0.0, 0.0]))
+    t_ns, (note,) = video._read_times(film, 50.0)
+    assert t_ns == [0, 20_000_000, 40_000_000, 60_000_000]
+    assert "2 of 4 frames have no time" in note
     monkeypatch.setattr(video, "_open_capture", lambda _: _Clock([0.0, 0.0, 0.0]))
     with pytest.raises(RecordingError, match="rate"):
         video._read_times(film, 0.0)

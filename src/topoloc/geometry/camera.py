@@ -78,8 +78,8 @@ class Camera:
             raise CalibrationError(f"camera parameters are not finite: {self.params}")
         if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
             raise CalibrationError(
-                f"camera needs a positive size and focal length, not {self.width}x{self.height}, f"
-                f" = {self.fx:g}"
+                f"camera needs a positive size and focal length, not {self.width}x{self.height}, fx"
+                f" = {self.fx:g}, fy = {self.fy:g}"
             )
         side = max(self.width, self.height)
         ratios = self.fx / side, self.fy / side

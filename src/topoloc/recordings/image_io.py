@@ -89,19 +89,21 @@ def read_image(path: Path | EncodedImage) -> Image:
 
 
 def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.ndarray, "h w"]:
-    """Read a 16-bit depth image in metres. Unknown depth is NaN (0 and 65535 in the file).
+    """Read a depth image of 16 bits or of floats (TIFF) in metres. Unknown depth is NaN (0 in the
+    file, and 65535 of 16 bits).
 
     Raises:
-        UnreadableImageError: as `read_image`, or the image is not one channel of 16 bits.
+        UnreadableImageError: as `read_image`, or the image is not one such channel.
     """
     with _decode_image(path) as picture:
-        if picture.mode not in _GREY_16_MODES:
+        if picture.mode not in (*_GREY_16_MODES, "F"):
             raise UnreadableImageError(
                 f"{path}: depth must be one channel of 16 bits, not pixels of {picture.mode}"
             )
-        units = np.array(picture).astype(np.uint16)
+        is_float = picture.mode == "F"
+        units = np.array(picture).astype(np.float32 if is_float else np.uint16)
     depth = units.astype(np.float32) / np.float32(units_per_metre)
-    depth[(units == 0) | (units == 65535)] = np.nan
+    depth[~((units > 0) & np.isfinite(units)) | (units == 65535) & (not is_float)] = np.nan
     return depth
 
 
@@ -192,7 +194,7 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
     UnreadableImageError."""
     data = _read_bytes(path)
     try:
-        types = _supported_types(path)
+        types = _supported_types(path, data)
         picture = Pillow.open(io.BytesIO(data), formats=types)
         if picture.format == "PNG":  # its checksums are not verified otherwise
             picture.verify()
@@ -228,10 +230,10 @@ def _decode_image(path: Path | EncodedImage) -> Iterator[Pillow.Image]:
             yield picture
 
 
-def _supported_types(path: Path | EncodedImage) -> tuple[str, ...]:
-    """Return the types to try. HEIF is included only for its suffixes, because its decoder is an
+def _supported_types(path: Path | EncodedImage, data: bytes) -> tuple[str, ...]:
+    """Return the types to try. HEIF is included only for its first bytes, because its decoder is an
     extra."""
-    if path.suffix.lower() not in (".heic", ".heif"):
+    if data[4:8] != b"ftyp" or data[8:12] not in (b"heic", b"heix", b"heim", b"heis", b"mif1"):
         return _IMAGE_TYPES
     try:
         pi_heif = import_module("pi_heif")

@@ -152,6 +152,13 @@ def test_recorded_requests_get_the_pose_of_the_native_answer(
     )
 
 
+def test_base64_in_lines(client: httpx.Client, view: Path, camera: str):
+    lines = base64.encodebytes(view.read_bytes()).decode()
+    for text in (lines, lines.replace("\n", "\r\n"), f"data:image/jpeg;base64,{lines}"):
+        request = _version_2(view, camera, imageBytes=text)
+        assert _ask(client, request).status_code == 200
+
+
 def test_bare_pixels(client: httpx.Client, view: Path, camera: str):
     grey = cv2.imread(str(view), cv2.IMREAD_GRAYSCALE)
     assert grey is not None

@@ -225,7 +225,7 @@ def read_image_bytes(reading: CameraReading) -> EncodedImage | Image:
         raise RequestError(400, "a depth image cannot be localized")
     text = reading.imageBytes.rpartition(",")[2]  # some clients send a data: URL
     try:
-        data = base64.b64decode(text, validate=True)
+        data = base64.b64decode("".join(text.split()), validate=True)  # Android breaks lines
     except (binascii.Error, ValueError):
         raise RequestError(400, "imageBytes: not base64") from None
     if not data:

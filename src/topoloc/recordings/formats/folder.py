@@ -86,7 +86,7 @@ def _open_pairs(
     if is_stereo and found and found.rig:
         right = RightImages(others, found.rig)
     elif not is_stereo and found and found.depth_factor:
-        depth = DepthImages(others, found.depth_factor, found.camera, Rigid3.identity())
+        depth = DepthImages(others, found.depth_factor, None, Rigid3.identity())
     else:
         need = (
             '"baseline" in metres or two cameras, or the YAML of OpenCV or Kalibr'

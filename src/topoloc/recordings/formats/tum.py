@@ -68,7 +68,7 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
     t_ns = [colour_times[row] for row in kept]
     poses = read_ground_truth(path / "groundtruth.txt", [], t_ns)
     paths, units = [path / depth[nearest[row]] for row in kept], found.depth_factor or DEPTH_FACTOR
-    images = DepthImages(paths, units, found.camera, Rigid3.identity())
+    images = DepthImages(paths, units, None, Rigid3.identity())
     names = [colour[row] for row in kept]
     return Recording(path.resolve().name, path, names, t_ns, poses, found.camera, depth=images)
 

@@ -54,6 +54,7 @@ class Video:
     poses: list[Rigid3 | None]
     camera: Camera | None
     size: tuple[int, int]
+    notes: tuple[str, ...] = ()
     _reader: _Reader | None = field(default=None, repr=False)
 
     @staticmethod
@@ -71,10 +72,10 @@ class Video:
             TrajectoryError: the truth is malformed or fits no frame.
         """
         size, rate = _read_frame_size(path)
-        t_ns = _read_times(path, rate)
+        t_ns, notes = _read_times(path, rate)
         poses = read_ground_truth(path.with_suffix(".tum"), [], t_ns)
         names = [f"{index:06d}" for index in range(len(t_ns))]
-        return Video(path.name, path, names, t_ns, poses, None, size)
+        return Video(path.name, path, names, t_ns, poses, None, size, notes)
 
     @staticmethod
     def read_size(path: Path) -> tuple[int, int]:
@@ -167,23 +168,28 @@ def _open_capture(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def _read_times(path: Path, rate: float) -> list[int]:
-    """Return the time of each frame in nanoseconds, from the frame rate if the container has no
-    times."""
+def _read_times(path: Path, rate: float) -> tuple[list[int], tuple[str, ...]]:
+    """Return the time of each frame in nanoseconds, and notes for the user.
+
+    Times come from the frame rate if a frame has no time, as in AVI files. The other times are then
+    late by the frames that the decoder holds back.
+    """
     capture, t_ns = _open_capture(path), []
     while capture.grab():
         t_ns.append(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
-    if len(t_ns) > 1 and not any(t_ns):
+    if num_without := t_ns[1:].count(0):
         if not rate > 0:
             raise RecordingError(f"{path}: neither its frames have times, nor does it name a rate")
-        return [round(index * 1e9 / rate) for index in range(len(t_ns))]
+        note = f"{num_without} of {len(t_ns)} frames have no time; times are from its {rate:g} Hz"
+        notes = () if not any(t_ns) else (f"{path}: {note}",)
+        return [round(index * 1e9 / rate) for index in range(len(t_ns))], notes
     for index, (before, after) in enumerate(pairwise(t_ns), start=1):
         if after <= before:
             raise RecordingError(
                 f"{path}, frame {index}: at {after / 1e9:.3f} s, but the frame before is at"
                 f" {before / 1e9:.3f} s"
             )
-    return t_ns
+    return t_ns, ()
 
 
 @contextmanager
