@@ -2,20 +2,29 @@
 `"best"` in the same map, beside exact truth.
 
     python benchmarks/exactness.py MAP_SEQ QUERY_SEQ [QUERY_SEQ ...] [--every N]
+    python benchmarks/exactness.py MAP_SEQ QUERY_SEQ ... --vary num_nodes=6,12,24 ...
 
 Recordings as by `topoloc simulate`, or any with truth in the same world. MAP_SEQ may be a map file.
 `error/sigma` is the median error over the root of the covariance's trace: 0.89 if the covariance is
-exact. `inside` is the share of poses within their 95 % ellipsoid.
+exact. `inside` is the share of poses within their 95 % ellipsoid. `wrong`: beyond 0.25 m or 2
+degrees. `--vary` prints a row for each value of a number of `exact/weights.json` (JSON, such as
+`max_errors_px=[8,3],[8,4]` or `crowding.weight=0.3,0.4`), while the others stay.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 
+from topoloc.localization.exact import last_step
+from topoloc.localization.fitted_weights import load_last_step_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
@@ -32,6 +41,7 @@ def main() -> None:
     parser.add_argument("mapped")
     parser.add_argument("queries", nargs="+")
     parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--vary", nargs="+", default=[], metavar="NAME=VALUES")
     arguments = parser.parse_args()
     is_file = arguments.mapped.endswith(".topo")
     topomap = (
@@ -39,13 +49,36 @@ def main() -> None:
         if is_file
         else build_map(open_sequence(arguments.mapped))
     )
-    localizers = {
-        exactness: Localizer(topomap, LocalizerConfig(exactness=exactness))
-        for exactness in ("fast", "best")
-    }
+    fast, best = (Localizer(topomap, LocalizerConfig(exactness=name)) for name in ("fast", "best"))
     for recording in arguments.queries:
-        for exactness, localizer in localizers.items():
-            print_row(f"{Path(recording).name}, {exactness}", localizer, recording, arguments.every)
+        name = Path(recording).name
+        if not arguments.vary:
+            print_row(f"{name}, fast", fast, recording, arguments.every)
+        for label in vary_weights(arguments.vary):
+            print_row(f"{name}, {label}", best, recording, arguments.every)
+
+
+def vary_weights(changes: list[str]) -> Iterator[str]:
+    """Yield "best", then each changed number, while the last step uses it."""
+    yield "best"
+    for change in changes:
+        name, _, text = change.partition("=")
+        for value in json.loads(f"[{text}]"):
+            numbers = msgspec.to_builtins(load_last_step_weights())
+            set_number(numbers, name.split("."), value)
+            changed = msgspec.convert(numbers, type(load_last_step_weights()))
+            last_step.load_last_step_weights = lambda changed=changed: changed
+            yield f"{name}={json.dumps(value)}"
+    last_step.load_last_step_weights = load_last_step_weights
+
+
+def set_number(numbers: dict[str, Any], path: list[str], value: Any) -> None:
+    """Set the number at a path of names. Raises SystemExit: there is no such number."""
+    for name in path[:-1]:
+        numbers = numbers.get(name, {})
+    if path[-1] not in numbers:
+        raise SystemExit(f"exact/weights.json has no number {'.'.join(path)}")
+    numbers[path[-1]] = value
 
 
 def print_row(name: str, localizer: Localizer, recording: str, every: int) -> None:
@@ -63,14 +96,16 @@ def print_row(name: str, localizer: Localizer, recording: str, every: int) -> No
             degrees = float(np.rad2deg(np.linalg.norm(error[3:])))
             rows.append((metres, degrees, square, metres / found.position_sigma_m, milliseconds))
     if not rows:
-        print(f"{name:32} 0 of {len(asked)}")
+        print(f"{name:40} 0 of {len(asked)}")
         return
     metres, degrees, squares, ratios, milliseconds = np.array(rows).T
+    num_wrong = np.count_nonzero((metres > 0.25) | (degrees > 2.0))
     print(
-        f"{name:32} {len(rows)} of {len(asked)}, median {100 * np.median(metres):.3f} cm"
-        f" {np.median(degrees):.3f} deg, 90 % {100 * np.percentile(metres, 90):.2f} cm, max"
-        f" {100 * metres.max():.1f} cm, inside {np.mean(squares < CHI_SQUARE_6_AT_95):.0%},"
-        f" error/sigma {np.median(ratios):.2f}, {np.median(milliseconds):.0f} ms of the processor",
+        f"{name:40} {len(rows)} of {len(asked)}, {num_wrong} wrong, median"
+        f" {100 * np.median(metres):.3f} cm {np.median(degrees):.3f} deg,"
+        f" 90 % {100 * np.percentile(metres, 90):.2f} cm, max {100 * metres.max():.1f} cm,"
+        f" inside {np.mean(squares < CHI_SQUARE_6_AT_95):.0%}, error/sigma {np.median(ratios):.2f},"
+        f" {np.median(milliseconds):.0f} ms of the processor",
         flush=True,
     )
 

@@ -201,6 +201,28 @@ class CorrelatedErrorWeights(Struct, frozen=True, forbid_unknown_fields=True):
     unknown: Finite
 
 
+class CrowdingWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the numbers of the second look at a refused pose with log-odds above `min_log_odds`.
+
+    Its matches are searched within `radius_px` (pixels of an image whose longer side is 640). Of
+    chance matches, `chance_share` lies within `near_px` of the prediction. The matches crowd by
+    the standard deviations above that. `weight` times the crowding plus `bias` is added to the
+    log-odds, if matches crowd in all parts of the view: of the `cells` (columns, rows) with
+    `min_cell_matches`, the `quantile` of the shares near the prediction is at least `min_share`.
+    """
+
+    min_log_odds: Finite
+    radius_px: Finite
+    near_px: Finite
+    chance_share: Finite
+    cells: tuple[int, int]
+    min_cell_matches: int
+    quantile: Finite
+    min_share: Finite
+    weight: Finite
+    bias: Finite
+
+
 class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the numbers of the last step (`last_step.py`).
 
@@ -211,11 +233,9 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
       patches of `patch_px` squared pixels whose grey levels vary by `min_patch_sigma`. At least
       `min_aligned` must agree within `max_aligned_error_px`. `correlations`, `aligned_sigmas_px`:
       table of the error of an aligned pixel. Matches below the first correlation are dropped.
+      A pose of key points needs `min_matches`.
     - `max_correlated_error_share`: rho of a map above which the step is left out.
     - `shared_error_line` (a, b): a + b rho of the verdict's correlated covariance remains.
-    - `min_log_odds`: a refused pose above it gets a second look. `crowding_weight` times the
-      crowding of its matches plus `crowding_bias` is added to its log-odds, if the matches crowd in
-      all parts of the view: by `min_crowding_share`.
     """
 
     corpus: str
@@ -225,6 +245,7 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     radii_px: tuple[Finite, Finite]
     max_errors_px: tuple[Finite, Finite]
     key_point_sigma_px: Finite
+    min_matches: int
     min_aligned: int
     max_aligned: int
     reaches_px: tuple[int, ...]
@@ -235,10 +256,7 @@ class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
     aligned_sigmas_px: tuple[Finite, ...]
     max_correlated_error_share: Finite
     shared_error_line: tuple[Finite, Finite]
-    min_log_odds: Finite
-    crowding_weight: Finite
-    crowding_bias: Finite
-    min_crowding_share: Finite
+    crowding: CrowdingWeights
 
 
 @cache

@@ -101,8 +101,8 @@ def _reconsider_refusal(
     for search in searches:
         ordered = [search, *(other for other in searches if other is not search)]
         for one in search.belief.hypotheses:
-            gain = 0.0
-            if one.log_odds > weights.min_log_odds and _is_from_nodes(search, one.evidence):
+            gain, is_near = 0.0, one.log_odds > weights.crowding.min_log_odds
+            if is_near and _is_from_nodes(search, one.evidence):
                 around = Surroundings.of(ordered, one.fit.cam_from_world, weights)
                 gain = around.compute_gain(one.fit.cam_from_world)
             if gain > 0.0:
@@ -238,24 +238,29 @@ class Surroundings:
     def compute_gain(self, cam_from_world: Rigid3) -> float:
         """Return the log-odds to add to a pose around whose predictions the matches crowd.
 
-        Of chance matches within 10 pixels, 9 to 15 % lie within 3 pixels. A place that shares only
-        a part with this one, such as another floor, has chance matches in other parts of the view.
+        Few chance matches within the search radius lie near their predictions. A place that shares
+        only a part with this one, such as another floor, has chance matches in other parts of the
+        view.
         """
-        fit = self.refine_by_key_points(cam_from_world)
+        fit, weights = self.refine_by_key_points(cam_from_world), self.weights.crowding
         if fit is None:
             return 0.0
-        matches = self.match(fit.pose.cam_from_world, 10.0, len(self.searches))
+        matches = self.match(fit.pose.cam_from_world, weights.radius_px, len(self.searches))
         predicted = self.camera.img_from_cam(fit.pose.cam_from_world.apply(matches.points_world))
-        is_near = np.linalg.norm(predicted - matches.points_img, axis=1) < 3.0 * self.scale
-        columns, rows = (matches.points_img * [4, 3] / [self.camera.width, self.camera.height]).T
-        cells = np.clip(rows, 0, 2).astype(int) * 4 + np.clip(columns, 0, 3).astype(int)
-        counts, num_near = np.bincount(cells, minlength=12), np.bincount(cells, is_near, 12)
-        shares = num_near[counts >= 8] / counts[counts >= 8]
-        if len(shares) == 0 or np.percentile(shares, 25) < self.weights.min_crowding_share:
+        errors_px = np.linalg.norm(predicted - matches.points_img, axis=1)
+        is_near = errors_px < weights.near_px * self.scale
+        size, counts = [self.camera.width, self.camera.height], np.array(weights.cells)
+        columns, rows = np.clip(matches.points_img * counts / size, 0, counts - 1).astype(int).T
+        cells, num_cells = rows * counts[0] + columns, int(counts.prod())
+        totals = np.bincount(cells, minlength=num_cells)
+        is_full = totals >= weights.min_cell_matches
+        shares = np.bincount(cells, is_near, num_cells)[is_full] / totals[is_full]
+        if len(shares) == 0 or np.quantile(shares, weights.quantile) < weights.min_share:
             return 0.0
-        expected = 0.15 * len(matches)
-        crowding = (np.count_nonzero(is_near) - expected) / np.sqrt(0.85 * expected)
-        return float(self.weights.crowding_weight * crowding + self.weights.crowding_bias)
+        expected = weights.chance_share * len(matches)
+        deviation = np.sqrt((1.0 - weights.chance_share) * expected)
+        crowding = (np.count_nonzero(is_near) - expected) / deviation
+        return float(weights.weight * crowding + weights.bias)
 
     def match(self, cam_from_world: Rigid3, radius_px: float, num_searches: int) -> PreciseMatches:
         """Match the key points of the first searches within a radius of the predicted pixels."""
@@ -280,7 +285,7 @@ class Surroundings:
         return PreciseMatches(*(np.concatenate(column) for column in columns))
 
     def fit(self, matches: PreciseMatches, start: Rigid3, max_error_px: float) -> PreciseFit | None:
-        """Fit the pose to matches. None if fewer than 12 agree."""
+        """Fit the pose to matches. None if too few agree."""
         pose = refine_absolute_pose(
             matches.points_img.astype(np.float64),
             matches.points_world,
@@ -290,6 +295,6 @@ class Surroundings:
             start,
             max_error_px * self.scale,
         )
-        if pose is None or np.count_nonzero(pose.inliers) < 12:
+        if pose is None or np.count_nonzero(pose.inliers) < self.weights.min_matches:
             return None
         return PreciseFit(pose, matches)
