@@ -35,7 +35,8 @@ if TYPE_CHECKING:
         write_text,
     )
     from topoloc.recordings.calibration import parse_calibration
-    from topoloc.recordings.camera_json import read_camera_json
+    from topoloc.recordings.camera_json import CameraCalibration, read_camera_json
+    from topoloc.recordings.depth_images import resize_depth
     from topoloc.recordings.format import (
         RecordingFormat,
         find_nearest_idx,
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
         has_scale,
         scale_poses,
     )
+    from topoloc.recordings.ros_calibration import RosCalibration
     from topoloc.recordings.text_files import parse_relative_path, read_text
     from topoloc.removed_settings import parse_tables
 
@@ -68,6 +70,7 @@ __all__ = [
     "Above",
     "AtLeast",
     "Between",
+    "CameraCalibration",
     "DepthImages",
     "EncodedImage",
     "Finite",
@@ -75,6 +78,7 @@ __all__ = [
     "NodeMatcher",
     "Recording",
     "RecordingFormat",
+    "RosCalibration",
     "TilePending",
     "Video",
     "as_monocular",
@@ -102,6 +106,7 @@ __all__ = [
     "read_ground_truth",
     "read_text",
     "remove_stale_files",
+    "resize_depth",
     "scale_poses",
     "silence_opencv",
     "split_selection",
@@ -127,7 +132,8 @@ _NAMES = {
         "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"
     ),
     "topoloc.recordings.calibration": "parse_calibration",
-    "topoloc.recordings.camera_json": "read_camera_json",
+    "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",
+    "topoloc.recordings.depth_images": "resize_depth",
     "topoloc.recordings.format": (
         "RecordingFormat find_nearest_idx list_images natural_key read_ground_truth times_from_rate"
     ),
@@ -137,6 +143,7 @@ _NAMES = {
     ),
     "topoloc.recordings.open": "find_format split_selection",
     "topoloc.recordings.recording": "DepthImages Recording as_monocular has_scale scale_poses",
+    "topoloc.recordings.ros_calibration": "RosCalibration",
     "topoloc.recordings.text_files": "parse_relative_path read_text",
     "topoloc.removed_settings": "parse_tables",
 }

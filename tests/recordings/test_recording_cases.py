@@ -37,6 +37,12 @@ def kind(sequence: StereoSequence, index: int) -> str:
     [
         ("depth_coarser_than_colour", 6, "depth", False),
         ("transforms_backslashes", 12, "image", True),
+        ("bag_binning", 12, "stereo", True),
+        ("bag_rvl_depth", 3, "depth", True),
+        ("bag_uncalibrated", 12, "stereo", False),
+        ("ros_left_right_yaml", 12, "stereo", True),
+        ("colmap_exif_orientation", 12, "image", True),
+        ("colmap_simple_radial_fisheye", 12, "image", True),
         ("tum_names_with_spaces", 6, "depth", True),
     ],
 )

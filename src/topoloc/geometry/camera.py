@@ -32,6 +32,10 @@ MODELS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 # The keys of camera.json by model, without a model only the size.
@@ -42,6 +46,8 @@ _JSON = {
 # Times the longer side of the image; real lenses have 0.2 to 100.
 _MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 1e-3, 1e4
 _TWO_FOCAL_MODELS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
+_TWO_FOCAL_MODELS |= {name: "OPENCV_FISHEYE" for name in MODELS if name.endswith("L_FISHEYE")}
+_TWO_FOCAL_MODELS["SIMPLE_FISHEYE"] = "FISHEYE"
 
 
 @dataclass(frozen=True)
@@ -124,8 +130,8 @@ class Camera:
 
     @property
     def is_fisheye(self) -> bool:
-        """Return whether the model is OpenCV's fisheye."""
-        return self.model == "OPENCV_FISHEYE"
+        """Return whether the model is OpenCV's fisheye, with any number of its coefficients."""
+        return self.model.endswith("FISHEYE")
 
     @property
     def is_distorted(self) -> bool:

@@ -20,7 +20,12 @@ from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import image_size
 from topoloc.recordings.recording import Recording
-from topoloc.recordings.stereo_yaml import YAML_SUFFIXES, is_calibration, read_calibration_yaml
+from topoloc.recordings.stereo_yaml import (
+    YAML_SUFFIXES,
+    find_right_file,
+    is_calibration,
+    read_calibration_yaml,
+)
 
 CalibrationForSize = Callable[[int, int], CameraCalibration]
 """Returns the calibration for images of this width and height (pixels). Raises CalibrationError."""
@@ -91,7 +96,7 @@ def camera_from_intrinsics(
 
 def find_calibration(folder: Path) -> CalibrationForSize | None:
     """Return the calibration in a recording's folder: camera.json, or the only YAML file with a
-    calibration. Return None if there is none.
+    calibration, or ROS's files of a left and a right camera. Return None if there is none.
 
     Raises:
         CalibrationError: the calibration is not usable, or there are several.
@@ -103,6 +108,8 @@ def find_calibration(folder: Path) -> CalibrationForSize | None:
         for path in sorted(folder.iterdir())
         if path.suffix.lower() in YAML_SUFFIXES and path.is_file() and is_calibration(path)
     ]
+    right_files = {find_right_file(path) for path in found}
+    found = [path for path in found if path not in right_files]
     if len(found) > 1:
         raise CalibrationError(
             f"{folder}: several calibrations ({', '.join(path.name for path in found)}); name one"
@@ -153,7 +160,8 @@ def with_calibration(sequence: StereoSequence, calibration: CalibrationForSize) 
             f"{sequence.name}: a recording of this kind keeps its own calibration; --camera does"
             " not go with it"
         )
-    given = calibration(*first_image_size([sequence.root / name for name in sequence.names]))
+    images = [sequence.root / name for name in sequence.names]
+    given = calibration(*first_image_size(images, sequence.as_stored))
     right, depth = sequence.right, sequence.depth
     if right is not None:
         if given.rig is None and not right.rig.is_rectified:
@@ -171,12 +179,12 @@ def with_calibration(sequence: StereoSequence, calibration: CalibrationForSize) 
     return replace(sequence, camera=given.camera, cameras=None, right=right, depth=depth)
 
 
-def first_image_size(images: Sequence[Path]) -> tuple[int, int]:
+def first_image_size(images: Sequence[Path], as_stored: bool = False) -> tuple[int, int]:
     """Return the width and height of the first readable image. Return (0, 0) if none can be read,
     because reading the images reports the error later."""
     for path in images:
         with suppress(UnreadableImageError):
-            return image_size(path)
+            return image_size(path, as_stored)
     return 0, 0
 
 

@@ -37,7 +37,7 @@ def read_depth_image(path: Path, units_per_metre: float) -> Float32[np.ndarray, 
 
 
 def resize_depth(
-    path: Path, depth: Float32[np.ndarray, "h w"], camera: Camera
+    path: Path | str, depth: Float32[np.ndarray, "h w"], camera: Camera
 ) -> Float32[np.ndarray, "h2 w2"]:
     """Resize a depth image to the image of `camera`. Pixels beside unknown depth become unknown.
 

@@ -70,15 +70,15 @@ class EncodedImage:
         return self.name
 
 
-def read_image(path: Path | EncodedImage) -> Image:
+def read_image(path: Path | EncodedImage, as_stored: bool = False) -> Image:
     """Read an image as grey (H, W) or RGB (H, W, 3), uint8. Alpha is dropped, and 16 bits are
-    scaled to 8.
+    scaled to 8. `as_stored` ignores the EXIF orientation.
 
     Raises:
         UnreadableImageError: the file is missing, empty, truncated, damaged, not an image, or
             larger than 100 megapixels.
     """
-    with _decode_image(path) as picture:
+    with _decode_image(path, as_stored) as picture:
         if picture.mode in _GREY_MODES:
             return np.array(picture.convert("L"))
         if picture.mode in _GREY_16_MODES:
@@ -122,8 +122,8 @@ def _encode(image: Image, suffix: str, options: list[int]) -> bytes:
     return cv2.imencode(suffix, bgr, options)[1].tobytes()
 
 
-def image_size(path: Path | EncodedImage) -> tuple[int, int]:
-    """Read width and height in pixels from the header, after EXIF rotation.
+def image_size(path: Path | EncodedImage, as_stored: bool = False) -> tuple[int, int]:
+    """Read width and height in pixels from the header, after EXIF rotation unless `as_stored`.
 
     Raises:
         UnreadableImageError: as `read_image`, as far as the header shows it.
@@ -131,7 +131,7 @@ def image_size(path: Path | EncodedImage) -> tuple[int, int]:
     with _open_image(path) as picture:
         width, height = picture.size
         is_turned = picture.getexif().get(ExifTags.Base.Orientation) in _TRANSPOSED_ORIENTATIONS
-        return (height, width) if is_turned else (width, height)
+        return (height, width) if is_turned and not as_stored else (width, height)
 
 
 def exif_focal_length(path: Path | EncodedImage, width: int, height: int) -> float | None:
@@ -220,14 +220,12 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
 
 
 @contextmanager
-def _decode_image(path: Path | EncodedImage) -> Iterator[Pillow.Image]:
+def _decode_image(path: Path | EncodedImage, as_stored: bool = False) -> Iterator[Pillow.Image]:
     with _open_image(path) as picture:
         picture.load()
-        if picture.mode == "P" or picture.getexif().get(ExifTags.Base.Orientation, 1) != 1:
-            upright = ImageOps.exif_transpose(picture)
-            yield upright.convert("RGB") if upright.mode == "P" else upright
-        else:
-            yield picture
+        is_turned = picture.getexif().get(ExifTags.Base.Orientation, 1) != 1 and not as_stored
+        upright = ImageOps.exif_transpose(picture) if is_turned else picture
+        yield upright.convert("RGB") if upright.mode == "P" else upright
 
 
 def _supported_types(path: Path | EncodedImage, data: bytes) -> tuple[str, ...]:

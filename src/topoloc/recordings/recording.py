@@ -43,7 +43,9 @@ class Recording:
 
     `names` are image paths relative to `root`. `camera` belongs to the left or colour image.
     `cameras` holds a camera per frame if the frames have different cameras. `has_scale` is False if
-    the poses are not in metres, such as those of a model from monocular images.
+    the poses are not in metres, such as those of a model from monocular images. `as_stored` is True
+    if the cameras belong to the stored images, not to those turned by their EXIF orientation.
+    `notes` are for the user.
     """
 
     name: str
@@ -56,6 +58,8 @@ class Recording:
     depth: DepthImages | None = None
     cameras: list[Camera] | None = None
     has_scale: bool = True
+    as_stored: bool = False
+    notes: tuple[str, ...] = ()
 
     @staticmethod
     def with_cameras(
@@ -67,9 +71,13 @@ class Recording:
         cameras: list[Camera],
         depth: DepthImages | None = None,
         has_scale: bool = True,
+        as_stored: bool = False,
     ) -> Recording:
         """Return a recording with a camera for each frame, which may be the same for all."""
-        one = Recording(name, root, names, t_ns, poses, cameras[0], None, depth, None, has_scale)
+        scale_and_turn = has_scale, as_stored
+        one = Recording(
+            name, root, names, t_ns, poses, cameras[0], None, depth, None, *scale_and_turn
+        )
         return one if len(set(cameras)) == 1 else replace(one, camera=None, cameras=cameras)
 
     def __len__(self) -> int:
@@ -98,7 +106,7 @@ class Recording:
         """Read one frame without its right or depth image. Raises as `__getitem__`."""
         path = self.root / self.names[index]
         camera = self.camera if self.cameras is None else self.cameras[index]
-        image = _read_checked_image(path, camera)
+        image = _read_checked_image(path, camera, self.as_stored)
         focal = exif_focal_length(path, image.shape[1], image.shape[0]) if camera is None else None
         return StereoFrame(
             self.names[index],
@@ -232,9 +240,11 @@ def _depth_image(depth: DepthImages, index: int, camera: Camera) -> DepthImage:
     return DepthImage(resize_depth(path, metres, camera), camera, depth.cam_from_depth)
 
 
-def _read_checked_image(path: Path, camera: Camera | None) -> Image:
-    image = read_image(path)
+def _read_checked_image(path: Path, camera: Camera | None, as_stored: bool = False) -> Image:
+    image = read_image(path, as_stored)
     if camera is not None:
+        if as_stored and image.shape[:2] != (camera.height, camera.width):
+            image = read_image(path)  # a model of turned images
         _check_size(path, image.shape, camera)
     return image
 

@@ -3,7 +3,8 @@ ROS.
 
 OpenCV: `M1 D1 M2 D2 R T` as in its stereo sample, or the longer names of other programs. `R` and
 `T` may be in an extrinsics.yml beside it. They transform points from the left camera to the right
-one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`. Lengths are in metres.
+one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`. ROS: a file for each camera, `left.yaml` and
+`right.yaml`. Lengths are in metres.
 
 The files come with or without OpenCV's header and in several styles of YAML. So only words and
 numbers after the needed keys are read. Tags and aliases are ignored.
@@ -22,6 +23,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.camera_json import CameraCalibration
+from topoloc.recordings.ros_calibration import RosCalibration
 from topoloc.recordings.text_files import read_text
 
 _MAX_CHARS = 1_000_000
@@ -117,6 +119,10 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraCalibrat
     if _is_kalibr(text):
         return _read_kalibr(path, text)
     size = _image_size(text) or (float(width), float(height))
+    if right_file := find_right_file(path):
+        left, right = (_ros_calibration(file, size) for file in (path, right_file))
+        if rig := left.rig(right, is_rectified=False):
+            return CameraCalibration(rig.left, rig)
     if not yaml_numbers(text, *_LEFT_KEYS[0]):
         return CameraCalibration(_opencv_camera(path, text, _MONO_KEYS, size))
     left, right = (_opencv_camera(path, text, names, size) for names in (_LEFT_KEYS, _RIGHT_KEYS))
@@ -126,6 +132,36 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraCalibrat
     translation = require_numbers(path, motion, 3, "T", "translation_vector", "T_right_left")
     right_from_left = np.column_stack([np.reshape(rotation, (3, 3)), translation])
     return CameraCalibration(left, rig=_rig(path, left, right, right_from_left))
+
+
+def find_right_file(path: Path) -> Path | None:
+    """Return ROS's file of the right camera beside that of the left one, such as right.yaml beside
+    left.yaml. Return None if there is none."""
+    right = path.with_name(path.name.replace("left", "right"))
+    is_pair = right != path and path.is_file() and right.is_file()
+    files = (path, right) if is_pair else ()
+    has_projections = [bool(yaml_numbers(read_yaml(file), "projection_matrix")) for file in files]
+    return right if has_projections and all(has_projections) else None
+
+
+def _ros_calibration(path: Path, size: tuple[float, float]) -> RosCalibration:
+    text = read_yaml(path)
+    width, height = map(int, _image_size(text) or size)
+    numbers = {
+        key: np.array(require_numbers(path, text, count, f"{key}_matrix"))
+        for key, count in (("camera", 9), ("rectification", 9), ("projection", 12))
+    }
+    return RosCalibration(
+        name=str(path),
+        frame="",
+        width=width,
+        height=height,
+        model=yaml_word(text, "distortion_model", ""),
+        distortion=np.array(yaml_numbers(text, "distortion_coefficients")),
+        matrix=numbers["camera"].reshape(3, 3),
+        rotation=numbers["rectification"].reshape(3, 3),
+        projection=numbers["projection"].reshape(3, 4),
+    )
 
 
 def kalibr_camera(path: Path, section: str) -> Camera:

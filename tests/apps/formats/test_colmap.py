@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import pytest
 
 import topoloc
@@ -98,6 +99,42 @@ def test_pictures_cameras_and_poses(model: Make, binary: bool):
     np.testing.assert_array_equal(sequence[2].image, picture(2))
     for index, found in enumerate(scale_poses(sequence, METRES).poses):
         assert_same_pose(found, true_pose(index))
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+@pytest.mark.parametrize("is_of_turned", [False, True])
+def test_images_are_read_as_stored(model: Make, orientation: int, is_of_turned: bool):
+    """COLMAP ignores the EXIF orientation. A model of turned images shows it by the size."""
+    size = {"width": HEIGHT, "height": WIDTH} if is_of_turned and orientation == 6 else {}
+    root, exif = model(**size), PIL.Image.Exif()
+    exif[0x0112] = orientation
+    PIL.Image.fromarray(picture(0)).save(root / "images" / "a1.png", exif=exif)
+    expected = np.rot90(picture(0), -1) if size else picture(0)
+    np.testing.assert_array_equal(open_sequence(root)[0].image, expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "coefficients"),
+    [
+        ("SIMPLE_FISHEYE", []),
+        ("FISHEYE", []),
+        ("SIMPLE_RADIAL_FISHEYE", [0.03]),
+        ("RADIAL_FISHEYE", [0.03, -0.01]),
+    ],
+)
+def test_fisheye_models_project_as_in_colmap(model: Make, name: str, coefficients: list[float]):
+    focal = [20.0, 21.0] if name == "FISHEYE" else [20.0]
+    params = [*focal, 16.0, 12.0, *coefficients]
+    found = open_sequence(model(model=name, params=params)).camera
+    theirs = pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=params)
+    points = np.array([[0.3, -0.2, 1.0], [-1.0, 1.5, 1.0], [0.0, 0.0, 2.0]])
+    np.testing.assert_allclose(
+        found.img_from_cam(points) + 0.5, theirs.img_from_cam(points), atol=1e-9
+    )
+    turned = found.rescaled(2 * WIDTH, 3 * HEIGHT)
+    np.testing.assert_allclose(
+        turned.img_from_cam(points) + 0.5, [2, 3] * (found.img_from_cam(points) + 0.5), atol=1e-9
+    )
 
 
 def test_pictures_that_lie_elsewhere(model: Make, tmp_path: Path):

@@ -157,6 +157,47 @@ def test_a_camera_of_ros(tmp_path: Path):
     assert open_sequence(tmp_path / "walk")[0].camera == LEFT
 
 
+ROS = """image_width: 32
+image_height: 24
+camera_name: {name}
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: {k}
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: {d}
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: {r}
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: {p}
+"""
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_the_two_files_of_ros(pairs: Path, given: bool):
+    """As its cameracalibrator writes them: the baseline stands in P of the right camera."""
+    rotation, translation = RIGHT_FROM_LEFT.rotation, RIGHT_FROM_LEFT.translation[:, None]
+    cameras = (LEFT, RIGHT)
+    matrices = [(camera.matrix(), camera.distortion()[:5]) for camera in cameras]
+    r_left, r_right, p_left, p_right, *_ = cv2.stereoRectify(
+        *matrices[0], *matrices[1], (WIDTH, HEIGHT), rotation, translation
+    )
+    names, parts = ("left", "right"), ((r_left, p_left), (r_right, p_right))
+    for name, (k, d), (r, p) in zip(names, matrices, parts, strict=True):
+        numbers = {"k": k, "d": d, "r": r, "p": p}
+        text = {key: value.ravel().tolist() for key, value in numbers.items()}
+        (pairs / f"{name}.yaml").write_text(ROS.format(name=name, **text))
+    sequence = open_sequence(pairs, camera=pairs / "left.yaml" if given else None)
+    _assert_rig(sequence[0], LEFT, RIGHT)
+
+
 def test_several_calibrations_and_other_yaml(pairs: Path, tmp_path: Path):
     (pairs / "notes.yaml").write_text("weather: [1, 2]\n")
     write_opencv(pairs / "one.yml")

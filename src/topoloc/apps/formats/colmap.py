@@ -73,7 +73,8 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
     of_images = [cameras[image.camera_id] for image in posed]
     poses: list[Rigid3 | None] = [_world_from_cam(image, model) for image in posed]
     name, t_ns = path.resolve().name, times_from_names(names)
-    return Recording.with_cameras(name, root, names, t_ns, poses, of_images, has_scale=False)
+    frames = (names, t_ns, poses, of_images)
+    return Recording.with_cameras(name, root, *frames, has_scale=False, as_stored=True)
 
 
 def _find_model(path: Path) -> Path | None:

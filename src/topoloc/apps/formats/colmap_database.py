@@ -18,7 +18,7 @@ from topoloc.plugin import Recording, RecordingFormat, natural_key, parse_relati
 
 EXPECTED_FILES = "database.db of COLMAP"
 _NAME = "database.db"
-_CAMERA_MODELS = (
+_CAMERA_MODELS = [
     "SIMPLE_PINHOLE",
     "PINHOLE",
     "SIMPLE_RADIAL",
@@ -30,7 +30,12 @@ _CAMERA_MODELS = (
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
     "THIN_PRISM_FISHEYE",
-)
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+]
 """COLMAP's camera models by their numbers."""
 _MAX_PARAMS, _MAX_ROWS = 64, 10_000_000
 
@@ -66,7 +71,7 @@ def open_colmap_database(path: Path, images: Path | None = None) -> Recording:
     of_frames = [cameras[camera_id_by_image[name]] for name in names]
     poses: list[Rigid3 | None] = [None] * len(names)
     name, t_ns = file.resolve().parent.name, colmap.times_from_names(names)
-    return Recording.with_cameras(name, root, names, t_ns, poses, of_frames)
+    return Recording.with_cameras(name, root, names, t_ns, poses, of_frames, as_stored=True)
 
 
 def _read_database(file: Path) -> tuple[dict[int, Camera], dict[str, int]]:

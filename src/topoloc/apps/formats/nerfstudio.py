@@ -103,6 +103,8 @@ class _Lens(Struct, frozen=True):
         "FULL_OPENCV",
         "perspective",
         "OPENCV_FISHEYE",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
         "fisheye",
     ] = "OPENCV"
 
@@ -119,7 +121,7 @@ def _camera(data: dict[str, Any], where: str) -> Camera:
     p1, p2, fl_y = lens.p1, lens.p2, lens.fl_x if lens.fl_y is None else lens.fl_y
     params = (lens.fl_x, fl_y, lens.cx, lens.cy)
     try:
-        if lens.camera_model in ("OPENCV_FISHEYE", "fisheye"):
+        if lens.camera_model.lower().endswith("fisheye"):
             return Camera.from_colmap("OPENCV_FISHEYE", w, h, (*params, k1, k2, k3, k4))
         if k4 != 0.0:  # OpenCV's model has no fourth radial coefficient, its k4 is a divisor
             raise CalibrationError("a fourth radial coefficient is not supported")

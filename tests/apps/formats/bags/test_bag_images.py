@@ -106,6 +106,53 @@ def test_compressed_depth_of_both_kinds():
     )
 
 
+def encode_rvl(pixels: np.ndarray) -> bytes:
+    """As in the paper: runs of zeros and of others, differences in zigzag, 3 bits a nibble."""
+    nibbles: list[int] = []
+
+    def add(number: int) -> None:
+        while number > 7:
+            nibbles.append(number & 7 | 8)
+            number >>= 3
+        nibbles.append(number)
+
+    flat, at, before = pixels.ravel().astype(int).tolist(), 0, 0
+    while at < len(flat):
+        zeros = next((k for k, one in enumerate(flat[at:]) if one), len(flat) - at)
+        at += zeros
+        others = next((k for k, one in enumerate(flat[at:]) if not one), len(flat) - at)
+        add(zeros)
+        add(others)
+        for one in flat[at : at + others]:
+            add(2 * (one - before) if one >= before else 2 * (before - one) - 1)
+            before = one
+        at += others
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [
+        sum(nibble << 28 - 4 * place for place, nibble in enumerate(nibbles[at : at + 8]))
+        for at in range(0, len(nibbles), 8)
+    ]
+    return struct.pack(f"<II{len(words)}I", pixels.shape[1], pixels.shape[0], *words)
+
+
+def test_depth_compressed_by_rvl():
+    units = np.random.default_rng(1).integers(0, 65535, (7, 9)).astype(np.uint16)
+    units[units % 3 == 0] = 0
+    units[0, 0], units[3, 4], units[6, 8] = 0, 65535, 0
+    header = struct.pack("<iff", 0, 3000.0, 1000.0)
+    packed = SimpleNamespace(format="16UC1; compressedDepth rvl", data=header + encode_rvl(units))
+    expected = np.where((units == 0) | (units == 65535), np.nan, units / np.float32(1000))
+    np.testing.assert_allclose(decode_depth(packed, "a"), expected, rtol=1e-6)
+    packed.format = "32FC1; compressedDepth rvl"
+    found = decode_depth(packed, "a")
+    is_known = (units > 1000) & (units < 65535)
+    np.testing.assert_allclose(found[is_known], 3000.0 / (units[is_known] - 1000.0), rtol=1e-6)
+    assert np.isnan(found[~is_known]).all()
+    for data in (packed.data[:-12], packed.data[:14], header + b"\xff" * 50):
+        with pytest.raises(UnreadableImageError, match=r"a: depth .*RVL"):
+            decode_depth(SimpleNamespace(format=packed.format, data=data), "a")
+
+
 @pytest.mark.parametrize(
     ("fields", "said"),
     [

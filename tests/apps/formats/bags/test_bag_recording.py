@@ -349,6 +349,67 @@ def test_a_pair_needs_calibration(tmp_path: Path):
     assert rig.baseline == pytest.approx(0.1)
 
 
+def write_mono(path: Path, width: int, height: int, **fields: object) -> Path:
+    """A bag of one image of this size, with a calibration with these fields."""
+    pixels = np.zeros((height, width), np.uint8)
+    with bag_writer(path, "ros2") as write:
+        write("/image_raw", "sensor_msgs/msg/Image", 10**18, image(pixels, 10**18))
+        write("/camera_info", "sensor_msgs/msg/CameraInfo", 10**18, info(CAMERA, 10**18, **fields))
+    return path
+
+
+def test_binning_and_region_of_interest(tmp_path: Path):
+    fx, fy, cx, cy = CAMERA.intrinsics
+    full, binned = {"binning_x": 2, "binning_y": 4}, (fx / 2, fy / 4, cx / 2, cy / 4)
+    part = {"x_offset": 8, "y_offset": 4, "width": 40, "height": 20}
+    cut = ((fx / 2), fy, (cx - 8) / 2, cy - 4)
+    for number, (size, fields, intrinsics) in enumerate(
+        (
+            ((32, 12), full, binned),
+            ((64, 48), full, (fx, fy, cx, cy)),  # of the binned image, as some drivers write it
+            ((20, 20), {"roi": part, "binning_x": 2}, cut),
+            ((64, 48), {"roi": {}}, (fx, fy, cx, cy)),
+        )
+    ):
+        sequence = open_sequence(write_mono(tmp_path / str(number), *size, **fields))
+        assert sequence[0].camera == Camera.pinhole(*size, *intrinsics)
+
+
+def test_an_uncalibrated_camera_needs_a_calibration(tmp_path: Path):
+    bag = write_mono(tmp_path / "bag", 64, 48, k=np.zeros(9), p=np.zeros(12))
+    assert open_sequence(bag)[0].camera is None
+    assert open_sequence(bag, camera="50,51,31,24")[0].camera == Camera.pinhole(
+        64, 48, 50.0, 51.0, 31.0, 24.0
+    )
+    (bag / "camera.json").write_text(
+        '{"width": 64, "height": 48, "fx": 55, "fy": 55, "cx": 31, "cy": 24}'
+    )
+    assert open_sequence(bag)[0].camera.fx == 55.0
+    assert open_sequence(bag, camera="50,51,31,24")[0].camera.fx == 50.0
+
+
+def test_a_given_camera_keeps_the_baseline_of_a_rectified_pair(bag_of: BagOf):
+    path = bag_of("ros2")
+    own = open_sequence(path)[0].rig
+    width, height = own.left.width, own.left.height
+    sequence = open_sequence(path, camera=f"222,222,{(width - 1) / 2},{(height - 1) / 2}")
+    rig = sequence[0].rig
+    assert (rig.left.fx, rig.baseline) == (222.0, own.baseline)
+    assert sequence[0].camera == rig.left
+
+
+def test_registered_depth_may_be_coarser(tmp_path: Path):
+    depth = np.full((12, 16), 1500, np.uint16)
+    with bag_writer(tmp_path / "bag", "ros2") as write:
+        kind = "sensor_msgs/msg/Image"
+        write("/rgb/image_raw", kind, 10**18, image(np.zeros((48, 64), np.uint8), 10**18))
+        write("/rgb/camera_info", "sensor_msgs/msg/CameraInfo", 10**18, info(CAMERA, 10**18))
+        write("/depth_registered/image", kind, 10**18, image(depth, 10**18, "16UC1"))
+    found = open_sequence(tmp_path / "bag")[0].depth
+    assert found.camera == CAMERA
+    np.testing.assert_array_equal(found.depth, np.full((48, 64), 1.5, np.float32))
+
+
 def test_a_picture_of_another_size_than_its_camera(tmp_path: Path):
     with bag_writer(tmp_path / "bag", "ros2") as write:
         write(

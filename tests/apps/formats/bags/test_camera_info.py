@@ -10,15 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from topoloc.apps.formats.bags.bag_images import CameraInfo, camera_info
+from topoloc.apps.formats.bags.bag_images import camera_info
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import exp_so3
+from topoloc.recordings.ros_calibration import RosCalibration
 
 K = np.array([[500.0, 0, 320], [0, 505, 240], [0, 0, 1]])
 
 
-def info(**fields: Any) -> CameraInfo:
+def info(**fields: Any) -> RosCalibration:
     p = np.column_stack([np.diag([480.0, 480, 1]), np.zeros(3)])
     p[:2, 2] = 319.0, 239.0
     its = {

@@ -1,33 +1,27 @@
 """Decode images, depth and calibrations of messages.
 
 Raw images are decoded by their encoding, compressed ones as image files. A calibration (REP 104)
-gives the raw camera from K and D, the rectified one from P. In ROS the centre of the top-left pixel
-is (0, 0), as in topoloc.
+may belong to the full sensor: binning and the region of interest are applied.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32, Int64, UInt16
 
 from topoloc import (
     CalibrationError,
-    Camera,
     Image,
-    Rigid3,
-    StereoRig,
-    TrajectoryError,
     UnreadableImageError,
     read_depth,
     read_image,
 )
 from topoloc.apps.formats.bags.messages import frame_id, image_bytes
-from topoloc.plugin import MAX_PIXELS, EncodedImage
+from topoloc.plugin import MAX_PIXELS, EncodedImage, RosCalibration, image_size
 
 # Type of a pixel, number of channels, and OpenCV's conversion to RGB (None for grey and RGB).
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
@@ -55,9 +49,7 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
 _MILLIMETRES = 1000.0
 # Header of image_transport before the PNG: the format, and the quantization of inverse depth.
 _COMPRESSED_DEPTH = struct.Struct("<iff")
-_NO_DISTORTION = ("", "none", "plumb_bob", "rational_polynomial")
-_MAX_BASELINE = 1000.0  # metres; a larger one comes from a damaged number
-_FISHEYE = ("equidistant", "fisheye", "kannala_brandt4", "kannala_brandt")
+_RVL_SIZE = struct.Struct("<II")
 
 
 def decode_image(message: Any, name: str) -> Image:
@@ -106,13 +98,64 @@ def _decode_compressed_depth(message: Any, name: str) -> Float32[np.ndarray, "h 
     if len(data) <= _COMPRESSED_DEPTH.size:
         raise UnreadableImageError(f"{name}: the picture is empty")
     _, scale, offset = _COMPRESSED_DEPTH.unpack_from(data)
-    picture = EncodedImage(name, data[_COMPRESSED_DEPTH.size :])
-    if "32FC1" not in message.format:
-        return read_depth(picture, _MILLIMETRES)
+    data, is_float = data[_COMPRESSED_DEPTH.size :], "32FC1" in message.format
+    units_per_metre = 1.0 if is_float else _MILLIMETRES
+    if "rvl" in message.format.lower():
+        units = _decode_rvl(data, name).astype(np.float32)
+        depth = np.where((units > 0) & (units < 65535), units / units_per_metre, np.nan)
+        depth = depth.astype(np.float32)
+    else:
+        depth = read_depth(EncodedImage(name, data), units_per_metre)
+    if not is_float:
+        return depth
     with np.errstate(all="ignore"):
-        depth = np.float32(scale) / (read_depth(picture, 1.0) - np.float32(offset))
+        depth = np.float32(scale) / (depth - np.float32(offset))
     is_known = np.isfinite(depth) & (depth > 0.0)
     return np.where(is_known, depth, np.float32(np.nan)).astype(np.float32)
+
+
+def _decode_rvl(data: bytes, name: str) -> UInt16[np.ndarray, "h w"]:
+    """Return the pixels of depth compressed by RVL, 0 if unknown (Wilson, *Fast lossless depth
+    image compression*, ISS 2017).
+
+    The data are counts of zeros and of other pixels, and differences of the other pixels. Raises
+    UnreadableImageError: damaged, or too large.
+    """
+    width, height = _RVL_SIZE.unpack_from(data) if len(data) >= _RVL_SIZE.size else (0, 0)
+    if not 0 < width * height <= MAX_PIXELS:
+        raise UnreadableImageError(f"{name}: depth of {width}x{height} pixels, compressed by RVL")
+    numbers = _decode_numbers(data[_RVL_SIZE.size :])
+    pixels = np.zeros(width * height, np.int64)
+    is_known = np.zeros(width * height, bool)
+    row = start = 0
+    while start < len(pixels):
+        zeros, others = numbers[row : row + 2] if row + 2 <= len(numbers) else (0, len(pixels) + 1)
+        row, start = row + 2, start + int(zeros)
+        end = start + int(others)
+        if end > len(pixels) or row + others > len(numbers):
+            raise UnreadableImageError(f"{name}: depth compressed by RVL is damaged")
+        pixels[start:end] = numbers[row : row + others]
+        is_known[start:end] = True
+        row, start = row + int(others), end
+    zigzag = pixels[is_known]
+    pixels[is_known] = np.cumsum((zigzag >> 1) ^ -(zigzag & 1))
+    return (pixels & 0xFFFF).astype(np.uint16).reshape(height, width)
+
+
+def _decode_numbers(data: bytes) -> Int64[np.ndarray, " n"]:
+    """Return the numbers in groups of nibbles: three bits each, the lowest first. The fourth bit is
+    set if the number continues."""
+    max_nibbles = 11  # of 32 bits
+    words = np.frombuffer(data, "<u4", len(data) // 4)
+    nibbles = ((words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32)) & 15).ravel()
+    ends = np.flatnonzero(nibbles < 8)
+    if not len(ends):
+        return np.zeros(0, np.int64)
+    nibbles = nibbles[: ends[-1] + 1].astype(np.int64)
+    starts = np.append(0, ends[:-1] + 1)
+    place = np.arange(len(nibbles)) - np.repeat(starts, ends - starts + 1)
+    bits = np.where(place < max_nibbles, (nibbles & 7) << np.minimum(3 * place, 33), 0)
+    return np.add.reduceat(bits, starts)
 
 
 def _message_bytes(message: Any, name: str) -> bytes:
@@ -143,85 +186,7 @@ def _decode_pixels(message: Any, name: str) -> tuple[np.ndarray, int | None]:
     return pixels if channels == 1 else pixels.reshape(height, width, channels), to_rgb
 
 
-@dataclass(frozen=True, eq=False)
-class CameraInfo:
-    """Hold the calibration of a topic. `rotation` rotates the raw camera to the rectified one,
-    which has the projection `projection`."""
-
-    topic: str
-    frame: str
-    width: int
-    height: int
-    model: str
-    distortion: Float[np.ndarray, " d"]
-    matrix: Float[np.ndarray, "3 3"]
-    rotation: Float[np.ndarray, "3 3"]
-    projection: Float[np.ndarray, "3 4"]
-
-    def camera(self, is_rectified: bool) -> Camera:
-        """Return the camera of the raw images, or of the rectified ones. Raises CalibrationError:
-        of a model that is not known here, or no camera's numbers."""
-        if is_rectified and self.projection[0, 0] > 0.0:
-            return self._make_camera("PINHOLE", self.projection, [])
-        if is_rectified or not np.any(self.distortion):
-            return self._make_camera("PINHOLE", self.matrix, [])
-        coefficients = self.distortion.tolist()
-        if self.model in _FISHEYE and len(coefficients) >= 4:
-            return self._make_camera("OPENCV_FISHEYE", self.matrix, coefficients[:4])
-        if self.model not in _NO_DISTORTION or len(coefficients) < 4 or any(coefficients[8:]):
-            raise CalibrationError(
-                f"{self.topic}: distortion_model {self.model!r} of {len(coefficients)} coefficients"
-                " is not known here"
-            )
-        if any(coefficients[4:]):
-            return self._make_camera("FULL_OPENCV", self.matrix, (coefficients + [0.0] * 4)[:8])
-        return self._make_camera("OPENCV", self.matrix, coefficients[:4])
-
-    def rig(self, right: CameraInfo, is_rectified: bool) -> StereoRig | None:
-        """Return the rig of this left camera and its right one. None if P does not contain the
-        baseline. Raises CalibrationError: as of `camera`, or the right camera is not to the
-        right."""
-        shift = right._projection_offset() - self._projection_offset()
-        if not np.isfinite(shift) or shift == 0.0:
-            return None
-        if abs(shift) > _MAX_BASELINE:
-            raise CalibrationError(
-                f"{right.topic}: P puts the right camera {abs(shift):.3g} m away"
-            )
-        if shift > 0.0:
-            raise CalibrationError(
-                f"{right.topic}: P puts the right camera {shift:.3g} m to the left; are left and"
-                " right swapped?"
-            )
-        rect_right_from_rect_left = Rigid3(np.eye(3), np.array([shift, 0.0, 0.0]))
-        if is_rectified:
-            return StereoRig(self.camera(True), right.camera(True), rect_right_from_rect_left)
-        try:
-            rect_from_left, rect_from_right = (
-                Rigid3.from_matrix(np.block([[one.rotation, np.zeros((3, 1))], [0, 0, 0, 1]]))
-                for one in (self, right)
-            )
-        except TrajectoryError as error:
-            raise CalibrationError(
-                f"{right.topic}, or that of the left camera: R is {error}"
-            ) from None
-        right_from_left = rect_from_right.inverse() @ rect_right_from_rect_left @ rect_from_left
-        return StereoRig(self.camera(False), right.camera(False), right_from_left)
-
-    def _projection_offset(self) -> float:
-        """Return the x offset of the rectified camera, from P = K [I | t]. NaN without a P."""
-        focal, offset = float(self.projection[0, 0]), float(self.projection[0, 3])
-        return offset / focal if focal > 0.0 else float("nan")
-
-    def _make_camera(self, model: str, matrix: np.ndarray, coefficients: list[float]) -> Camera:
-        params = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *coefficients)
-        try:
-            return Camera(model, self.width, self.height, tuple(float(value) for value in params))
-        except CalibrationError as error:
-            raise CalibrationError(f"{self.topic}: {error}") from None
-
-
-def camera_info(message: Any, topic: str) -> CameraInfo:
+def camera_info(message: Any, topic: str) -> RosCalibration:
     """Return the calibration of a message of ROS 1 (D, K, R, P), ROS 2 (d, k, r, p) or Foxglove.
     Raises CalibrationError: a field is missing, or not finite numbers of its shape."""
     try:
@@ -233,9 +198,26 @@ def camera_info(message: Any, topic: str) -> CameraInfo:
         projection = projection.reshape(3, 4) if projection.size else np.zeros((3, 4))
         size, model = (int(message.width), int(message.height)), str(message.distortion_model)
         numbers = (distortion, matrix.reshape(3, 3), rotation, projection)
-        return CameraInfo(topic, frame_id(message), *size, model, *numbers)
+        return RosCalibration(topic, frame_id(message), *size, model, *numbers)
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{topic}: no calibration ({error})") from None
+
+
+def reduce_to_part(found: RosCalibration, message: Any) -> RosCalibration:
+    """Return the calibration of the images that the binning and the region of interest of its
+    message describe."""
+    part = getattr(message, "roi", None)
+    names = ("x_offset", "y_offset", "width", "height")
+    x, y, width, height = (int(getattr(part, name, 0)) for name in names)
+    across, down = (int(getattr(message, f"binning_{axis}", 1)) for axis in "xy")
+    return found.reduced((x, y), (width, height), (across, down))
+
+
+def message_size(message: Any, name: str) -> tuple[int, int]:
+    """Return width and height of an image of a message. Raises UnreadableImageError."""
+    if hasattr(message, "encoding"):
+        return int(message.width), int(message.height)
+    return image_size(EncodedImage(name, _message_bytes(message, name)))
 
 
 def _get_field(message: Any, name: str) -> Any:

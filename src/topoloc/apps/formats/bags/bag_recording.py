@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -30,17 +29,28 @@ from topoloc.apps.formats.bags.bag import (
     missing_bags_error,
     open_bag_files,
 )
-from topoloc.apps.formats.bags.bag_images import CameraInfo, camera_info, decode_depth, decode_image
-from topoloc.apps.formats.bags.bag_poses import TransformTree, camera_poses, read_transform_tree
+from topoloc.apps.formats.bags.bag_calibration import (
+    find_depth_camera,
+    find_left_camera,
+    find_rig,
+    read_camera_info,
+    read_image_size,
+)
+from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image
+from topoloc.apps.formats.bags.bag_poses import camera_poses, read_transform_tree
 from topoloc.apps.formats.bags.messages import decode, frame_id, header_stamp_ns, num_header_bytes
 from topoloc.apps.formats.bags.topics import (
     Roles,
-    is_rectified,
     is_registered,
     parse_topics,
     select_topics,
 )
-from topoloc.plugin import RecordingFormat, find_nearest_idx, read_camera_json
+from topoloc.plugin import (
+    CameraCalibration,
+    RecordingFormat,
+    find_nearest_idx,
+    resize_depth,
+)
 
 MAX_PAIR_DELAY_MS, MAX_DEPTH_DELAY_MS = 5, 20
 
@@ -95,6 +105,8 @@ class BagRecording:
             images, camera, cam_from_depth = self.depth
             message, name = self._read_message(images, index)
             depth = decode_depth(message, name)
+            if camera == self.camera:  # registered, and may be coarser
+                depth = resize_depth(name, depth, camera)
             _check_size(name, depth.shape, camera)
             return replace(frame, depth=DepthImage(depth, camera, cam_from_depth))
         return frame
@@ -121,7 +133,11 @@ class BagRecording:
             raise UnreadableImageError(f"{name}: {error}") from None
 
 
-def open_bag(path: Path, topics: str | Mapping[str, str] | None = None) -> BagRecording:
+def open_bag(
+    path: Path,
+    topics: str | Mapping[str, str] | None = None,
+    calibration: Callable[[int, int], CameraCalibration] | None = None,
+) -> BagRecording:
     """Open a bag. Topics that are not given are guessed. No image is read. Raises RecordingError:
     no bag, a topic that is not in it, no pictures, or none with its right picture or depth;
     CalibrationError: the calibration of a pair or of depth is missing or not usable;
@@ -132,38 +148,41 @@ def open_bag(path: Path, topics: str | Mapping[str, str] | None = None) -> BagRe
         topics: the topic of a role (``left``, ``right``, ``depth``, ``left_info``, ``right_info``,
             ``depth_info``, ``pose``), and ``pose_frame``, the frame that the poses are of; as a
             dictionary or ``left=/cam0/image_raw,pose=/odom``. ``pose`` may be ``tf`` or ``none``.
+        calibration: replaces that of the left camera and of registered depth, or of a pair. A
+            rectified pair keeps its baseline.
     """
     bag = open_bag_files(path)
     try:
         requested = parse_topics(topics) if isinstance(topics, str) else dict(topics or {})
         roles = select_topics(bag, requested)
-        recording = _open_recording(bag, roles)
+        given = calibration and calibration(*read_image_size(bag, roles.left))
+        recording = _open_recording(bag, roles, given)
     except ModuleNotFoundError as error:
         raise missing_bags_error(error, path) from error
     bag.add_fault_notes()
     return recording
 
 
-def _open_recording(bag: Bag, roles: Roles) -> BagRecording:
+def _open_recording(bag: Bag, roles: Roles, given: CameraCalibration | None) -> BagRecording:
     t_ns, left = _index_by_time(bag, roles.left)
-    tree, info = read_transform_tree(bag), _read_camera_info(bag, roles.left_info)
+    tree, info = read_transform_tree(bag), read_camera_info(bag, roles.left_info, roles.left)
     frame = (info.frame if info is not None else "") or _read_frame_id(bag, left)
-    camera = (
-        info.camera(is_rectified(roles.left)) if info is not None else _read_folder_camera(bag)[0]
-    )
+    camera = find_left_camera(bag, roles, info, given)
     right, depth = None, None
     if roles.right is not None:
-        rig = _rig(bag, roles, info, tree)
+        rig = find_rig(bag, roles, info, tree, given)
         t_ns, left, images = _match_by_time(bag, (t_ns, left), roles.right, MAX_PAIR_DELAY_MS)
         camera, right = rig.left, (images, rig)
     elif roles.depth is not None:
         if camera is None:
             raise CalibrationError(
-                f"{bag.path}: no calibration of {roles.left}; --topics left_info=TOPIC, or a"
-                " camera.json beside the bag"
+                f"{bag.path}: no calibration of {roles.left}; use --camera FILE, --topics"
+                " left_info=TOPIC, or a camera.json beside the bag"
             )
         t_ns, left, images = _match_by_time(bag, (t_ns, left), roles.depth, MAX_DEPTH_DELAY_MS)
-        depth = (images, *_depth_camera(bag, roles, camera, frame, tree))
+        is_replaced = given is not None and is_registered(roles.depth)
+        depth_info = None if is_replaced else roles.depth_info
+        depth = (images, *find_depth_camera(bag, roles.depth, depth_info, camera, frame, tree))
     poses = camera_poses(bag, roles, frame, tree, t_ns)
     return BagRecording(bag.path.resolve().name, bag, t_ns, poses, camera, left, right, depth)
 
@@ -209,80 +228,11 @@ def _match_by_time(
     return [t_ns[row] for row in kept], *matched
 
 
-def _read_camera_info(bag: Bag, name: str | None) -> CameraInfo | None:
-    """Return the first complete calibration of a topic."""
-    if name is None:
-        return None
-    for ref in bag.messages(name)[:10]:
-        with suppress(RecordingError):
-            message = decode(bag.topics[name], bag.read(ref))
-            break
-    else:
-        raise CalibrationError(f"{bag.path}: no whole message of {name}")
-    return camera_info(message, name)
-
-
 def _read_frame_id(bag: Bag, images: ImageMessages) -> str:
     try:
         return frame_id(decode(images.topic, bag.read(images.refs[0])))
     except (RecordingError, AttributeError):
         return ""
-
-
-def _rig(bag: Bag, roles: Roles, left: CameraInfo | None, tree: TransformTree) -> StereoRig:
-    """Return the rig: from P of both calibrations, else from the transform between their frames,
-    else from a camera.json with a baseline."""
-    right = _read_camera_info(bag, roles.right_info)
-    if left is not None and right is not None:
-        rig = left.rig(right, is_rectified(roles.left))
-        if rig is not None:
-            return rig
-        right_from_left = None
-        if left.frame != right.frame:
-            right_from_left = tree.find_static_transform(right.frame, left.frame)
-        if right_from_left is not None and is_rectified(roles.left):
-            baseline = float(np.linalg.norm(right_from_left.translation))
-            return StereoRig.rectified(left.camera(True), baseline)
-        if right_from_left is not None:
-            return StereoRig(left.camera(False), right.camera(False), right_from_left)
-    camera, baseline = _read_folder_camera(bag)
-    if camera is not None and baseline is not None:
-        return StereoRig.rectified(camera, baseline)
-    infos = {"left": left, "right": right}
-    lacking = " and ".join(side for side, info in infos.items() if info is None)
-    what = f"neither P of {roles.right_info} nor TF says where the right camera is"
-    what = f"no calibration of the {lacking} camera" if lacking else what
-    raise CalibrationError(
-        f"{bag.path}: {what}; --topics left_info=TOPIC,right_info=TOPIC, or a camera.json with a"
-        " baseline beside the bag"
-    )
-
-
-def _depth_camera(
-    bag: Bag, roles: Roles, camera: Camera, frame: str, tree: TransformTree
-) -> tuple[Camera, Rigid3]:
-    """Return the camera of the depth images, and cam_from_depth. Registered ones have the colour
-    camera."""
-    info = _read_camera_info(bag, roles.depth_info)
-    if info is None:
-        return camera, Rigid3.identity()
-    cam_from_depth = tree.find_static_transform(frame, info.frame) if frame and info.frame else None
-    if cam_from_depth is None:
-        cam_from_depth = Rigid3.identity()
-        if not is_registered(roles.depth or ""):
-            bag.notes.append(
-                f"{bag.path}: no fixed transform from that of {roles.depth} to the camera of the"
-                " pictures: taken for the same place"
-            )
-    return info.camera(is_rectified(roles.depth or "")), cam_from_depth
-
-
-def _read_folder_camera(bag: Bag) -> tuple[Camera | None, float | None]:
-    path = (bag.path if bag.path.is_dir() else bag.path.parent) / "camera.json"
-    if not path.is_file():
-        return None, None
-    file = read_camera_json(path)
-    return file.camera, None if file.rig is None else file.rig.baseline
 
 
 def _check_size(name: str, shape: tuple[int, ...], camera: Camera) -> None:
@@ -294,7 +244,8 @@ def _check_size(name: str, shape: tuple[int, ...], camera: Camera) -> None:
 
 
 EXPECTED_FILES = "a ROS bag: .bag, .db3, or a folder with metadata.yaml"
-ROSBAG_FORMAT = RecordingFormat(EXPECTED_FILES, is_bag, open_bag, ("topics",))
+_OPTIONS = ("topics", "calibration")
+ROSBAG_FORMAT = RecordingFormat(EXPECTED_FILES, is_bag, open_bag, _OPTIONS)
 MCAP_FORMAT = RecordingFormat(
-    "an .mcap file", lambda path: is_bag(path, MCAP_SUFFIXES), open_bag, ("topics",)
+    "an .mcap file", lambda path: is_bag(path, MCAP_SUFFIXES), open_bag, _OPTIONS
 )
