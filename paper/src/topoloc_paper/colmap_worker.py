@@ -25,7 +25,8 @@ MIN_POINTS = 4
 class MapImage:
     """A triangulated picture: row k of `points_world` is NaN where key point k has no 3-D point."""
 
-    descriptors: Float32[np.ndarray, "n 128"]
+    name: str
+    descriptors: Float32[np.ndarray, "n d"]
     points_world: Float[np.ndarray, "n 3"]
 
 
@@ -39,21 +40,25 @@ class Worker:
         self.job: dict[str, Any] = json.loads((folder / "job.json").read_text())
 
     def run(self) -> None:
-        start = time.perf_counter()
+        start = self._now()
         images = self._map()
-        answers: dict[str, Any] = {"seconds_to_map": time.perf_counter() - start}
+        answers: dict[str, Any] = {"seconds_to_map": self._now() - start}
         answers["map_bytes"] = sum(
             image.descriptors.shape[0] * (128 + 8) + image.points_world.nbytes // 2
             for image in images.values()
         )
-        start = time.perf_counter()
+        start = self._now()
         database = self._extract("queries", self.job["queries"])
-        extraction_ms = 1e3 * (time.perf_counter() - start) / max(len(self.job["queries"]), 1)
+        extraction_ms = 1e3 * (self._now() - start) / max(len(self.job["queries"]), 1)
         answers["queries"] = [
             self._answer(query, database, images, extraction_ms) for query in self.job["queries"]
         ]
         database.close()
         (self.folder / "answers.json").write_text(json.dumps(answers))
+
+    def _now(self) -> float:
+        """Seconds of a clock that never goes back."""
+        return time.perf_counter()
 
     def _extract(self, name: str, rows: list[dict[str, Any]]) -> Any:
         """A database with the features of these pictures, all of one camera where that is so."""
@@ -78,12 +83,7 @@ class Worker:
         each node."""
         rows = self.job["map"]
         database = self._extract("map", rows)
-        pairing = self.pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(self.folder / "pairs.txt")
-        (self.folder / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in self.job["pairs"]))
-        self.pycolmap.match_image_pairs(
-            self.folder / "map.db", pairing_options=pairing, device=self.pycolmap.Device.cpu
-        )
+        self._match_map(database)
         known = self.pycolmap.Reconstruction()
         for camera in database.read_all_cameras():
             known.add_camera_with_trivial_rig(camera)
@@ -100,13 +100,32 @@ class Worker:
         model = self.pycolmap.triangulate_points(
             known, self.folder / "map.db", self.pictures, self.folder / "model"
         )
-        first = {row["node"]: ids[row["name"]].image_id for row in reversed(rows)}
+        first = {row["node"]: ids[row["name"]] for row in reversed(rows)}
         images = {
-            node: MapImage(self._descriptors(database, image_id), _points(model, image_id))
-            for node, image_id in first.items()
+            node: MapImage(
+                image.name,
+                self._descriptors(database, image.image_id),
+                _points(model, image.image_id),
+            )
+            for node, image in first.items()
         }
         database.close()
         return images
+
+    def _match_map(self, database: Any) -> None:
+        """Write the verified matches of the job's pairs into the database of the map."""
+        pairing = self.pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(self.folder / "pairs.txt")
+        (self.folder / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in self.job["pairs"]))
+        self.pycolmap.match_image_pairs(
+            self.folder / "map.db", pairing_options=pairing, device=self.pycolmap.Device.cpu
+        )
+
+    def _match(
+        self, name: str, descriptors: Float32[np.ndarray, "n d"], found: MapImage
+    ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+        """Match the query of this name with a picture of the map: rows of both's key points."""
+        return mutual_matches(descriptors, found.descriptors, RATIO)
 
     def _descriptors(self, database: Any, image_id: int) -> Float32[np.ndarray, "n 128"]:
         """Of unit length; as many as there are key points."""
@@ -120,11 +139,11 @@ class Worker:
         images: dict[int, MapImage],
         extraction_ms: float,
     ) -> dict[str, Any]:
-        start = time.perf_counter()
+        start = self._now()
         image = database.read_image_with_name(query["name"])
         pixels = np.asarray(database.read_keypoints(image.image_id), np.float64)[:, :2]
         pose = self._pose(query, pixels, self._descriptors(database, image.image_id), images)
-        return {"cam_from_world": pose, "ms": extraction_ms + 1e3 * (time.perf_counter() - start)}
+        return {"cam_from_world": pose, "ms": extraction_ms + 1e3 * (self._now() - start)}
 
     def _pose(
         self,
@@ -136,7 +155,7 @@ class Worker:
         rows = [np.zeros((0, 4))]
         for node in query["nodes"]:
             found = images[node]
-            query_idx, map_idx = mutual_matches(descriptors, found.descriptors, RATIO)
+            query_idx, map_idx = self._match(query["name"], descriptors, found)
             rows.append(np.column_stack([query_idx.astype(float), found.points_world[map_idx]]))
         pairs = np.concatenate(rows)
         pairs = np.unique(pairs[np.isfinite(pairs).all(axis=1)], axis=0)

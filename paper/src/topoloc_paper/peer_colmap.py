@@ -75,24 +75,17 @@ class Colmap:
         """
         with tempfile.TemporaryDirectory(dir=self._folder) as work:
             folder = Path(work)
-            (folder / "pictures").mkdir()
             job: dict[str, Any] = {
                 "map": self._write_map(folder),
                 "queries": [self._write_query(folder, i, frame) for i, frame in enumerate(frames)],
             }
             job["pairs"] = self._pairs(job["map"])
-            (folder / "job.json").write_text(json.dumps(job))
-            command = [sys.executable, "-m", "topoloc_paper.colmap_worker", str(folder)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode != 0:
-                last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-                raise TopolocError(f"pycolmap ended with status {done.returncode}: {last[:200]}")
-            answers = json.loads((folder / "answers.json").read_text())
+            answers = run_worker(folder, job)
         self.map_bytes = self._retrieval.map_bytes + answers["map_bytes"]
         self.seconds_to_map = answers["seconds_to_map"]
         rows = zip(job["queries"], answers["queries"], strict=True)
         return [
-            PeerAnswer(_pose(answer["cam_from_world"]), query["retrieval_ms"] + answer["ms"])
+            PeerAnswer(pose_of(answer["cam_from_world"]), query["retrieval_ms"] + answer["ms"])
             for query, answer in rows
         ]
 
@@ -102,49 +95,17 @@ class Colmap:
         for node_id in self._kept:
             summary = self._topomap.summaries[node_id]
             sequence, index = self._frames[summary.recording, summary.name]
-            frame = sequence[index]
-            assert frame.camera is not None
-            assert frame.world_from_cam is not None
-            cam_from_world = frame.world_from_cam.inverse()
-            rows.append(
-                _map_row(
-                    folder,
-                    f"map/{node_id:05d}-0",
-                    node_id,
-                    frame.image,
-                    frame.camera,
-                    cam_from_world,
-                )
-            )
-            if frame.right is not None and frame.rig is not None:
-                right_from_world = frame.rig.right_from_left @ cam_from_world
-                rows.append(
-                    _map_row(
-                        folder,
-                        f"map/{node_id:05d}-1",
-                        node_id,
-                        frame.right,
-                        frame.rig.right,
-                        right_from_world,
-                    )
-                )
+            rows += map_rows(folder, node_id, sequence[index])
         return rows
 
     def _write_query(self, folder: Path, number: int, frame: StereoFrame) -> dict[str, Any]:
-        assert frame.camera is not None
         start = time.perf_counter()
         kept = set(self._kept)
         ranked = [
             node_id for node_id in self._retrieval.nodes(frame.image, NUM_RANKED) if node_id in kept
         ][:NUM_RETRIEVED]
         retrieval_ms = 1e3 * (time.perf_counter() - start)
-        name = _write(folder, f"queries/{number:05d}", frame.image)
-        return {
-            "name": name,
-            "camera": _colmap_camera(frame.camera),
-            "nodes": ranked,
-            "retrieval_ms": retrieval_ms,
-        }
+        return query_row(folder, number, frame, ranked) | {"retrieval_ms": retrieval_ms}
 
     def _pairs(self, rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
         """Each left picture with its right one and with the left ones of the nearest nodes."""
@@ -165,6 +126,47 @@ class Colmap:
         return sorted(set(pairs))
 
 
+def run_worker(
+    folder: Path, job: dict[str, Any], worker: str = "colmap_worker", *options: str
+) -> dict[str, Any]:
+    """Write the job, let a worker process do it and return its answers.
+
+    Raises:
+        TopolocError: The worker ended with an error.
+    """
+    (folder / "job.json").write_text(json.dumps(job))
+    command = [sys.executable, "-m", f"topoloc_paper.{worker}", str(folder), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise TopolocError(f"{worker} ended with status {done.returncode}: {last[:200]}")
+    return json.loads((folder / "answers.json").read_text())
+
+
+def query_row(
+    folder: Path, number: int, frame: StereoFrame, node_ids: Sequence[int]
+) -> dict[str, Any]:
+    """Write a query's picture and return its row of the job, to be matched with these nodes."""
+    assert frame.camera is not None
+    name = _write(folder, f"queries/{number:05d}", frame.image)
+    return {"name": name, "camera": _colmap_camera(frame.camera), "nodes": list(node_ids)}
+
+
+def map_rows(folder: Path, node_id: int, frame: StereoFrame) -> list[dict[str, Any]]:
+    """Write the left and, where there is one, right picture of a node; return their rows."""
+    assert frame.camera is not None
+    assert frame.world_from_cam is not None
+    cam_from_world = frame.world_from_cam.inverse()
+    left = _map_row(
+        folder, f"map/{node_id:05d}-0", node_id, frame.image, frame.camera, cam_from_world
+    )
+    if frame.right is None or frame.rig is None:
+        return [left]
+    right_from_world = frame.rig.right_from_left @ cam_from_world
+    name = f"map/{node_id:05d}-1"
+    return [left, _map_row(folder, name, node_id, frame.right, frame.rig.right, right_from_world)]
+
+
 def _map_row(
     folder: Path, name: str, node_id: int, image: Image, camera: Camera, cam_from_world: Rigid3
 ) -> dict[str, Any]:
@@ -179,7 +181,7 @@ def _map_row(
 
 def _write(folder: Path, name: str, image: Image) -> str:
     path = folder / "pictures" / f"{name}.png"
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     cv2.imwrite(str(path), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return f"{name}.png"
@@ -199,7 +201,7 @@ def _colmap_camera(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _pose(cam_from_world: list[list[float]] | None) -> Rigid3 | None:
+def pose_of(cam_from_world: list[list[float]] | None) -> Rigid3 | None:
     if cam_from_world is None:
         return None
     matrix = np.array(cam_from_world)
