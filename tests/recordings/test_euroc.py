@@ -1,4 +1,5 @@
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -145,6 +146,16 @@ def test_bad_sensors(tmp_path: Path, old: str, new: str, says: str):
     (tmp_path / "sensor.yaml").write_text(sensor_yaml(BODY_FROM_CAM[0]).replace(old, new))
     with pytest.raises(CalibrationError, match=r"sensor\.yaml.*" + says):
         read_sensor(tmp_path / "sensor.yaml")
+
+
+def test_blank_lines_cost_no_more_than_comments(tmp_path: Path):
+    path, seconds = tmp_path / "sensor.yaml", list[float]()
+    for line in ("# a comment of forty characters, no more\n", " \n"):
+        path.write_text(line * (990_000 // len(line)) + sensor_yaml(BODY_FROM_CAM[0]))
+        start = perf_counter()
+        assert read_sensor(path).camera.fx == 45.5
+        seconds.append(perf_counter() - start)
+    assert seconds[1] < 20 * max(seconds[0], 0.1)
 
 
 def test_no_sensor_and_no_rotation(euroc: Path, tmp_path: Path):

@@ -67,7 +67,7 @@ def read_yaml(path: Path) -> str:
 
 def yaml_word(text: str, key: str, default: str) -> str:
     """Return the word after a key, or `default`."""
-    found = re.search(rf"^\s*{key}:\s*[\"']?([\w-]+)", text, re.MULTILINE)
+    found = re.search(rf"^[ \t]*{key}:\s*[\"']?([\w-]+)", text, re.MULTILINE)
     return found[1] if found else default
 
 

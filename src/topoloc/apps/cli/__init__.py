@@ -176,16 +176,22 @@ def _check_address_space() -> None:
 
 
 def _print_warning(message: Warning | str, *_place: object, **_line: object) -> None:
-    _print_line(f"warning: {message}")
+    _print_line("warning: " + " ".join(str(message).split()))
 
 
 def _print_error(text: str) -> None:
     _print_line("error: " + " ".join(text.split()))
 
 
+def printable(text: str) -> str:
+    """Return a text with escapes instead of control characters. So a text from a file neither
+    controls the terminal nor begins a line."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 def _print_line(line: str) -> None:
     try:
-        print(line, file=sys.stderr)
+        print(printable(line), file=sys.stderr)
     except OSError:  # only the exit status remains
         _discard_output(sys.stderr)
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequence
+from topoloc.apps.cli import printable
 from topoloc.plugin import remove_stale_files, write_text
 
 # A switch: no `--no-...`, and no "(default: False)" in the help.
@@ -88,19 +89,19 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str | None] = 
     """Check before the work that the output files can be written. None and ``-`` are ignored.
     `inputs`: files that must not be overwritten. Raises TopolocError: the folder is missing or
     read-only, the path is no regular file, or a file is used twice."""
-    taken = {Path(path).resolve() for path in inputs if path}
+    taken = {os.path.realpath(path) for path in inputs if path}
     for path in (Path(output) for output in outputs if output not in (None, "-")):
         faults = {
             f"folder {path.parent} does not exist": not path.parent.is_dir(),
             "it is a folder": path.is_dir(),
             "it is no regular file": path.exists() and not path.is_file(),  # such as a device
             f"folder {path.parent} is read-only": not os.access(path.parent, os.W_OK),
-            "this file is used twice": path.resolve() in taken,
+            "this file is used twice": os.path.realpath(path) in taken,
         }
         if fault := next((text for text, is_found in faults.items() if is_found), None):
             raise TopolocError(f"cannot write {path}: {fault}")
         remove_stale_files(path)
-        taken.add(path.resolve())
+        taken.add(os.path.realpath(path))
 
 
 @contextmanager
@@ -193,16 +194,21 @@ def import_report_writer() -> Callable[..., None]:
         return write_report
 
 
+def print_line(text: str, file: Any = None) -> None:
+    """Print one line, by default on standard output. Control characters are written as escapes."""
+    print(printable(text), file=file, flush=True)
+
+
 def print_warning(text: str) -> None:
     """Print a warning to standard error."""
-    print(f"warning: {text}", file=sys.stderr)
+    print_line(f"warning: {text}", sys.stderr)
 
 
 def print_fields(facts: Sequence[tuple[str, str]]) -> None:
     """Print names and values, one pair on each line, in two columns."""
     width = max(len(name) for name, _ in facts)
     for name, value in facts:
-        print(f"{name:<{width}}  {value}".rstrip())
+        print_line(f"{name:<{width}}  {value}".rstrip())
 
 
 def print_recordings(
@@ -216,7 +222,7 @@ def print_recordings(
     widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
     for name, *cells in rows:
         padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
-        print("  ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
+        print_line("  ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
 
 
 def _row(recording: dict[str, Any]) -> tuple[str, ...]:

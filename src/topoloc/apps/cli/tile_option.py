@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc import Atlas, AtlasError, MapError, ObjectStoreError, SharedWorld, SingleMap
-from topoloc.apps.cli.output import UsageError, print_warning, write_json
+from topoloc.apps.cli.output import UsageError, print_line, print_warning, write_json
 
 TileOption = Annotated[str | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(atlases only)")]
 _MAX_LISTED = 8
@@ -69,9 +69,7 @@ def run_for_each_tile(
             if not one or isinstance(error, ObjectStoreError):
                 raise
             text = str(error)
-            print(
-                f"error: {text if f'tile {one}' in text else f'tile {one}: {text}'}",
-                file=sys.stderr,
-            )
+            named = text if f"tile {one}" in text else f"tile {one}: {text}"
+            print_line(f"error: {named}", sys.stderr)
     write_json(json, place.report(facts))
     return 0 if len(facts) == len(ids) else 1

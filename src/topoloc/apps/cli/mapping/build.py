@@ -31,6 +31,8 @@ from topoloc.apps.cli.output import (
     Topics,
     UsageError,
     check_outputs,
+    print_line,
+    print_waiting,
     progress_bar,
     write_json,
 )
@@ -155,7 +157,7 @@ class Command:
     def _make_map(self, map_job: MapJob, target: Path) -> int:
         with progress_bar() as progress:
             topomap, poses_from = map_job.make(progress)
-        topomap.save(target)
+        topomap.save(target, print_waiting)
         info = topomap.describe(target)
         if self.json != "-":
             size = f"{info['num_nodes']} nodes, {info['num_points']} points"
@@ -192,7 +194,7 @@ class Command:
         write_json(self.json, facts | ({"tried": joined.rows} if joined else {}))
         not_compared = joined.not_compared if joined else []
         for problem in not_compared:
-            print(f"error: {problem}", file=sys.stderr)
+            print_line(f"error: {problem}", sys.stderr)
         return 1 if facts["failed"] or not_compared else 0
 
     def _jobs(self, map_job: MapJob, split: SplitOptions | None) -> list[list[TileJob]]:

@@ -30,7 +30,7 @@ from topoloc import (
     with_pose_conventions,
     with_trajectory,
 )
-from topoloc.apps.cli.output import UsageError, open_recording
+from topoloc.apps.cli.output import UsageError, open_recording, print_line
 from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.formats.colmap import estimate_metric_scale
 from topoloc.plugin import has_scale, scale_poses, split_selection
@@ -168,7 +168,7 @@ class MapJob:
 
 
 def _warn(text: str) -> None:
-    print(text, file=sys.stderr)
+    print_line(text, sys.stderr)
 
 
 def _list_files(path: Path) -> Iterator[Path]:

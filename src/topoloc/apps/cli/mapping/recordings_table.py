@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from topoloc.apps.cli.output import print_line
 from topoloc.apps.cluster.tasks import JobProgress
 from topoloc.apps.cluster.tiles import Outcome
 
@@ -43,9 +44,9 @@ def print_notes(outcomes: Sequence[Outcome], was_live: bool) -> None:
     """Print the notes of recordings, and after a table (`was_live`) the failures again."""
     for outcome in outcomes:
         for note in outcome.notes:
-            print(f"{outcome.recording}: {note}", file=sys.stderr)
+            print_line(f"{outcome.recording}: {note}", sys.stderr)
         if was_live and outcome.reason is not None:
-            print(format_outcome(outcome), file=sys.stderr)
+            print_line(format_outcome(outcome), sys.stderr)
 
 
 def report_outcomes(
@@ -69,12 +70,12 @@ def recordings_table(
     """Yield a callable (recording's number, its state) that shows it, and whether it also shows
     recordings in progress."""
 
-    def print_line(number: int, state: Outcome | JobProgress) -> None:
+    def print_outcome(number: int, state: Outcome | JobProgress) -> None:
         if isinstance(state, Outcome):
-            print(format_outcome(state), file=sys.stderr)
+            print_line(format_outcome(state), sys.stderr)
 
     if not sys.stderr.isatty():
-        yield print_line, False
+        yield print_outcome, False
         return
     from rich.console import Console
     from rich.live import Live

@@ -12,7 +12,15 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from topoloc import Atlas, join_tiles
-from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, print_fields, write_json
+from topoloc.apps.cli.output import (
+    File,
+    Flag,
+    RayOption,
+    UsageError,
+    print_fields,
+    print_line,
+    write_json,
+)
 from topoloc.apps.cli.settings_file import Settings, read_settings
 
 
@@ -129,7 +137,7 @@ def report_atlas(facts: dict[str, Any], json: str | None, problems: Sequence[str
         _print_atlas(facts)
     write_json(json, facts)
     for problem in problems:
-        print(f"error: {problem}", file=sys.stderr)
+        print_line(f"error: {problem}", sys.stderr)
     return 1 if problems else 0
 
 
@@ -217,7 +225,7 @@ def join_overlapping_tiles(
 
     def report_pair(one: Any) -> None:
         if is_verbose and one.problem is None:
-            print(f"{one.first} and {one.second}: {one}", file=sys.stderr)
+            print_line(f"{one.first} and {one.second}: {one}", sys.stderr)
 
     run_jobs = None if ray is None else _run_jobs_on(ray, settings, report_pair)
     done = join_tiles(where, tile_ids, report_pair, pairs, run_jobs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -56,7 +57,7 @@ class Command:
         form = find_export_format(Path(self.out), self.format)
         outputs = [self.json] if form.folder is not None else [self.out, self.json]
         check_outputs(outputs, inputs=[self.source])
-        if Path(self.out).resolve() == Path(self.source).resolve():
+        if os.path.realpath(self.out) == os.path.realpath(self.source):
             raise UsageError("OUT is the exported path; choose another one")
         if not Path(self.out).absolute().parent.is_dir():
             raise TopolocError(f"cannot write {self.out}: its folder does not exist")

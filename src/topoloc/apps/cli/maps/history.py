@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc import open_place
-from topoloc.apps.cli.output import File, print_fields
+from topoloc.apps.cli.output import File, print_fields, print_line
 from topoloc.apps.cli.tile_option import run_for_each_tile
 
 
@@ -28,7 +28,7 @@ class Command:
             edits = place.history(tile_id)
             if self.json != "-":
                 if tile_id:
-                    print(f"tile {tile_id}")
+                    print_line(f"tile {tile_id}")
                 _print_edits(edits, f"{self.map} --tile {tile_id}" if tile_id else self.map)
             return {"edits": edits}
 
@@ -44,7 +44,7 @@ def _print_edits(edits: list[dict[str, Any]], where: str) -> None:
     print_fields(rows or [("", "the edits of this map are unknown")])
     if num_undoable := sum(edit["undoable"] for edit in edits):
         more = f"; {num_undoable} can be" if num_undoable > 1 else ""
-        print(f"`topoloc undo {where}` takes the last one back{more}")
+        print_line(f"`topoloc undo {where}` takes the last one back{more}")
 
 
 def _format_changes(changes: dict[str, Any]) -> str:

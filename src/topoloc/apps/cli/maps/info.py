@@ -24,7 +24,15 @@ from topoloc import (
     open_place,
 )
 from topoloc.apps.cli.maps.atlas import show_atlas
-from topoloc.apps.cli.output import File, Flag, UsageError, check_outputs, print_fields, write_json
+from topoloc.apps.cli.output import (
+    File,
+    Flag,
+    UsageError,
+    check_outputs,
+    print_fields,
+    print_line,
+    write_json,
+)
 from topoloc.apps.export.formats import coordinates, geojson_feature
 from topoloc.plugin import write_bytes
 
@@ -63,7 +71,8 @@ class Command:
         with TopoMetricMap.load(path) as topomap:
             found = check_map(path) if self.check else []
             if found:
-                print("\n".join(found[:MAX_PROBLEMS]))
+                for fault in found[:MAX_PROBLEMS]:
+                    print_line(fault)
                 raise MapError(f"map {path} is damaged: {len(found)} faults, the first: {found[0]}")
             if self.graph:
                 write_graph(topomap, Path(self.graph))
@@ -105,10 +114,12 @@ def _print(info: dict[str, Any]) -> None:
 
 
 def _format_coarse(facts: dict[str, Any], default: str) -> str:
-    source, name = "from random weights", facts["name"]
-    if weights := facts.get("weights"):
-        source = f"{weights['file']}, SHA-256 {weights['sha256'][:12]}"
-    network = f", {facts['backbone']} ({source})" if "backbone" in facts else ""
+    name, weights = facts["name"], facts.get("weights")
+    if isinstance(weights, dict):  # the settings of a model are any JSON
+        weights = f"{weights.get('file')}, SHA-256 {str(weights.get('sha256'))[:12]}"
+    network = (
+        f", {facts['backbone']} ({weights or 'from random weights'})" if "backbone" in facts else ""
+    )
     return f"{name}{' (default)' * (name == default)}{network}, {facts['bytes'] / 1e6:.2f} MB"
 
 

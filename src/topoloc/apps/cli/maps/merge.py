@@ -11,7 +11,14 @@ import tyro
 from topoloc import Atlas, LocalizerConfig, merge, open_place
 from topoloc.apps.cli.maps.atlas import join_overlapping_tiles, report_joined
 from topoloc.apps.cli.maps.session_update import describe_outdated_models
-from topoloc.apps.cli.output import File, UsageError, check_outputs, progress_bar, write_json
+from topoloc.apps.cli.output import (
+    File,
+    UsageError,
+    check_outputs,
+    print_line,
+    progress_bar,
+    write_json,
+)
 from topoloc.apps.cli.settings_file import Settings, read_settings
 
 
@@ -52,7 +59,7 @@ class Command:
         if self.json != "-":
             nodes = f"{c['agreeing']} of {c['nodes_of_second']} nodes of {self.second}"
             size = f"{c['bytes'] / 1e6:.2f} MB{describe_outdated_models(c)}"
-            print(
+            print_line(
                 f"{self.out}: {nodes} were recognised in {self.first}, {c['nodes_added']} added,"
                 f" {size}"
             )

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from topoloc import open_place, prune
-from topoloc.apps.cli.output import File, UsageError, check_outputs, print_waiting
+from topoloc.apps.cli.output import File, UsageError, check_outputs, print_line, print_waiting
 from topoloc.apps.cli.tile_option import TileOption, run_for_each_tile
 
 
@@ -46,7 +46,7 @@ class Command:
             )
             if self.json != "-":
                 text = describe_prune(pruned.changes, pruned.length_m / 1e3)
-                print(f"{place.title(tile_id)}: {text}")
+                print_line(f"{place.title(tile_id)}: {text}")
             return pruned.changes
 
         return run_for_each_tile(place, self.tile, prune_tile, self.json)

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from topoloc import open_place, undo_edit
-from topoloc.apps.cli.output import File, print_waiting, write_json
+from topoloc.apps.cli.output import File, print_line, print_waiting, write_json
 from topoloc.apps.cli.tile_option import TileOption, select_tile
 
 
@@ -29,7 +29,7 @@ class Command:
         tile_id = select_tile(place, self.tile)
         undone = place.edit(tile_id, lambda path: undo_edit(path, print_waiting))
         if self.json != "-":
-            print(f"{place.title(tile_id)}: {undone.name!r} of {undone.date} is taken back")
+            print_line(f"{place.title(tile_id)}: {undone.name!r} of {undone.date} is taken back")
         tile = {"tile": tile_id} if tile_id else {}
         write_json(self.json, {"map": self.map, **tile, "undone": asdict(undone)})
         return 0

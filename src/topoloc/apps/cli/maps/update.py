@@ -20,6 +20,7 @@ from topoloc.apps.cli.output import (
     Topics,
     UsageError,
     check_outputs,
+    print_line,
     progress_bar,
     write_json,
 )
@@ -104,7 +105,7 @@ class Command:
             if self.joined:
                 Trajectory.of_frames(sequence.poses, sequence.t_ns).write_tum(Path(self.joined))
             if self.json != "-":
-                print(f"{target}: {describe_update(changes)}")
+                print_line(f"{target}: {describe_update(changes)}")
             done.append(changes)
         write_json(self.json, {"map": target, "updates": done})
         return 0
@@ -119,7 +120,8 @@ class Command:
         if self.json != "-":
             for outcome in outcomes:
                 if outcome.changes is not None:
-                    print(f"{where}, tile {outcome.tile_id}: {describe_update(outcome.changes)}")
+                    text = describe_update(outcome.changes)
+                    print_line(f"{where}, tile {outcome.tile_id}: {text}")
         facts = report_outcomes(where, outcomes, {"updated": "joined"}, self.json != "-")
         write_json(self.json, facts)
         return 1 if facts["failed"] else 0

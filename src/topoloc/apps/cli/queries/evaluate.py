@@ -35,6 +35,7 @@ from topoloc.apps.cli.output import (
     check_outputs,
     import_report_writer,
     print_fields,
+    print_line,
     print_recordings,
     progress_bar,
     write_json,
@@ -154,7 +155,7 @@ class Command:
             _print(evaluation)
         for fit in fits:
             line = _report_world_fit(fit, self.fit_map_from_truth)
-            print(line, file=sys.stderr if self.json == "-" else sys.stdout)
+            print_line(line, sys.stderr if self.json == "-" else sys.stdout)
         answers = evaluated.answers
         write_json(self.json, evaluation | {"answers": [answer.to_json() for answer in answers]})
         if self.report:

@@ -25,7 +25,7 @@ from topoloc.apps.cli.features_option import (
     open_localizer,
     parse_camera,
 )
-from topoloc.apps.cli.output import File, UsageError, check_outputs, write_json
+from topoloc.apps.cli.output import File, UsageError, check_outputs, print_line, write_json
 from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.query_camera import select_frame_camera
 from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
@@ -73,7 +73,8 @@ class Command:
                 page = explanation_page(frame.name, frame.image, explanation, in_tile.topomap)
                 write_text(Path(self.out), page)
         if self.json != "-":
-            print("\n".join([*ranking, *_report(explanation)]))
+            for line in [*ranking, *_report(explanation)]:
+                print_line(line)
             if self.out:
                 print(f"page: {self.out}")
         facts = explanation_to_json(frame.name, explanation)

@@ -27,6 +27,7 @@ from topoloc.apps.cli.output import (
     UsageError,
     catch_stop_signals,
     open_recording,
+    print_line,
 )
 from topoloc.apps.cli.queries.query_answers import QueryFrame, capture_frames, format_answer
 from topoloc.apps.cli.settings_file import read_settings
@@ -93,7 +94,7 @@ class Command:
                 if robots is not None and isinstance(result, Localization):
                     robots.publish(frame.t_ns, result.world_from_cam, result.covariance)
                 line = format_answer(answer) if self.plain else json.dumps(answer.to_json())
-                print(line, flush=True)
+                print_line(line)
         return 0
 
 

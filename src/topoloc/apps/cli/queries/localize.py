@@ -43,6 +43,7 @@ from topoloc.apps.cli.output import (
     check_outputs,
     interruptible,
     open_recording,
+    print_line,
     print_warning,
     progress_bar,
     write_text,
@@ -170,7 +171,7 @@ class Command:
                 for answer in coming:
                     answers.append(answer)
                     line = json.dumps(answer.to_json()) if as_json else format_answer(answer)
-                    print(line, flush=True)
+                    print_line(line)
                     progress("queries", len(answers), total or len(answers))
         except (KeyboardInterrupt, TopolocError) as stopped:
             files = self._write_files(answers) if answers else []

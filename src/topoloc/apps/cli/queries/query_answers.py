@@ -24,7 +24,7 @@ from topoloc import (
     UnreadableImageError,
     check_camera_calibrations,
 )
-from topoloc.apps.cli.output import print_warning
+from topoloc.apps.cli.output import print_line, print_warning
 from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
 
@@ -116,7 +116,7 @@ def exit_status(answers: list[QueryAnswer]) -> int:
     ]
     if details and len(details) == len(answers):
         others = f" (and the other {len(details) - 1} could not be read either)"
-        print(f"error: {details[0]}{others if len(details) > 1 else ''}", file=sys.stderr)
+        print_line(f"error: {details[0]}{others if len(details) > 1 else ''}", sys.stderr)
         return 1
     if details:
         count = f"{len(details)} of {len(answers)}"
