@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import threading
+
 import faiss
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topoloc.retrieval.descriptor_index import DescriptorIndex, learn_visual_words
+from topoloc.retrieval.descriptor_index import (
+    DescriptorIndex,
+    learn_visual_words,
+    single_faiss_thread,
+)
 
 
 def unit(array: np.ndarray) -> np.ndarray:
@@ -91,3 +97,27 @@ def test_words_do_not_depend_on_the_number_of_threads_which_stays_as_it_was():
     finally:
         faiss.omp_set_num_threads(before)
     np.testing.assert_array_equal(*words)
+
+
+def test_each_python_thread_has_its_own_number_of_faiss_threads():
+    """So `single_faiss_thread` needs no lock: whoever leaves last changes nobody's number."""
+    entered, left, seen = threading.Event(), threading.Event(), list[int]()
+    before = faiss.omp_get_max_threads()
+
+    def longer() -> None:
+        faiss.omp_set_num_threads(before + 2)
+        with single_faiss_thread():
+            entered.set()
+            left.wait(10)
+        seen.append(faiss.omp_get_max_threads())
+
+    thread = threading.Thread(target=longer)
+    with single_faiss_thread():
+        thread.start()
+        assert entered.wait(10)
+        assert faiss.omp_get_max_threads() == 1
+    assert faiss.omp_get_max_threads() == before
+    left.set()
+    thread.join()
+    assert seen == [before + 2]
+    assert faiss.omp_get_max_threads() == before

@@ -12,8 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from jaxtyping import Bool, Float16, Float32, Int
 
 from topoloc.errors import AtlasError
 from topoloc.recordings.atomic import atomic_write
+from topoloc.retrieval.descriptor_index import single_faiss_thread
 
 faiss: Any = faiss_module  # its type stubs lack overloads
 NUM_COMPARED, MAX_COMPARED = 1024, 16_384
@@ -122,7 +122,7 @@ class DescriptorShard:
         else:
             chosen = None if len(asked) == len(is_selected) else self._select_tile_rows(is_selected)
             parameters = faiss.SearchParametersIVF(nprobe=self._num_probes, sel=chosen)
-            with _single_threaded():
+            with single_faiss_thread():
                 found = self._codes.search(vector[None], min(count, num_rows), params=parameters)
             rows = found[1][0][found[1][0] >= 0]
         similarities = self.vectors[rows].astype(np.float32) @ vector
@@ -224,22 +224,8 @@ def _build_codes(vectors: Float16[np.ndarray, "n d"]) -> Any:
     index.cp.niter, index.cp.seed, index.cp.min_points_per_centroid = 8, 1, 1
     index.pq.cp.min_points_per_centroid = 1
     sample = np.sort(np.random.default_rng(1).permutation(num_rows)[:_NUM_TRAINING_VECTORS])
-    with _single_threaded():
+    with single_faiss_thread():
         index.train(vectors[sample].astype(np.float32))
         for start in range(0, num_rows, _CHUNK):
             index.add(vectors[start : start + _CHUNK].astype(np.float32))
     return index
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Run FAISS in a single thread.
-
-    Its threads busy-wait for each other, which takes ten times as long on a loaded machine.
-    """
-    before = faiss.omp_get_max_threads()
-    faiss.omp_set_num_threads(1)
-    try:
-        yield
-    finally:
-        faiss.omp_set_num_threads(before)

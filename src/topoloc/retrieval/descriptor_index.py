@@ -4,7 +4,8 @@ nodes of these images."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -172,12 +173,21 @@ def learn_visual_words(
     kmeans: Any = faiss.Kmeans(
         descriptors.shape[1], num_words, niter=20, seed=seed + 1, min_points_per_centroid=1
     )
-    # One thread needs a tenth of a second. Several threads wait for each other in busy loops, at
-    # two hundred places, which takes longer.
+    with single_faiss_thread():
+        kmeans.train(np.ascontiguousarray(descriptors))
+    return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)
+
+
+@contextmanager
+def single_faiss_thread() -> Iterator[None]:
+    """Run FAISS in a single thread. Its threads wait for each other in busy loops, which takes ten
+    times as long on a loaded machine.
+
+    FAISS has one number of threads for each Python thread. So Python threads need no lock here.
+    """
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)
     try:
-        kmeans.train(np.ascontiguousarray(descriptors))
+        yield
     finally:
         faiss.omp_set_num_threads(before)
-    return np.asarray(kmeans.centroids, np.float32).reshape(num_words, -1)
