@@ -120,7 +120,7 @@ def test_a_tile_that_is_named_is_not_sought(
         ("failed", "other"),
         ("updated", "other"),
     ]
-    assert "the map stays as it is" in updated["recordings"][0]["reason"]
+    assert "no map is changed" in updated["recordings"][0]["reason"]
     assert _map(own_atlas, "room") == before
 
 

@@ -87,7 +87,7 @@ def test_maps_of_two_places_stay_apart(
         tmp_path / "other.topo",
         Rigid3.identity(),
     )
-    assert "nothing is merged" in complaint("merge", maps[0], other, tmp_path / "both.topo")
+    assert "no map is changed" in complaint("merge", maps[0], other, tmp_path / "both.topo")
     assert not (tmp_path / "both.topo").exists()
 
 

@@ -17,7 +17,13 @@ from schema_1 import write_schema_1
 
 from topoloc import TopoMetricMap
 from topoloc.errors import MapError
-from topoloc.mapping.edit import edit_map, find_kept_files, read_history, undo_edit
+from topoloc.mapping.edit import (
+    edit_map,
+    find_kept_files,
+    keep_file,
+    read_history,
+    undo_edit,
+)
 from topoloc.mapping.storage.integrity_check import find_map_damage
 
 
@@ -151,6 +157,8 @@ def test_a_damaged_kept_file_is_refused(map_file: Path, seed: int):
     with pytest.raises(MapError, match=r"room\.topo\.undo-.* is damaged"):
         undo_edit(map_file)
     assert map_file.read_bytes() == edited
+    with pytest.warns(UserWarning, match=r"no earlier edit can be undone: .* is damaged"):
+        assert not any(edit["undoable"] for edit in read_history(map_file))
     _without_a_node(map_file)
     undo_edit(map_file)
     assert map_file.read_bytes() == edited
@@ -261,3 +269,60 @@ def test_killed_at_any_moment_the_map_is_whole(map_file: Path):
     assert ended.returncode == 0, ended.stderr
     assert "6 kills" in ended.stdout
     assert "0 times broken, 0 times something left" in ended.stdout
+
+
+def test_a_map_that_is_replaced_while_the_edit_is_written_stays(
+    map_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    other = Path(shutil.copy(map_file, tmp_path / "other.topo"))
+    _without_a_node(other)
+    data = other.read_bytes()
+    for kept in find_kept_files(other):
+        kept.unlink()
+
+    def keep_slowly(path: Path, changed: Path) -> Path:
+        kept = keep_file(path, changed)
+        os.replace(other, path)
+        return kept
+
+    monkeypatch.setattr("topoloc.mapping.edit.keep_file", keep_slowly)
+    with (
+        edit_map(map_file) as edit,
+        pytest.raises(MapError, match="was replaced during the edit"),
+    ):
+        edit.commit(edit.topomap, "nothing")
+    assert map_file.read_bytes() == data
+    assert _names(map_file) == ["room.topo"]
+
+
+def test_a_map_is_saved_over_one_after_its_edit(map_file: Path):
+    waited, done = threading.Event(), list[str]()
+
+    def save(topomap: TopoMetricMap) -> None:
+        topomap.save(map_file, waited.set)
+        done.append("saved")
+
+    with TopoMetricMap.load(map_file) as other:
+        thread = threading.Thread(target=save, args=(other,))
+        with edit_map(map_file) as edit:
+            thread.start()
+            assert waited.wait(20)
+            edit.commit(edit.topomap, "first")
+            done.append("edited")
+            edited = map_file.read_bytes()
+        thread.join(60)
+    assert done == ["edited", "saved"]
+    assert map_file.read_bytes() != edited
+    with edit_map(map_file) as edit, pytest.raises(MapError, match="edited by this thread"):
+        edit.topomap.save(map_file)
+
+
+@pytest.mark.parametrize("length", [200, 201, 216, 255])
+def test_maps_of_long_names_are_edited(map_file: Path, length: int):
+    path = map_file.rename(map_file.with_name("x" * (length - 5) + ".topo"))
+    before = path.read_bytes()
+    _without_a_node(path)
+    assert len(find_kept_files(path)) == 1
+    undo_edit(path)
+    assert path.read_bytes() == before
+    assert _names(path) == [path.name]

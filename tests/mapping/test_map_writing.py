@@ -107,9 +107,15 @@ def stop(error: BaseException) -> Callable[..., None]:
     return raise_it
 
 
+def _full_of_sqlite() -> sqlite3.Error:
+    error = sqlite3.OperationalError("database or disk is full")
+    error.sqlite_errorcode = sqlite3.SQLITE_FULL
+    return error
+
+
 @pytest.mark.parametrize(
     "error",
-    [sqlite3.OperationalError("database or disk is full"), OSError(28, "No space left on device")],
+    [_full_of_sqlite(), OSError(28, "No space left on device")],
 )
 @pytest.mark.parametrize("there_before", [True, False])
 def test_a_failed_write_leaves_the_old_map_and_nothing_else(
@@ -126,7 +132,7 @@ def test_a_failed_write_leaves_the_old_map_and_nothing_else(
     monkeypatch.setattr(
         map_writing, "compute_map_digest", stop(error)
     )  # asked for last, after all nodes are written
-    with pytest.raises(MapError, match=r"cannot write map .*room\.topo"):
+    with pytest.raises(MapError, match=r"cannot write map .*room\.topo: No space left"):
         tiny_map.save(path)
     assert (path.read_bytes() if path.exists() else None) == before
     assert list(tmp_path.iterdir()) == ([path] if there_before else [])

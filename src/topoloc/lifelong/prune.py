@@ -9,7 +9,6 @@ landmarks as fit.
 
 from __future__ import annotations
 
-import sqlite3
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -33,6 +32,8 @@ from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.landmark_statistics import merge_count_statistics
 from topoloc.mapping.storage.entries import overlay
+from topoloc.mapping.storage.failures import describe_failure
+from topoloc.mapping.storage.map_file import MapFile
 from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.recordings.atomic import temporary_file
@@ -53,12 +54,10 @@ class _FileSize:
 
     @staticmethod
     def of(path: Path, kinds: Sequence[str]) -> _FileSize:
-        """Measure a map's file with these feature types."""
+        """Measure a map's file with these feature types. Raises MapError."""
         lengths = " + ".join(f"total(length({name}))" for name in _POINT_COLUMNS)
         counted = "SELECT count(*), total(length(jpeg)) FROM"
-        with closing(
-            sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
-        ) as database:
+        with closing(MapFile(path)) as file, file.read_connection() as database:
             bytes_per_point = {}
             for kind in kinds:
                 points = f"SELECT {lengths}, total(num_points) FROM node_points WHERE kind = ?"
@@ -94,7 +93,7 @@ def _measure_file_size(topomap: TopoMetricMap, path: Path) -> _FileSize:
             write_map(topomap, tried)
             return _FileSize.of(tried, topomap.kinds)
     except OSError as error:
-        raise MapError(f"cannot write beside map {path}: {error.strerror}") from error
+        raise MapError(f"cannot write beside map {path}: {describe_failure(error)}") from error
 
 
 @dataclass(frozen=True, eq=False)

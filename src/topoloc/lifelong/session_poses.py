@@ -72,9 +72,7 @@ def estimate_poses_by_motion(
     ]
     motions = [odom for odom in numbered if odom]
     if not motions:
-        raise TrajectoryError(
-            f"{sequence.name}: none of its frames has a pose; the map stays as it is"
-        )
+        raise TrajectoryError(f"{sequence.name}: none of its frames has a pose; no map is changed")
     queried = list[list[int]]()
     for odom in motions:
         frames, poses = list(odom), list(odom.values())
@@ -145,12 +143,12 @@ def _find_consensus(
         some = many if num_queried > 1 else "one of its pictures is"
         raise TrajectoryError(
             f"{name}: {some} as far apart as nodes of the map, too few to join: it takes"
-            f" {MIN_AGREEING}; the map stays as it is"
+            f" {MIN_AGREEING}; no map is changed"
         )
     if len(indices) < MIN_AGREEING:
         raise TrajectoryError(
             f"{name}: the map recognises {len(indices)} of {num_queried} pictures asked: another"
-            " place, or changed; the map stays as it is"
+            " place, or changed; no map is changed"
         )
     _check_scale(name, odom, localized)
     # Drift of the motion between two agreeing localizations: a share of the distance travelled, and
@@ -160,7 +158,7 @@ def _find_consensus(
     if len(inlier_idx) < max(MIN_AGREEING, min_share * len(indices)):
         raise TrajectoryError(
             f"{name}: of {len(indices)} pictures that the map localizes {len(inlier_idx)} agree"
-            " with its poses; the map stays as it is"
+            " with its poses; no map is changed"
         )
     return inlier_idx
 
@@ -189,7 +187,7 @@ def _check_scale(
     uncertainty = 3.0 * spread / np.sqrt(len(a)) + sigma_m / lengths.max()
     if abs(scale - 1.0) > max_scale + uncertainty:
         raise TrajectoryError(
-            f"{name}: a metre of its poses is {scale:.3g} m of the map; the map stays as it is"
+            f"{name}: a metre of its poses is {scale:.3g} m of the map; no map is changed"
         )
 
 

@@ -83,9 +83,7 @@ def estimate_poses_by_map(
                 poses[index] = pose
     known = sorted(poses.items(), key=lambda pair: pair[0])
     if not known:
-        raise TrajectoryError(
-            f"{sequence.name}: {_failure_reason(localized)}; the map stays as it is"
-        )
+        raise TrajectoryError(f"{sequence.name}: {_failure_reason(localized)}; no map is changed")
     known_poses = [pose for _, pose in known]
     rows = select_node_frames(known_poses, d_thresh, map_config.lambda_rot)
     queried = [known[k][0] for k in rows]

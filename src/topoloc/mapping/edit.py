@@ -15,8 +15,9 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import accumulate
 from pathlib import Path
@@ -24,10 +25,12 @@ from typing import Any, TypeVar
 
 from topoloc.errors import MapError
 from topoloc.mapping.sessions import Edit, today
+from topoloc.mapping.storage.failures import describe_failure
+from topoloc.mapping.storage.map_lock import WaitCallback, lock_map_file
 from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.atomic import atomic_write
+from topoloc.recordings.atomic import atomic_write, fsync, short_name
 
 T = TypeVar("T")
 _MAX_BYTES = 1_000_000_000
@@ -37,7 +40,7 @@ _MAX_BYTES = 1_000_000_000
 def kept_path(path: Path, after: str, before: str) -> Path:
     """Return the path of the file that an edit of the map at `path` replaced. `after` and `before`
     are the SHA-256 of the map file after and before the edit, in hexadecimal digits."""
-    return path.with_name(f"{path.name}.undo-{after[:16]}-{before[:16]}")
+    return path.with_name(f"{short_name(path)}.undo-{after[:16]}-{before[:16]}")
 
 
 def find_kept_files(path: Path) -> list[Path]:
@@ -47,7 +50,7 @@ def find_kept_files(path: Path) -> list[Path]:
         found = _find_by_digest(path)
         digest = _digest_of(path)[:16] if found else ""
     except OSError as error:
-        raise MapError(f"cannot read map {path}: {error.strerror}") from error
+        raise MapError(f"cannot read map {path}: {describe_failure(error)}") from error
     kept = list[Path]()
     while digest in found:
         kept.append(found.pop(digest))
@@ -56,8 +59,8 @@ def find_kept_files(path: Path) -> list[Path]:
 
 
 def keep_file(path: Path, changed: Path) -> Path:
-    """Keep the file at `path`, before `changed` is renamed over it. Return the kept file. Raises
-    OSError."""
+    """Keep the file at `path` on the disk, before `changed` is renamed over it. Return the kept
+    file. Raises OSError."""
     kept = kept_path(path, _digest_of(changed), _digest_of(path))
     kept.unlink(missing_ok=True)
     try:
@@ -65,17 +68,26 @@ def keep_file(path: Path, changed: Path) -> Path:
     except OSError:  # a file system without links
         with atomic_write(kept) as temporary:
             shutil.copyfile(path, temporary)
+    with suppress(OSError):  # no handle is left: the file is in place
+        fsync(path.parent)
     return kept
 
 
 def restore_file(kept: Path, path: Path) -> None:
     """Rename a kept file to `path`, if it is undamaged. Raises MapError, OSError."""
-    if _digest_of(kept)[:16] != kept.name[-16:]:
-        raise MapError(
-            f"{kept} is damaged: it is not the map before the edit. Remove it; the map stays as it"
-            " is"
-        )
+    if fault := _find_fault(kept):
+        raise MapError(fault)
     os.replace(kept, path)
+
+
+def _find_fault(kept: Path) -> str | None:
+    """Return why a kept file cannot be restored, with the remedy, None if it can."""
+    try:
+        is_same = _digest_of(kept)[:16] == kept.name[-16:]
+    except OSError as error:
+        return f"cannot read {kept}: {describe_failure(error)}"
+    text = "is damaged: it is not the map before the edit. Remove it; the map stays as it is"
+    return None if is_same else f"{kept} {text}"
 
 
 def drop_kept_files(path: Path) -> None:
@@ -96,7 +108,7 @@ def select_kept(files: Sequence[T], sizes: Sequence[int]) -> Sequence[T]:
 
 def _find_by_digest(path: Path) -> dict[str, Path]:
     """Return all kept files of a map, by the digest of the map after the edit."""
-    name = re.compile(rf"{re.escape(path.name)}\.undo-([0-9a-f]{{16}})-[0-9a-f]{{16}}")
+    name = re.compile(rf"{re.escape(short_name(path))}\.undo-([0-9a-f]{{16}})-[0-9a-f]{{16}}")
     found = (name.fullmatch(one) for one in os.listdir(path.parent))
     return {match[1]: path.with_name(match[0]) for match in found if match}
 
@@ -106,15 +118,7 @@ def _digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-try:
-    import fcntl
-except ImportError:  # Windows: if two edits run at once, the last one wins
-    fcntl = None
-
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
-
-WaitCallback = Callable[[], None]
-"""Called before waiting for another process that edits the map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +145,15 @@ class MapEdit:
         try:
             with atomic_write(self.path) as temporary:
                 write_map(replace(changed, edits=[*edits, edit]), temporary)
-                self.check_still_locked()
+                fsync(temporary)  # takes long, so it comes before the check
                 kept = keep_file(self.path, temporary)
-        except OSError as error:
+                self.check_still_locked()
+        except (OSError, MapError) as error:
             if kept is not None:
                 kept.unlink(missing_ok=True)
-            raise MapError(f"cannot write map {self.path}: {error.strerror}") from error
+            if isinstance(error, MapError):
+                raise
+            raise MapError(f"cannot write map {self.path}: {describe_failure(error)}") from error
         drop_kept_files(self.path)
         return edit
 
@@ -167,7 +174,11 @@ def edit_map(path: str | Path, on_wait: WaitCallback | None = None) -> Iterator[
     unknown to this version.
     """
     path = Path(os.path.realpath(path))
-    with _lock_map_file(path, on_wait) as locked:
+    with ExitStack() as stack:
+        try:
+            locked = stack.enter_context(lock_map_file(path, on_wait))
+        except (OSError, ValueError) as error:
+            raise MapError(f"cannot open map {path}: {describe_failure(error)}") from None
         if (
             not os.access(path, os.W_OK) or not path.stat().st_mode & _WRITABLE
         ):  # read-only for all, even if root may write
@@ -192,13 +203,13 @@ def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
             edit.check_still_locked()
             restore_file(kept[0], edit.path)
         except OSError as error:
-            raise MapError(f"cannot write map {path}: {error.strerror}") from error
+            raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
     return last
 
 
 def read_history(path: str | Path, num_undoable: int | None = None) -> list[dict[str, Any]]:
     """Return the edits of a map file as JSON, the first one first, each with whether it can be
-    undone (`undoable`).
+    undone (`undoable`). Warns of a damaged kept file.
 
     Args:
         num_undoable: number of edits that can be undone. By default the files are counted that are
@@ -210,7 +221,11 @@ def read_history(path: str | Path, num_undoable: int | None = None) -> list[dict
     with TopoMetricMap.load(path) as topomap:
         edits = [asdict(edit) for edit in topomap.edits]
     if num_undoable is None:
-        num_undoable = len(find_kept_files(Path(os.path.realpath(path))))
+        kept = find_kept_files(Path(os.path.realpath(path)))
+        faults = [_find_fault(one) for one in kept]
+        num_undoable = next((row for row, fault in enumerate(faults) if fault), len(kept))
+        if num_undoable < len(kept):
+            warnings.warn(f"no earlier edit can be undone: {faults[num_undoable]}", stacklevel=2)
     return [
         edit | {"undoable": number > len(edits) - num_undoable}
         for number, edit in enumerate(edits, start=1)
@@ -225,35 +240,3 @@ def _explain_missing(path: Path, last: Edit | None) -> str:
     if old.exists():
         return f"{old} is of an older topoloc, and only that version can undo with it"
     return f"the file before {last.name!r} is not kept"
-
-
-@contextmanager
-def _lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[os.stat_result]:
-    """Lock the file at `path` and yield its status. Repeats if the previous owner of the lock
-    replaced the file."""
-    while True:
-        try:
-            descriptor = os.open(path, os.O_RDONLY)
-        except (OSError, ValueError) as error:
-            raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from None
-        try:
-            _wait_for_lock(descriptor, on_wait)
-            locked = os.fstat(descriptor)
-            if path.exists() and os.path.samestat(locked, path.stat()):
-                yield locked
-                return
-        finally:
-            os.close(descriptor)
-
-
-def _wait_for_lock(descriptor: int, on_wait: WaitCallback | None) -> None:
-    if fcntl is None:
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        if on_wait is not None:
-            on_wait()
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-    except OSError:  # a file system without locks
-        return

@@ -10,7 +10,7 @@ Every entry has an id that never changes and is never reused. Computations use r
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -221,11 +221,12 @@ class TopoMetricMap:
         first = replace(self.first_layer, **changes)
         return replace(self, layers={**self.layers, self.kind: first})
 
-    def save(self, path: str | Path) -> None:
-        """Write the map file atomically. Raises MapError."""
+    def save(self, path: str | Path, on_wait: Callable[[], None] | None = None) -> None:
+        """Write the map file atomically. Waits while another process edits the map at `path`, and
+        calls `on_wait` once before. Raises MapError."""
         from topoloc.mapping.storage.map_writing import save_map
 
-        save_map(self, Path(path))
+        save_map(self, Path(path), on_wait)
 
     @staticmethod
     def load(path: str | Path) -> TopoMetricMap:

@@ -16,6 +16,7 @@ import numpy as np
 from topoloc.errors import CalibrationError, MapError, MapVersionError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.storage.failures import describe_failure
 from topoloc.mapping.storage.schema import APPLICATION_ID, SCHEMA_VERSION
 
 MAX_POINTS = 100_000
@@ -39,7 +40,7 @@ def check_header(path: Path) -> int:
             header = file.read(100)
             num_bytes = file.seek(0, os.SEEK_END)
     except (OSError, ValueError) as error:  # ValueError: the name contains a null character
-        raise MapError(f"cannot open map {path}: {getattr(error, 'strerror', error)}") from error
+        raise MapError(f"cannot open map {path}: {describe_failure(error)}") from error
     if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
         raise MapError(
             f"{path} is not a topoloc map" + (" (the file is empty)" if num_bytes == 0 else "")

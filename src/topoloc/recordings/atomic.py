@@ -52,10 +52,10 @@ def atomic_write(path: Path) -> Iterator[Path]:
     path = _resolve_link(path)
     with temporary_file(path) as temporary:
         yield temporary
-        _fsync(temporary)
+        fsync(temporary)
         os.replace(temporary, path)
         with suppress(OSError):  # no handle is left: the file is in place
-            _fsync(path.parent)
+            fsync(path.parent)
 
 
 @contextmanager
@@ -115,11 +115,11 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
         for name, data in files.items():
             (temporary / name).parent.mkdir(parents=True, exist_ok=True)
             (temporary / name).write_bytes(data)
-            _fsync(temporary / name)
+            fsync(temporary / name)
         if path.is_dir():
             os.rename(path, before)
         os.rename(temporary, path)
-        _fsync(path.parent)
+        fsync(path.parent)
     except OSError as error:
         if before.is_dir() and not path.exists():
             os.rename(before, path)
@@ -176,12 +176,17 @@ def remove_all_stale_files(folder: Path) -> None:
 
 
 def _temporary_prefix(path: Path) -> str:
-    """Return the prefix of the names of all temporary files of `path`. It is short enough for any
-    file system."""
-    name, encoded = path.name, os.fsencode(path.name)
-    if len(encoded) > 200:
-        name = blake2b(encoded, digest_size=16).hexdigest()
-    return f".{name}."
+    """Return the prefix of the names of all temporary files of `path`."""
+    return f".{short_name(path)}."
+
+
+def short_name(path: Path) -> str:
+    """Return the name of a file, or a digest of it if a longer name were too long for some file
+    systems. Names of files that belong to `path` begin with it."""
+    encoded = os.fsencode(path.name)
+    if len(encoded) <= 200:
+        return path.name
+    return blake2b(encoded, digest_size=16).hexdigest()
 
 
 def _create_locked_file(path: Path) -> tuple[Path, int]:
@@ -243,7 +248,7 @@ def _try_lock(descriptor: int) -> bool | None:
     return True
 
 
-def _fsync(path: Path) -> None:
+def fsync(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:

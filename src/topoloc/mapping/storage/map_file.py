@@ -2,14 +2,13 @@
 
 The file is untrusted. Its tables must match the schema exactly, so that no view, trigger or virtual
 table runs. The lengths of a row are checked before its bytes are read. Types and checksum are
-checked after. SQLite runs with limits of time and size.
+checked after. SQLite runs with limits of work and size.
 """
 
 from __future__ import annotations
 
 import sqlite3
 import threading
-import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ from topoloc.errors import (
     MapError,
 )
 from topoloc.json_data import Count, decode_json
+from topoloc.mapping.storage.failures import describe_failure, sqlite_failures_as_os_errors
 from topoloc.mapping.storage.schema import (
     SCHEMA_1,
     SORT_COLUMNS,
@@ -36,9 +36,8 @@ from topoloc.mapping.storage.schema import (
 )
 from topoloc.mapping.validation import CorruptDataError, check_header
 
-MAX_SECONDS = 5.0
-"""Time limit of one read. The slowest valid read (all node summaries of a large map) takes a tenth
-of a second."""
+MAX_STEPS = 50_000_000
+"""Limit of SQLite's steps in one read. A table of MAX_ROWS rows takes a quarter of them."""
 MAX_ROWS = 1_000_000
 MAX_BYTES = 50_000_000
 MAX_ARRAYS_BYTES = 800_000_000
@@ -71,7 +70,7 @@ class MapFile:
     def __init__(self, path: Path, digest: str | None = None) -> None:
         self.path = path
         self._lock = threading.RLock()
-        self._deadline, self._database = 0.0, None
+        self._calls_left, self._database = 0, None
         self._counts: dict[str, int] = {}
         self._cache: dict[str, Any] = {}
         self.version = check_header(path)
@@ -84,7 +83,7 @@ class MapFile:
             )
             for category, limit in _LIMITS.items():
                 self._database.setlimit(category, limit)
-            self._database.set_progress_handler(lambda: time.monotonic() > self._deadline, 20_000)
+            self._database.set_progress_handler(self._is_too_much, MAX_STEPS // 10)
         try:
             with self.read_connection() as database:
                 for pragma in (
@@ -129,14 +128,22 @@ class MapFile:
         with self._guarded_read():
             if self._database is None:
                 raise MapError(f"map {self.path} is closed")
-            self._deadline = time.monotonic() + MAX_SECONDS
+            self._calls_left = 10
             yield self._database
+
+    def _is_too_much(self) -> bool:
+        """Return whether a read takes more than MAX_STEPS. SQLite calls it after a tenth of
+        them."""
+        self._calls_left -= 1
+        return self._calls_left < 0
 
     @contextmanager
     def _guarded_read(self) -> Iterator[None]:
         try:
-            with self._lock:
+            with self._lock, sqlite_failures_as_os_errors():
                 yield
+        except OSError as error:  # the file may be undamaged
+            raise MapError(f"cannot read map {self.path}: {describe_failure(error)}") from error
         except (sqlite3.ProgrammingError, sqlite3.InterfaceError):  # a programming error
             raise
         except (
@@ -148,9 +155,10 @@ class MapFile:
             CalibrationError,
             GeoreferenceError,
         ) as error:
-            raise MapError(
-                f"map {self.path} is damaged: {' '.join(str(error).split())[:300]}"
-            ) from error
+            fault = " ".join(str(error).split())[:300]
+            if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_INTERRUPT:
+                fault = f"a read takes more than {MAX_STEPS} steps, which no map needs"
+            raise MapError(f"map {self.path} is damaged: {fault}") from error
 
     def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
         """Return all rows of a table with small rows, in its order. With `columns`, only these

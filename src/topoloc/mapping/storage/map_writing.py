@@ -27,6 +27,8 @@ from topoloc.mapping.config import config_to_text
 from topoloc.mapping.landmark_statistics import encode_statistics
 from topoloc.mapping.sessions import Session, sessions_from_names
 from topoloc.mapping.storage.entries import TopoNode
+from topoloc.mapping.storage.failures import describe_failure, sqlite_failures_as_os_errors
+from topoloc.mapping.storage.map_lock import WaitCallback, no_edit_of
 from topoloc.mapping.storage.point_encoding import compress_array, node_to_arrays
 from topoloc.mapping.storage.schema import (
     APPLICATION_ID,
@@ -47,34 +49,35 @@ _PAGE_BYTES = 1024
 pages cost 1 to 5 kB more per node."""
 
 
-def save_map(topomap: TopoMetricMap, path: Path) -> None:
-    """Write the map to `path` atomically. A reader sees the old map or the new one.
+def save_map(topomap: TopoMetricMap, path: Path, on_wait: WaitCallback | None = None) -> None:
+    """Write the map to `path` atomically. A reader sees the old map or the new one. Waits while
+    another process edits the map at `path`, and calls `on_wait` once before.
 
     Raises:
-        MapError: the folder does not exist or cannot be written, or the disk is full. Nothing is
-            left behind.
+        MapError: the folder does not exist or cannot be written, the disk is full, or this thread
+            edits the map at `path`. Nothing is left behind.
     """
     if os.path.isdir(path):  # Path.is_dir raises an error for names that are too long
         raise MapError(f"cannot write map {path}: it is a folder")
     try:
-        with atomic_write(path) as temporary:
+        with no_edit_of(path, on_wait), atomic_write(path) as temporary:
             write_map(topomap, temporary)
     except (OSError, ValueError) as error:
         # a null character in the name; any other ValueError is a bug
         if isinstance(error, ValueError) and "null" not in str(error):
             raise
-        raise MapError(f"cannot write map {path}: {error}") from error
+        raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
 
 
 def write_map(topomap: TopoMetricMap, path: Path) -> None:
-    """Write the map to the empty file `path`. Raises MapError if the disk is full."""
-    try:
-        # an empty name creates a private temporary database, removed at closing
-        with closing(sqlite3.connect("", isolation_level=None)) as database:
-            _Writer(database).write(topomap)
-            copy_sorted_tables(database, path)
-    except sqlite3.OperationalError as error:
-        raise MapError(f"cannot write map {path}: {error}") from error
+    """Write the map to the empty file `path`. Raises OSError if the disk is full."""
+    # an empty name creates a private temporary database, removed at closing
+    with (
+        sqlite_failures_as_os_errors(),
+        closing(sqlite3.connect("", isolation_level=None)) as database,
+    ):
+        _Writer(database).write(topomap)
+        copy_sorted_tables(database, path)
 
 
 class _Writer:
