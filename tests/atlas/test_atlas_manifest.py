@@ -140,3 +140,17 @@ _JSON = st.recursive(
 def test_anything_else_is_refused(data: bytes):
     with pytest.raises(AtlasError):
         Manifest.from_bytes(data, "here")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('"serial": 1', '"serial": 7'), ('"num_nodes": ', '"num_nodes": 1')]
+)
+def test_a_changed_manifest_is_refused(old: str, new: str):
+    data = Manifest().with_tiles({"a": _tile("a")}, now=1.0).to_bytes()
+    changed = data.decode().replace(old, new, 1).encode()
+    assert changed != data
+    with pytest.raises(AtlasError, match=r"its digest is another\. Restore the file"):
+        Manifest.from_bytes(changed, "here")
+    older = json.loads(changed)
+    del older["digest"]
+    Manifest.from_bytes(json.dumps(older).encode(), "here")

@@ -237,7 +237,7 @@ def test_what_was_opened_answers_while_the_store_is_gone(
     in_memory: str, queries: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     monkeypatch.setattr(query_handler, "POLL_INTERVAL_S", 0.02)
-    monkeypatch.setattr(tile_fetcher, "_RETRY_AFTER_S", 0.2)
+    monkeypatch.setattr(tile_fetcher, "RETRY_AFTER_S", 0.2)
 
     def gone(*args: object, **more: object) -> None:
         raise OSError("the network is unreachable")

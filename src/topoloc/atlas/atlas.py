@@ -14,7 +14,8 @@ from topoloc.atlas.index import AtlasIndex, GlobalDescriptors, load_global_descr
 from topoloc.atlas.index_files import OpenedIndex, index_folder, open_index
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of
-from topoloc.errors import AtlasError
+from topoloc.atlas.tile_facts import find_other_facts
+from topoloc.errors import AtlasError, MapError
 from topoloc.mapping.edit import read_history
 
 _OBJECT_STORES = "topoloc.apps.stores.object_store"
@@ -201,16 +202,22 @@ class Atlas:
         return on_atlas(self)
 
     def find_problem(self, tile_id: str) -> str | None:
-        """Return the first difference between a tile's files and their checksums, None if there is
-        none. Raises AtlasError: the atlas has no such tile."""
-        for stored in self.tile(tile_id).files:
+        """Return the first difference between a tile's files and their checksums, or between its
+        map and its entry in the manifest, None if there is none. Raises AtlasError: the atlas has
+        no such tile."""
+        tile = self.tile(tile_id)
+        for stored in tile.files:
             try:
                 path = self.store.local_path(stored.name, stored.sha256)
                 if path.stat().st_size != stored.num_bytes or sha256_of(path) != stored.sha256:
                     return f"{stored.name} is not the file that was added: its checksum is another"
             except AtlasError as error:
                 return str(error)
-        return None
+        try:
+            other = find_other_facts(tile, self.map_path(tile))
+        except MapError as error:
+            return str(error)
+        return f"{MANIFEST} differs from its map: {', '.join(other)}" if other else None
 
     def tile(self, tile_id: str) -> Tile:
         """Return the tile with this id.
@@ -249,9 +256,13 @@ class Atlas:
         Raises:
             AtlasError: the file is missing or damaged.
         """
-        return load_global_descriptors(
-            self.store.local_path(tile.places.name, tile.places.sha256), tile.places.vocabularies
-        )
+        path = self.store.local_path(tile.places.name, tile.places.sha256)
+        if sha256_of(path) != tile.places.sha256:
+            raise AtlasError(f"{path} is not the file that was added: its checksum is another")
+        vectors = load_global_descriptors(path, tile.places.vocabularies)
+        if any(len(rows) != tile.num_nodes for rows in vectors.values()):
+            raise AtlasError(f"{path} is damaged: the tile has {tile.num_nodes} nodes")
+        return vectors
 
     @property
     def problems(self) -> dict[str, str]:

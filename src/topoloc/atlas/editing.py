@@ -13,15 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from msgspec import structs
 
 from topoloc.atlas.atlas import read_manifest, store_at
 from topoloc.atlas.index import compute_global_descriptors, save_global_descriptors
 from topoloc.atlas.joins import Join
-from topoloc.atlas.joint_worlds import geo_box
 from topoloc.atlas.manifest import TILES, Manifest, PlacesFile, StoredFile, Tile, check_tile_id
 from topoloc.atlas.store import Store, sha256_of
+from topoloc.atlas.tile_facts import map_facts
 from topoloc.errors import AtlasError, EmptyMapError
 from topoloc.mapping.edit import find_kept_files, select_kept
 from topoloc.mapping.topomap import TopoMetricMap
@@ -227,27 +226,15 @@ def _describe_tile(
     previous: tuple[StoredFile, ...],
 ) -> Tile:
     """Return the manifest entry of a map and its stored files."""
-    centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
-    session_ids = [summary.session_id for summary in topomap.summaries]
-    _, first_rows = np.unique(session_ids, return_index=True)
-    known = topomap.georeference
     return Tile(
         new.tile_id,
         map=stored,
         places=places,
-        map_id=topomap.id,
-        map_version=topomap.version,
-        kinds=tuple(topomap.kinds),
-        num_nodes=len(topomap.summaries),
-        sessions=tuple(sorted({summary.recording for summary in topomap.summaries})),
-        focal_px=max(float(topomap.nodes[row].camera.fx) for row in first_rows),
-        box_world=np.array([centres.min(axis=0), centres.max(axis=0)]),
         world=new.world,
-        georeference=known,
-        geo_box=None if known is None else geo_box([*map(known.geopoint, centres)]),
         atlas_from_world=None,
         recipe=new.recipe,
         previous=previous,
+        **map_facts(topomap),
     )
 
 

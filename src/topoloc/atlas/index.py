@@ -6,7 +6,6 @@ vocabularies. One index for each feature type holds those of all tiles.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from jaxtyping import Bool, Float32, Int
 from topoloc.atlas.descriptor_shard import DescriptorShard
 from topoloc.errors import AtlasError
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.validation import CorruptDataError, arrays_from_npz
 from topoloc.retrieval.descriptor_kernels import multiply_rows
 from topoloc.retrieval.shared_vocabulary import shared_vocabulary
 
@@ -70,21 +70,21 @@ def load_global_descriptors(
     missing or damaged, or no version matches."""
     vectors = {}
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            for kind in stored.files:
-                vocabulary, rows = shared_vocabulary(kind), stored[kind]
-                if rows.ndim != 2 or rows.dtype != np.float16 or not np.isfinite(rows).all():
-                    raise AtlasError(f"{path} is damaged: the vectors of {kind} are none")
-                if (
-                    vocabulary is not None
-                    and vocabulary.version == versions.get(kind)
-                    and rows.shape[1] == vocabulary.dimension
-                ):
-                    vectors[kind] = rows.astype(np.float32)
-    except (OSError, ValueError, KeyError, EOFError, SyntaxError, zipfile.BadZipFile) as error:
+        stored = arrays_from_npz(path.read_bytes(), "global descriptors")
+    except (OSError, CorruptDataError) as error:
         raise AtlasError(
             f"{path} is missing or damaged: {' '.join(str(error).split())[:120]}"
         ) from None
+    for kind, rows in stored.items():
+        vocabulary = shared_vocabulary(kind)
+        if rows.ndim != 2 or rows.dtype != np.float16 or not np.isfinite(rows).all():
+            raise AtlasError(f"{path} is damaged: the vectors of {kind} are none")
+        if (
+            vocabulary is not None
+            and vocabulary.version == versions.get(kind)
+            and rows.shape[1] == vocabulary.dimension
+        ):
+            vectors[kind] = rows.astype(np.float32)
     if not vectors:
         raise AtlasError(
             f"{path} holds place vectors of another version of topoloc: `topoloc atlas add"

@@ -7,6 +7,7 @@ grows by one with each write.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import re
@@ -218,11 +219,12 @@ class Manifest:
         data = {"format": FORMAT, "version": FORMAT_VERSION} | encode_json(self)
         if not self.joins:
             data.pop("joins", None)
+        data["digest"] = _digest_of(data)
         return (json.dumps(data, indent=1) + "\n").encode("utf-8")
 
     @staticmethod
     def from_bytes(data: bytes, where: str) -> Manifest:
-        """Parse the output of `to_bytes`.
+        """Parse the output of `to_bytes`. Manifests of earlier versions have no digest.
 
         Raises:
             AtlasError: the bytes are not a valid manifest. The message contains `where`.
@@ -237,7 +239,18 @@ class Manifest:
             )
         decode_json(whole, _Header, AtlasError, fault)
         read = decode_json(whole, Manifest, AtlasError, fault)
+        if _digest_of(whole) != whole.get("digest", _digest_of(whole)):
+            raise AtlasError(
+                f"{fault}: its content was changed, its digest is another. Restore the file, or"
+                " create the atlas again from its maps"
+            )
         return replace(read, tiles=tuple(sorted(read.tiles, key=lambda tile: tile.tile_id)))
+
+
+def _digest_of(data: Mapping[str, Any]) -> str:
+    """Return the digest of a manifest without its entry `digest`."""
+    content = {key: value for key, value in data.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 class _Header(Struct, frozen=True):

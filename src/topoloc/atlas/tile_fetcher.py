@@ -21,8 +21,8 @@ from topoloc.errors import AtlasError, ObjectStoreError
 
 _MAX_CONCURRENT_FETCHES = 16
 """Maximum number of concurrent fetches from one store. Other stores are not affected."""
-_RETRY_AFTER_S = 5.0
-"""Seconds before a failed fetch of a tile is repeated."""
+RETRY_AFTER_S = 5.0
+"""Seconds before a tile that could not be fetched or opened is tried again."""
 
 
 class WatchedAtlas:
@@ -97,7 +97,7 @@ class TileFetch:
     @property
     def is_stale(self) -> bool:
         """Return whether the fetch ended so long ago that it may be repeated."""
-        return time.monotonic() > self.finished_at + _RETRY_AFTER_S
+        return time.monotonic() > self.finished_at + RETRY_AFTER_S
 
 
 class TilePending(Exception):

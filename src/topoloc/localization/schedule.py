@@ -218,7 +218,7 @@ class Schedule:
             ObjectStoreError: the object store of the tile does not respond.
             MapError: the map cannot be read, and no other tile is left.
         """
-        if tile_id in self.tiles.problems:
+        if not self.tiles.can_search(tile_id):
             self.results.pop(tile_id, None)
             return
         if prior is None and self.reach is not None:
@@ -278,7 +278,7 @@ class Schedule:
 
     def _readable(self, ranking: TileRanking) -> TileRanking:
         """Return the ranking without unreadable tiles."""
-        return [one for one in ranking if one[0] not in self.tiles.problems]
+        return [one for one in ranking if self.tiles.can_search(one[0])]
 
     def _priority(self, ranked: tuple[str, float]) -> tuple[float, float]:
         """Return the sort key of a tile: the probability of its coarse pose, its similarity."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,6 +18,7 @@ from topoloc.atlas.joins import sigmas_at
 from topoloc.atlas.location_prior import LocationPrior, tiles_in_reach
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.map_cache import MapCache
+from topoloc.atlas.tile_fetcher import RETRY_AFTER_S
 from topoloc.errors import AtlasError, MapError, MissingExtraError, WeightsError
 from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig, check_available
 from topoloc.geometry.camera import Camera
@@ -42,7 +44,7 @@ class AtlasTiles(Tiles):
 
     Args:
         maps: opens the tiles and caches the most recently used ones.
-        warn: called once for each tile that cannot be searched.
+        warn: called once for each problem of a tile. The tile is tried again after a while.
 
     Raises:
         AtlasError: the atlas has no tile.
@@ -61,6 +63,7 @@ class AtlasTiles(Tiles):
             )
         self.atlas, self.config, self._maps, self._warn = atlas, config, maps, warn
         self.ids, self.problems = list(atlas.manifest.by_id), dict[str, str]()
+        self._retry_times = dict[str, float]()
         self.unranked = frozenset(atlas.problems)
         for note in atlas.notes:
             warn(note)
@@ -82,12 +85,19 @@ class AtlasTiles(Tiles):
         """Keep the map of a tile open for the context. Raises AtlasError, MapError."""
         path = self._maps.tile_path(self.atlas, self.atlas.tile(tile_id))
         with self._maps.use_map(tile_id, path) as cached:
+            self.problems.pop(tile_id, None)
             yield cached.content.context
 
+    def can_search(self, tile_id: str) -> bool:
+        """See `Tiles.can_search`."""
+        return time.monotonic() >= self._retry_times.get(tile_id, 0.0)
+
     def report(self, tile_id: str, error: MapError) -> None:
-        """Record that a tile cannot be searched."""
+        """Record that a tile cannot be searched for a while."""
+        self._retry_times[tile_id] = time.monotonic() + RETRY_AFTER_S
+        if self.problems.get(tile_id) != str(error):
+            self._warn(f"tile {tile_id} is not searched: {error}")
         self.problems[tile_id] = str(error)
-        self._warn(f"tile {tile_id} is not searched: {error}")
 
     def in_reach(self, near: LocationPrior | None, georeferenced_only: bool) -> Reach:
         """Return the tiles in reach of a position. Raises AtlasError: it is in no world here."""
