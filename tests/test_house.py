@@ -49,7 +49,7 @@ CEILINGS = {
     "branches.walls": 10,  # goal 0
     "constants.all": 434,  # goal 474, localization 25
     "constants.core/localization": 38,
-    "user_docs_bytes": 142905,  # goal 150000
+    "user_docs_bytes": 143774,  # goal 150000
     "readme_lines": 150,  # goal 150
     "architecture_lines": 110,  # goal 110
 }
