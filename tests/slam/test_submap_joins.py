@@ -17,7 +17,6 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.points.disparity import measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
-from topoloc.slam.input_checks import InputChecks
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks, PlaceFeatures
 from topoloc.slam.loop_closure import find_links, match_keyframes
 from topoloc.slam.odometry import Odometry
@@ -59,12 +58,7 @@ def tracked(*recordings: FrameList) -> tuple[list[KeyFrame], list[FramePose]]:
     keyframes: list[KeyFrame] = []
     landmarks, poses = Landmarks(), []
     for number, recording in enumerate(recordings):
-        odometry = Odometry(
-            number,
-            keyframes,
-            landmarks,
-            InputChecks(recording.name),
-        )
+        odometry = Odometry(number, keyframes, landmarks)
         for i, frame in enumerate(recording.frames):
             poses += odometry.process(i, frame, measured_view(frame))
         poses += odometry.finish()

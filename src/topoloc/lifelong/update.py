@@ -43,6 +43,7 @@ from topoloc.mapping.virtual_nodes import add_virtual_nodes
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import SequenceView
+from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import estimate_slam_poses
 from topoloc.tracking.tracker import Tracker
@@ -112,8 +113,10 @@ def update(
             posed = estimate_slam_poses([sequence], progress=progress)[0]
         else:
             posed = sequence
-        if is_checked and poses_from not in ("map", "slam"):
-            check_poses(posed)
+        if poses_from not in ("map", "slam"):
+            check_stereo(posed)
+            if is_checked:
+                check_poses(posed)
         updated = update_map(edit.topomap, posed, poses_from, localizer_config, progress)
         changes = updated.changes | {"bytes_before": edit.path.stat().st_size}
         topomap = updated.topomap

@@ -264,6 +264,14 @@ def find_source_path(sequence: StereoSequence) -> str | None:
     return str(sequence.root) if isinstance(sequence, Recording) else None
 
 
+def find_depth_units(sequence: StereoSequence) -> float | None:
+    """Return the units per metre of the depth images of a recording on disk, or None."""
+    while isinstance(sequence, SequenceView):
+        sequence = sequence.base
+    depth = sequence.depth if isinstance(sequence, Recording) else None
+    return depth and depth.units_per_metre
+
+
 def find_pose_source(sequence: StereoSequence) -> str:
     """Return `truth` if the poses are the recording's own, else `given`."""
     while isinstance(sequence, SequenceView) and not sequence.has_own_poses:

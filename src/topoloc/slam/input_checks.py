@@ -1,144 +1,157 @@
-"""Check recordings for inputs that would give wrong SLAM results.
+"""Check the stereo pairs of a recording for faults that would give a wrong map, and measure the
+residuals of SLAM in the right images.
 
-These are swapped left and right images, a baseline in millimetres, and images that are no stereo
-pairs.
+The faults are swapped left and right images, a baseline in millimetres, and images that are no
+rectified pairs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from topoloc.errors import CalibrationError, RecordingError
-from topoloc.points.disparity import MeasuredView, measure_disparities
-from topoloc.points.point_tracking import align_with_reference, track_points
-from topoloc.recordings.frame import StereoFrame
+from topoloc.features.config import MatchingConfig
+from topoloc.features.extraction import extract_features
+from topoloc.features.feature_types import FeatureConfig, find_feature_type
+from topoloc.features.matching import match_features
+from topoloc.features.parallel import parallel_map
+from topoloc.geometry.pose_conventions import UNITS
+from topoloc.points.disparity import MeasuredView
+from topoloc.points.point_tracking import align_with_reference
+from topoloc.recordings.frame import StereoFrame, StereoSequence
+from topoloc.recordings.frame_preparation import prepare_frame
+from topoloc.recordings.recording import find_depth_units
 from topoloc.slam.keyframes import KeyFrame, Landmarks
 
 
-class InputChecks:
-    """Accumulate the checks of one recording."""
+def check_stereo(sequence: StereoSequence, num_frames: int = 8) -> None:
+    """Check that the left and right images of a recording are rectified pairs in the right order.
 
-    def __init__(self, recording: str) -> None:
-        self._recording = recording
-        self._vertical_px: list[float] = []
-        self._has_started = False
-        self.right_residuals_px: list[Float[np.ndarray, " n"]] = []
-        """Distances between measured and predicted landmarks in the right image, pixels, one array
-        for each key frame."""
+    Features of `num_frames` pairs, spread over the recording, are matched over the whole images.
+    Other recordings, and pairs with too few matches, pass.
 
-    def check_rig(self, frame: StereoFrame) -> None:
-        """Check the baseline of the rig.
-
-        Raises:
-            CalibrationError: the baseline cannot be in metres.
-        """
-        max_baseline = 5.0  # metres; a larger one is assumed to be in millimetres
-        if frame.rig is not None and frame.rig.baseline > max_baseline:
-            raise CalibrationError(
-                f"{self._recording}: a baseline of {frame.rig.baseline:g} m; is it in millimetres?"
-            )
-
-    def can_start(
-        self, frame: StereoFrame, measured: MeasuredView, corners: Float32[np.ndarray, "n 2"]
-    ) -> bool:
-        """Return whether enough corners have a disparity to start tracking.
-
-        Raises:
-            RecordingError: they have, but only with left and right swapped.
-        """
-        min_start_points = 40  # minimum number of points with disparity to start tracking
-        num_found = _count_disparities(measured, corners)
-        right_grey = measured.view.right_grey
-        if measured.right is None or right_grey is None or self._has_started:
-            return num_found >= min_start_points
-        # A point farther right in the right image is farther left if both images are mirrored.
-        left, right = (
-            np.ascontiguousarray(image[:, ::-1]) for image in (measured.left, measured.right)
+    Raises:
+        CalibrationError: the baseline cannot be in metres.
+        RecordingError: left and right are swapped, or are no pairs of one moment, rectified as
+            calibrated. Also if a frame cannot be read.
+        UnreadableImageError: an image cannot be read.
+    """
+    max_baseline = 5.0  # metres; a larger one is assumed to be in millimetres
+    # Maximum vertical distance of left and right points (median), pixels and share of the width.
+    max_vertical_px, max_vertical_share = 0.9, 0.001
+    if (rig := sequence[0].rig) is None:
+        return
+    if rig.baseline > max_baseline:
+        raise CalibrationError(
+            f"{sequence.name}: a baseline of {rig.baseline:g} m; is it in millimetres?"
         )
-        mirrored = replace(measured, left=left, right=right)
-        mirrored_corners = (np.array([left.shape[1] - 1, 0]) + corners * [-1, 1]).astype(np.float32)
-        if _count_disparities(mirrored, mirrored_corners) > max(min_start_points, 2 * num_found):
-            raise RecordingError(
-                f"{self._recording}: left and right pictures are swapped: {frame.name} shows points"
-                " further right in right"
-            )
-        if num_found < min_start_points:
-            coarse, _ = track_points(measured.view.grey, right_grey, corners, corners)
-            self._match_in_right_image(measured.left, measured.right, corners, coarse)
-        self._has_started = num_found >= min_start_points
-        return self._has_started
-
-    def check_keyframe(
-        self, keyframe: KeyFrame, landmarks: Landmarks, measured: MeasuredView
-    ) -> None:
-        """Match landmarks of a new key frame in the right image and compare them with their
-        predictions."""
-        sampled_points = 80  # points of a key frame at which the vertical distance is measured
-        if measured.right is None or measured.view.rig is None:
-            return
-        seen = keyframe.observations
-        rows = np.flatnonzero(seen.active & (seen.weights[:, 2] > 0.0))
-        rows = rows[:: max(1, len(rows) // sampled_points)]
-        if len(rows) == 0:
-            return
-        at_infinity = measured.view.rig.left.cx - measured.view.rig.right.cx
-        to_right = np.column_stack([-seen.measured[rows, 2] - at_infinity, np.zeros(len(rows))])
-        points = seen.measured[rows, :2]
-        guesses = (points + to_right).astype(np.float32)
-        found = self._match_in_right_image(
-            measured.left, measured.right, points.astype(np.float32), guesses
+    chosen = np.unique(np.linspace(0, len(sequence) - 1, num_frames).astype(int)).tolist()
+    is_left, vertical = _compare_pairs(sequence[k] for k in chosen)
+    is_pair = not vertical > max(max_vertical_px, max_vertical_share * rig.left.width)
+    if not is_pair and is_left:  # rectified, swapped images are no pairs
+        is_left = not _compare_pairs(_exchange(sequence[k]) for k in chosen)[1] < 0.5 * vertical
+    if not is_left:
+        raise RecordingError(
+            f"{sequence.name}: left and right pictures are swapped: points lie further right in the"
+            " right ones; exchange the two folders or topics"
         )
-        expected = keyframe.stereo.project(
-            keyframe.cam_from_world.apply(landmarks.positions[seen.landmark_ids[rows]])
+    if not is_pair:
+        raise RecordingError(
+            f"{sequence.name}: left and right pictures are no pairs: the same points are"
+            f" {vertical:.1f} px apart vertically (median); taken at different moments, or not"
+            " rectified as calibrated?"
         )
-        expected_right = expected[:, :2] - np.column_stack(
-            [expected[:, 2] + keyframe.bias.value_px + at_infinity, np.zeros(len(rows))]
-        )
-        self.right_residuals_px.append(np.linalg.norm(found - expected_right, axis=1))
-
-    def check_stereo_pairs(self) -> None:
-        """Check that left and right images are stereo pairs.
-
-        Raises:
-            RecordingError: they were taken at different times, or are not rectified as calibrated.
-        """
-        min_keyframes = 3  # minimum number of key frames for this check
-        # Maximum vertical distance of left and right points, pixels (median over points,
-        # then over key frames). Beyond it the images are no stereo pairs.
-        max_vertical_px = 0.9
-        if len(self._vertical_px) < min_keyframes:
-            return
-        vertical = float(np.median(self._vertical_px))
-        if vertical > max_vertical_px:
-            raise RecordingError(
-                f"{self._recording}: left and right pictures are no pairs: the same points are"
-                f" {vertical:.1f} px apart vertically (median); taken at different moments, or"
-                " calibrated wrongly?"
-            )
-
-    def _match_in_right_image(
-        self,
-        left: Float32[np.ndarray, "h w"],
-        right: Float32[np.ndarray, "h w"],
-        points: Float32[np.ndarray, "n 2"],
-        guesses: Float32[np.ndarray, "n 2"],
-    ) -> Float[np.ndarray, "n 2"]:
-        """Match points of the left image in the right one, also vertically, and record the vertical
-        median.
-
-        Return their pixels, NaN if not found.
-        """
-        scales = np.ones(len(points), np.float32)
-        found = align_with_reference(left, right, points, guesses, scales, max_shift_px=5.0)
-        places = np.where(found.is_matched[:, None], found.points_img, np.nan).astype(np.float64)
-        if np.count_nonzero(found.is_matched) >= max(10, len(points) // 3):
-            self._vertical_px.append(float(np.nanmedian(np.abs(places[:, 1] - points[:, 1]))))
-        return places
 
 
-def _count_disparities(measured: MeasuredView, corners: Float32[np.ndarray, "n 2"]) -> int:
-    disparities, _ = measure_disparities(measured, corners, np.full(len(corners), np.nan))
-    return int(np.isfinite(disparities).sum())
+def _exchange(frame: StereoFrame) -> StereoFrame:
+    return frame if frame.right is None else replace(frame, image=frame.right, right=frame.image)
+
+
+def add_calibration(looks: str, sequence: StereoSequence, conventions: Sequence[str]) -> str:
+    """Add the calibration that explains another unit of the poses as well to their description.
+
+    The baseline or the depth factor is named first if the unit is none that poses often have.
+    """
+    # Common depth factors (units per metre), preferred to others that are nearly the same.
+    common, max_ratio = (100.0, 256.0, 1000.0, 4000.0, 5000.0, 10000.0), 1.15
+    max_factor = 20.0  # no wrong calibration explains more
+    unit = next((name for name in conventions if name in UNITS or name.startswith("scale")), None)
+    factor = UNITS.get(unit) or float(unit.removeprefix("scale=")) if unit else 0.0
+    rig, units = sequence[0].rig, find_depth_units(sequence)
+    if not 1.0 / max_factor < factor < max_factor or (rig is None and units is None):
+        return looks
+    if rig is not None:
+        right = f"a baseline of {rig.baseline / factor:.4g} m, not {rig.baseline:.4g},"
+    else:
+        found = (units or 1.0) * factor
+        near = min(common, key=lambda one: max(one / found, found / one))
+        found = near if 1.0 / max_ratio < near / found < max_ratio else found
+        right = f'a "depth_factor" of {found:.4g}, not {units:g},'
+    others = ",".join(name for name in conventions if name != unit)
+    right += f" and --poses {others}" * bool(others)
+    explains = f"if the poses are in metres, {right} explains it"
+    return f"{looks}; or, {explains}" if unit in UNITS else f"{explains}; otherwise {looks}"
+
+
+def _compare_pairs(frames: Iterable[StereoFrame]) -> tuple[bool, float]:
+    """Return whether the points of left images lie further left in the right ones, as they must,
+    and how far they are apart vertically (median, pixels). Too few matches give True and NaN."""
+    min_matches, min_shift_px, max_swapped_share = 40, 1.5, 0.8
+    shifts = np.concatenate(list(parallel_map(_match_pair, frames)))
+    if len(shifts) < min_matches:
+        return True, float("nan")
+    moved = shifts[np.abs(shifts[:, 0]) > min_shift_px, 0]
+    is_left = len(moved) < min_matches or float(np.mean(moved < 0.0)) < max_swapped_share
+    return is_left, float(np.median(np.abs(shifts[:, 1])))
+
+
+def _match_pair(frame: StereoFrame) -> Float[np.ndarray, "n 2"]:
+    """Return how far features lie left, and below, of where the right image shows them, pixels. A
+    point at infinity has 0."""
+    view = prepare_frame(frame)
+    if view.right_grey is None or view.rig is None:
+        return np.zeros((0, 2))
+    left, right = (
+        extract_features(grey, FeatureConfig(max_features=500))
+        for grey in (view.grey, view.right_grey)
+    )
+    matching = MatchingConfig(ratio=find_feature_type("surf").ratio)
+    matches = match_features(left.descriptors, right.descriptors, matching)
+    shifts = left.points_img[matches.query_idx] - right.points_img[matches.train_idx]
+    return shifts - np.array([view.rig.left.cx - view.rig.right.cx, 0.0])
+
+
+def measure_right_residuals(
+    keyframe: KeyFrame, landmarks: Landmarks, measured: MeasuredView
+) -> Float[np.ndarray, " n"]:
+    """Return the distances between measured and predicted landmarks in the right image of a key
+    frame, pixels. NaN if not found."""
+    sampled_points = 80
+    seen = keyframe.observations
+    rows = np.flatnonzero(seen.active & (seen.weights[:, 2] > 0.0))
+    rows = rows[:: max(1, len(rows) // sampled_points)]
+    if measured.right is None or measured.view.rig is None or len(rows) == 0:
+        return np.zeros(0)
+    at_infinity = measured.view.rig.left.cx - measured.view.rig.right.cx
+    to_right = np.column_stack([-seen.measured[rows, 2] - at_infinity, np.zeros(len(rows))])
+    points = seen.measured[rows, :2]
+    found = align_with_reference(
+        measured.left,
+        measured.right,
+        points.astype(np.float32),
+        (points + to_right).astype(np.float32),
+        np.ones(len(rows), np.float32),
+        max_shift_px=5.0,
+    )
+    places = np.where(found.is_matched[:, None], found.points_img, np.nan).astype(np.float64)
+    expected = keyframe.stereo.project(
+        keyframe.cam_from_world.apply(landmarks.positions[seen.landmark_ids[rows]])
+    )
+    to_right = np.column_stack(
+        [expected[:, 2] + keyframe.bias.value_px + at_infinity, np.zeros(len(rows))]
+    )
+    return np.linalg.norm(places - (expected[:, :2] - to_right), axis=1)

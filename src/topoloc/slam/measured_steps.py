@@ -37,8 +37,8 @@ _DIRECTION_TOLERANCE = math.radians(12.0)  # of a translation without scale
 class MeasuredStep:
     """Hold the measured motion between the cameras of two frames.
 
-    `median_depth` (metres) is that of the inliers. For a single camera `has_scale` is False, the
-    translation has length 1 and the depth is 0 (unknown).
+    `median_depth` (metres) is that of the `num_inliers` points. For a single camera `has_scale` is
+    False, the translation has length 1 and the depth is 0 (unknown).
     """
 
     first: int
@@ -46,6 +46,7 @@ class MeasuredStep:
     first_from_last: Rigid3
     median_depth: float
     has_scale: bool = True
+    num_inliers: int = 0
 
     @property
     def translation_tolerance(self) -> float:
@@ -90,20 +91,16 @@ def measure_steps(
     # Numbers of frames between the two images of a step, tried until one has enough matches.
     gaps = (12, 5, 2, 1)
     starts = np.unique(np.linspace(0, len(usable_idx) - 1, num_steps).astype(int)).tolist()
-    firsts: dict[int, _ViewFeatures] = {}
+    firsts: dict[int, ViewFeatures] = {}
     steps: dict[int, MeasuredStep] = {}
 
     def measure(
         pair: tuple[int, int, StereoFrame | None, StereoFrame],
-    ) -> tuple[int, _ViewFeatures, MeasuredStep | None]:
+    ) -> tuple[int, ViewFeatures, MeasuredStep | None]:
         start, other, frame, other_frame = pair
-        first = firsts[start] if frame is None else _extract_view(frame, is_first=True)
-        motion = _estimate_motion(first, last := _extract_view(other_frame, is_first=False))
-        if motion is None:
-            return start, first, None
-        first_from_last = first.view_from_cam.inverse() @ motion[0].inverse() @ last.view_from_cam
-        ends, has_scale = (usable_idx[start], usable_idx[other]), first.points is not None
-        return start, first, MeasuredStep(*ends, first_from_last, motion[1], has_scale)
+        first = firsts[start] if frame is None else extract_view(frame)
+        last = extract_view(other_frame, is_first=False)
+        return start, first, estimate_step(usable_idx[start], usable_idx[other], first, last)
 
     for gap in gaps:  # backwards at the end of the recording
         pairs = [
@@ -129,14 +126,18 @@ def measure_steps(
 
 
 @dataclass(frozen=True, eq=False)
-class _ViewFeatures:
+class ViewFeatures:
+    """Hold the features of a view. If it has `points`, there is one for each feature."""
+
     camera: Camera
     view_from_cam: Rigid3
     features: Features
     points: MetricPoints | None
 
 
-def _extract_view(frame: StereoFrame, is_first: bool) -> _ViewFeatures:
+def extract_view(frame: StereoFrame, is_first: bool = True) -> ViewFeatures:
+    """Extract the features of a frame. Those of the first frame of a step are the ones with a 3-D
+    position, unless it is a single image. Raises CalibrationError: no camera model."""
     has_depth = is_first and (frame.right is not None or frame.depth is not None)
     view = prepare_frame(frame, with_depth=has_depth)
     features, points = extract_features(view.grey, FeatureConfig()), None
@@ -145,15 +146,14 @@ def _extract_view(frame: StereoFrame, is_first: bool) -> _ViewFeatures:
         rows = np.flatnonzero(located.valid)
         features = features.select(rows)
         points = MetricPoints(*(column[rows] for column in vars(located).values()))
-    return _ViewFeatures(view.camera, view.view_from_cam, features, points)
+    return ViewFeatures(view.camera, view.view_from_cam, features, points)
 
 
-def _estimate_motion(first: _ViewFeatures, last: _ViewFeatures) -> tuple[Rigid3, float] | None:
-    """Estimate last_from_first of the views, and the median depth of the inliers.
-
-    For a single camera the depth is 0 and the translation has length 1. None if too few points
-    match.
-    """
+def estimate_step(
+    first_idx: int, last_idx: int, first: ViewFeatures, last: ViewFeatures
+) -> MeasuredStep | None:
+    """Estimate the step between two views, of the frames with these indices. None if too few points
+    match."""
     min_inliers = 40  # minimum number of points of the first image that match in the last
     matches = match_features(
         last.features.descriptors, first.features.descriptors, MatchingConfig()
@@ -161,19 +161,22 @@ def _estimate_motion(first: _ViewFeatures, last: _ViewFeatures) -> tuple[Rigid3,
     if len(matches) < min_inliers:
         return None
     points_img = last.features.points_img[matches.query_idx].astype(np.float64)
+    points = None
     if first.points is None:
         first_img = first.features.points_img[matches.train_idx].astype(np.float64)
         moved = estimate_relative_pose(first_img, first.camera, points_img, last.camera)
-        if moved is None or np.count_nonzero(moved.inliers) < min_inliers:
-            return None
-        return moved.second_from_first, 0.0
-    points = first.points.points_cam[matches.train_idx]
-    pose = estimate_absolute_pose(
-        points_img,
-        points,
-        last.camera,
-        point_covariances=first.points.covariances[matches.train_idx],
-    )
-    if pose is None or np.count_nonzero(pose.inliers) < min_inliers:
+        motion = None if moved is None else (moved.second_from_first, moved.inliers)
+    else:
+        points = first.points.points_cam[matches.train_idx]
+        covariances = first.points.covariances[matches.train_idx]
+        pose = estimate_absolute_pose(
+            points_img, points, last.camera, point_covariances=covariances
+        )
+        motion = None if pose is None else (pose.cam_from_world, pose.inliers)
+    if motion is None or np.count_nonzero(motion[1]) < min_inliers:
         return None
-    return pose.cam_from_world, float(np.median(points[pose.inliers, 2]))
+    last_from_first, inliers = motion
+    first_from_last = first.view_from_cam.inverse() @ last_from_first.inverse() @ last.view_from_cam
+    depth = 0.0 if points is None else float(np.median(points[inliers, 2]))
+    num_inliers, has_scale = int(np.count_nonzero(inliers)), points is not None
+    return MeasuredStep(first_idx, last_idx, first_from_last, depth, has_scale, num_inliers)

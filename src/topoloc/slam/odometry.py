@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 
 import numpy as np
+from jaxtyping import Float
 
 from topoloc.compiled import mark_worker_thread
 from topoloc.disk_list import DiskList
@@ -25,7 +26,7 @@ from topoloc.points.point_tracking import find_corners
 from topoloc.recordings.frame import StereoFrame
 from topoloc.slam.bundle.bundle_adjustment import adjust_window
 from topoloc.slam.frame_tracker import FrameTracker
-from topoloc.slam.input_checks import InputChecks
+from topoloc.slam.input_checks import measure_right_residuals
 from topoloc.slam.keyframes import (
     FramePose,
     KeyFrame,
@@ -48,11 +49,11 @@ class Odometry(FrameTracker):
     `keyframes` and `landmarks` are shared by all recordings, and this class adds to them.
     """
 
-    def __init__(
-        self, recording: int, keyframes: list[KeyFrame], landmarks: Landmarks, checks: InputChecks
-    ):
+    def __init__(self, recording: int, keyframes: list[KeyFrame], landmarks: Landmarks):
         super().__init__(landmarks, min_tracked=25, patch_half_px=5)
-        self._recording, self._keyframes, self._checks = recording, keyframes, checks
+        self._recording, self._keyframes = recording, keyframes
+        # Residuals of each key frame in the right image, pixels.
+        self.right_residuals_px: list[Float[np.ndarray, " n"]] = []
         # Frames since the camera was lost, which may start a sub-map.
         self._lost_frames: list[tuple[int, StereoFrame]] = []
         self._repeated_motions: list[Rigid3] = []  # of the last frame before the camera was lost
@@ -183,7 +184,7 @@ class Odometry(FrameTracker):
         self._recent_keyframes.append(keyframe)
         adjust_window(self._recent_keyframes, self._landmarks, 8, 5, max_steps=6)
         self._set_reference(keyframe, measured)
-        self._checks.check_keyframe(keyframe, self._landmarks, measured)
+        self.right_residuals_px += [measure_right_residuals(keyframe, self._landmarks, measured)]
         if self._is_new_place(keyframe):
             # One extraction is pending in a background thread, so that few images are in memory.
             if self._pending_keyframe is not None:
@@ -238,6 +239,7 @@ class Odometry(FrameTracker):
     def _restart_submap(self) -> list[FramePose]:
         """Start a sub-map from the lost frames, at the first one from which all later ones can be
         tracked."""
+        min_start_points = 40  # minimum number of corners with a disparity to start tracking
         missed, self._lost_frames, self._reference = self._lost_frames, [], None
         num_keyframes, num_landmarks = len(self._keyframes), self._landmarks.num
         num_lost = self._num_lost
@@ -250,7 +252,10 @@ class Odometry(FrameTracker):
                 del self._keyframes[num_keyframes:]
                 self._landmarks.num = num_landmarks
                 corners = find_corners(measured.view.grey, np.zeros((0, 2)))
-                if self._checks.can_start(frame, measured, corners):
+                disparities, _ = measure_disparities(
+                    measured, corners, np.full(len(corners), np.nan)
+                )
+                if np.count_nonzero(np.isfinite(disparities)) >= min_start_points:
                     pose = self._start_tracking(frame_idx, frame, measured, Rigid3.identity(), None)
             if pose is not None:
                 poses.append(pose)

@@ -34,6 +34,7 @@ from topoloc.geometry.pose_conventions import (
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.trajectory import Trajectory
+from topoloc.slam.input_checks import add_calibration
 from topoloc.slam.measured_steps import ROTATION_TOLERANCE, MeasuredStep, measure_steps
 
 _MIN_INFORMATIVE_STEPS = 5
@@ -126,16 +127,15 @@ def check_poses(sequence: StereoSequence) -> None:
         f"{verdict.num_informative - verdict.num_consistent} of {verdict.num_informative} steps"
         " from picture to picture are not the poses'"
     )
-    if verdict.conventions:
-        names = ",".join(verdict.conventions)
+    if not verdict.conventions:
         raise TrajectoryError(
-            f"{sequence.name}: {differ}; they look like poses"
-            f" {describe_conventions(verdict.conventions)}: --poses {names}"
+            f"{sequence.name}: {differ}, and no known convention explains it: of another recording,"
+            " or wrongly calibrated? --poses unchecked maps it all the same"
         )
-    raise TrajectoryError(
-        f"{sequence.name}: {differ}, and no known convention explains it: of another recording, or"
-        " wrongly calibrated? --poses unchecked maps it all the same"
-    )
+    described = describe_conventions(verdict.conventions)
+    looks = f"they look like poses {described}: --poses {','.join(verdict.conventions)}"
+    explained = add_calibration(looks, sequence, verdict.conventions)
+    raise TrajectoryError(f"{sequence.name}: {differ}; {explained}")
 
 
 def evaluate_poses(

@@ -30,7 +30,7 @@ from topoloc.slam.global_optimization import (
     close_loops,
     join_submaps,
 )
-from topoloc.slam.input_checks import InputChecks
+from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.keyframes import FramePose, KeyFrame, Landmarks
 from topoloc.slam.loop_closure import Link, find_links
 from topoloc.slam.odometry import Odometry
@@ -138,10 +138,10 @@ def run_slam(
     tracked: list[list[FramePose | None]] = []
     residuals: list[np.ndarray] = []
     for number, sequence in enumerate(sequences):
-        checks = InputChecks(sequence.name)
-        odometry = Odometry(number, keyframes, landmarks, checks)
-        tracked.append(_track_recording(sequence, odometry, checks, progress))
-        residuals += checks.right_residuals_px
+        check_stereo(sequence)
+        odometry = Odometry(number, keyframes, landmarks)
+        tracked.append(_track_recording(sequence, odometry, progress))
+        residuals += odometry.right_residuals_px
     links = find_links(keyframes, progress)
     links += find_joins(
         keyframes,
@@ -185,16 +185,15 @@ def estimate_slam_poses(
 
 
 def _track_recording(
-    sequence: StereoSequence, odometry: Odometry, checks: InputChecks, progress: Progress
+    sequence: StereoSequence, odometry: Odometry, progress: Progress
 ) -> list[FramePose | None]:
     poses: list[FramePose | None] = [None] * len(sequence)
-    for i, (frame, measured) in enumerate(_prefetch_frames(sequence, checks)):
+    for i, (frame, measured) in enumerate(_prefetch_frames(sequence)):
         for pose in odometry.process(i, frame, measured):
             poses[pose.frame_idx] = pose
         progress(f"tracking {sequence.name}", i + 1, len(sequence))
     for pose in odometry.finish():
         poses[pose.frame_idx] = pose
-    checks.check_stereo_pairs()
     if all(pose is None for pose in poses):
         raise RecordingError(
             f"{sequence.name}: none of the {len(poses)} frames could be tracked: too dark, without"
@@ -203,15 +202,12 @@ def _track_recording(
     return poses
 
 
-def _prefetch_frames(
-    sequence: StereoSequence, checks: InputChecks
-) -> Iterator[tuple[StereoFrame, MeasuredView]]:
+def _prefetch_frames(sequence: StereoSequence) -> Iterator[tuple[StereoFrame, MeasuredView]]:
     """Iterate over the frames. Each one is read and prepared while the preceding one is
     processed."""
 
     def read(index: int) -> tuple[StereoFrame, MeasuredView]:
         frame = sequence[index]
-        checks.check_rig(frame)
         return frame, measured_view(frame)
 
     with ThreadPoolExecutor(max_workers=1) as reader:

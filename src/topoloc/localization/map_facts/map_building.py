@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,8 +22,10 @@ from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
+from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_pose_coverage, check_poses
 from topoloc.slam.slam import estimate_slam_poses
+from topoloc.slam.world_checks import check_common_world
 
 
 def build_map(
@@ -33,6 +35,7 @@ def build_map(
     poses_from: Sequence[str] | None = None,
     are_poses_checked: bool = True,
     is_coverage_checked: bool = True,
+    warn: Callable[[str], object] | None = None,
 ) -> TopoMetricMap:
     """Build a topo-metric map from recordings whose poses share one world frame.
 
@@ -46,11 +49,12 @@ def build_map(
         are_poses_checked: compare the poses with the images, unless SLAM estimated them.
         is_coverage_checked: require that at least half of the frames have a pose, unless SLAM
             estimated them.
+        warn: called with each note on what could not be checked.
 
     Raises:
         ConfigError: a value of `config` is out of bounds.
-        TrajectoryError: fewer than half of a recording's frames have a pose, or the poses do not
-            fit the images.
+        TrajectoryError: fewer than half of a recording's frames have a pose, the poses do not fit
+            the images, or those of two recordings are in different worlds.
         EmptyMapError: no image gave a usable node.
         FeatureTypeError: `config` names an unknown feature type.
         RecordingError, CalibrationError, UnreadableImageError: a recording cannot be read.
@@ -58,19 +62,24 @@ def build_map(
     config = config or build.BuildConfig()
     for kind in config.kinds:
         find_feature_type(kind)
-    given = [sequences] if isinstance(sequences, StereoSequence | str | Path) else sequences
-    sequences = [open_sequence(one) if isinstance(one, str | Path) else one for one in given]
+    several = [sequences] if isinstance(sequences, StereoSequence | str | Path) else sequences
+    sequences = [open_sequence(one) if isinstance(one, str | Path) else one for one in several]
     if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
         sequences, poses_from = (
             estimate_slam_poses(sequences, progress=progress),
             ["slam"] * len(sequences),
         )
-    for k, sequence in enumerate(sequences):
-        is_from_slam = poses_from is not None and poses_from[k] == "slam"
-        if is_coverage_checked and not is_from_slam:
+    sources = poses_from or [""] * len(sequences)
+    given = [one for one, source in zip(sequences, sources, strict=True) if source != "slam"]
+    for sequence in given:
+        check_stereo(sequence)
+        if is_coverage_checked:
             check_pose_coverage(sequence)
-        if are_poses_checked and not is_from_slam:
+        if are_poses_checked:
             check_poses(sequence)
+    for note in check_common_world(given) if are_poses_checked else []:
+        if warn is not None:
+            warn(note)
     return with_map_statistics(build.build_map(sequences, config, progress, poses_from), progress)
 
 

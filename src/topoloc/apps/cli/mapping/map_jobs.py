@@ -89,7 +89,7 @@ class MapJob:
                 _warn(f"{sequence.name}: {count} frames have no pose and are left out")
         options = self.pose_options
         checks = parse_conventions(options.poses)[1], not (options.allow_gaps or is_slam)
-        return build_map(sequences, self.build, progress, poses_from, *checks), poses_from
+        return build_map(sequences, self.build, progress, poses_from, *checks, _warn), poses_from
 
     def split_by_recording(self) -> list[MapJob]:
         """Return one job for each recording. Raises UsageError if the number of trajectories is
