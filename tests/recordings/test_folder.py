@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tiny_recordings import CAMERA, assert_same_pose, kitti_row, picture, pose, tum_line
+from tiny_recordings import CAMERA, assert_same_pose, kitti_row, picture, pose, tum_line, write
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.open import open_sequence
@@ -124,3 +124,20 @@ def test_empty_folders_and_truth_of_another_length(plain: Plain, tmp_path: Path)
     (folder / "poses.txt").write_text(kitti_row(pose(0)))
     with pytest.raises(TrajectoryError, match="1 poses for 3"):
         open_sequence(folder)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_cameras_of_fewer_bits_in_16(tmp_path: Path, bits: int):
+    image = np.linspace(0, 255, 24 * 32).astype(np.uint8).reshape(24, 32)
+    full = image.astype(np.uint16) << (bits - 8)
+    write(tmp_path / "0.png", full >> 3)
+    write(tmp_path / "1.png", full)
+    first, second = (open_sequence(tmp_path)[k].image for k in (0, 1))
+    assert np.abs(second.astype(int) - image).max() <= 1
+    assert np.abs(first.astype(int) - image // 8).max() <= 1  # stays darker
+
+
+def test_a_broken_picture_does_not_break_the_others(tmp_path: Path):
+    write(tmp_path / "0.png", np.full((24, 32), 4000, np.uint16))
+    (tmp_path / "1.png").write_bytes(b"no picture")
+    assert open_sequence(tmp_path)[0].image[0, 0] == 249

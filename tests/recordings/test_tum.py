@@ -34,10 +34,11 @@ def test_other_recordings_need_a_camera(tum: Path):
     other = tum.rename(tum.with_name("my_desk"))
     with pytest.raises(CalibrationError, match=r"camera\.json"):
         open_tum(other)
-    (other / "camera.json").write_text(
-        '{"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240, "depth_factor":'
-        " 1000}"
-    )
+    intrinsics = '{"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240'
+    (other / "camera.json").write_text(intrinsics + "}")
+    with pytest.raises(CalibrationError, match='no "depth_factor" here'):
+        open_tum(other)
+    (other / "camera.json").write_text(intrinsics + ', "depth_factor": 1000}')
     frame = open_tum(other)[0]
     assert frame.camera.fx == 600
     assert frame.depth.depth[0, 0] == 5.0

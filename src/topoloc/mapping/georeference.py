@@ -83,7 +83,9 @@ def read_gnss(path: Path, topomap: TopoMetricMap) -> ControlPoints:
             f"{path}: no line begins with a time, or the name of a mapping picture, such as"
             f" {example}"
         )
-    return _interpolate_at_times(path, topomap, parse_times(rows, path, GeoreferenceError), places)
+    return _interpolate_at_times(
+        path, topomap, parse_times(rows, path, GeoreferenceError, np.inf), places
+    )
 
 
 def _interpolate_at_times(

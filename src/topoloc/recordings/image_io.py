@@ -13,8 +13,8 @@ import stat
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -22,7 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt16
 from PIL import (  # importing the readers registers them in Pillow
     BmpImagePlugin,  # noqa: F401
     ExifTags,
@@ -70,9 +70,12 @@ class EncodedImage:
         return self.name
 
 
-def read_image(path: Path | EncodedImage, as_stored: bool = False) -> Image:
-    """Read an image as grey (H, W) or RGB (H, W, 3), uint8. Alpha is dropped, and 16 bits are
-    scaled to 8. `as_stored` ignores the EXIF orientation.
+def read_image(
+    path: Path | EncodedImage, as_stored: bool = False, white: int | None = None
+) -> Image:
+    """Read an image as grey (H, W) or RGB (H, W, 3), uint8. Alpha is dropped. `as_stored` ignores
+    the EXIF orientation. 16 bits are scaled to 8, so that `white` becomes 255. By default it is
+    that of `find_white_level`.
 
     Raises:
         UnreadableImageError: the file is missing, empty, truncated, damaged, not an image, or
@@ -82,10 +85,29 @@ def read_image(path: Path | EncodedImage, as_stored: bool = False) -> Image:
         if picture.mode in _GREY_MODES:
             return np.array(picture.convert("L"))
         if picture.mode in _GREY_16_MODES:
-            return cv2.convertScaleAbs(np.array(picture).astype(np.uint16), alpha=1.0 / 257.0)
+            values = np.array(picture).astype(np.uint16)
+            return cv2.convertScaleAbs(values, alpha=255.0 / (white or _white_level(values)))
         if picture.mode == "F":
             raise UnreadableImageError(f"{path}: pixels of type float32, not of 8 or 16 bits")
         return np.array(picture.convert("RGB"))
+
+
+def find_white_level(paths: Sequence[Path]) -> int:
+    """Return the largest value of a camera of 10, 12, 14 or 16 bits whose 16-bit images these are.
+
+    Images that cannot be read are skipped.
+    """
+    white = 0
+    for path in paths:
+        with suppress(UnreadableImageError), _open_image(path) as picture:
+            if picture.mode not in _GREY_16_MODES:
+                break
+            white = max(white, _white_level(np.array(picture).astype(np.uint16)))
+    return white or 65535
+
+
+def _white_level(values: UInt16[np.ndarray, "h w"]) -> int:
+    return next(white for white in (1023, 4095, 16383, 65535) if values.max(initial=0) <= white)
 
 
 def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.ndarray, "h w"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from topoloc.errors import UnreadableImageError
@@ -12,7 +13,7 @@ from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.depth_images import read_depth_image, resize_depth
 from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
-from topoloc.recordings.image_io import exif_focal_length, read_image
+from topoloc.recordings.image_io import exif_focal_length, find_white_level, read_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +88,12 @@ class Recording:
         """Return the recording without its right and depth images."""
         return replace(self, right=None, depth=None)
 
+    @cached_property
+    def _white_level(self) -> int:
+        """That of the whole recording, so that dark images stay darker than others."""
+        names = self.names[:: max(1, len(self.names) // 5)]
+        return find_white_level([self.root / name for name in names])
+
     def __getitem__(self, index: int) -> StereoFrame:
         """Read one frame.
 
@@ -96,7 +103,8 @@ class Recording:
         """
         frame = self.read_left_frame(index)
         if self.right is not None:
-            right = _read_checked_image(self.right.paths[index], self.right.rig.right)
+            path, camera = self.right.paths[index], self.right.rig.right
+            right = _read_checked_image(path, camera, self._white_level)
             return replace(frame, right=right)
         if self.depth is not None and frame.camera is not None:
             return replace(frame, depth=_depth_image(self.depth, index, frame.camera))
@@ -106,7 +114,7 @@ class Recording:
         """Read one frame without its right or depth image. Raises as `__getitem__`."""
         path = self.root / self.names[index]
         camera = self.camera if self.cameras is None else self.cameras[index]
-        image = _read_checked_image(path, camera, self.as_stored)
+        image = _read_checked_image(path, camera, self._white_level, self.as_stored)
         focal = exif_focal_length(path, image.shape[1], image.shape[0]) if camera is None else None
         return StereoFrame(
             self.names[index],
@@ -240,11 +248,13 @@ def _depth_image(depth: DepthImages, index: int, camera: Camera) -> DepthImage:
     return DepthImage(resize_depth(path, metres, camera), camera, depth.cam_from_depth)
 
 
-def _read_checked_image(path: Path, camera: Camera | None, as_stored: bool = False) -> Image:
-    image = read_image(path, as_stored)
+def _read_checked_image(
+    path: Path, camera: Camera | None, white: int, as_stored: bool = False
+) -> Image:
+    image = read_image(path, as_stored, white)
     if camera is not None:
         if as_stored and image.shape[:2] != (camera.height, camera.width):
-            image = read_image(path)  # a model of turned images
+            image = read_image(path, white=white)  # a model of turned images
         _check_size(path, image.shape, camera)
     return image
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 from pathlib import Path, PurePath, PureWindowsPath
 
 import numpy as np
@@ -13,9 +14,8 @@ from jaxtyping import Bool, Float
 from topoloc.errors import TopolocError, TrajectoryError
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
-# Larger times are nanoseconds (as ORB-SLAM3 writes them for EuRoC). In seconds they would be 30 000
-# years.
-_MAX_SECONDS = 10**12
+# Times with as many decimals are seconds, such as those of `Trajectory.write_tum`.
+_NUM_FINE_DECIMALS = 7
 # Maximum number of digits before the decimal point. Parsing an integer of a million digits takes
 # minutes.
 _MAX_DIGITS = 25
@@ -116,12 +116,19 @@ def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
             return None
         t_ns = 10 * t_ns + (column - ord("0"))
     t_ns *= 10 ** (9 - (len(digits) - at))
-    return t_ns.tolist() if (np.diff(t_ns) > 0).all() else None
+    steps = np.diff(t_ns)
+    step_s = float(np.median(steps)) / NANOSECONDS_PER_SECOND if len(steps) else 0.0
+    is_fine = len(digits) - at >= _NUM_FINE_DECIMALS
+    in_seconds = is_fine or _find_digits(t_ns[-1] / NANOSECONDS_PER_SECOND, step_s) == 9
+    return t_ns.tolist() if in_seconds and (steps > 0).all() else None
 
 
-def parse_times(rows: Rows, path: Path, error: type[TopolocError]) -> list[int]:
-    """Parse the first column to integer nanoseconds, exact to the last decimal. Times are in
-    seconds, or in nanoseconds if one is above 1e12.
+def parse_times(
+    rows: Rows, path: Path, error: type[TopolocError], max_step_s: float = 10.0
+) -> list[int]:
+    """Parse the first column to integer nanoseconds, exact to the last decimal. The times may be in
+    seconds, milliseconds, microseconds or nanoseconds. Steps of seconds are at most `max_step_s`
+    (median), unless the times are dates.
 
     Raises:
         error: a time is not a finite number, or the times do not increase strictly. Names file and
@@ -136,12 +143,29 @@ def parse_times(rows: Rows, path: Path, error: type[TopolocError]) -> list[int]:
         if not time.is_finite() or time.adjusted() > _MAX_DIGITS:
             raise error(f"{path}, line {line}: {columns[0][:40]!r} is not a time")
         times.append(time)
-    in_nanoseconds = max(times) > _MAX_SECONDS
-    t_ns = [int((time if in_nanoseconds else time.scaleb(9)).to_integral_value()) for time in times]
+    steps = [float(after - before) for before, after in pairwise(times)]
+    step = float(np.median(steps)) if steps else 0.0
+    is_fine = -int(times[-1].as_tuple().exponent) >= _NUM_FINE_DECIMALS
+    digits = 9 if is_fine else _find_digits(float(times[-1]), step, max_step_s)
+    t_ns = [int(time.scaleb(digits).to_integral_value()) for time in times]
     for (line, columns), before, after in zip(rows[1:], t_ns[:-1], t_ns[1:], strict=True):
         if after <= before:
             raise error(f"{path}, line {line}: time {columns[0][:40]} is not after the one before")
     return t_ns
+
+
+def _find_digits(last: float, step: float, max_step_s: float = 10.0) -> int:
+    """Return 9 if times are in seconds, 6 for milliseconds, 3 for microseconds, 0 for nanoseconds:
+    the unit that gives a date of this century, or else the largest with steps as of frames."""
+    first_date, last_date, max_date_step = 946_684_800, 4_102_444_800, 3600  # 2000 to 2100, s
+    max_seconds = 1e12  # larger ones would be 30 000 years
+    for digits in (9, 6, 3, 0):
+        unit = 10.0 ** (digits - 9)
+        if first_date <= last * unit < last_date and step * unit <= max_date_step:
+            return digits
+    if last <= max_seconds and step <= max_step_s:
+        return 9
+    return 6 if 0.0 < step <= 2e3 else 3 if 0.0 < step <= 2e6 else 0
 
 
 def read_file_list(path: Path, error: type[TopolocError]) -> tuple[list[int], list[str]]:

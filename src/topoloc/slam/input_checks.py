@@ -1,9 +1,5 @@
-"""Check the stereo pairs of a recording for faults that would give a wrong map, and measure the
-residuals of SLAM in the right images.
-
-The faults are swapped left and right images, a baseline in millimetres, and images that are no
-rectified pairs.
-"""
+"""Check the stereo pairs of a recording for faults that would give a wrong map. Measure the
+residuals of SLAM in right images."""
 
 from __future__ import annotations
 
@@ -36,8 +32,7 @@ def check_stereo(sequence: StereoSequence, num_frames: int = 8) -> None:
 
     Raises:
         CalibrationError: the baseline cannot be in metres.
-        RecordingError: left and right are swapped, or are no pairs of one moment, rectified as
-            calibrated. Also if a frame cannot be read.
+        RecordingError: left and right are swapped, or are no rectified pairs of one moment.
         UnreadableImageError: an image cannot be read.
     """
     max_baseline = 5.0  # metres; a larger one is assumed to be in millimetres
@@ -72,10 +67,8 @@ def _exchange(frame: StereoFrame) -> StereoFrame:
 
 
 def add_calibration(looks: str, sequence: StereoSequence, conventions: Sequence[str]) -> str:
-    """Add the calibration that explains another unit of the poses as well to their description.
-
-    The baseline or the depth factor is named first if the unit is none that poses often have.
-    """
+    """Add the calibration that explains another unit of poses as well to their description. It is
+    named first if the unit is not a common one."""
     # Common depth factors (units per metre), preferred to others that are nearly the same.
     common, max_ratio = (100.0, 256.0, 1000.0, 4000.0, 5000.0, 10000.0), 1.15
     max_factor = 20.0  # no wrong calibration explains more

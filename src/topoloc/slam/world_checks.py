@@ -1,9 +1,8 @@
 """Check that recordings whose poses should share one world do share it.
 
-Images of one place in two recordings give the motion between their cameras, as between two images
-of one recording (`measured_steps.py`). If the poses agree with a few such steps, the worlds are the
-same. If most steps agree on one transform between the worlds instead, the poses are in worlds of
-their own. Steps that agree on neither, as along equal panels, accuse nobody.
+Steps between images of two recordings are measured (`measured_steps.py`). If the poses agree with a
+few of them, the worlds are the same. If most agree on one transform between the worlds instead, the
+worlds differ. Steps that agree on neither, as along equal panels, accuse nobody.
 """
 
 from __future__ import annotations
@@ -21,10 +20,8 @@ from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_ste
 
 
 def check_common_world(sequences: Sequence[StereoSequence]) -> list[str]:
-    """Check that the poses of recordings are in one world, as far as their images show it.
-
-    Returns:
-        One line for each recording of which no image could be compared with an earlier recording.
+    """Check that the poses of recordings are in one world, as far as their images show it. Return
+    one line for each recording of which no image could be compared with an earlier recording.
 
     Raises:
         TrajectoryError: the poses of a recording are in another world. Names the transform.
@@ -65,8 +62,7 @@ class _Views:
         self.cache.update(zip(new, views, strict=True))
 
     def nearest(self, pose: Rigid3, max_angle: float = 0.5) -> tuple[float, int]:
-        """Return the distance in metres of the frame with the nearest pose, and its row. The
-        distance is infinite if all look elsewhere."""
+        """Return distance (metres, infinite if all look elsewhere) and row of the nearest pose."""
         frames = list(self.poses)
         apart = [pose.inverse() @ self.poses[k] for k in frames]
         costs = [
@@ -125,8 +121,7 @@ def _is_confirmed(one: _Views, other: _Views, steps: Sequence[MeasuredStep]) -> 
 
 
 def _check_transform(one: _Views, other: _Views, steps: list[MeasuredStep]) -> None:
-    """Raise TrajectoryError if most steps agree on a transform between the worlds that is far from
-    the identity."""
+    """Raise TrajectoryError if most steps agree on a transform far from the identity."""
     # Number and share of the steps that agree, and error of the poses as they are.
     min_pairs, min_ratio, min_error = 3, 0.6, 4.0
     if len(steps) < min_pairs:

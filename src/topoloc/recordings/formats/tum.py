@@ -45,7 +45,7 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
 
     Raises:
         RecordingError: a list is missing or malformed, or no colour image has depth.
-        CalibrationError: there is neither a camera.json nor a freiburg in the folder's name.
+        CalibrationError: neither a camera.json with depth_factor nor freiburg in the name.
         TrajectoryError: the ground truth is malformed or matches no frame.
     """
     colour_times, colour = read_file_list(path / "rgb.txt", RecordingError)
@@ -67,7 +67,7 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
         )
     t_ns = [colour_times[row] for row in kept]
     poses = read_ground_truth(path / "groundtruth.txt", [], t_ns)
-    paths, units = [path / depth[nearest[row]] for row in kept], found.depth_factor or DEPTH_FACTOR
+    paths, units = [path / depth[nearest[row]] for row in kept], _depth_factor(path, found)
     images = DepthImages(paths, units, None, Rigid3.identity())
     names = [colour[row] for row in kept]
     return Recording(path.resolve().name, path, names, t_ns, poses, found.camera, depth=images)
@@ -76,7 +76,7 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
 def _calibration(path: Path) -> CameraCalibration:
     if (path / FILE_NAME).is_file():
         return read_camera_json(path / FILE_NAME)
-    number = re.search(r"freiburg([123])", path.resolve().name)
+    number = _find_freiburg(path)
     if number is None:
         raise CalibrationError(
             f"{path / FILE_NAME}: no calibration here, and the folder's name does not say"
@@ -85,6 +85,20 @@ def _calibration(path: Path) -> CameraCalibration:
     params = _FREIBURG[number[1]]
     model = "PINHOLE" if len(params) == 4 else "FULL_OPENCV"
     return CameraCalibration(Camera(model, 640, 480, params))
+
+
+def _depth_factor(path: Path, found: CameraCalibration) -> float:
+    if found.depth_factor is None and _find_freiburg(path) is None:
+        raise CalibrationError(
+            f'{path / FILE_NAME}: no "depth_factor" here, and the folder\'s name does not say'
+            " freiburg1, 2 or 3; add the units a metre of its depth images: 1000 for millimetres,"
+            f" {DEPTH_FACTOR:g} as the data set has them"
+        )
+    return found.depth_factor or DEPTH_FACTOR
+
+
+def _find_freiburg(path: Path) -> re.Match[str] | None:
+    return re.search(r"freiburg([123])", path.resolve().name)
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_tum, ("calibration",))
