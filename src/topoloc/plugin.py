@@ -34,13 +34,13 @@ if TYPE_CHECKING:
         write_folder,
         write_text,
     )
-    from topoloc.recordings.calibration import parse_calibration
+    from topoloc.recordings.calibration import parse_calibration, replace_cameras
     from topoloc.recordings.camera_json import CameraCalibration, read_camera_json
-    from topoloc.recordings.depth_images import resize_depth
+    from topoloc.recordings.depth_images import read_depth_image, resize_depth
     from topoloc.recordings.format import (
         RecordingFormat,
-        find_nearest_idx,
         list_images,
+        match_times,
         natural_key,
         read_ground_truth,
         times_from_rate,
@@ -91,11 +91,11 @@ __all__ = [
     "encode_jpeg",
     "exif_focal_length",
     "find_format",
-    "find_nearest_idx",
     "format_length",
     "has_scale",
     "image_size",
     "list_images",
+    "match_times",
     "natural_key",
     "parse_calibration",
     "parse_feature_types",
@@ -103,9 +103,11 @@ __all__ = [
     "parse_tables",
     "read_bytes",
     "read_camera_json",
+    "read_depth_image",
     "read_ground_truth",
     "read_text",
     "remove_stale_files",
+    "replace_cameras",
     "resize_depth",
     "scale_poses",
     "silence_opencv",
@@ -131,11 +133,11 @@ _NAMES = {
     "topoloc.recordings.atomic": (
         "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"
     ),
-    "topoloc.recordings.calibration": "parse_calibration",
+    "topoloc.recordings.calibration": "parse_calibration replace_cameras",
     "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",
-    "topoloc.recordings.depth_images": "resize_depth",
+    "topoloc.recordings.depth_images": "read_depth_image resize_depth",
     "topoloc.recordings.format": (
-        "RecordingFormat find_nearest_idx list_images natural_key read_ground_truth times_from_rate"
+        "RecordingFormat list_images match_times natural_key read_ground_truth times_from_rate"
     ),
     "topoloc.recordings.formats.video": "Video silence_opencv",
     "topoloc.recordings.image_io": (

@@ -9,6 +9,7 @@ from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, Un
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.formats.euroc import open_euroc, read_sensor
+from topoloc.recordings.open import open_sequence
 
 MILLISECOND = 1_000_000
 
@@ -35,6 +36,63 @@ def test_pairs_are_of_equal_times(euroc: Path):
     of_mav = open_euroc(euroc / "mav0")
     assert of_mav.name == "v1"
     np.testing.assert_array_equal(of_mav[1].image, picture(2))
+
+
+def test_times_that_differ_by_nanoseconds(euroc: Path):
+    path = euroc / "mav0" / "cam1" / "data.csv"
+    delays = {EUROC_TIMES[0]: -40, EUROC_TIMES[2]: 900_000, EUROC_TIMES[3]: 1_100_000}
+    rows = [f"{time + delay},{time}.png" for time, delay in delays.items()]
+    path.write_text("\n".join(rows))
+    sequence = open_euroc(euroc)
+    assert sequence.t_ns == [EUROC_TIMES[0], EUROC_TIMES[2]]
+    np.testing.assert_array_equal(sequence[1].right, picture(102))
+    (note,) = sequence.notes
+    assert "2 of 4 pictures of cam0 have none of cam1 (3) within 1 ms and are left out" in note
+
+
+def camchain(motion: str, **matrices: np.ndarray) -> str:
+    """Kalibr's file of the two cameras; cam1 has `motion` beside its mounting."""
+    text = ""
+    for number, body_from_cam in enumerate(BODY_FROM_CAM):
+        sensor = sensor_yaml(body_from_cam).split("\n")
+        lines = [line for line in sensor if line.split(":")[0] in ("resolution", "intrinsics")]
+        text += f"cam{number}:\n" + "".join(f"  {line}\n" for line in lines)
+        text += "  camera_model: pinhole\n  distortion_model: radtan\n"
+        text += "  distortion_coeffs: [-0.28, 0.07, 0.0002, 1.7e-05]\n"
+        for key, matrix in ((motion, matrices["chain"]),) if number and motion else ():
+            text += f"  {key}:\n" + "".join(f"  - {row}\n" for row in matrix.tolist())
+        for key, of in (("T_cam_imu", body_from_cam.inverse()), ("T_imu_cam", body_from_cam)):
+            if key in matrices:
+                rows = of.matrix().tolist()
+                text += f"  {key}:\n" + "".join(f"  - {row}\n" for row in rows)
+    return text
+
+
+@pytest.mark.parametrize("key", ["T_cam_imu", "T_imu_cam"])
+@pytest.mark.parametrize("motion", ["T_cn_cnm1", ""])
+@pytest.mark.parametrize("place", ["camchain.yaml", "dso/camchain.yaml", "../given.yaml"])
+def test_kalibrs_file_in_place_of_sensor_yaml(euroc: Path, key: str, motion: str, place: str):
+    write_truth(euroc, EUROC_TIMES, [pose(index) for index in range(4)])
+    expected = open_euroc(euroc)
+    for number in (0, 1):
+        (euroc / "mav0" / f"cam{number}" / "sensor.yaml").unlink()
+    with pytest.raises(CalibrationError, match=r"cam0/sensor\.yaml: no calibration here"):
+        open_sequence(euroc)
+    chain = (BODY_FROM_CAM[1].inverse() @ BODY_FROM_CAM[0]).matrix()
+    (euroc / place).parent.mkdir(exist_ok=True)
+    (euroc / place).write_text(camchain(motion, chain=chain, **{key: chain}))
+    sequence = open_sequence(euroc, camera=euroc / place if place.startswith("..") else None)
+    assert sequence.t_ns == expected.t_ns
+    for found, other in zip(sequence, expected, strict=True):
+        assert found.rig.left == other.rig.left
+        assert_same_pose(found.rig.right_from_left, other.rig.right_from_left)
+        assert_same_pose(found.world_from_cam, other.world_from_cam)
+
+
+def test_one_camera_in_place_of_a_pair(euroc: Path):
+    (euroc / "mav0" / "cam0" / "sensor.yaml").unlink()
+    with pytest.raises(CalibrationError, match="--camera needs a file of both cameras"):
+        open_sequence(euroc, camera="45,45,16,12")
 
 
 def test_rig(euroc: Path):
@@ -113,7 +171,7 @@ def test_bad_lists(euroc: Path, text: str, says: str):
 
 def test_no_pair(euroc: Path):
     (euroc / "mav0" / "cam1" / "data.csv").write_text("1,1.png\n")
-    with pytest.raises(RecordingError, match=r"none of the 4 pictures of cam0.*1 of cam1"):
+    with pytest.raises(RecordingError, match=r"4 of 4 pictures of cam0 have none of cam1 \(1\)"):
         open_euroc(euroc)
 
 

@@ -41,6 +41,9 @@ def kind(sequence: StereoSequence, index: int) -> str:
         ("bag_rvl_depth", 3, "depth", True),
         ("bag_uncalibrated", 12, "stereo", False),
         ("ros_left_right_yaml", 12, "stereo", True),
+        ("euroc_times_differ", 12, "stereo", True),
+        ("nerfcapture_depth_path", 6, "depth", True),
+        ("stray_scanner", 6, "depth", True),
         ("colmap_exif_orientation", 12, "image", True),
         ("colmap_simple_radial_fisheye", 12, "image", True),
         ("tum_names_with_spaces", 6, "depth", True),
@@ -60,6 +63,17 @@ def test_a_video_whose_last_frames_have_no_time(cases: Path):
     sequence = open_sequence(folder / "walk.avi", camera=folder / "camera.json", warn=notes.append)
     assert [round(t_ns / 1e6) for t_ns in sequence.t_ns] == [200 * index for index in range(24)]
     assert notes == [f"{folder / 'walk.avi'}: 2 of 24 frames have no time; times are from its 5 Hz"]
+
+
+@pytest.mark.parametrize("is_given", [True, False])
+def test_a_recording_without_sensor_yaml(cases: Path, is_given: bool):
+    notes: list[str] = []
+    folder = cases / "tumvi_without_sensor_yaml"
+    camera = folder / "dso" / "camchain.yaml" if is_given else None
+    sequence = open_sequence(folder, camera=camera, warn=notes.append)
+    assert [kind(sequence, index) for index in range(len(sequence))] == ["stereo"] * 12
+    assert len(notes) == 1
+    assert "no T_cam_imu" in notes[0]
 
 
 def test_a_negative_focal_length_is_named(cases: Path):

@@ -12,6 +12,7 @@ def test_frames(tum: Path):
     sequence = open_tum(tum)
     assert sequence.t_ns == [1305031102175304000, 1305031102275326000]
     assert sequence.names == ["rgb/1305031102.175304.png", "rgb/1305031102.275326.png"]
+    assert "1 of 3 pictures of rgb.txt have none of depth.txt" in sequence.notes[0]
     frame = sequence[1]
     np.testing.assert_array_equal(frame.image, picture(2, 3, 640, 480)[:, :, ::-1])
     np.testing.assert_array_equal(frame.depth.depth, np.full((480, 640), 3.0, np.float32))
@@ -98,6 +99,6 @@ def test_truth_of_another_day(tum: Path):
 def test_bad_lists(tum: Path, text: str, says: str):
     (tum / "depth.txt").write_text(text)
     with pytest.raises(
-        RecordingError, match=says or "none of 3 colour pictures has one of 1 depth"
+        RecordingError, match=says or r"3 of 3 pictures of rgb.txt have none of depth.txt \(1\)"
     ):
         open_tum(tum)

@@ -164,19 +164,28 @@ def with_calibration(sequence: StereoSequence, calibration: CalibrationForSize) 
     given = calibration(*first_image_size(images, sequence.as_stored))
     right, depth = sequence.right, sequence.depth
     if right is not None:
-        if given.rig is None and not right.rig.is_rectified:
-            raise CalibrationError(
-                f"{sequence.name}: its stereo pair is not rectified, so that both cameras'"
-                " calibrations are needed"
-            )
-        rig = given.rig or StereoRig.rectified(given.camera, right.rig.baseline)
-        right = replace(right, rig=rig)
+        right = replace(right, rig=replace_cameras(right.rig, given, sequence.name))
     if depth is not None:
         registered = depth.camera is not None and depth.camera == sequence.camera
         camera = given.camera if registered else depth.camera
         units = given.depth_factor or depth.units_per_metre
         depth = replace(depth, camera=camera, units_per_metre=units)
     return replace(sequence, camera=given.camera, cameras=None, right=right, depth=depth)
+
+
+def replace_cameras(rig: StereoRig | None, given: CameraCalibration, where: str) -> StereoRig:
+    """Return the given rig, or a rectified one with the given camera and the same baseline.
+
+    Raises:
+        CalibrationError: the given one is of one camera and `rig` is not rectified, or None. Begins
+            with `where`.
+    """
+    if given.rig is not None:
+        return given.rig
+    if rig is None or not rig.is_rectified:
+        fault = "its stereo pair is not rectified" if rig else "the right camera's place is unknown"
+        raise CalibrationError(f"{where}: {fault}, so that --camera needs a file of both cameras")
+    return StereoRig.rectified(given.camera, rig.baseline)
 
 
 def first_image_size(images: Sequence[Path], as_stored: bool = False) -> tuple[int, int]:

@@ -22,11 +22,12 @@ FILE_NAME = "camera.json"
 @dataclass(frozen=True)
 class CameraCalibration:
     """Hold a camera model, and the `rig` of a stereo pair. The camera is the left one of the pair.
-    `depth_factor` is in file units per metre."""
+    `depth_factor` is in file units per metre. `body_from_cam` is the mounting of the camera."""
 
     camera: Camera
     rig: StereoRig | None = None
     depth_factor: float | None = None
+    body_from_cam: Rigid3 | None = None
 
 
 def read_camera_json(path: Path) -> CameraCalibration:

@@ -80,11 +80,35 @@ def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
             )
 
 
-def find_nearest_idx(times: np.ndarray, others: np.ndarray) -> list[int]:
-    """Return the row of the nearest of `others` (increasing) for each time."""
-    after = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
-    before, after = after - 1, np.minimum(after, len(others) - 1)
-    return np.where(times - others[before] <= others[after] - times, before, after).tolist()
+def match_times(
+    t_ns: Sequence[int],
+    others: Sequence[int],
+    max_delay_ms: int,
+    where: str,
+    names: tuple[str, str],
+) -> tuple[list[tuple[int, int]], tuple[str, ...]]:
+    """Return the row of each time that has another one (both increasing, nanoseconds) within
+    `max_delay_ms`, with the row of the nearest. The second value is a note on the times without.
+
+    Raises:
+        RecordingError: no time has one. Begins with `where`. `names` are those of the two lists.
+    """
+    times, partners = np.array(t_ns), np.array(others)
+    after = np.clip(np.searchsorted(partners, times), 1, max(len(partners) - 1, 1))
+    before, after = after - 1, np.minimum(after, len(partners) - 1)
+    is_before = times - partners[before] <= partners[after] - times
+    nearest = np.where(is_before, before, after)
+    delays = np.abs(times - partners[nearest])
+    kept = np.flatnonzero(delays <= max_delay_ms * 1_000_000)
+    num_without = len(times) - len(kept)
+    text = (
+        f"{where}: {num_without} of {len(times)} pictures of {names[0]} have none of {names[1]}"
+        f" ({len(partners)}) within {max_delay_ms} ms"
+    )
+    if not len(kept):
+        raise RecordingError(f"{text}; the nearest is {delays.min() / 1e6:.1f} ms away")
+    notes = (f"{text} and are left out",) if num_without else ()
+    return list(zip(kept.tolist(), nearest[kept].tolist(), strict=True)), notes
 
 
 def times_from_rate(num_frames: int, rate_hz: int = 10) -> list[int]:

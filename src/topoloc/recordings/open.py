@@ -23,6 +23,7 @@ FORMATS = {
     "tum": "topoloc.recordings.formats.tum:FORMAT",
     "seven_scenes": "topoloc.recordings.formats.seven_scenes:FORMAT",
     "nerfstudio": "topoloc.apps.formats.nerfstudio:FORMAT",
+    "stray_scanner": "topoloc.apps.formats.stray_scanner:FORMAT",
     "record3d": "topoloc.apps.formats.record3d:FORMAT",
     "colmap": "topoloc.apps.formats.colmap:FORMAT",
     "colmap_database": "topoloc.apps.formats.colmap_database:FORMAT",

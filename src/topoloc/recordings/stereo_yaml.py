@@ -3,8 +3,8 @@ ROS.
 
 OpenCV: `M1 D1 M2 D2 R T` as in its stereo sample, or the longer names of other programs. `R` and
 `T` may be in an extrinsics.yml beside it. They transform points from the left camera to the right
-one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`. ROS: a file for each camera, `left.yaml` and
-`right.yaml`. Lengths are in metres.
+one. Kalibr: `cam0`, `cam1` with `T_cn_cnm1`, or both with `T_cam_imu` or `T_imu_cam`. ROS: a file
+for each camera, `left.yaml` and `right.yaml`. Lengths are in metres.
 
 The files come with or without OpenCV's header and in several styles of YAML. So only words and
 numbers after the needed keys are read. Tags and aliases are ignored.
@@ -189,12 +189,28 @@ def _is_kalibr(text: str) -> bool:
 def _read_kalibr(path: Path, text: str) -> CameraCalibration:
     parts = re.split(r"^cam(\d+):", text, flags=re.MULTILINE)
     sections = dict(zip(parts[1::2], parts[2::2], strict=True))
-    left = kalibr_camera(path, sections["0"])
+    left, body_from_left = kalibr_camera(path, sections["0"]), _mounting(path, sections["0"])
     if "1" not in sections:
-        return CameraCalibration(left)
-    right = kalibr_camera(path, sections["1"])
-    motion = np.array(require_numbers(path, sections["1"], 16, "T_cn_cnm1")).reshape(4, 4)
-    return CameraCalibration(left, rig=_rig(path, left, right, motion[:3]))
+        return CameraCalibration(left, body_from_cam=body_from_left)
+    right, body_from_right = kalibr_camera(path, sections["1"]), _mounting(path, sections["1"])
+    if body_from_left and body_from_right and not yaml_numbers(sections["1"], "T_cn_cnm1"):
+        motion = (body_from_right.inverse() @ body_from_left).matrix()
+    else:
+        motion = np.array(require_numbers(path, sections["1"], 16, "T_cn_cnm1")).reshape(4, 4)
+    return CameraCalibration(left, _rig(path, left, right, motion[:3]), None, body_from_left)
+
+
+def _mounting(path: Path, section: str) -> Rigid3 | None:
+    """Return the pose of a camera in the frame of the IMU, or None if the section has none."""
+    for key in ("T_cam_imu", "T_imu_cam", "T_BS"):
+        if yaml_numbers(section, key):
+            numbers = require_numbers(path, section, 16, key)
+            try:
+                mounting = Rigid3.from_matrix(np.array(numbers).reshape(4, 4))
+            except TrajectoryError as error:
+                raise CalibrationError(f"{path}, {key}: {error}") from None
+            return mounting.inverse() if key == "T_cam_imu" else mounting
+    return None
 
 
 def _opencv_camera(

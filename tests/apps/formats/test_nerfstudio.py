@@ -60,6 +60,17 @@ def capture(tmp_path: Path) -> Make:
     return make
 
 
+def test_depth_of_nerfcapture(capture: Make):
+    def change(data: dict[str, Any]) -> None:
+        data["integer_depth_scale"] = 0.002
+        for frame in data["frames"]:
+            frame["depth_path"] = frame.pop("depth_file_path")
+
+    frame = open_sequence(capture(change))[2]
+    assert frame.name == "images/frame_10.png"
+    assert frame.depth.depth[12, 12] == pytest.approx(20.0)
+
+
 def test_axes_camera_order_and_depth(capture: Make):
     folder = capture()
     assert find_format(folder) == find_format(folder / "transforms.json") == "nerfstudio"

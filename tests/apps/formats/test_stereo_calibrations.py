@@ -269,9 +269,7 @@ class TestCameraOption:
         assert "P1: 50 0 16 -10" in CALIB
 
     def test_a_pair_that_is_not_rectified_needs_both(self, euroc: Path, tmp_path: Path):
-        with pytest.raises(
-            CalibrationError, match="not rectified, so that both cameras' calibrations are needed"
-        ):
+        with pytest.raises(CalibrationError, match=r"not rectified.* needs a file of both cameras"):
             open_sequence(euroc, camera="45,46,16,12")
         _assert_rig(open_sequence(euroc, camera=write_opencv(tmp_path / "rig.yml"))[0], LEFT, RIGHT)
 

@@ -28,8 +28,8 @@ Format = Annotated[
     tyro.conf.arg(
         metavar="NAME",
         help_behavior_hint="(default: recognised)",
-        help="Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio, record3d,"
-        " colmap, rosbag, mcap, zed, video or folder.",
+        help="Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio,"
+        " stray_scanner, record3d, colmap, colmap_database, rosbag, mcap, zed, video or folder.",
     ),
 ]
 CameraOption = Annotated[

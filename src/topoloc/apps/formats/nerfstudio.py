@@ -4,7 +4,8 @@
 program knows them; `applied_scale` is removed. `fl_x fl_y cx cy w h` and the distortion of OpenCV
 stand in the file or in each frame. As in COLMAP the centre of the top-left pixel is (0.5, 0.5).
 Depth is along z, with the view of the image, in units of `depth_unit_scale_factor` metres (default
-0.001, as in nerfstudio). Frames are in the order of their names and have no times: 10 a second.
+0.001, as in nerfstudio). NeRFCapture writes `depth_path` and `integer_depth_scale` (metres). Frames
+are in the order of their names and have no times: 10 a second.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def open_nerfstudio(path: Path) -> Recording:
     poses: list[Rigid3 | None] = [_pose(frame, whole.applied_scale) for frame in frames]
     # Keys of the file take precedence, as in nerfstudio.
     cameras = [_camera(lens | data, at) for (_, _, lens), at in zip(named, where, strict=True)]
-    depth = _depth(frames, whole.depth_unit_scale_factor, file, where)
+    depth = _depth(frames, whole.integer_depth_scale or whole.depth_unit_scale_factor, file, where)
     name, t_ns = file.parent.resolve().name, times_from_rate(len(names))
     return Recording.with_cameras(name, file.parent, names, t_ns, poses, cameras, depth=depth)
 
@@ -73,12 +74,14 @@ class _Frame(Struct, frozen=True):
     file_path: str
     transform_matrix: Rigid3
     depth_file_path: str | None = None
+    depth_path: str | None = None
 
 
 class _File(Struct, frozen=True):
     frames: Annotated[list[dict[str, Any]], Meta(min_length=1)]
     applied_scale: _Factor = 1.0
     depth_unit_scale_factor: _Factor = DEPTH_UNIT
+    integer_depth_scale: _Factor | None = None
 
 
 class _Lens(Struct, frozen=True):
@@ -136,7 +139,8 @@ def _camera(data: dict[str, Any], where: str) -> Camera:
 
 
 def _depth(frames: list[_Frame], unit: float, file: Path, where: list[str]) -> DepthImages | None:
-    names = [frame.depth_file_path for frame in frames if frame.depth_file_path is not None]
+    found = [frame.depth_file_path or frame.depth_path for frame in frames]
+    names = [name for name in found if name is not None]
     if not names:
         return None
     if len(names) != len(frames):

@@ -1,7 +1,8 @@
 """Read EuRoC / ASL recordings (Burri et al., IJRR 2016): ``mav0/cam0`` and ``mav0/cam1``.
 
-Images are distorted and not rectified. Images of equal time stamps form a stereo pair. An image
-without a partner is skipped, because some published recordings lack frames of one camera. Ground
+Images are distorted and not rectified. Images whose time stamps differ by at most 1 ms form a
+stereo pair. An image without a partner is skipped, because some published recordings lack frames of
+one camera. Ground
 truth is ``state_groundtruth_estimate0`` (or ``mocap0``). Its body poses are converted to poses of
 the left camera.
 """
@@ -17,14 +18,20 @@ from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.format import RecordingFormat
+from topoloc.recordings.calibration import (
+    CalibrationForSize,
+    find_calibration,
+    first_image_size,
+    replace_cameras,
+)
+from topoloc.recordings.format import RecordingFormat, match_times
 from topoloc.recordings.recording import Recording, RightImages
 from topoloc.recordings.stereo_yaml import kalibr_camera, read_yaml, require_numbers
 from topoloc.recordings.text_files import read_file_list
 from topoloc.recordings.trajectory import read_asl_poses
 
 EXPECTED_FILES = "mav0/ with cam0/data.csv, or cam0/data.csv"
-MAX_TRUTH_GAP = 0.05
+MAX_TRUTH_GAP, MAX_PAIR_DELAY_MS = 0.05, 1
 _TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0")
 
 
@@ -46,35 +53,63 @@ def _find_mav(path: Path) -> Path | None:
     return next((folder for folder in folders if (folder / "cam0" / "data.csv").is_file()), None)
 
 
-def open_euroc(path: Path) -> Recording:
+def open_euroc(path: Path, calibration: CalibrationForSize | None = None) -> Recording:
     """Open a recording by its folder or its mav0. Without cam1 it is a monocular recording of the
     left camera.
 
+    Args:
+        path: the folder.
+        calibration: replaces the cameras of each sensor.yaml, which may be missing. Without one, it
+            is Kalibr's file beside mav0 or in dso/.
+
     Raises:
         RecordingError: data.csv is missing or malformed, or no two images have the same time.
-        CalibrationError: a sensor.yaml is missing or not usable.
+        CalibrationError: a sensor.yaml is missing or not usable, and there is no calibration.
         TrajectoryError: the ground truth is malformed, or matches no frame.
     """
     mav = _find_mav(path)
     if mav is None:
         raise RecordingError(f"{path}: not an EuRoC recording, which has {EXPECTED_FILES}")
-    left = _read_csv(mav / "cam0" / "data.csv")
-    sensor = read_sensor(mav / "cam0" / "sensor.yaml")
-    t_ns, right = sorted(left), None
-    if (mav / "cam1" / "data.csv").is_file():
-        right_by_time = _read_csv(mav / "cam1" / "data.csv")
-        right_sensor = read_sensor(mav / "cam1" / "sensor.yaml")
-        t_ns = [time for time in t_ns if time in right_by_time]
-        if not t_ns:
-            raise RecordingError(
-                f"{mav}: none of the {len(left)} pictures of cam0 has a partner of its time among"
-                f" {len(right_by_time)} of cam1"
-            )
-        right = RightImages([right_by_time[time] for time in t_ns], _rig(mav, sensor, right_sensor))
-    names = [left[time].relative_to(path).as_posix() for time in t_ns]
+    t_ns, left = _read_csv(mav / "cam0" / "data.csv")
+    sensor, rig, notes = _read_sensors(mav, left, calibration)
+    right = None
+    if rig is not None:
+        others, images = _read_csv(mav / "cam1" / "data.csv")
+        pairs, lost = match_times(t_ns, others, MAX_PAIR_DELAY_MS, str(mav), ("cam0", "cam1"))
+        notes = (*notes, *lost)
+        t_ns, left = [t_ns[row] for row, _ in pairs], [left[row] for row, _ in pairs]
+        right = RightImages([images[row] for _, row in pairs], rig)
+    names = [image.relative_to(path).as_posix() for image in left]
     name = mav.resolve().parent.name if mav.resolve().name == "mav0" else path.resolve().name
     poses = _read_ground_truth(mav, t_ns, sensor)
-    return Recording(name, path, names, t_ns, poses, sensor.camera, right)
+    return Recording(name, path, names, t_ns, poses, sensor.camera, right, notes=notes)
+
+
+def _read_sensors(
+    mav: Path, images: list[Path], calibration: CalibrationForSize | None
+) -> tuple[Sensor, StereoRig | None, tuple[str, ...]]:
+    """Return the left sensor, the rig of a pair, and notes."""
+    files = [mav / f"cam{number}" / "sensor.yaml" for number in (0, 1)]
+    is_pair, has_sensors = (mav / "cam1" / "data.csv").is_file(), files[0].is_file()
+    if not has_sensors:
+        folders = [folder for folder in (mav.parent, mav.parent / "dso") if folder.is_dir()]
+        found = (find_calibration(folder) for folder in folders)
+        calibration = calibration or next((one for one in found if one), None)
+    given = calibration and calibration(*first_image_size(images))
+    if given is None or has_sensors:
+        sensor = read_sensor(files[0])
+        rig = _rig(mav, sensor, read_sensor(files[1])) if is_pair else None
+        if given is None:
+            return sensor, rig, ()
+        mounting = sensor.body_from_cam
+    else:
+        rig, mounting = None, given.body_from_cam
+    if is_pair:
+        rig = replace_cameras(rig, given, str(mav))
+    has_truth = any((mav / name / "data.csv").is_file() for name in _TRUTH_FOLDERS)
+    note = f"{mav}: no sensor.yaml and no T_cam_imu: the poses of the body are used as the camera's"
+    notes = (note,) if mounting is None and has_truth else ()
+    return Sensor(given.camera, mounting or Rigid3.identity()), rig, notes
 
 
 def read_sensor(path: Path) -> Sensor:
@@ -102,10 +137,10 @@ def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:
         ) from None
 
 
-def _read_csv(path: Path) -> dict[int, Path]:
-    """Return the image of each time stamp."""
+def _read_csv(path: Path) -> tuple[list[int], list[Path]]:
+    """Return the time stamps and the images."""
     t_ns, names = read_file_list(path, RecordingError)
-    return {time: path.parent / "data" / name for time, name in zip(t_ns, names, strict=True)}
+    return t_ns, [path.parent / "data" / name for name in names]
 
 
 def _read_ground_truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid3 | None]:
@@ -119,4 +154,4 @@ def _read_ground_truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid
     return [pose and pose @ sensor.body_from_cam for pose in poses]
 
 
-FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_euroc)
+FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_euroc, ("calibration",))

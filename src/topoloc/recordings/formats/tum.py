@@ -10,20 +10,18 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.calibration import CalibrationForSize, first_image_size
 from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration, read_camera_json
-from topoloc.recordings.format import RecordingFormat, find_nearest_idx, read_ground_truth
+from topoloc.recordings.format import RecordingFormat, match_times, read_ground_truth
 from topoloc.recordings.recording import DepthImages, Recording
 from topoloc.recordings.text_files import read_file_list
 
 EXPECTED_FILES = "rgb.txt and depth.txt"
 DEPTH_FACTOR = 5000.0
-MAX_DEPTH_DELAY = 0.02
+MAX_DEPTH_DELAY_MS = 20
 _FREIBURG = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633, 0.0, 0.0, 0.0),
     "2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0.0, 0.0, 0.0),
@@ -54,23 +52,15 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
     else:
         found = _calibration(path)
     depth_times, depth = read_file_list(path / "depth.txt", RecordingError)
-    nearest = find_nearest_idx(np.array(colour_times), np.array(depth_times))
-    kept = [
-        row
-        for row, other in enumerate(nearest)
-        if abs(colour_times[row] - depth_times[other]) <= MAX_DEPTH_DELAY * 1e9
-    ]
-    if not kept:
-        raise RecordingError(
-            f"{path}: none of {len(colour)} colour pictures has one of {len(depth)} depth pictures"
-            " within 20 ms"
-        )
-    t_ns = [colour_times[row] for row in kept]
+    names = ("rgb.txt", "depth.txt")
+    pairs, notes = match_times(colour_times, depth_times, MAX_DEPTH_DELAY_MS, str(path), names)
+    t_ns = [colour_times[row] for row, _ in pairs]
     poses = read_ground_truth(path / "groundtruth.txt", [], t_ns)
-    paths, units = [path / depth[nearest[row]] for row in kept], _depth_factor(path, found)
+    paths, units = [path / depth[row] for _, row in pairs], _depth_factor(path, found)
     images = DepthImages(paths, units, None, Rigid3.identity())
-    names = [colour[row] for row in kept]
-    return Recording(path.resolve().name, path, names, t_ns, poses, found.camera, depth=images)
+    frames = ([colour[row] for row, _ in pairs], t_ns, poses)
+    name = path.resolve().name
+    return Recording(name, path, *frames, found.camera, depth=images, notes=notes)
 
 
 def _calibration(path: Path) -> CameraCalibration:

@@ -19,7 +19,7 @@ from topoloc.apps.formats.bags.bag_images import camera_info, message_size, redu
 from topoloc.apps.formats.bags.bag_poses import TransformTree
 from topoloc.apps.formats.bags.messages import decode
 from topoloc.apps.formats.bags.topics import Roles, is_rectified, is_registered
-from topoloc.plugin import CameraCalibration, RosCalibration, read_camera_json
+from topoloc.plugin import CameraCalibration, RosCalibration, read_camera_json, replace_cameras
 
 
 def find_left_camera(
@@ -43,14 +43,7 @@ def find_rig(
     if given is not None and given.rig is not None:
         return given.rig
     rig = _find_own_rig(bag, roles, left, tree)
-    if given is None:
-        return rig
-    if not rig.is_rectified:
-        raise CalibrationError(
-            f"{bag.path}: its stereo pair is not rectified, so that --camera needs a file with both"
-            " cameras"
-        )
-    return StereoRig.rectified(given.camera, rig.baseline)
+    return rig if given is None else replace_cameras(rig, given, str(bag.path))
 
 
 def _find_own_rig(

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from topoloc import (
     CalibrationError,
     Camera,
@@ -48,7 +46,7 @@ from topoloc.apps.formats.bags.topics import (
 from topoloc.plugin import (
     CameraCalibration,
     RecordingFormat,
-    find_nearest_idx,
+    match_times,
     resize_depth,
 )
 
@@ -211,21 +209,11 @@ def _match_by_time(
     the partners."""
     t_ns, left = first
     others, images = _index_by_time(bag, name)
-    nearest = find_nearest_idx(np.array(t_ns), np.array(others))
-    delays = [abs(time - others[other]) for time, other in zip(t_ns, nearest, strict=True)]
-    kept = [row for row, delay in enumerate(delays) if delay <= delay_ms * 1_000_000]
-    lacking = (
-        f"of {len(t_ns)} pictures of {left.topic.name} have none of {name} ({len(others)}) within"
-        f" {delay_ms} ms"
-    )
-    if not kept:
-        off = min(delays) / 1e6
-        raise RecordingError(f"{bag.path}: {len(t_ns)} {lacking}; the nearest is {off:.1f} ms away")
-    if len(kept) < len(t_ns):
-        bag.notes.append(f"{bag.path}: {len(t_ns) - len(kept)} {lacking} and are left out")
-    refs, partners = [left.refs[row] for row in kept], [images.refs[nearest[row]] for row in kept]
+    pairs, notes = match_times(t_ns, others, delay_ms, str(bag.path), (left.topic.name, name))
+    bag.notes += notes
+    refs, partners = [left.refs[row] for row, _ in pairs], [images.refs[row] for _, row in pairs]
     matched = ImageMessages(left.topic, refs), ImageMessages(images.topic, partners)
-    return [t_ns[row] for row in kept], *matched
+    return [t_ns[row] for row, _ in pairs], *matched
 
 
 def _read_frame_id(bag: Bag, images: ImageMessages) -> str:
