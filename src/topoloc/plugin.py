@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from topoloc.features.feature_types import check_available, parse_feature_types
     from topoloc.features.network_files import NetworkInfo, cache_folder, read_bytes
     from topoloc.json_data import Finite, decode_json
+    from topoloc.mapping.node_images import read_node_image
     from topoloc.recordings.atomic import (
         atomic_write,
         remove_stale_files,
@@ -49,7 +50,6 @@ if TYPE_CHECKING:
     from topoloc.recordings.image_io import (
         MAX_PIXELS,
         EncodedImage,
-        encode_jpeg,
         exif_focal_length,
         image_size,
     )
@@ -62,6 +62,7 @@ if TYPE_CHECKING:
         scale_poses,
     )
     from topoloc.recordings.ros_calibration import RosCalibration
+    from topoloc.recordings.stored_images import encode_jpeg
     from topoloc.recordings.text_files import parse_relative_path, read_text
     from topoloc.removed_settings import parse_tables
 
@@ -105,6 +106,7 @@ __all__ = [
     "read_camera_json",
     "read_depth_image",
     "read_ground_truth",
+    "read_node_image",
     "read_text",
     "remove_stale_files",
     "replace_cameras",
@@ -130,6 +132,7 @@ _NAMES = {
     "topoloc.features.feature_types": "check_available parse_feature_types",
     "topoloc.features.network_files": "NetworkInfo cache_folder read_bytes",
     "topoloc.json_data": "Finite decode_json",
+    "topoloc.mapping.node_images": "read_node_image",
     "topoloc.recordings.atomic": (
         "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"
     ),
@@ -140,12 +143,11 @@ _NAMES = {
         "RecordingFormat list_images match_times natural_key read_ground_truth times_from_rate"
     ),
     "topoloc.recordings.formats.video": "Video silence_opencv",
-    "topoloc.recordings.image_io": (
-        "EncodedImage MAX_PIXELS encode_jpeg exif_focal_length image_size"
-    ),
+    "topoloc.recordings.image_io": ("EncodedImage MAX_PIXELS exif_focal_length image_size"),
     "topoloc.recordings.open": "find_format split_selection",
     "topoloc.recordings.recording": "DepthImages Recording as_monocular has_scale scale_poses",
     "topoloc.recordings.ros_calibration": "RosCalibration",
+    "topoloc.recordings.stored_images": "encode_jpeg",
     "topoloc.recordings.text_files": "parse_relative_path read_text",
     "topoloc.removed_settings": "parse_tables",
 }

@@ -164,7 +164,7 @@ def test_the_command_prints_writes_and_draws(
         "node_ids": [facts["nodes"][-1]["node_id"]],
     }
     html = page.read_text()
-    assert not re.search(r"(?:src|href)=\"(?!data:image/jpeg;base64,|#)", html)
+    assert not re.search(r"(?:src|href)=\"(?!data:image/(?:jpeg|webp);base64,|#)", html)
     body = html[html.index("<body>") : html.index("</html>")]
     ElementTree.fromstring(re.sub(r"(<img [^>]*)>", r"\1/>", body))
     assert "not localized without itself" in html

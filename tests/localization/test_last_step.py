@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from built_room import unseen_views
 from tiny_world import CAMERA
+from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
@@ -20,6 +21,7 @@ from topoloc.localization.exact import patch_alignment
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
+from topoloc.localization.search import Trace
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -77,9 +79,16 @@ def test_without_images_of_the_nodes_a_pose_is_found_all_the_same(
         monkeypatch.setattr(
             patch_alignment.NodeTemplate,
             "of_node",
-            staticmethod(lambda node, jpeg=damaged: read(replace(node, template_jpeg=jpeg))),
+            staticmethod(lambda node, jpeg=damaged: read(replace(node, template_image=jpeg))),
         )
-        assert _error_mm(_localized(Localizer(room), image), truth) < 10.0
+        trace = Trace()
+        result = Localizer(room).localize(image, CAMERA, trace=trace)
+        assert isinstance(result, Localization)
+        assert _error_mm(result, truth) < 10.0
+        assert result.node_id in trace.nodes_without_image
+    explained = explain(Localizer(room), image, CAMERA)
+    assert "missing or damaged" in " ".join(explained.advice)
+    assert explanation_to_json("a", explained)["nodes_without_image"]
 
 
 def test_a_focal_length_that_is_estimated_is_left_alone(room: TopoMetricMap):

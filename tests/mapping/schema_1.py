@@ -42,7 +42,7 @@ def write_schema_1(topomap: TopoMetricMap, path: Path) -> Path:
             _insert(database, node, "")
             database.execute(
                 "INSERT INTO node_templates VALUES (?, ?)",
-                (node.summary.node_id, node.template_jpeg),
+                (node.summary.node_id, node.template_image),
             )
         database.executemany(
             "INSERT INTO edges VALUES (?, ?)",

@@ -90,7 +90,7 @@ def test_a_node_holds_what_the_paper_says(tiny_map: TopoMetricMap):
     assert (np.diff(node.features.responses) <= 0).all()  # strongest first
     np.testing.assert_allclose(np.linalg.norm(node.features.descriptors, axis=1), 1.0, atol=1e-3)
     assert cv2.imdecode(
-        np.frombuffer(node.template_jpeg, np.uint8), cv2.IMREAD_GRAYSCALE
+        np.frombuffer(node.template_image, np.uint8), cv2.IMREAD_GRAYSCALE
     ).shape == (240, 320)
     truth = tiny_world.path_pose(
         2.0 * [image.name for image in tiny_map.place_images].index(node.summary.name)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image as Pillow
 
 from built_room import built_room
 from topoloc.apps.cli import main
+from topoloc.apps.viewer.document import create_document
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.contradictions import find_contradictions
@@ -46,7 +49,7 @@ def test_damage_is_told_in_one_line_and_by_the_exit_status(
     saved: Path, capsys: pytest.CaptureFixture[str]
 ):
     content = saved.read_bytes()
-    place = content.index(TopoMetricMap.load(saved).nodes[1].template_jpeg[:40]) + 20
+    place = content.index(TopoMetricMap.load(saved).nodes[1].template_image[:40]) + 20
     saved.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
     assert main(["info", str(saved)]) == 0
     assert main(["info", str(saved), "--check"]) == 1
@@ -73,3 +76,17 @@ def test_nodes_that_were_moved_together_are_found(tiny_recording: Path):
     )
     assert {contradiction.node_id for contradiction in found} == moved
     assert all(0.9 < contradiction.metres < 1.1 for contradiction in found)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+def test_an_image_larger_than_its_camera_is_damage_of_its_node(saved: Path, kind: str):
+    topomap, file = TopoMetricMap.load(saved), io.BytesIO()
+    Pillow.new("L", (10_000, 9_000)).save(file, kind, quality=1)
+    *nodes, last = topomap.nodes
+    topomap.with_first_layer(nodes=[*nodes, replace(last, template_image=file.getvalue())]).save(
+        saved
+    )
+    fault = f"node {last.summary.node_id} is damaged: its image is 10000x9000, more than 320x240"
+    assert find_map_damage(saved) == [fault]
+    with TopoMetricMap.load(saved) as damaged, pytest.raises(MapError, match=fault):
+        create_document(damaged, "large")

@@ -40,7 +40,7 @@ def test_everything_comes_back(tiny_map: TopoMetricMap, saved: Path):
                 s.world_from_cam.matrix(), other.summary.world_from_cam.matrix()
             )
         assert one.camera == other.camera
-        assert one.template_jpeg == other.template_jpeg
+        assert one.template_image == other.template_image
         for name in ("points_img", "sizes_px", "angles", "responses"):
             np.testing.assert_array_equal(
                 getattr(one.features, name), getattr(other.features, name)

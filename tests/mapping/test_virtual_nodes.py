@@ -102,7 +102,7 @@ def test_side_nodes_are_numbered_and_say_where_they_come_from(sides: VirtualNode
     for node in sides.nodes:
         s = node.summary
         assert (s.recording, s.num_points) == ("walk", len(node.features))
-        assert node.template_jpeg == b""
+        assert node.template_image == b""
         np.testing.assert_allclose(
             s.world_from_cam.translation, of_names[s.name].translation, atol=1e-9
         )

@@ -1,5 +1,6 @@
 import os
 import struct
+import subprocess
 import sys
 import zlib
 from pathlib import Path
@@ -246,3 +247,35 @@ def test_sixteen_bits_of_colour_become_eight(tmp_path: Path):
     np.testing.assert_allclose(
         read_image(write(tmp_path / "a.png", levels)), levels[:, :, ::-1] / 257.0, atol=1.0
     )
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+def test_large_images_are_reduced(tmp_path: Path, suffix: str):
+    path = write(tmp_path / f"large.{suffix}", cv2.resize(smooth(3), (323, 241)))
+    whole = read_image(path)
+    for max_pixels, size in ((323 * 241, (323, 241)), (77_000, (161, 120)), (5_000, (81, 60))):
+        reduced = read_image(path, max_pixels=max_pixels)
+        assert np.abs(np.subtract(reduced.shape[1::-1], size)).max() <= 1
+        expected = cv2.resize(whole, reduced.shape[1::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(reduced.astype(int) - expected).max() < 8
+    assert image_size(path) == (323, 241)
+
+
+def test_a_webp_image_of_50_megapixels_takes_little_memory(tmp_path: Path):
+    """Pillow takes 770 MB for it."""
+    Pillow.new("RGB", (7070, 7070)).save(tmp_path / "black.webp")
+    code = (
+        "import resource; from pathlib import Path; from topoloc import read_image;"
+        f" path = Path({str(tmp_path)!r}) / 'black.webp';"
+        " peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; before = peak();"
+        " assert read_image(path, max_pixels=12_500_000).shape == (3535, 3535, 3);"
+        " print(peak() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 250_000  # kB
+
+
+def test_a_side_has_a_limit(tmp_path: Path):
+    Pillow.new("L", (30_001, 1)).save(tmp_path / "long.png")
+    with pytest.raises(UnreadableImageError, match="30001x1 is more than"):
+        read_image(tmp_path / "long.png")

@@ -83,7 +83,7 @@ def test_a_map_learns_and_is_asked(
         ["cnn-nn", "surf-vlad"],
         "surf-vlad",
     )
-    assert after.nodes[0].template_jpeg == before.nodes[0].template_jpeg
+    assert after.nodes[0].template_image == before.nodes[0].template_image
     assert (
         main(
             ["evaluate", str(copied_map), str(queries), "--coarse", "cnn-nn", "--json", str(facts)]

@@ -10,11 +10,13 @@ from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
+from topoloc.localization.exact.patch_alignment import NodeTemplate
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.pose_fit import PointMatches, PoseFit
 from topoloc.localization.query import Query
 from topoloc.localization.result import CandidateNode
+from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import NodeScore
 
 
@@ -52,9 +54,11 @@ class TriedProposal:
 
 @dataclass(eq=False)
 class Trace:
-    """Collect all tried pose proposals, in order."""
+    """Collect all tried pose proposals, in order, and the nodes without a usable image that the
+    last step met."""
 
     tried: list[TriedProposal] = field(default_factory=list)
+    nodes_without_image: set[NodeId] = field(default_factory=set)
 
 
 Source = Literal[
@@ -149,6 +153,13 @@ class Search:
             log_odds_margin(best, other, self.weights.rivals) > self.weights.evidence.clear_log_odds
             for other in others
         )
+
+    def template(self, node_id: NodeId) -> NodeTemplate:
+        """Return the image of a node. The trace collects the nodes without a usable one."""
+        template = self.map.template(node_id)
+        if template.is_black and self.trace is not None:
+            self.trace.nodes_without_image.add(node_id)
+        return template
 
     def add(self, hypothesis: Hypothesis | None) -> None:
         """Add a hypothesis to the belief, unless it is None."""

@@ -35,8 +35,8 @@ from topoloc.points.motion_triangulation import (
 )
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
-from topoloc.recordings.image_io import encode_jpeg
 from topoloc.recordings.recording import find_source_path, has_scale, read_left_frame
+from topoloc.recordings.stored_images import encode_jpeg
 
 R = TypeVar("R")
 

@@ -30,7 +30,7 @@ from topoloc.mapping.storage.entries import NodeSummary, TopoNode
 from topoloc.mapping.virtual_nodes import create_virtual_nodes
 from topoloc.node_ids import NodeId, Row
 from topoloc.recordings.frame_preparation import PreparedFrame
-from topoloc.recordings.image_io import encode_webp
+from topoloc.recordings.stored_images import encode_webp
 from topoloc.retrieval.vlad import append_positions
 
 MIN_NODE_POINTS = 20  # an image with fewer located features becomes no node
@@ -55,7 +55,7 @@ class NodeDraft:
     summary: NodeSummary
     frame: MappingFrame
     image: MappingImage
-    template_jpeg: bytes
+    template_image: bytes
     points: dict[str, DraftPoints]
     sides: list[TopoNode]
     sources: list[MappingFrame]
@@ -121,7 +121,7 @@ def create_node_draft(
         positions, covariances = located[kind].points_cam[rows], located[kind].covariances[rows]
         points[kind] = DraftPoints(features.select(rows), positions, covariances, [])
     # correlation needs 400 pixels; as WebP they take little more than 240 as JPEG
-    template_jpeg = encode_small(view.picture, 400, partial(encode_webp, quality=70))
+    template_image = encode_small(view.picture, 400, partial(encode_webp, quality=70))
     summary = NodeSummary(
         NodeId(-1),
         frame.sequence.name,
@@ -136,7 +136,7 @@ def create_node_draft(
         if has_virtual_views and not sources
         else []
     )
-    return NodeDraft(summary, frame, image, template_jpeg, points, sides, [frame, *sources])
+    return NodeDraft(summary, frame, image, template_image, points, sides, [frame, *sources])
 
 
 def observe_draft(
@@ -186,6 +186,6 @@ def finish_node(node_id: NodeId, draft: NodeDraft, kind: str, max_points: int = 
         points.features.select(rows),
         refined.points_cam[rows].astype(np.float32),
         sqrt_covs.astype(np.float32),
-        draft.template_jpeg,
+        draft.template_image,
         session_statistics,
     )

@@ -71,17 +71,24 @@ class EncodedImage:
 
 
 def read_image(
-    path: Path | EncodedImage, as_stored: bool = False, white: int | None = None
+    path: Path | EncodedImage,
+    as_stored: bool = False,
+    white: int | None = None,
+    max_pixels: int = MAX_PIXELS,
 ) -> Image:
     """Read an image as grey (H, W) or RGB (H, W, 3), uint8. Alpha is dropped. `as_stored` ignores
     the EXIF orientation. 16 bits are scaled to 8, so that `white` becomes 255. By default it is
-    that of `find_white_level`.
+    that of `find_white_level`. An image of 8 bits and more than `max_pixels` is reduced by 2, 4
+    or 8.
 
     Raises:
         UnreadableImageError: the file is missing, empty, truncated, damaged, not an image, or
             larger than 100 megapixels.
     """
-    with _decode_image(path, as_stored) as picture:
+    with _open_image(path) as picture:
+        if picture.format == "WEBP" and (as_stored or _orientation(picture) == 1):
+            return _decode_webp(path, _reduction(picture, max_pixels))
+    with _decode_image(path, as_stored, max_pixels) as picture:
         if picture.mode in _GREY_MODES:
             return np.array(picture.convert("L"))
         if picture.mode in _GREY_16_MODES:
@@ -89,7 +96,17 @@ def read_image(
             return cv2.convertScaleAbs(values, alpha=255.0 / (white or _white_level(values)))
         if picture.mode == "F":
             raise UnreadableImageError(f"{path}: pixels of type float32, not of 8 or 16 bits")
-        return np.array(picture.convert("RGB"))
+        return np.array(picture if picture.mode == "RGB" else picture.convert("RGB"))
+
+
+def _decode_webp(path: Path | EncodedImage, factor: int) -> Image:
+    """Decode a WebP image with OpenCV, which takes a third of Pillow's memory."""
+    flags = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
+    flag = flags.get(factor, cv2.IMREAD_REDUCED_COLOR_8) | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = cv2.imdecode(np.frombuffer(_read_bytes(path), np.uint8), flag)
+    if bgr is None:
+        raise UnreadableImageError(f"{path}: damaged or truncated WebP file")
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr)
 
 
 def find_white_level(paths: Sequence[Path]) -> int:
@@ -129,21 +146,6 @@ def read_depth(path: Path | EncodedImage, units_per_metre: float) -> Float32[np.
     return depth
 
 
-def encode_jpeg(image: Image, quality: int) -> bytes:
-    """Encode an image as JPEG. The same image gives the same bytes."""
-    return _encode(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def encode_webp(image: Image, quality: int) -> bytes:
-    """Encode an image as WebP. The same image gives the same bytes."""
-    return _encode(image, ".webp", [cv2.IMWRITE_WEBP_QUALITY, quality])
-
-
-def _encode(image: Image, suffix: str, options: list[int]) -> bytes:
-    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(suffix, bgr, options)[1].tobytes()
-
-
 def image_size(path: Path | EncodedImage, as_stored: bool = False) -> tuple[int, int]:
     """Read width and height in pixels from the header, after EXIF rotation unless `as_stored`.
 
@@ -152,7 +154,7 @@ def image_size(path: Path | EncodedImage, as_stored: bool = False) -> tuple[int,
     """
     with _open_image(path) as picture:
         width, height = picture.size
-        is_turned = picture.getexif().get(ExifTags.Base.Orientation) in _TRANSPOSED_ORIENTATIONS
+        is_turned = _orientation(picture) in _TRANSPOSED_ORIENTATIONS
         return (height, width) if is_turned and not as_stored else (width, height)
 
 
@@ -231,10 +233,10 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
         raise UnreadableImageError(f"{path}: {fault}") from None
     with picture:
         width, height = picture.size
-        if width * height > MAX_PIXELS:
-            raise UnreadableImageError(
-                f"{path}: {width}x{height} is more than {MAX_PIXELS // 1_000_000} megapixels"
-            )
+        most = f"{MAX_PIXELS // 1_000_000} megapixels" if width * height > MAX_PIXELS else ""
+        most = most or ("30000 pixels on a side" if max(width, height) > 30_000 else "")
+        if most:
+            raise UnreadableImageError(f"{path}: {width}x{height} is more than {most}")
         try:
             yield picture
         except _DAMAGE_ERRORS as error:
@@ -242,12 +244,30 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
 
 
 @contextmanager
-def _decode_image(path: Path | EncodedImage, as_stored: bool = False) -> Iterator[Pillow.Image]:
+def _decode_image(
+    path: Path | EncodedImage, as_stored: bool = False, max_pixels: int = MAX_PIXELS
+) -> Iterator[Pillow.Image]:
     with _open_image(path) as picture:
+        factor = _reduction(picture, max_pixels)
+        if factor > 1 and picture.format == "JPEG":  # reduced while it is decoded
+            picture.draft(None, (picture.width // factor or 1, picture.height // factor or 1))
         picture.load()
-        is_turned = picture.getexif().get(ExifTags.Base.Orientation, 1) != 1 and not as_stored
-        upright = ImageOps.exif_transpose(picture) if is_turned else picture
-        yield upright.convert("RGB") if upright.mode == "P" else upright
+        is_turned = _orientation(picture) != 1 and not as_stored
+        decoded = ImageOps.exif_transpose(picture) if is_turned else picture
+        decoded = decoded.convert("RGB") if decoded.mode == "P" else decoded
+        is_reducible = decoded.mode not in (*_GREY_16_MODES, "1", "F")
+        factor = _reduction(decoded, max_pixels) if is_reducible else 1
+        yield decoded.reduce(factor) if factor > 1 else decoded
+
+
+def _reduction(picture: Pillow.Image, max_pixels: int) -> int:
+    """Return the factor, 1, 2, 4 or 8, that reduces an image to `max_pixels`."""
+    num_pixels = picture.width * picture.height
+    return next((k for k in (1, 2, 4) if num_pixels <= max_pixels * k * k), 8)
+
+
+def _orientation(picture: Pillow.Image) -> int:
+    return picture.getexif().get(ExifTags.Base.Orientation, 1)
 
 
 def _supported_types(path: Path | EncodedImage, data: bytes) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from topoloc.errors import MapError
+from topoloc.recordings.stored_images import read_stored_image
 from topoloc.retrieval.coarse import Image
 from topoloc.retrieval.network_config import NetworkInputConfig
 
@@ -39,11 +39,9 @@ class ImageShape:
 
 
 def decode_stored_image(jpeg: bytes) -> RgbImage:
-    """Return a stored image in colour. Raises MapError if it is damaged."""
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise MapError("the map is damaged: a mapping image is no picture")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    """Return a stored mapping image in colour. Raises MapError if it is damaged or too large."""
+    image = read_stored_image("a mapping image of the map", jpeg, (4000, 4000))
+    return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
 
 
 def prepare_network_images(

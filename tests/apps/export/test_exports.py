@@ -16,6 +16,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from PIL import Image as Pillow
 
 from topoloc.apps.cli import main
 from topoloc.apps.viewer.map_scene import create_map_scene
@@ -132,9 +133,11 @@ def test_nerfstudio_finds_pictures_cameras_and_poses(
     assert transforms["camera_model"] == "OPENCV"
     assert (folder / transforms["ply_file_path"]).is_file()
     for frame, view in zip(transforms["frames"], scene.views, strict=True):
-        assert (folder / frame["file_path"]).read_bytes() == view.jpeg
-        assert view.jpeg_camera is not None
-        assert (frame["w"], frame["h"]) == (view.jpeg_camera.width, view.jpeg_camera.height)
+        assert (folder / frame["file_path"]).read_bytes() == view.image
+        assert Pillow.open(folder / frame["file_path"]).format == "WEBP"
+        assert frame["file_path"].endswith(".webp")
+        assert view.image_camera is not None
+        assert (frame["w"], frame["h"]) == (view.image_camera.width, view.image_camera.height)
         # a point in front of the camera lies at negative z in OpenGL's axes, and where its pixel is
         seen = np.flatnonzero(view.point_rows >= 0)[:20]
         world = scene.points.world[view.point_rows[seen]]

@@ -1,6 +1,7 @@
 """What is said of an answer, or of none."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,3 +106,14 @@ def test_many_pictures_are_too_many(
 ):
     assert main(["explain", str(room_map), str(queries)]) == 2
     assert "@0 is its first" in capsys.readouterr().err
+
+
+def test_a_damaged_node_image_is_named(room_map: Path, queries: Path, tmp_path: Path):
+    with TopoMetricMap.load(room_map) as topomap:
+        nodes = [replace(node, template_image=b"none") for node in topomap.nodes]
+        topomap.with_first_layer(nodes=nodes).save(tmp_path / "damaged.topo")
+    page, frame = tmp_path / "why.html", f"{queries}@0"
+    assert main(["explain", str(tmp_path / "damaged.topo"), frame, "--out", str(page)]) == 0
+    text = page.read_text(encoding="utf-8")
+    assert re.search(r"left the image, node \d+ is damaged: its image: not a picture", text)
+    assert "Images of nodes that are missing or damaged" in text

@@ -21,7 +21,7 @@ def without_points(node: TopoNode) -> TopoNode:
         features=node.features.select(none),
         points_cam=node.points_cam[none],
         point_sqrt_covs=node.point_sqrt_covs[none],
-        template_jpeg=b"no picture",
+        template_image=b"",
         stored_descriptors=None,
     )
 
@@ -57,7 +57,7 @@ def test_nodes_without_points_or_pictures_are_views_all_the_same(tiny_recording:
         scene = create_map_scene(topomap.with_first_layer(nodes=nodes), "room")
         assert len(scene.views) == len(topomap.summaries)
         assert len(scene.views[0].points_img) == 0
-        assert scene.views[0].jpeg == b""
+        assert scene.views[0].image == b""
         assert set(to_colmap_model(scene)) >= {"images.txt", "points3D.txt"}
 
 

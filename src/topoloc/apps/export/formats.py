@@ -27,7 +27,7 @@ from topoloc import (
 from topoloc.apps.export.colmap import to_colmap_model
 from topoloc.apps.export.foxglove import to_mcap
 from topoloc.apps.viewer.map_scene import create_map_scene
-from topoloc.apps.viewer.scene import Scene
+from topoloc.apps.viewer.scene import Scene, image_type
 from topoloc.plugin import write_bytes, write_folder
 
 _CAMERA_RGB = (255, 0, 0)
@@ -143,14 +143,15 @@ def to_nerfstudio(scene: Scene) -> dict[str, bytes]:
     """
     files, frames = dict[str, bytes](), []
     for number, view in enumerate(scene.views):
-        camera, file_path = view.jpeg_camera or view.camera, view.name
+        camera, file_path = view.image_camera or view.camera, view.name
         if camera is None:
             raise TopolocError(f"{view.name}: nerfstudio needs the camera, which is not known")
-        if view.jpeg:
+        if view.image:
+            suffix = image_type(view.image).replace("jpeg", "jpg")
             stem = view.name.rpartition("/")[2].rpartition(".")[0] or view.name
             stem = re.sub(r"[^\w.-]", "_", stem)[:100]
-            file_path = f"images/{number:06d}_{stem}.jpg"
-            files[file_path] = view.jpeg
+            file_path = f"images/{number:06d}_{stem}.{suffix}"
+            files[file_path] = view.image
         matrix = view.world_from_cam.matrix() @ _CAM_FROM_OPENGL
         frame = {"file_path": file_path, **_intrinsics_to_json(camera)}
         frames.append(frame | {"transform_matrix": matrix.tolist()})

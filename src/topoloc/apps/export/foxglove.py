@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from topoloc import MissingExtraError, Rigid3
-from topoloc.apps.viewer.scene import Scene, View
+from topoloc.apps.viewer.scene import Scene, View, image_type
 
 MAP_FRAME, CAMERA_FRAME = "map", "camera"
 _STEP_NS = 1_000_000_000
@@ -73,7 +73,7 @@ def _view_messages(view: View, t_ns: int) -> Iterator[tuple[str, Any]]:
     frames = {"parent_frame_id": MAP_FRAME, "child_frame_id": CAMERA_FRAME}
     moved = {"translation": pose.position, "rotation": pose.orientation}
     yield "/tf", _schema("FrameTransform")(timestamp=_to_timestamp(t_ns), **frames, **moved)
-    camera = view.jpeg_camera or view.camera
+    camera = view.image_camera or view.camera
     if camera is not None:
         k = camera.matrix()
         model = "kannala_brandt" if camera.is_fisheye else "rational_polynomial"
@@ -85,8 +85,8 @@ def _view_messages(view: View, t_ns: int) -> Iterator[tuple[str, Any]]:
             "/camera/calibration",
             _message("CameraCalibration", t_ns, CAMERA_FRAME, **size, **numbers),
         )
-    if view.jpeg:
-        image = {"data": view.jpeg, "format": "jpeg"}
+    if view.image:
+        image = {"data": view.image, "format": image_type(view.image)}
         yield "/camera/image", _message("CompressedImage", t_ns, CAMERA_FRAME, **image)
     if view.geopose is not None:
         place = view.geopose.position

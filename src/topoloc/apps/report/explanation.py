@@ -50,7 +50,8 @@ class EvaluatedPose:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """`poses` are in the order in which they were tried. The most important `advice` is first."""
+    """`poses` are in the order in which they were tried. The most important `advice` is first.
+    `nodes_without_image` are nodes whose image was needed, and is missing or damaged."""
 
     result: Localization | NotLocalized
     num_features: dict[str, int]
@@ -58,6 +59,7 @@ class Explanation:
     session_lights: dict[str, Illumination]
     poses: list[EvaluatedPose]
     advice: list[str]
+    nodes_without_image: list[int]
 
     @property
     def best(self) -> EvaluatedPose | None:
@@ -76,13 +78,18 @@ def explain(
     trace = Trace()
     result = localizer.localize(image, camera, trace=trace)
     poses = [_evaluate_pose(tried, result) for tried in trace.tried]
+    near = {pose.tried.fit.node_id for pose in poses if pose.num_inliers and pose.node_id >= 0}
+    without = trace.nodes_without_image | {
+        node_id for node_id in near if localizer.context.first.map.template(node_id).is_black
+    }
     num_features = {pose.tried.features: len(pose.tried.fit.features) for pose in poses}
     lights = {
         f"{session.session_id} ({session.name})": session.light
         for session in localizer.topomap.sessions
         if session.light is not None
     }
-    facts = Explanation(result, num_features, Illumination.of_image(image), lights, poses, [])
+    light = Illumination.of_image(image)
+    facts = Explanation(result, num_features, light, lights, poses, [], sorted(without))
     return replace(facts, advice=list(dict.fromkeys(_collect_advice(facts, localizer))))
 
 
@@ -102,6 +109,7 @@ def explanation_to_json(name: str, explanation: Explanation) -> dict[str, Any]:
     ]
     return explanation.result.to_json(name) | {
         "advice": explanation.advice,
+        "nodes_without_image": explanation.nodes_without_image,
         "num_features": explanation.num_features,
         "tried": poses,
     }
@@ -169,6 +177,12 @@ def _collect_advice(explanation: Explanation, localizer: Localizer) -> Iterator[
         yield (
             "No part of the map is similar enough to this image. The image may be out of the map,"
             " or the place changed."
+        )
+    if without := explanation.nodes_without_image:
+        nodes = ", ".join(map(str, without[:5])) + (", ..." if len(without) > 5 else "")
+        yield (
+            f"Images of nodes that are missing or damaged: {len(without)} (nodes {nodes}). This"
+            " makes the pose less exact. `topoloc info MAP --check` names the damage."
         )
     for kind, reason in localizer.unavailable_types.items():
         yield f"The map's features {kind}, for other light, were not used: {reason}."

@@ -9,7 +9,7 @@ import numpy as np
 
 from topoloc import Image, Localization, TopoMetricMap
 from topoloc.apps.report.explanation import EvaluatedPose, Explanation
-from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, decode_template, draw_pair
+from topoloc.apps.report.match_images import JPEG_QUALITY, NodeMatches, draw_pair, read_template
 from topoloc.apps.report.page_template import (
     render_figure,
     render_gallery_items,
@@ -48,9 +48,9 @@ def explanation_page(
     items = [_render_pose(image, pose, topomap) for pose in shown]
     if not items and explanation.result.candidates:
         node = topomap.nodes[topomap.row_of(explanation.result.candidates[0].node_id)]
-        pair = encode_jpeg(draw_pair(image, decode_template(node)), JPEG_QUALITY)
-        caption = f"left the image, right node {node.summary.node_id}"
-        items = [(render_figure(pair, caption), "")]
+        template, words = read_template(node)
+        pair = encode_jpeg(draw_pair(image, template), JPEG_QUALITY)
+        items = [(render_figure(pair, f"left the image, {words}"), "")]
     rows = [[escape(cell) for cell in row_of(pose)] for pose in explanation.poses]
     table = render_table(_COLUMNS, rows, "tried", "What was tried")
     pairs_text = _PAIRS_TEXT if shown else _NO_PAIRS_TEXT
@@ -126,14 +126,14 @@ def _render_pose(image: Image, pose: EvaluatedPose, topomap: TopoMetricMap) -> t
     """Return the figure and the facts of a pose."""
     node = topomap.nodes[topomap.row_of(pose.tried.fit.node_id)]
     matches = _find_explained_matches(image, pose, topomap)
-    pair = draw_pair(image, decode_template(node), matches, node.camera)
+    template, words = read_template(node)
+    pair = draw_pair(image, template, matches, node.camera)
     kind = "good" if pose.verdict == "the answer" else "bad"
     facts = (
         f"<b>node {pose.tried.fit.node_id}, {pose.num_inliers} inliers</b>"
         f'<p class="{kind}">{escape(pose.verdict)}</p>'
     )
-    caption = f"left the image, right node {pose.tried.fit.node_id}"
-    return render_figure(encode_jpeg(pair, JPEG_QUALITY), caption), facts
+    return render_figure(encode_jpeg(pair, JPEG_QUALITY), f"left the image, {words}"), facts
 
 
 def row_of(pose: EvaluatedPose) -> tuple[str, ...]:

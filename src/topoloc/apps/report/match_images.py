@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from topoloc import Camera, EvaluatedQuery, Image, Localization, MapError, TopoNode
-from topoloc.apps.viewer.map_scene import decode_jpeg
+from topoloc.apps.viewer.map_scene import read_node_rgb
 from topoloc.plugin import NodeMatcher
 
 # Images are shown and matched at these widths or less.
@@ -67,12 +67,12 @@ def match_with_node(
     return NodeMatches(points_query, points_node, is_inlier[is_shown])
 
 
-def decode_template(node: TopoNode) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the image of a node, RGB. Raises MapError if it is damaged."""
-    image = decode_jpeg(node.template_jpeg)
-    if image is None:
-        raise MapError("the map is damaged: a mapping image cannot be decoded")
-    return image
+def read_template(node: TopoNode) -> tuple[UInt8[np.ndarray, "h w 3"] | None, str]:
+    """Return the image of a node, RGB, and the words for it in a caption, which name damage."""
+    try:
+        return read_node_rgb(node), f"right node {node.summary.node_id}"
+    except MapError as error:
+        return None, str(error)
 
 
 def draw_pair(

@@ -11,6 +11,7 @@ from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from topoloc.apps.viewer.page import static_text
+from topoloc.apps.viewer.scene import image_type
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -123,12 +124,12 @@ def _render_cells(columns: Sequence[str], row: Sequence[str]) -> str:
     return "".join(f'<td data-column="{escape(name)}">{cell}</td>' for name, cell in cells)
 
 
-def render_figure(jpeg: bytes | None, caption: str) -> str:
-    """Return an image with its caption; without an image, the caption alone."""
+def render_figure(encoded: bytes | None, caption: str) -> str:
+    """Return an image (WebP or JPEG) with its caption; without an image, the caption alone."""
     caption, image = escape(caption), ""
-    if jpeg is not None:
-        data = base64.b64encode(jpeg).decode("ascii")
-        image = f'<img loading="lazy" alt="{caption}" src="data:image/jpeg;base64,{data}">'
+    if encoded:
+        source = f"data:image/{image_type(encoded)};base64,{base64.b64encode(encoded).decode()}"
+        image = f'<img loading="lazy" alt="{caption}" src="{source}">'
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 

@@ -25,9 +25,9 @@ from topoloc.apps.report.map_figure import draw_map
 from topoloc.apps.report.match_images import (
     JPEG_QUALITY,
     NodeMatches,
-    decode_template,
     draw_pair,
     match_with_node,
+    read_template,
 )
 from topoloc.apps.report.page_template import (
     render_figure,
@@ -142,15 +142,15 @@ def _render_images(answer: EvaluatedQuery, node: TopoNode | None, topomap: TopoM
     except UnreadableImageError:
         image = None
     if image is None:
-        jpeg = node.template_jpeg if node else None
-        return render_figure(jpeg, "the query's image cannot be read any more")
+        encoded = node.template_image if node else None
+        return render_figure(encoded, "the query's image cannot be read any more")
     if node is None:
         pair = draw_pair(image, None)
         return render_figure(encode_jpeg(pair, JPEG_QUALITY), "query, without a node to compare")
     matches = _find_matches(answer, image, node, topomap)
-    pair = draw_pair(image, decode_template(node), matches, node.camera)
-    caption = f"left the query, right node {node.summary.node_id}"
-    return render_figure(encode_jpeg(pair, JPEG_QUALITY), caption)
+    template, words = read_template(node)
+    pair = draw_pair(image, template, matches, node.camera)
+    return render_figure(encode_jpeg(pair, JPEG_QUALITY), f"left the query, {words}")
 
 
 def _find_matches(

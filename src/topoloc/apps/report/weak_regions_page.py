@@ -137,7 +137,7 @@ def _render_regions(weak: WeakRegions) -> str:
 def _render_images(weak: WeakRegions, topomap: TopoMetricMap) -> str:
     items = list[tuple[str, str]]()
     for node in weak.weakest[:_MAX_IMAGES]:
-        jpeg = topomap.nodes[topomap.row_of(node.node_id)].template_jpeg
+        image = topomap.nodes[topomap.row_of(node.node_id)].template_image
         outcome = "not localized without itself"
         if node.answer is not None and node.answer.is_wrong:
             outcome = "wrong pose without itself"
@@ -145,5 +145,5 @@ def _render_images(weak: WeakRegions, topomap: TopoMetricMap) -> str:
             outcome = f"{node.answer.num_inliers} inliers without itself"
         reasons = ", ".join(REASON_TEXTS[reason] for reason in node.reasons) or "not weak"
         facts = f"<b>{outcome}, {node.num_landmarks} landmarks</b><p>{reasons}</p>"
-        items.append((render_figure(jpeg, f"node {node.node_id}, {node.name}"), facts))
+        items.append((render_figure(image, f"node {node.node_id}, {node.name}"), facts))
     return render_gallery_items(items) if items else "<p>No node was tested.</p>"

@@ -11,21 +11,20 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import topoloc
 from topoloc import AtlasConfig, Localizer, MapCache, TopolocError, TrackerConfig
 from topoloc.apps.service import geopose_routes, map_routes, stream_routes
 from topoloc.apps.service.access_middleware import AccessMiddleware, App, RequestLimits
 from topoloc.apps.service.config import ServiceConfig
+from topoloc.apps.service.connections import KEEP_ALIVE_S, protocols
 from topoloc.apps.service.logs import Metrics, log, log_json
-from topoloc.apps.service.query_handler import QueryHandler, ServedAtlases
+from topoloc.apps.service.query_handler import ImageDecoder, QueryHandler, ServedAtlases
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, Streams, Workers
 
@@ -33,10 +32,6 @@ _DESCRIPTION = """6-DoF poses of images in maps that `topoloc build` made.
 
 The response for an image without a pose is 200 with `"localized": false` and the reason. Invalid
 requests are refused with one sentence."""
-_MAX_CONNECTIONS = 1000
-_KEEP_ALIVE_S = 75
-"""Longer than clients and load balancers keep a connection (5 to 60 s). Otherwise a request may
-meet a connection that is being closed."""
 
 
 def create_application(
@@ -51,7 +46,9 @@ def create_application(
     `loopback_only`."""
     metrics = Metrics()
     atlases = ServedAtlases(maps, atlas_config or AtlasConfig())
-    query_handler = QueryHandler(maps, config.max_pixels, 1e3 * config.answer_s, atlases)
+    query_handler = QueryHandler(
+        maps, ImageDecoder(config.max_pixels), 1e3 * config.answer_s, atlases
+    )
     streams = Streams(
         maps, query_handler, tracking or TrackerConfig(), config.max_sessions, config.session_idle_s
     )
@@ -122,15 +119,14 @@ def serve(app: App, address: Address, limits: ServiceConfig) -> None:
     Raises TopolocError: the address cannot be used."""
     config = uvicorn.Config(
         app,
-        http=type("_PatientHere", (_HeadTimeoutProtocol,), {"head_s": limits.upload_s}),
+        **protocols(limits, 1000, address.behind_proxy),
         ws_max_size=limits.max_upload_bytes,
         ws_per_message_deflate=False,
         access_log=False,
         log_config=None,
         server_header=False,
         proxy_headers=address.behind_proxy,
-        limit_concurrency=_MAX_CONNECTIONS,
-        timeout_keep_alive=_KEEP_ALIVE_S,
+        timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=round(limits.drain_s),
         ssl_certfile=address.tls_cert,
         ssl_keyfile=address.tls_key,
@@ -168,33 +164,3 @@ class _Server(uvicorn.Server):
         finally:
             for number in signals:
                 loop.remove_signal_handler(number)
-
-
-class _HeadTimeoutProtocol(H11Protocol):
-    """HTTP/1.1 that closes a connection if no request head arrives in time."""
-
-    head_s = 10.0
-    _timer: asyncio.TimerHandle | None = None
-
-    def connection_made(self, transport: Any) -> None:
-        super().connection_made(transport)
-        self._wait_for_head(self.head_s)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        super().connection_lost(exc)
-        if self._timer is not None:
-            self._timer.cancel()
-
-    def on_response_complete(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._wait_for_head(_KEEP_ALIVE_S + self.head_s)
-        super().on_response_complete()
-
-    def _wait_for_head(self, seconds: float) -> None:
-        self._timer = self.loop.call_later(seconds, self._close_if_idle, self.cycle)
-
-    def _close_if_idle(self, before: Any) -> None:
-        is_ours = self.transport.get_protocol() is self and not self.transport.is_closing()
-        if self.cycle is before and is_ours:
-            self.transport.close()

@@ -35,7 +35,7 @@ from topoloc.apps.service.geopose_messages import (
     read_request,
 )
 from topoloc.apps.service.openapi_schemas import resolve_references
-from topoloc.apps.service.query_handler import decode_image
+from topoloc.apps.service.query_handler import fit_camera
 from topoloc.apps.service.query_request import camera_from_json, parse_camera_field, read_body
 from topoloc.apps.service.request_errors import RequestError
 from topoloc.apps.service.state import Service, get_service
@@ -107,7 +107,7 @@ def _localize_and_reply(
     reading = query.camera_reading()
     picture, handler = read_image_bytes(reading), service.query_handler
     is_encoded = isinstance(picture, EncodedImage)
-    image = decode_image(picture, handler.max_pixels) if is_encoded else picture
+    image, size = handler.decoder.decode(picture) if is_encoded else (picture, picture.shape[1::-1])
     atlases = [] if only is not None else handler.atlases.opened()
     tiles = {tile_id for _, localizer in atlases for tile_id in localizer.tile_ids}
     maps = [name for name in service.maps.names() if name not in tiles] if only is None else [only]
@@ -117,7 +117,7 @@ def _localize_and_reply(
         with service.maps.use_map(name) as opened:
             topomap = opened.content.topomap
             if topomap.georeference is not None:
-                camera = _select_camera(reading, picture, image, topomap)
+                camera = fit_camera(_select_camera(reading, picture, size, topomap), size, image)
                 results[name] = opened.content.localize(image, camera, max_ms=handler.max_ms)
                 georeferences[name] = topomap.georeference
     near = query.near(service.config.geolocation_m)
@@ -126,7 +126,7 @@ def _localize_and_reply(
         places = {tile.tile_id: manifest.georeference_of(tile) for tile in manifest.tiles}
         known = {tile_id: place for tile_id, place in places.items() if place is not None}
         if known:
-            camera = _select_camera(reading, picture, image, None)
+            camera = fit_camera(_select_camera(reading, picture, size, None), size, image)
             nearby = localizer.near(near, georeferenced_only=True)
             result = nearby.localize(image, camera, max_ms=handler.max_ms)
             results[result.provenance.tile or ""] = result
@@ -142,11 +142,12 @@ def _localize_and_reply(
 def _select_camera(
     reading: CameraReading,
     picture: EncodedImage | Image,
-    image: Image,
+    size: tuple[int, int],
     topomap: TopoMetricMap | None,
 ) -> Camera | UncalibratedCamera:
-    """Return the camera of the request, else that of the EXIF data, else an unknown one."""
-    height, width = image.shape[:2]
+    """Return the camera of the request, else that of the EXIF data, else an unknown one, for an
+    image of this width and height."""
+    width, height = size
     given = camera_to_json(reading)
     if given is None and isinstance(picture, EncodedImage):
         return parse_camera_field(None, picture, (width, height), topomap)

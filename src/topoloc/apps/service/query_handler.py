@@ -95,11 +95,10 @@ def _warn(text: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class QueryHandler:
-    """Localize images in the maps of the service. Images of more than `max_pixels` are refused, and
-    searches end after `max_ms` milliseconds."""
+    """Localize images in the maps of the service. Searches end after `max_ms` milliseconds."""
 
     maps: MapCache[Localizer]
-    max_pixels: int
+    decoder: ImageDecoder
     max_ms: float
     atlases: ServedAtlases
 
@@ -161,9 +160,9 @@ class QueryHandler:
     ) -> tuple[Image, Camera | UncalibratedCamera]:
         """Return the image and its camera."""
         picture = query_request.picture
-        image = decode_image(picture, self.max_pixels)
-        size = (image.shape[1], image.shape[0])
-        return image, parse_camera_field(query_request.camera, picture, size, topomap)
+        image, size = self.decoder.decode(picture)
+        camera = parse_camera_field(query_request.camera, picture, size, topomap)
+        return image, fit_camera(camera, size, image)
 
     def _run_query(
         self,
@@ -188,15 +187,39 @@ class QueryHandler:
         return min(query_request.max_ms or self.max_ms, self.max_ms)
 
 
-def decode_image(picture: EncodedImage, max_pixels: int) -> Image:
-    """Decode an image, after a check of its size. Raises UnreadableImageError: it is no image, or
-    damaged; RequestError: it is too large."""
-    width, height = image_size(picture)
-    if width * height > max_pixels:
-        raise RequestError(
-            413, f"{picture}: {width}x{height} is more than {max_pixels / 1e6:g} megapixels"
-        )
-    return read_image(picture)
+class ImageDecoder:
+    """Decode images of at most `max_pixels`. All workers together decode that many at a time."""
+
+    def __init__(self, max_pixels: int) -> None:
+        self._max_pixels = self._num_free = max_pixels
+        self._condition = threading.Condition()
+
+    def decode(self, picture: EncodedImage) -> tuple[Image, tuple[int, int]]:
+        """Return an image, and its width and height before it is reduced to 12.5 megapixels.
+        Raises UnreadableImageError: it is no image, or damaged; RequestError: it is too large."""
+        width, height = image_size(picture)
+        num_pixels = width * height
+        if num_pixels > self._max_pixels:
+            most = f"{self._max_pixels / 1e6:g} megapixels"
+            raise RequestError(413, f"{picture}: {width}x{height} is more than {most}")
+        with self._condition:
+            self._condition.wait_for(lambda: num_pixels <= self._num_free)
+            self._num_free -= num_pixels
+        try:
+            return read_image(picture, max_pixels=12_500_000), (width, height)
+        finally:
+            with self._condition:
+                self._num_free += num_pixels
+                self._condition.notify_all()
+
+
+def fit_camera(
+    camera: Camera | UncalibratedCamera, size: tuple[int, int], image: Image
+) -> Camera | UncalibratedCamera:
+    """Return the camera of an image of this width and height for the image as it was decoded."""
+    height, width = image.shape[:2]
+    is_reduced = (width, height) != size == (camera.width, camera.height)
+    return camera.rescaled(width, height) if is_reduced else camera
 
 
 def result_to_line(result: Localization | NotLocalized, query: str) -> str:

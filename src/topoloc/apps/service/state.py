@@ -1,5 +1,5 @@
-"""The state that all routes share: one service in one process, its worker threads, and its streams.
-A stream has a tracker and keeps its map open until it ends."""
+"""The state that all routes share: worker threads, maps and streams. A stream has a tracker and
+keeps its map open until it ends."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar
 
-from starlette.requests import HTTPConnection
+from starlette.requests import HTTPConnection, Request
 
 from topoloc import (
     CalibrationError,
@@ -168,23 +168,28 @@ class Workers:
 
     def __init__(self, number: int, max_queue: int) -> None:
         self.number, self.max_queue = number, max_queue
-        self._pool = ThreadPoolExecutor(number, thread_name_prefix="worker")
+        self._places = asyncio.Semaphore(number)
+        # as many again for jobs whose answer was given up, so that others go on
+        self._pool = ThreadPoolExecutor(2 * number, thread_name_prefix="worker")
         self.num_jobs, self._seconds_per_job = 0, 0.05
         """Jobs in progress or waiting; their mean duration."""
 
     async def run(self, job: Callable[[], R], timeout_s: float) -> R:
-        """Return the result of the job, or raise its error. Raises RequestError: the queue is full,
-        or the time is over. A job in progress then continues and its result is dropped."""
+        """Return the result of the job, or raise its error. Raises RequestError: the queue is full;
+        TimeoutError: the time is over.
+
+        If it is cancelled or late, a job in progress continues without its place."""
         if self.num_jobs >= self.number + self.max_queue:
             wait_s = max(1, round(self.num_jobs * self._seconds_per_job / self.number))
             raise RequestError(
                 429, f"{self.num_jobs} requests are in progress or wait already", wait_s
             )
         self.num_jobs += 1
-        loop = asyncio.get_running_loop()
-        future: Future[R] = self._pool.submit(self._run_timed, job)
-        future.add_done_callback(lambda _: loop.call_soon_threadsafe(self._finish_job))
-        return await asyncio.wait_for(asyncio.wrap_future(future), timeout_s)
+        try:
+            async with asyncio.timeout(timeout_s), self._places:
+                return await asyncio.wrap_future(self._pool.submit(self._run_timed, job))
+        finally:
+            self.num_jobs -= 1
 
     def close(self) -> None:
         """Finish the jobs in progress and drop those that wait."""
@@ -196,9 +201,6 @@ class Workers:
             return job()
         finally:
             self._seconds_per_job += 0.1 * (time.perf_counter() - start - self._seconds_per_job)
-
-    def _finish_job(self) -> None:
-        self.num_jobs -= 1
 
 
 @dataclass(eq=False)
@@ -225,7 +227,7 @@ class Service:
             while True:
                 left_s = self.config.answer_s - (time.monotonic() - start)
                 try:
-                    return await self.workers.run(job, left_s)
+                    return await _while_connected(request, self.workers.run(job, left_s))
                 except TimeoutError:
                     raise RequestError(
                         503, f"no answer within {self.config.answer_s:g} s", 5
@@ -267,6 +269,30 @@ class Service:
         await asyncio.to_thread(self.workers.close)
         self.streams.close()
         self.maps.close()
+
+
+async def _while_connected(request: HTTPConnection, running: Coroutine[Any, Any, R]) -> R:
+    """Return the result, and cancel it if the client of an HTTP request goes away. Raises
+    RequestError then."""
+    if not isinstance(request, Request):
+        return await running
+    job = asyncio.create_task(running)
+    gone = asyncio.create_task(_wait_for_disconnect(request))
+    try:
+        await asyncio.wait((job, gone), return_when=asyncio.FIRST_COMPLETED)
+        if job.done():
+            return job.result()
+        gone.result()  # its error, if the rest of the request is too large or slow
+        raise RequestError(499, "the client has gone")
+    finally:
+        job.cancel()
+        gone.cancel()
+        await asyncio.gather(job, gone, return_exceptions=True)
+
+
+async def _wait_for_disconnect(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 def get_service(request: HTTPConnection) -> Service:

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from topoloc import Camera, Rigid3, TopoMetricMap
-from topoloc.apps.viewer.map_scene import decode_jpeg, sample_colours, unique_image_names
-from topoloc.plugin import encode_jpeg
+from topoloc import Camera, Rigid3, TopoMetricMap, read_image
+from topoloc.apps.viewer.map_scene import sample_colours, unique_image_names
+from topoloc.plugin import EncodedImage, encode_jpeg
 
 GAP_STEPS = 6.0
 """A step longer than this many median steps is a gap, over which no line is drawn."""
@@ -59,7 +59,7 @@ def create_document(
     poses = [summary.world_from_cam for summary in topomap.summaries]
     centres = np.array([pose.translation for pose in poses])
     focus = _find_focus_box(centres, shown.points_world)
-    images = _encode_images(shown.jpegs, budget.max_image_bytes)
+    images = _encode_images(shown.images, budget.max_image_bytes)
     return {
         "format": "topoloc-scene",
         "version": 1,
@@ -103,7 +103,7 @@ class _NodeContent:
     """The camera and image of each node, and the points of all nodes with their colours."""
 
     cameras: list[Camera]
-    jpegs: list[bytes]
+    images: list[bytes]
     points_world: Float[np.ndarray, "n 3"]
     rgb: UInt8[np.ndarray, "n 3"]
 
@@ -111,7 +111,7 @@ class _NodeContent:
 def _read_nodes(topomap: TopoMetricMap, max_points: int) -> _NodeContent:
     """Return at most `max_points` precise points, evenly from all nodes, with image colours."""
     share = min(1.0, max_points / max(1, sum(summary.num_points for summary in topomap.summaries)))
-    cameras, jpegs = list[Camera](), list[bytes]()
+    cameras, images = list[Camera](), list[bytes]()
     points, colours = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for node in topomap.nodes:
         sigmas = np.linalg.norm(node.point_sqrt_covs.astype(np.float64), axis=1)
@@ -122,9 +122,9 @@ def _read_nodes(topomap: TopoMetricMap, max_points: int) -> _NodeContent:
         points.append(node.summary.world_from_cam.apply(node.points_cam[chosen].astype(np.float64)))
         colours.append(sample_colours(node, node.features.points_img[chosen].astype(np.float64)))
         cameras.append(node.camera)
-        jpegs.append(node.template_jpeg)
+        images.append(node.template_image)
     rgb = np.concatenate(colours).round().astype(np.uint8)
-    return _NodeContent(cameras, jpegs, np.concatenate(points), rgb)
+    return _NodeContent(cameras, images, np.concatenate(points), rgb)
 
 
 def _find_up_axis(topomap: TopoMetricMap, poses: Sequence[Rigid3]) -> Float[np.ndarray, "3"]:
@@ -173,31 +173,30 @@ def _nodes_to_json(
     ]
 
 
-def _encode_images(jpegs: Sequence[bytes], max_bytes: int) -> list[str | None]:
+def _encode_images(images: Sequence[bytes], max_bytes: int) -> list[str | None]:
     """Return the images as base64, at the largest common width that fits into the budget.
 
     If the smallest width is too large, only every k-th image is kept.
     """
     room = max_bytes * 3 // 4
-    if sum(map(len, jpegs)) <= room:
-        return [to_base64(jpeg) if jpeg else None for jpeg in jpegs]
-    tried = jpegs[:: max(1, len(jpegs) // 12)]
+    if sum(map(len, images)) <= room:
+        return [to_base64(one) if one else None for one in images]
+    tried = images[:: max(1, len(images) // 12)]
     sizes = {
-        width: len(jpegs) * float(np.mean([len(_resize_jpeg(jpeg, width)) for jpeg in tried]))
+        width: len(images) * float(np.mean([len(_resize(one, width)) for one in tried]))
         for width in _IMAGE_WIDTHS
     }
     width = next((width for width, size in sizes.items() if size <= room), _IMAGE_WIDTHS[-1])
     step = max(1, int(np.ceil(sizes[width] / room)))
-    shrunk = (
-        _resize_jpeg(jpeg, width) if row % step == 0 else b"" for row, jpeg in enumerate(jpegs)
-    )
-    return [to_base64(jpeg) if jpeg else None for jpeg in shrunk]
+    shrunk = (_resize(one, width) if row % step == 0 else b"" for row, one in enumerate(images))
+    return [to_base64(one) if one else None for one in shrunk]
 
 
-def _resize_jpeg(jpeg: bytes, width: int) -> bytes:
-    picture = decode_jpeg(jpeg)
-    if picture is None:
+def _resize(encoded: bytes, width: int) -> bytes:
+    """Return an image that was read before as a JPEG of at most this width."""
+    if not encoded:
         return b""
+    picture = read_image(EncodedImage("an image of the map", encoded))
     scale = min(1.0, width / picture.shape[1])
     size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
     return encode_jpeg(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), _JPEG_QUALITY)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 
 from topoloc import MapError, TopoMetricMap, TopoNode
 from topoloc.apps.viewer.scene import Points, Progress, Scene, View
-from topoloc.plugin import NodeMatcher
+from topoloc.plugin import NodeMatcher, read_node_image
 
 NUM_NEIGHBOURS = 8
 MAX_ERROR_PX = 3.0
@@ -220,15 +220,15 @@ def create_map_scene(
 
 def _node_view(topomap: TopoMetricMap, node: TopoNode, name: str) -> View:
     s, georeference = node.summary, topomap.georeference
-    picture = decode_jpeg(node.template_jpeg)
+    picture = read_node_rgb(node)
     return View(
         name,
         s.world_from_cam,
         s.t_ns,
         node.camera,
         s.session_id,
-        jpeg=b"" if picture is None else node.template_jpeg,
-        jpeg_camera=None if picture is None else node.camera.rescaled(*picture.shape[1::-1]),
+        image=node.template_image,
+        image_camera=None if picture is None else node.camera.rescaled(*picture.shape[1::-1]),
         geopose=None if georeference is None else georeference.geopose(s.world_from_cam),
     )
 
@@ -255,8 +255,8 @@ def _to_scene_points(tracks: Tracks, sampled_rgb: Float[np.ndarray, "m 3"]) -> P
 
 def sample_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
     """Return the colours of the node's image at pixels of its camera, RGB, 0 to 255. They are black
-    if the image cannot be decoded."""
-    picture = decode_jpeg(node.template_jpeg)
+    without an image. Raises MapError: the image is damaged."""
+    picture = read_node_rgb(node)
     if picture is None or len(pixels) == 0:
         return np.zeros((len(pixels), 3))
     scale = np.array([picture.shape[1] / node.camera.width, picture.shape[0] / node.camera.height])
@@ -266,7 +266,9 @@ def sample_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np
     return sampled[:, 0].astype(float)
 
 
-def decode_jpeg(jpeg: bytes) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Return a stored image, RGB; None if there is none or it is damaged."""
-    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
-    return None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+def read_node_rgb(node: TopoNode) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Return the image of a node, RGB; None if there is none. Raises MapError: it is damaged."""
+    image = read_node_image(node)
+    if image is None or image.ndim == 3:
+        return image
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)

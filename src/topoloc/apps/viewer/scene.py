@@ -18,9 +18,9 @@ Progress = Callable[[str, int, int], None]
 class View:
     """An image with its pose. `name` is its file name. `t_ns` is None without a time.
 
-    Pixel `points_img[k]` of `camera` shows point `point_rows[k]` of the scene, -1 for none. `jpeg`
-    is the encoded image of `jpeg_camera`, which may be smaller than `camera`. It is empty without
-    an image.
+    Pixel `points_img[k]` of `camera` shows point `point_rows[k]` of the scene, -1 for none. `image`
+    is the encoded image (WebP or JPEG) of `image_camera`, which may be smaller than `camera`. It is
+    empty without an image.
     """
 
     name: str
@@ -30,9 +30,14 @@ class View:
     session_id: int = 0
     points_img: Float[np.ndarray, "m 2"] = field(default_factory=lambda: np.zeros((0, 2)))
     point_rows: Int[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    jpeg: bytes = b""
-    jpeg_camera: Camera | None = None
+    image: bytes = b""
+    image_camera: Camera | None = None
     geopose: GeoPose | None = None
+
+
+def image_type(encoded: bytes) -> str:
+    """Return the type of an image of a map: webp or jpeg."""
+    return "webp" if encoded.startswith(b"RIFF") else "jpeg"
 
 
 @dataclass(frozen=True, eq=False)

@@ -183,7 +183,7 @@ def refine_precisely(
             searches[0].query.grey,
             around.camera,
             chosen,
-            searches[0].map.template,
+            searches[0].template,
             aligned.pose.cam_from_world,
             reach_px,
             weights,

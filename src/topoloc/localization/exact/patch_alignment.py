@@ -6,24 +6,23 @@ query image. This is adaptive least-squares correlation (Gruen, 1985) with a shi
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from topoloc.errors import UnreadableImageError
+from topoloc.errors import MapError
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.fitted_weights import LastStepWeights
 from topoloc.localization.pose_fit import PointObservations
+from topoloc.mapping.node_images import read_node_image
 from topoloc.mapping.topomap import TopoNode
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import to_grey
-from topoloc.recordings.image_io import EncodedImage, image_size, read_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,24 +54,24 @@ def spread(matches: PreciseMatches, camera: Camera, max_number: int) -> PreciseM
 
 @dataclass(frozen=True, eq=False)
 class NodeTemplate:
-    """Hold the image of a node. `camera` has the size of the image."""
+    """Hold the image of a node. `camera` has the size of the image. An image that is missing or
+    damaged `is_black`."""
 
     image: UInt8[np.ndarray, "h w"]
     camera: Camera
     world_from_cam: Rigid3
+    is_black: bool = False
 
     @staticmethod
     def of_node(node: TopoNode) -> NodeTemplate:
-        """Return the stored image of a node in grey, black if it cannot be read or is larger than
-        the camera's images."""
-        encoded = EncodedImage(node.summary.name, node.template_jpeg)
-        image = np.zeros((2, 2), np.uint8)
-        with contextlib.suppress(UnreadableImageError):
-            width, height = image_size(encoded)
-            if width <= node.camera.width and height <= node.camera.height:
-                image = to_grey(read_image(encoded))
-        height, width = image.shape
-        return NodeTemplate(image, node.camera.rescaled(width, height), node.summary.world_from_cam)
+        """Return the stored image of a node in grey."""
+        try:
+            image = read_node_image(node)
+        except MapError:
+            image = None
+        grey = np.zeros((2, 2), np.uint8) if image is None else to_grey(image)
+        camera = node.camera.rescaled(grey.shape[1], grey.shape[0])
+        return NodeTemplate(grey, camera, node.summary.world_from_cam, image is None)
 
 
 def align(

@@ -95,7 +95,7 @@ class TopoNode:
     - Row k of `points_cam` (metres, the node's camera frame) is the position of feature k.
     - Row k of `point_sqrt_covs` holds the lower triangular L (xx, yx, yy, zx, zy, zz, in metres) of
       its covariance ``L @ L.T``.
-    - `template_jpeg` is the node's encoded image, possibly smaller than `camera`.
+    - `template_image` is the node's encoded image, possibly smaller than `camera`.
     - `session_statistics` are each session's statistics of the points, if kept.
     - `stored_descriptors` are the descriptors of the file, so that saving writes the same ones.
     """
@@ -105,7 +105,7 @@ class TopoNode:
     features: Features
     points_cam: Float32[np.ndarray, "n 3"]
     point_sqrt_covs: Float32[np.ndarray, "n 6"]
-    template_jpeg: bytes
+    template_image: bytes
     session_statistics: Iterable[LandmarkStatistics] = ()
     stored_descriptors: Int8[np.ndarray, "n d"] | None = None
 

@@ -143,7 +143,7 @@ class _Writer:
                 f"{prefix}nodes", s.node_id, owner, s.name, s.t_ns, camera_id, pose, num_points
             )
             if not prefix:
-                self._insert("node_templates", s.node_id, node.template_jpeg)
+                self._insert("node_templates", s.node_id, node.template_image)
             for table, *row in rows:
                 self._insert(f"{prefix}{table}", *row)
 

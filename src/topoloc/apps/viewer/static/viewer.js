@@ -207,7 +207,7 @@ export class Viewer {
   tellSummary() {
     const { name, map } = this.document;
     const said = [`${map.num_nodes} nodes, ${map.num_points.toLocaleString("en")} points, ${map.length_m.toFixed(0)} m mapped.`];
-    if (map.num_points_shown < map.num_points) said.push(`${map.num_points_shown.toLocaleString("en")} of the points are shown.`);
+    if (map.num_points_shown < 0.99 * map.num_points) said.push(`${map.num_points_shown.toLocaleString("en")} of the points are shown.`);
     if (map.sessions.length > 1) said.push(`Sessions: ${map.sessions.map((one) => one.name).join(", ")}.`);
     this.tell(name, said);
   }
@@ -220,7 +220,8 @@ export class Viewer {
   }
 }
 
-const pictureAddress = (node) => `data:image/jpeg;base64,${node.picture}`;
+/** The address of a node's picture: WebP begins with RIFF, here in base64; others are JPEG. */
+export const pictureAddress = ({ picture }) => `data:image/${picture.startsWith("UklG") ? "webp" : "jpeg"};base64,${picture}`;
 
 /** The trajectory of a stream; results without a state are no stream. */
 function trackOf(answers) {

@@ -2,7 +2,7 @@
 import { askAbout, mapNames, sceneOf, setToken } from "topoloc/page/asking";
 import { Live } from "topoloc/page/live";
 import { drawMatches } from "topoloc/page/matches";
-import { Viewer } from "topoloc/apps/viewer";
+import { Viewer, pictureAddress } from "topoloc/apps/viewer";
 import { isLocalized, sentences, verdict } from "topoloc/words";
 
 const part = (id) => document.getElementById(id);
@@ -78,7 +78,7 @@ async function explain(file, picture, signal) {
   const [best] = explained.compared;
   const node = best && state.viewer?.document.nodes.find((one) => one.id === best.node);
   if (node) {
-    const nodePicture = node.picture && `data:image/jpeg;base64,${node.picture}`;
+    const nodePicture = node.picture && pictureAddress(node);
     const [canvas, caption] = part("matches").children;
     await drawMatches(canvas, picture, explained.picture_size, nodePicture, best);
     const became = isLocalized(explained) ? "" : `, which is ${best.verdict}`;

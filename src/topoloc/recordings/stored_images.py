@@ -1,0 +1,42 @@
+"""Encode and read images that a map stores. Their size is checked before they are decoded, so that
+a damaged map cannot fill the memory."""
+
+from __future__ import annotations
+
+import cv2
+
+from topoloc.errors import MapError, UnreadableImageError
+from topoloc.recordings.frame import Image
+from topoloc.recordings.image_io import EncodedImage, image_size, read_image
+
+
+def encode_jpeg(image: Image, quality: int) -> bytes:
+    """Encode an image as JPEG. The same image gives the same bytes."""
+    return _encode(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def encode_webp(image: Image, quality: int) -> bytes:
+    """Encode an image as WebP. The same image gives the same bytes."""
+    return _encode(image, ".webp", [cv2.IMWRITE_WEBP_QUALITY, quality])
+
+
+def _encode(image: Image, suffix: str, options: list[int]) -> bytes:
+    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(suffix, bgr, options)[1].tobytes()
+
+
+def read_stored_image(owner: str, data: bytes, max_size: tuple[int, int]) -> Image:
+    """Return a stored image of at most this width and height (pixels).
+
+    Raises:
+        MapError: the image is damaged or larger. The message names its owner.
+    """
+    encoded = EncodedImage("its image", data)
+    try:
+        width, height = image_size(encoded)
+        if width > max_size[0] or height > max_size[1]:
+            fault = f"its image is {width}x{height}, more than {max_size[0]}x{max_size[1]}"
+            raise MapError(f"{owner} is damaged: {fault}")
+        return read_image(encoded)
+    except UnreadableImageError as error:
+        raise MapError(f"{owner} is damaged: {error}") from None
