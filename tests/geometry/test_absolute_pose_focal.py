@@ -143,7 +143,7 @@ def test_the_covariance_counts_what_is_not_known_of_the_focal_length():
     assert np.median(plain) > 0.03, "distance and focal length trade places in a flat scene"
 
 
-def test_a_start_is_refined_and_the_focal_length_stays_in_its_range():
+def test_a_start_is_refined_and_a_stated_focal_length_is_left_if_the_residuals_contradict_it():
     pixels, points, covariances = _scene(600.0, np.random.default_rng(1), noise_px=0.5)
     start = (CAM_FROM_WORLD, UNKNOWN.with_focal(560.0))
     found = estimate_pose_and_focal(
@@ -151,10 +151,13 @@ def test_a_start_is_refined_and_the_focal_length_stays_in_its_range():
     )
     assert found is not None
     assert found[1].fx == pytest.approx(600.0, rel=0.01)
-    narrow = UncalibratedCamera.from_focal_guess(640, 480, 500.0)
-    found = estimate_pose_and_focal(pixels, points, narrow, CONFIG, point_covariances=covariances)
-    assert found is not None
-    assert found[1].fx <= narrow.max_focal
+    for guess in (580.0, 300.0):  # that of a whole image, of which this one is half
+        narrow = UncalibratedCamera.from_focal_guess(640, 480, guess)
+        found = estimate_pose_and_focal(
+            pixels, points, narrow, CONFIG, point_covariances=covariances
+        )
+        assert found is not None
+        assert found[1].fx == pytest.approx(600.0, rel=0.01)
 
 
 def test_three_matches_give_nothing():
@@ -178,3 +181,48 @@ def test_a_rough_camera_keeps_its_field_of_view_when_its_picture_is_resized():
 def test_a_rough_camera_needs_a_range(focals: tuple[float, float]):
     with pytest.raises(CalibrationError, match="a range of focal lengths"):
         UncalibratedCamera(640, 480, *focals)
+
+
+@pytest.mark.parametrize("left", [0, 64, 160])
+def test_the_principal_point_is_estimated_if_a_side_was_cut_off(left: int):
+    rng = np.random.default_rng(4)
+    pixels, points, covariances = _scene(600.0, rng, num=300, noise_px=1.0)
+    kept = pixels[:, 0] >= left
+    cropped = UncalibratedCamera.unknown(640 - left, 480)
+    found = estimate_pose_and_focal(
+        pixels[kept] - [left, 0], points[kept], cropped, CONFIG, point_covariances=covariances[kept]
+    )
+    assert found is not None
+    pose, camera = found
+    if left:
+        assert camera.cx == pytest.approx(319.5 - left, abs=8.0)
+    else:
+        assert camera.cx == 319.5, "a whole image keeps its centre"
+    assert rotation_error(pose.cam_from_world, CAM_FROM_WORLD) < np.deg2rad(0.8)
+    assert pose.camera is not None
+    assert pose.camera.probability_within(0.25, np.deg2rad(2.0)) > 0.9
+
+
+@pytest.mark.parametrize("k1", [-0.25, 0.1])
+def test_radial_distortion_is_estimated_with_the_pose(k1: float):
+    pixels, points, covariances = _scene(400.0, np.random.default_rng(5), num=300, noise_px=0.5)
+    rays = UNKNOWN.with_focal(400.0).normalized_from_img(pixels)
+    bent = rays * (1.0 + k1 * np.sum(rays**2, axis=1, keepdims=True)) * 400.0 + [319.5, 239.5]
+    found = estimate_pose_and_focal(bent, points, UNKNOWN, CONFIG, point_covariances=covariances)
+    assert found is not None
+    assert found[1].distortion()[0] == pytest.approx(k1, abs=0.03)
+    assert rotation_error(found[0].cam_from_world, CAM_FROM_WORLD) < np.deg2rad(0.8)
+
+
+def test_a_panorama_contradicts_all_camera_models():
+    pixels, points, covariances = _scene(400.0, np.random.default_rng(6), num=400, noise_px=0.5)
+    x, y = UNKNOWN.with_focal(400.0).normalized_from_img(pixels).T
+    bent = np.column_stack([np.arctan(x), y / np.hypot(1.0, x)]) * 400.0 + [319.5, 239.5]
+    found = estimate_pose_and_focal(bent, points, UNKNOWN, CONFIG, point_covariances=covariances)
+    assert found is not None
+    belief = found[0].camera
+    assert belief is not None
+    assert belief.is_contradicted
+    metres = translation_error(found[0].cam_from_world.inverse(), CAM_FROM_WORLD.inverse())
+    is_right = metres < 0.25 and rotation_error(found[0].cam_from_world, CAM_FROM_WORLD) < 0.035
+    assert is_right or belief.probability_within(0.25, np.deg2rad(2.0)) < 0.5

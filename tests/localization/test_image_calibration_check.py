@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -79,3 +80,28 @@ def test_another_camera_is_named_only_where_it_explains_the_picture_better(
     assert isinstance(believed, Localization)
     assert believed.calibration_doubt is None
     assert believed.seen_camera is not None, "what it shows still counts beside what others do"
+
+
+def test_distortion_that_the_calibration_leaves_out_is_named(localizer: Localizer, queries: Path):
+    num_named = 0
+    for frame in open_sequence(queries):
+        assert frame.camera is not None
+        assert frame.world_from_cam is not None
+        f, cx, cy = frame.camera.fx, frame.camera.cx, frame.camera.cy
+        y, x = np.mgrid[: frame.camera.height, : frame.camera.width]
+        u, v = (x - cx) / f, (y - cy) / f
+        bent = 1.0 + 0.35 * (u**2 + v**2)
+        map_x, map_y = (
+            (u * bent * f + cx).astype(np.float32),
+            (v * bent * f + cy).astype(np.float32),
+        )
+        distorted = cv2.remap(frame.image, map_x, map_y, cv2.INTER_LINEAR)
+        result = localizer.localize(distorted, frame.camera)
+        if not isinstance(result, Localization):
+            num_named += "its lens distorts" in result.detail
+            continue
+        error = frame.world_from_cam.inverse() @ result.world_from_cam
+        assert np.linalg.norm(error.translation) < 0.25 or result.probability < 0.5
+        if result.calibration_doubt is not None:
+            num_named += "distortion" in result.calibration_doubt.of
+    assert num_named >= 0.8 * len(open_sequence(queries))

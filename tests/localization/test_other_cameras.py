@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from built_room import built_room, unseen_views
 from tiny_world import CAMERA, path_pose, render, room
@@ -14,6 +16,8 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.config import EvidenceConfig
+from topoloc.localization.evidence import highest_probability
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
@@ -146,3 +150,33 @@ def test_noise_is_not_made_a_place_by_leaving_the_focal_length_open(localizer: L
     assert not any(
         isinstance(localizer.localize(picture, None), Localization) for picture in pictures
     )
+
+
+@pytest.mark.parametrize(("left", "top"), [(0.0, 0.0), (0.1, 0.0), (0.25, 0.0), (0.0, 0.25)])
+def test_a_cropped_picture_without_calibration_is_localized_or_refused(
+    left: float, top: float, localizer: Localizer
+):
+    camera, panels, num_right = CAMERA.rescaled(640, 480), room(), 0
+    for index in (2.5, 4.5, 5.5, 7.5, 8.5):
+        picture, truth = render(panels, path_pose(index), camera)[0], path_pose(index)
+        result = localizer.localize(picture[round(480 * top) :, round(640 * left) :], None)
+        if isinstance(result, Localization):
+            is_right = _is_right(result, truth, metres=0.25)
+            num_right += is_right
+            assert is_right or result.probability < 0.5
+            assert result.provenance.camera is not None
+            assert result.provenance.camera.width == 640 - round(640 * left)
+            if result.probability > 0.95:
+                assert result.position_sigma_m < 0.25
+                assert result.rotation_sigma_deg < 2.0
+    assert num_right >= 4
+
+
+@given(st.floats(1e-4, 3.0), st.floats(1e-4, 20.0))
+def test_a_probability_above_95_percent_has_sigmas_within_the_tolerance(
+    metres: float, degrees: float
+):
+    variances = np.repeat([metres**2 / 3.0, np.deg2rad(degrees) ** 2 / 3.0], 3)
+    highest = highest_probability(np.diag(variances), EvidenceConfig())
+    assert (highest > 0.95) <= (metres < 0.25 and degrees < 2.0)
+    assert highest > 0.99 or metres > 0.15 or degrees > 1.2, "it must not refuse everything"

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from topoloc.bounds import Above, Between
 from topoloc.geometry.absolute_pose_kernels import squared_errors
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera_hypotheses import CameraBelief
 from topoloc.geometry.pose_matches import (
     MIN_POINTS,
     Matches,
@@ -29,7 +30,7 @@ from topoloc.geometry.pose_matches import (
 )
 from topoloc.geometry.rigid import Rigid3
 
-_MAX_THRESHOLD_SCALE = 3.0
+MAX_THRESHOLD_SCALE = 3.0
 # OpenCV draws five points per sample and refines no candidate. It would need a second for the
 # iterations that PoseLib runs in milliseconds.
 _OPENCV_MAX_ITERATIONS = 1000
@@ -65,11 +66,24 @@ class AbsolutePoseConfig:
 @dataclass(frozen=True, eq=False)
 class AbsolutePose:
     """Hold a pose and its inliers among n matches. `covariance` is of the left perturbation
-    (translation, rotation; m, rad)."""
+    (translation, rotation; m, rad). It includes that of `camera`, if the camera was estimated."""
 
     cam_from_world: Rigid3
     inliers: Bool[np.ndarray, " n"]
     covariance: Float[np.ndarray, "6 6"]
+    camera: CameraBelief | None = None
+
+    def inflated(self, factor: float) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance if errors that all matches share move the pose, not the camera."""
+        camera = 0.0 if self.camera is None else self.camera.covariance
+        return factor * (self.covariance - camera) + camera
+
+    def noise_share(self, factor: float) -> float:
+        """Return the share of the inflated position variance that is independent from image to
+        image."""
+        camera = 0.0 if self.camera is None else np.trace(self.camera.covariance[:3, :3])
+        noise = np.trace(self.covariance[:3, :3]) - camera
+        return float(noise / (factor * noise + camera))
 
 
 def estimate_absolute_pose(
@@ -273,7 +287,7 @@ def select_inliers(
     # precise.
     squares = squared_errors(*matches.kernel_args(cam_from_world))
     return (squares <= (limit_px / config.key_point_sigma_px) ** 2) & (
-        errors_px <= _MAX_THRESHOLD_SCALE * limit_px
+        errors_px <= MAX_THRESHOLD_SCALE * limit_px
     )
 
 

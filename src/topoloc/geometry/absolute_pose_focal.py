@@ -3,8 +3,8 @@
 RANSAC runs with a few focal lengths in steps of 1.25. Each run is no longer than needed to beat the
 best one so far. At an inlier threshold of several pixels, the nearest focal length is near enough
 to find the inliers. From the best results, Gauss-Newton refines the pose and the logarithm of the
-focal length together. The uncertainty of the focal length and of the principal point, assumed in
-the image centre, is added to the pose's covariance.
+focal length together. Principal point and distortion are estimated only if the residuals ask for
+it (`joint_camera_fit.py`). The uncertainty of the camera is added to the pose's covariance.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.geometry.absolute_pose import (
+    MAX_THRESHOLD_SCALE,
     AbsolutePose,
     AbsolutePoseConfig,
     estimate_absolute_pose,
@@ -24,6 +25,15 @@ from topoloc.geometry.absolute_pose import (
 )
 from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_cholesky
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera_hypotheses import CameraBelief, CameraHypothesis, CameraPrior
+from topoloc.geometry.clustered_errors import cells_of
+from topoloc.geometry.joint_camera_fit import (
+    Observations,
+    fit_camera,
+    fit_jointly,
+    weigh_cameras,
+    weigh_poses,
+)
 from topoloc.geometry.pose_matches import CAUCHY_SCALE, Matches, is_non_collinear, refine_pose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
@@ -45,9 +55,6 @@ _MAX_STARTS = 2
 # A wrong focal length has few inliers, and more are added over some rounds, mostly five. Some
 # images need more rounds and would be wrong by metres without them.
 _MAX_ROUNDS = 20
-# Standard deviation of the principal point from the image centre, as a fraction of the longer
-# side. Its shift is nearly equivalent to a rotation.
-_PRINCIPAL_POINT_SIGMA = 0.01
 # Weak prior on the logarithm of the focal length (standard deviation). Without it, points of a
 # single wall do not fix the focal length.
 _LOG_FOCAL_SIGMA = 0.7
@@ -77,12 +84,21 @@ def estimate_pose_and_focal(
         & np.isfinite(point_covariances).all(axis=(1, 2))
     )
     finite = points_img[usable], points_world[usable], point_covariances[usable]
-    starts = [start] if start else _search_focal_lengths(finite, uncalibrated, config)
-    refined = [_refine_pose_and_focal(each, finite, uncalibrated, config) for each in starts]
-    best = max(filter(None, refined), key=lambda one: one[0], default=None)
+    stated, usual = uncalibrated, uncalibrated.unknown(uncalibrated.width, uncalibrated.height)
+    best = None
+    for focals in (stated, usual):
+        starts = [start] if start else _search_focal_lengths(finite, focals, config)
+        refined = [_refine_pose_and_focal(each, finite, focals, config) for each in starts]
+        best = max(filter(None, [best, *refined]), key=lambda one: one[0], default=None)
+        # The stated focal length is that of the whole image. At a bound it is contradicted.
+        is_inside = best is not None and stated.min_focal < best[2].fx < stated.max_focal
+        if start or is_inside or stated == usual:
+            break
     if best is None:
         return None
     _, cam_from_world, camera = best
+    found = _choose_camera(cam_from_world, camera, finite, uncalibrated, config)
+    cam_from_world, camera, belief = found or (cam_from_world, camera, None)
     pose = estimate_absolute_pose(
         points_img,
         points_world,
@@ -91,15 +107,72 @@ def estimate_pose_and_focal(
         point_covariances=point_covariances,
         start=cam_from_world,
     )
-    if pose is None:
-        return None
-    matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)
-    information, _ = _normal_equations(
-        pose.cam_from_world, matches, pose.inliers[usable], camera, uncalibrated
+    if pose is None or belief is None:  # too few points to estimate a camera
+        return pose and (pose, camera)
+    return replace(pose, covariance=pose.covariance + belief.covariance, camera=belief), camera
+
+
+def _choose_camera(
+    cam_from_world: Rigid3,
+    camera: Camera,
+    finite: _FiniteMatches,
+    uncalibrated: UncalibratedCamera,
+    config: AbsolutePoseConfig,
+) -> tuple[Rigid3, Camera, CameraBelief] | None:
+    """Return the pose and the camera of the likeliest hypothesis, starting from those of a first
+    fit. The first fit itself is returned if its hypothesis is the likeliest."""
+    first = uncalibrated.with_focal(camera.fx)
+    seen = Observations(
+        first.normalized_from_img(finite[0]),
+        config.key_point_sigma_px / camera.fx,
+        finite[1],
+        finite[2],
+        cells_of(finite[0], camera.width, camera.height),
+        MAX_THRESHOLD_SCALE * config.max_reprojection_error_px / camera.fx,
     )
-    of_focal = _add_focal_uncertainty(pose.covariance, information)
-    of_centre = _principal_point_covariance(points_world[pose.inliers], pose, camera)
-    return replace(pose, covariance=of_focal + of_centre), camera
+    prior = _camera_prior(uncalibrated, camera.fx)
+    start = np.zeros(7)
+    start[1:3] = (camera.cx - first.cx) / camera.fx, (camera.cy - first.cy) / camera.fx
+    start[3:] = camera.distortion()[0]
+    fit = fit_camera(seen, cam_from_world, start, prior)
+    if fit is None:
+        return None
+    weighed = weigh_cameras(fit, prior)
+    allowed = [one for one in weighed if one.lens != "other"]
+    chosen = max(allowed, key=lambda one: weighed[one][0])
+    if max(weighed, key=lambda one: weighed[one][0]).lens == "other":
+        chosen = CameraHypothesis()
+    parameters = np.zeros(7)
+    if chosen == CameraHypothesis() and camera == first:
+        return cam_from_world, camera, weigh_poses(fit, weighed, (chosen, parameters))
+    mean = chosen.basis @ np.linalg.lstsq(chosen.basis, weighed[chosen][1], rcond=None)[0]
+    pose = Rigid3.exp(fit.pose_by_camera @ (mean - fit.camera)) @ fit.cam_from_world
+    refit = fit_jointly(seen, pose, mean, prior.of(chosen), chosen.basis)
+    if refit is None:
+        return None
+    parameters = refit.camera
+    belief = weigh_poses(fit, weighed, (chosen, parameters))
+    return refit.cam_from_world, _with_parameters(first, parameters), belief
+
+
+def _camera_prior(uncalibrated: UncalibratedCamera, focal: float) -> CameraPrior:
+    """Return the prior of a camera relative to one with this focal length."""
+    usual = UncalibratedCamera.unknown(uncalibrated.width, uncalibrated.height)
+    low, high = (math.log(one / focal) for one in (uncalibrated.min_focal, uncalibrated.max_focal))
+    widest = math.log(math.sqrt(usual.min_focal * usual.max_focal) / focal), _LOG_FOCAL_SIGMA
+    is_narrow = high - low < 0.999 * math.log(usual.max_focal / usual.min_focal)
+    stated = ((low + high) / 2.0, (high - low) / 4.0) if is_narrow else widest
+    return CameraPrior(max(uncalibrated.width, uncalibrated.height) / focal, stated, widest)
+
+
+def _with_parameters(camera: Camera, parameters: Float[np.ndarray, " 7"]) -> Camera:
+    """Return the camera that the parameters describe relative to a pinhole."""
+    focal = camera.fx * math.exp(parameters[0])
+    cx, cy = camera.cx + camera.fx * parameters[1], camera.cy + camera.fx * parameters[2]
+    if parameters[3] == 0.0:
+        return Camera.pinhole(camera.width, camera.height, focal, focal, cx, cy)
+    values = tuple(float(one) for one in (focal, cx, cy, parameters[3]))
+    return Camera("SIMPLE_RADIAL", camera.width, camera.height, values)
 
 
 def _search_focal_lengths(
@@ -108,14 +181,12 @@ def _search_focal_lengths(
     """Return the poses and focal lengths with the smallest errors. Focal lengths in the middle are
     tried first, because a right one shortens the remaining runs."""
     points_img, points_world, _ = finite
-    if len(points_img) < _MIN_INLIERS:
-        return []
+    found: list[tuple[float, Rigid3, Camera]] = []
+    most = _MIN_INLIERS - 1
     ratio = uncalibrated.max_focal / uncalibrated.min_focal
     num_steps = max(1, math.ceil(math.log(ratio) / math.log(_FOCAL_STEP)))
     exponents = sorted((np.arange(num_steps) + 0.5) / num_steps, key=lambda one: abs(one - 0.5))
-    found: list[tuple[float, Rigid3, Camera]] = []
-    most = _MIN_INLIERS - 1
-    for k, exponent in enumerate(exponents):
+    for k, exponent in enumerate(exponents if len(points_img) >= _MIN_INLIERS else ()):
         camera = uncalibrated.with_focal(uncalibrated.min_focal * ratio ** float(exponent))
         # After this many samples of three, one contains only right matches with a confidence of
         # 99.9 %.
@@ -143,6 +214,11 @@ def _refine_pose_and_focal(
     """Return the number of inliers, and the pose and camera that fit them best. Each round selects
     the inliers again."""
     cam_from_world, camera = start
+    # a start outside the stated range was found by the residuals
+    lowest, highest = (
+        min(uncalibrated.min_focal, camera.fx),
+        max(uncalibrated.max_focal, camera.fx),
+    )
     num_inliers = 0
     for _ in range(_MAX_ROUNDS):
         matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)
@@ -158,10 +234,10 @@ def _refine_pose_and_focal(
         if not is_definite:
             return None
         focal = camera.fx * math.exp(np.clip(step[6], -0.2, 0.2))
-        focal = float(np.clip(focal, uncalibrated.min_focal, uncalibrated.max_focal))
+        focal = float(np.clip(focal, lowest, highest))
         if abs(math.log(focal / camera.fx)) < 1e-4:
             break
-        camera = uncalibrated.with_focal(focal)
+        camera = camera.with_focal(focal)
         cam_from_world = Rigid3.exp(step[:6]) @ cam_from_world
     return num_inliers, cam_from_world, camera
 
@@ -182,32 +258,3 @@ def _normal_equations(
     information[6, 6] += 1.0 / _LOG_FOCAL_SIGMA**2
     gradient[6] += math.log(camera.fx / middle) / _LOG_FOCAL_SIGMA**2
     return information, gradient
-
-
-def _add_focal_uncertainty(
-    covariance: Float[np.ndarray, "6 6"], information: Float[np.ndarray, "7 7"]
-) -> Float[np.ndarray, "6 6"]:
-    """Return the pose's covariance, increased from that at a fixed focal length by the uncertainty
-    of the focal length."""
-    by_focal = -np.linalg.solve(information[:6, :6], information[:6, 6])
-    scale = float(np.trace(covariance @ information[:6, :6])) / 6.0
-    variance = scale / max(information[6, 6] + float(information[:6, 6] @ by_focal), 1e-12)
-    return covariance + variance * np.outer(by_focal, by_focal)
-
-
-def _principal_point_covariance(
-    points_world: Float[np.ndarray, "n 3"], pose: AbsolutePose, camera: Camera
-) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance that an uncertain principal point adds to the pose. A shift of all
-    pixels moves the pose."""
-    x, y, z = pose.cam_from_world.apply(points_world).T
-    u, v, w = x / z, y / z, 1.0 / z
-    zero = np.zeros_like(u)
-    by_x = np.column_stack([w, zero, -u * w, -u * v, 1.0 + u * u, -v])
-    by_y = np.column_stack([zero, w, -v * w, -(1.0 + v * v), u * v, u])
-    jacobian, shifts = np.concatenate([by_x, by_y]), np.zeros((2 * len(u), 2))
-    shifts[: len(u), 0] = shifts[len(u) :, 1] = 1.0 / camera.fx
-    by_centre = np.linalg.lstsq(jacobian, shifts, rcond=None)[0]
-    return (
-        (_PRINCIPAL_POINT_SIGMA * max(camera.width, camera.height)) ** 2 * by_centre @ by_centre.T
-    )

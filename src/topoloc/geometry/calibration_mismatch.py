@@ -33,7 +33,8 @@ class CalibrationMismatch:
     """Compare the camera estimated from an image with the calibration, in pixels of the original
     image.
 
-    `of` names the deviating parts: "focal_length", "principal_point". `shift` is the left
+    `of` names the deviating parts: "focal_length", "principal_point", or "distortion", whose amount
+    is not measured. `shift` is the left
     perturbation (metres, radians) from the pose under the calibration to the pose under the
     estimated camera.
     """
@@ -56,6 +57,8 @@ class CalibrationMismatch:
             parts.append(
                 f"the principal point at ({x:.0f}, {y:.0f}), the calibration ({cx:.0f}, {cy:.0f})"
             )
+        if "distortion" in self.of:
+            parts.append("that its lens distorts more than the calibration states")
         return f"the picture says {'; '.join(parts)}"
 
     def to_json(self) -> dict[str, Any]:

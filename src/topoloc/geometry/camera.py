@@ -205,6 +205,22 @@ class Camera:
         """Return the pinhole camera with the same matrix and size."""
         return Camera.pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
+    def with_focal(self, focal: float) -> Camera:
+        """Return the camera with this focal length (pixels) in both directions."""
+        named = zip(MODELS[self.model], self.params, strict=True)
+        return replace(
+            self, params=tuple(focal if name[0] == "f" else value for name, value in named)
+        )
+
+    def is_similar(self, other: Camera) -> bool:
+        """Return whether two opposite corners have nearly the same rays in both cameras: to 0.02 on
+        the plane z = 1."""
+        if self == other:
+            return True
+        corners = np.array([[0.0, 0.0], [self.width - 1.0, self.height - 1.0]])
+        apart = self.normalized_from_img(corners) - other.normalized_from_img(corners)
+        return bool(np.all(np.abs(apart) < 0.02))
+
     def rescaled(self, width: int, height: int) -> Camera:
         """Return the camera of the image resized to width x height. Pixel centres stay pixel
         centres.

@@ -10,7 +10,7 @@ generalized linear models*, 1986).
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from topoloc.geometry.absolute_pose_kernels import score_outer_products
 from topoloc.geometry.camera import Camera
@@ -19,6 +19,15 @@ from topoloc.geometry.rigid import Rigid3
 
 _COLUMNS, _ROWS = 8, 6
 _MIN_CELLS = 6  # with fewer occupied cells no inflation is estimated
+
+
+def cells_of(
+    points_img: Float[np.ndarray, "n 2"], width: int, height: int
+) -> Int[np.ndarray, " n"]:
+    """Return the number of the image cell of each pixel."""
+    grid = np.array([_COLUMNS, _ROWS])
+    columns, rows = np.clip((points_img + 0.5) * grid / [width, height], 0, grid - 1).astype(int).T
+    return rows * _COLUMNS + columns
 
 
 def compute_variance_inflation(
@@ -41,9 +50,8 @@ def compute_variance_inflation(
         sigma_px: standard deviation of the pixels.
     """
     matches = Matches.from_pixels(points_img, points_world, point_covariances, camera, sigma_px)
-    grid, size = np.array([_COLUMNS, _ROWS]), [camera.width, camera.height]
-    columns, rows = np.clip((points_img + 0.5) * grid / size, 0, grid - 1).astype(np.intp).T
-    used, cells = np.unique(rows * _COLUMNS + columns, return_inverse=True)
+    of_points = cells_of(points_img, camera.width, camera.height)
+    used, cells = np.unique(of_points, return_inverse=True)
     if len(used) < _MIN_CELLS:
         return 1.0
     information, independent, clustered = score_outer_products(

@@ -98,19 +98,19 @@ def estimate_pose_covariance(
     if np.count_nonzero(active) < MIN_POINTS or not is_non_collinear(matches.points_world[active]):
         return None
     arguments = matches.kernel_args(cam_from_world)
-    scale = _estimate_noise_scale(squared_errors(*arguments)[active])
+    scale = estimate_noise_scale(squared_errors(*arguments)[active], 6)
     information, *_ = normal_equations(*arguments, active, CAUCHY_SCALE * scale, 6)
     inverse = _invert_information(information)
     return None if inverse is None else _ESTIMATOR_VARIANCE * scale**2 * inverse
 
 
-def _estimate_noise_scale(squares: Float[np.ndarray, " n"]) -> float:
+def estimate_noise_scale(squares: Float[np.ndarray, " n"], num_unknowns: int) -> float:
     """Return the factor by which the noise exceeds its assumed standard deviation, from squared
-    whitened residuals (Huber's proposal 2, 1964).
+    whitened residuals of a fit of some unknowns (Huber's proposal 2, 1964).
 
     It is at least 1. If few matches fit well, this is due to chance or to the fit itself.
     """
-    num_free, variance = max(2 * len(squares) - 6, 1), 1.0
+    num_free, variance = max(2 * len(squares) - num_unknowns, 1), 1.0
     for _ in range(_MAX_SCALE_STEPS):
         scaled = squares / variance
         total = float(np.sum(scaled / (1.0 + scaled / CAUCHY_SCALE**2)))

@@ -27,7 +27,7 @@ from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.guided import count_chance_matches, select_visible_points
 from topoloc.localization.map_facts.repetition import fold_repetitions, shifted_copies
 from topoloc.localization.pose_fit import PointMatches, PoseFit
-from topoloc.localization.provenance import Evidence
+from topoloc.localization.provenance import Evidence, probability_within_tolerance
 from topoloc.localization.search import Search
 
 _GRID = np.array([8, 6])
@@ -57,6 +57,18 @@ def compute_normalized_uncertainty(
         math.degrees(math.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
         / config.max_rotation_deg,
     )
+
+
+def highest_probability(covariance: Float[np.ndarray, "6 6"], config: EvidenceConfig) -> float:
+    """Return the highest probability that agrees with a covariance of cam_from_world.
+
+    The covariance is an upper bound: rho is that of the worse parts of a map. The probability is
+    0.95 if a standard deviation equals its tolerance.
+    """
+    variances = np.diag(covariance)
+    metres = math.sqrt(variances[:3].sum()) / config.max_translation
+    degrees = math.degrees(math.sqrt(variances[3:].sum())) / config.max_rotation_deg
+    return probability_within_tolerance(0.512 * max(metres, degrees))
 
 
 def sample_rows(count: int) -> Int[np.ndarray, " k"]:

@@ -28,6 +28,16 @@ from topoloc.geometry.calibration_check import (
 )
 from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
+from topoloc.geometry.camera_hypotheses import CameraPrior
+from topoloc.geometry.clustered_errors import cells_of
+from topoloc.geometry.joint_camera_fit import (
+    JointFit,
+    Observations,
+    fit_camera,
+    linearized_fit,
+    weigh_cameras,
+)
+from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.guided import match_guided
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
@@ -76,6 +86,8 @@ def check_image_calibration(
     """
     if isinstance(fit.input_camera, UncalibratedCamera):
         return None, None
+    if (mismatch := _check_distortion(search, fit)) is not None:
+        return None, mismatch
     found = _estimate_image_calibration(search, fit)
     if found is None:
         return None, None
@@ -101,6 +113,52 @@ def check_image_calibration(
         list(compress(("focal_length", "principal_point"), is_off)),
         (found.cam_from_world @ first.inverse()).log(),
     )
+
+
+def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | None:
+    """Return the mismatch if the residuals show distortion that the calibration leaves out.
+
+    A linear estimate is enough where they show none.
+    """
+    seen, camera = fit.inlier_observations(1.0), fit.camera
+    seen = seen.select(np.unique(np.linspace(0, len(seen) - 1, 256).astype(int)))
+    points_img = seen.points_img.astype(np.float64)
+    observed = Observations(
+        camera.normalized_from_img(points_img),
+        search.config.pose.key_point_sigma_px / camera.fx,
+        seen.points_world,
+        seen.covariances,
+        cells_of(points_img, camera.width, camera.height),
+        math.inf,
+    )
+    side, calibrated = max(camera.width, camera.height) / camera.fx, np.zeros(7)
+    # standard deviations of the logarithm of the focal length: calibrated or not
+    prior = CameraPrior(side, stated=(0.0, 0.01), usual=(0.0, 0.3))
+    joint = linearized_fit(observed, fit.cam_from_world, calibrated)
+    if joint is None or _find_distortion(joint, prior, 0.05) is None:
+        return None
+    joint = fit_camera(observed, fit.cam_from_world, calibrated, prior)
+    found = None if joint is None else _find_distortion(joint, prior, 0.99)
+    if joint is None or found is None:
+        return None
+    scale = search.query.scale
+    focal, centre = camera.fx * scale, _principal_point(camera, scale)
+    # from the pose under the calibration to the pose under the estimated camera
+    cam_from_world = (
+        Rigid3.exp(joint.pose_by_camera @ (found - joint.camera)) @ joint.cam_from_world
+    )
+    shift = (cam_from_world @ fit.cam_from_world.inverse()).log()
+    return CalibrationMismatch(focal, 0.0, focal, centre, centre, ["distortion"], shift)
+
+
+def _find_distortion(
+    joint: JointFit, prior: CameraPrior, min_probability: float
+) -> Float[np.ndarray, " 7"] | None:
+    """Return the likeliest camera parameters, None unless distortion is probable."""
+    weighed = weigh_cameras(joint, prior)
+    if sum(weighed[one][0] for one in weighed if one.lens != "none") < min_probability:
+        return None
+    return max(weighed.values(), key=lambda one: one[0])[1]
 
 
 def _refine_image_calibration(

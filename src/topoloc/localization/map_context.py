@@ -18,7 +18,7 @@ from topoloc.localization.map_facts.correlated_errors import find_correlated_err
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.query import Query, QueryImage, StageClock, reduce_image
-from topoloc.localization.result import Localization, NotLocalized, R
+from topoloc.localization.result import NotLocalized, R
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
@@ -168,8 +168,8 @@ class MapContext:
         """Return the result with the map's identity, its geopose, the camera and the time
         (nanoseconds)."""
         if isinstance(camera, UncalibratedCamera):
-            focal = result.focal_length_px if isinstance(result, Localization) else None
-            camera = None if focal is None else camera.with_focal(focal)
+            found = result.provenance.camera  # estimated with the pose
+            camera = None if found is None else found.rescaled(camera.width, camera.height)
         provenance = Provenance(
             self.map_id,
             self.topomap.version,

@@ -65,13 +65,14 @@ class NodeProposal(Proposal):
             return None
         with search.query.clock.stage("evidence"):
             inflated = covariance_inflation(final.num_inliers, search.correlated_error_share)
-            covariance = inflated * final.pose.covariance
+            covariance = final.pose.inflated(inflated)
             unguided = None if self.is_guided else first
             evidence = compute_evidence(search, final, covariance, unguided, self.repeats)
             if evidence is None:
                 return None
             log_odds = search.weights.log_odds(evidence)
-        return Hypothesis(self.source, final, evidence, covariance, 1.0 / inflated, log_odds)
+        noise_share = final.pose.noise_share(inflated)
+        return Hypothesis(self.source, final, evidence, covariance, noise_share, log_odds)
 
 
 def is_already_found(proposal: NodeProposal) -> bool:
@@ -107,6 +108,11 @@ def refine(proposal: NodeProposal) -> PointMatches:
         first.num_inliers < search.config.num_clear_inliers
     ):  # a poor first pose may need a second round to find all points
         final = max(final, refit_around(search, final), key=lambda fit: fit.num_inliers)
+    before = first.camera
+    for _ in range(3):  # matches around another camera hold the estimate back
+        if final.camera.is_similar(before):
+            break
+        before, final = final.camera, refit_around(search, final)
     return final
 
 
@@ -151,7 +157,7 @@ def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:
         return None
     with search.query.clock.stage("evidence"):
         inflated = covariance_inflation(final.num_inliers, search.correlated_error_share)
-        return compute_best_case_evidence(search, final, inflated * final.pose.covariance)
+        return compute_best_case_evidence(search, final, final.pose.inflated(inflated))
 
 
 def confirm_hypotheses(first: Search, last: Search) -> ResultWithInliers:

@@ -8,12 +8,15 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from topoloc.geometry.camera_hypotheses import CameraBelief
 from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis, log_odds_margin
 from topoloc.localization.evidence import (
     compute_normalized_uncertainty,
+    compute_translation_tolerance,
+    highest_probability,
     is_only_imprecise,
 )
 from topoloc.localization.image_calibration_check import check_image_calibration
@@ -50,7 +53,8 @@ def decide_result(search: Search) -> ResultWithInliers:
     )
     if is_leading and probability >= min_probability:
         named = _build_localization(search, best, probability)
-        return named[0], [named]
+        if named[0].probability >= min_probability:
+            return named[0], [named]
     return _ambiguous_result(search, ranked, log_odds_margins, others)
 
 
@@ -65,6 +69,8 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     if isinstance(result, NotLocalized):
         return result, named
     best = search.belief.ranked(search.weights.rivals)[0]
+    if best.fit.pose.camera is not None:
+        return _weigh_camera(search, best, result, best.fit.pose.camera)
     with search.query.clock.stage("calibration"):
         seen, doubt = check_image_calibration(search, best.fit)
     if doubt is None:
@@ -85,6 +91,24 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     localization, points = _build_localization(search, penalized, probability)
     localization = replace(localization, calibration_doubt=doubt, seen_camera=seen)
     return localization, [(localization, points)]
+
+
+def _weigh_camera(
+    search: Search, best: Hypothesis, result: Localization, camera: CameraBelief
+) -> ResultWithInliers:
+    """Return the result of a camera without calibration, with the probability that the pose is
+    within the tolerance whatever its camera may be."""
+    config, seen = search.config.evidence, best.fit.inlier_observations(1.0)
+    depth = float(np.median(best.fit.cam_from_world.apply(seen.points_world)[:, 2]))
+    tolerances = compute_translation_tolerance(depth, config), math.radians(config.max_rotation_deg)
+    probability = result.probability * camera.probability_within(*tolerances)
+    if probability >= config.min_probability:
+        named = _build_localization(search, best, probability)
+        return named[0], [named]
+    detail = "a cropped image or another lens would put the camera elsewhere"
+    if camera.is_contradicted:
+        detail = "the image contradicts all camera models, as a panorama does"
+    return _build_not_localized(search, "too_few_inliers", best, f"{detail}: state --camera"), []
 
 
 def _uncertainty_with_covariance(
@@ -138,7 +162,7 @@ def _build_localization(
     localization = Localization(
         world_from_cam=best.world_from_cam,
         covariance=inverse_covariance(best.fit.cam_from_world, best.covariance),
-        probability=probability,
+        probability=min(probability, highest_probability(best.covariance, search.config.evidence)),
         node_id=best.fit.node_id,
         candidates=search.candidate_nodes,
         num_matches=len(best.fit.matches),
@@ -148,7 +172,7 @@ def _build_localization(
         focal_length_px=best.fit.camera.fx * search.query.scale if is_rough else None,
         noise_share=best.noise_share,
         calibrated=search.weights.is_calibrated,
-        provenance=_provenance(search),
+        provenance=replace(_provenance(search), camera=best.fit.camera if is_rough else None),
     )
     return localization, best.fit.inlier_observations(search.query.scale)
 

@@ -187,7 +187,7 @@ def _score(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis:
         covariance_inflation(num, search.correlated_error_share)
         + search.weights.walls.few_points / num
     )
-    covariance = inflated * final.pose.covariance
+    covariance = final.pose.inflated(inflated)
     columns_img = final.features.points_img[final.inlier_query_idx, 0]
     num_left = int(np.count_nonzero(columns_img < final.camera.cx))
     evidence = replace(
@@ -206,7 +206,8 @@ def _score(proposal: VirtualViewProposal, final: PoseFit) -> Hypothesis:
         num_lesser_side=min(num_left, num - num_left),
     )
     log_odds = search.weights.log_odds(evidence)
-    return Hypothesis("walls", final, evidence, covariance, 1.0 / inflated, log_odds)
+    noise_share = final.pose.noise_share(inflated)
+    return Hypothesis("walls", final, evidence, covariance, noise_share, log_odds)
 
 
 def _num_distinct(walls: VirtualViewSearch, final: PoseFit) -> int:

@@ -1,0 +1,133 @@
+"""Hold hypotheses about an uncalibrated camera: priors of seven parameters, and their
+probabilities. The parameters are those of `joint_camera_fit.py`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+Vector = Float[np.ndarray, " 7"]
+Matrix = Float[np.ndarray, "7 7"]
+
+
+@dataclass(frozen=True)
+class CameraHypothesis:
+    """Hold what is assumed of a camera: whether its focal length is in the stated range, whether
+    its principal point is in the image centre, and the kind of distortion."""
+
+    is_focal_stated: bool = True
+    is_centred: bool = True
+    lens: Literal["none", "radial", "other"] = "none"
+
+    @property
+    def log_prior(self) -> float:
+        """Return the logarithm of the prior probability, but for a constant."""
+        lens = {"none": 0.0, "radial": math.log(0.1), "other": math.log(0.03)}[self.lens]
+        odds = (0.2 ** (not self.is_centred)) * (0.1 ** (not self.is_focal_stated))
+        return math.log(odds) + lens
+
+    @property
+    def basis(self) -> Float[np.ndarray, "7 k"]:
+        """Return the directions in which the parameters are estimated."""
+        eye = np.eye(7)
+        radial = np.array([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]]).T
+        lens = {"none": eye[:, :0], "radial": radial, "other": eye[:, 3:]}[self.lens]
+        return np.hstack([eye[:, :1], eye[:, :0] if self.is_centred else eye[:, 1:3], lens])
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPrior:
+    """Hold the priors of the parameters. `side` is the longer side of the image, in focal lengths.
+
+    `stated` and `usual` are mean and standard deviation of the logarithm of the focal length, by
+    its stated range and without it. They are equal if no range is stated.
+    """
+
+    side: float
+    stated: tuple[float, float]
+    usual: tuple[float, float]
+
+    def of(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
+        """Return mean and covariance of the parameters under a hypothesis."""
+        mean, focal = np.zeros(7), self.stated if hypothesis.is_focal_stated else self.usual
+        # The principal point of a whole image is less than 1 % of its side off the centre.
+        offset = (0.005 if hypothesis.is_centred else 0.15) * self.side
+        mean[0] = focal[0]
+        covariance = np.diag([focal[1] ** 2, offset**2, offset**2, *[0.01**2] * 4])
+        if hypothesis.lens != "none":
+            covariance[3:, 3:] += 0.15**2
+        if hypothesis.lens == "other":
+            covariance[3:, 3:] += 0.15**2 * np.eye(4)
+        return mean, covariance
+
+    @property
+    def hypotheses(self) -> list[CameraHypothesis]:
+        """Return the hypotheses that differ."""
+        focal = (True,) if self.stated == self.usual else (True, False)
+        lenses: tuple[Literal["none", "radial", "other"], ...] = ("none", "radial", "other")
+        return [CameraHypothesis(*one) for one in product(focal, (True, False), lenses)]
+
+
+@dataclass(frozen=True, eq=False)
+class WeighedCamera:
+    """Hold a hypothesis with its probability, and the error of the reported pose if it is right:
+    mean and covariance of the left perturbation (metres, radians)."""
+
+    hypothesis: CameraHypothesis
+    probability: float
+    shift: Float[np.ndarray, " 6"]
+    covariance: Float[np.ndarray, "6 6"]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraBelief:
+    """Hold the hypotheses about a camera, and the one by which the pose is reported."""
+
+    reported: CameraHypothesis
+    weighed: Sequence[WeighedCamera]
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Return whether the residuals contradict the reported camera."""
+        return self._chosen.probability < 0.5
+
+    @property
+    def _chosen(self) -> WeighedCamera:
+        return next(one for one in self.weighed if one.hypothesis == self.reported)
+
+    @cached_property
+    def covariance(self) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance that the camera adds to the pose: under the reported hypothesis, or
+        under all of them if the residuals contradict it."""
+        counted = self.weighed if self.is_contradicted else [self._chosen]
+        total = sum(one.probability for one in counted)
+        parts = [
+            one.probability * (one.covariance + np.outer(one.shift, one.shift)) for one in counted
+        ]
+        return np.sum(parts, axis=0) / total
+
+    def probability_within(self, metres: float, radians: float) -> float:
+        """Return the probability that the camera moves the pose by less than both tolerances."""
+        return sum(
+            one.probability
+            * _probability_below(metres, one.shift[:3], one.covariance[:3, :3])
+            * _probability_below(radians, one.shift[3:], one.covariance[3:, 3:])
+            for one in self.weighed
+        )
+
+
+def _probability_below(
+    limit: float, mean: Float[np.ndarray, " 3"], covariance: Float[np.ndarray, "3 3"]
+) -> float:
+    """Return the probability that a normal vector is shorter than a limit, as if it varied along
+    its mean only."""
+    scale = math.sqrt(2.0 * max(float(np.linalg.eigvalsh(covariance)[-1]), 1e-18))
+    length = float(np.linalg.norm(mean))
+    return (math.erf((limit - length) / scale) + math.erf((limit + length) / scale)) / 2.0
