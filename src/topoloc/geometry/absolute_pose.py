@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from topoloc.bounds import Above, Between
 from topoloc.geometry.absolute_pose_kernels import squared_errors
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.camera_hypotheses import CameraBelief
+from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
 from topoloc.geometry.pose_matches import (
     MIN_POINTS,
     Matches,

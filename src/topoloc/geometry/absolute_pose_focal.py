@@ -4,7 +4,7 @@ RANSAC runs with a few focal lengths in steps of 1.25. Each run is no longer tha
 best one so far. At an inlier threshold of several pixels, the nearest focal length is near enough
 to find the inliers. From the best results, Gauss-Newton refines the pose and the logarithm of the
 focal length together. Principal point and distortion are estimated only if the residuals ask for
-it (`joint_camera_fit.py`). The uncertainty of the camera is added to the pose's covariance.
+it (`joint_camera/joint_fit.py`). The uncertainty of the camera is added to the pose's covariance.
 """
 
 from __future__ import annotations
@@ -25,9 +25,13 @@ from topoloc.geometry.absolute_pose import (
 )
 from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_cholesky
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.camera_hypotheses import CameraBelief, CameraHypothesis, CameraPrior
 from topoloc.geometry.clustered_errors import cells_of
-from topoloc.geometry.joint_camera_fit import (
+from topoloc.geometry.joint_camera.camera_hypotheses import (
+    CameraBelief,
+    CameraHypothesis,
+    CameraPrior,
+)
+from topoloc.geometry.joint_camera.joint_fit import (
     Observations,
     fit_camera,
     fit_jointly,

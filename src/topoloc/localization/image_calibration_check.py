@@ -28,9 +28,9 @@ from topoloc.geometry.calibration_check import (
 )
 from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
-from topoloc.geometry.camera_hypotheses import CameraPrior
 from topoloc.geometry.clustered_errors import cells_of
-from topoloc.geometry.joint_camera_fit import (
+from topoloc.geometry.joint_camera.camera_hypotheses import CameraPrior
+from topoloc.geometry.joint_camera.joint_fit import (
     JointFit,
     Observations,
     fit_camera,

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.geometry.camera_hypotheses import CameraBelief
 from topoloc.geometry.clustered_errors import compute_variance_inflation
+from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
 from topoloc.geometry.rigid import inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis, log_odds_margin

@@ -1,5 +1,5 @@
 """Hold hypotheses about an uncalibrated camera: priors of seven parameters, and their
-probabilities. The parameters are those of `joint_camera_fit.py`."""
+probabilities. The parameters are those of `joint_camera/joint_fit.py`."""
 
 from __future__ import annotations
 
