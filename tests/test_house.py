@@ -47,7 +47,7 @@ CEILINGS = {
     "asserts.sum": 3,  # goal 40
     "branches.map_or_atlas": 0,
     "branches.walls": 10,  # goal 0
-    "constants.all": 435,  # goal 474, localization 25
+    "constants.all": 434,  # goal 474, localization 25
     "constants.core/localization": 38,
     "user_docs_bytes": 144607,  # goal 150000
     "readme_lines": 150,  # goal 150
@@ -57,7 +57,7 @@ FLOORS = {"documented %": 90, "typed %": 95}
 # Modules of topoloc, and how many of OpenCV, Numba, torch, FAISS and ONNX Runtime, that are loaded
 # in a fresh process after an import.
 REACH = {
-    "localizer": (82, 3),  # goal 60
+    "localizer": (84, 3),  # goal 60
     "result": (10, 0),  # goal 10, 0
     "map": (21, 0),  # goal 20
     "client": (11, 0),  # goal 10, 0
