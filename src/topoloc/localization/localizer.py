@@ -212,9 +212,9 @@ class Localizer:
     ) -> Localization | NotLocalized:
         """Estimate the pose of an image (grey or RGB, uint8).
 
-        If the camera is only approximately known, or unknown (None), the focal length is estimated
-        with the pose. This takes a few times as long and assumes a pinhole camera. In an atlas the
-        provenance of the result holds the tile, in whose world the pose is.
+        If the camera is not exactly known, or unknown (None), the focal length is estimated with
+        the pose, and principal point and distortion if the residuals ask for it. This takes a few
+        times as long. In an atlas the provenance holds the tile, in whose world the pose is.
 
         Args:
             camera: camera model of the image, exact or approximate. None: unknown.
