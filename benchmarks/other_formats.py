@@ -23,8 +23,8 @@ import numpy as np
 
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
-from topoloc.recordings.image_io import encode_jpeg
 from topoloc.recordings.open import open_sequence
+from topoloc.recordings.stored_images import encode_jpeg
 
 COLMAP_UNIT = 2.5  # metres
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])

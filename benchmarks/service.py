@@ -36,7 +36,8 @@ import numpy as np
 
 from topoloc import Localizer, TopoMetricMap, open_sequence, set_num_threads
 from topoloc.geometry.camera import Camera
-from topoloc.recordings.image_io import EncodedImage, encode_jpeg, read_image
+from topoloc.recordings.image_io import EncodedImage, read_image
+from topoloc.recordings.stored_images import encode_jpeg
 
 
 @dataclass

@@ -15,6 +15,7 @@ import numpy as np
 from topoloc.errors import TrajectoryError
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.transform_consensus import select_hypothesis
 from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_step, extract_view
 
@@ -131,7 +132,7 @@ def _check_transform(one: _Views, other: _Views, steps: list[MeasuredStep]) -> N
         for step in steps
     ]
     agree = np.array([_errors(one, other, steps, each) < 1.0 for each in candidates])
-    best = int(np.argmax(agree.sum(axis=1)))
+    best, _ = select_hypothesis(agree)
     kept = [step for step, is_kept in zip(steps, agree[best], strict=True) if is_kept]
     as_is = _errors(one, other, kept, Rigid3.identity())
     if len(kept) < max(min_pairs, min_ratio * len(steps)) or np.median(as_is) < min_error:
