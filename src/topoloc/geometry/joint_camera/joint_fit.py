@@ -103,17 +103,20 @@ class JointFit:
         """Return the shift of the pose for a change of the camera parameters."""
         return -np.linalg.solve(self.information[:6, :6], self.information[:6, 6:])
 
-    def posterior(self, mean: Vector, covariance: Matrix) -> tuple[float, Vector, Matrix]:
-        """Return the logarithm of the evidence of a prior, and the parameters' mean and covariance
-        under it."""
+    def posteriors(
+        self, means: Float[np.ndarray, "k 7"], covariances: Float[np.ndarray, "k 7 7"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 7"], Float[np.ndarray, "k 7 7"]]:
+        """Return the logarithm of the evidence of each of k priors, and the parameters' mean and
+        covariance under it."""
         known = self.information[6:, 6:] + self.information[6:, :6] @ self.pose_by_camera
         known, pull = known / self.variance, self.pull / self.variance
-        by_prior = np.linalg.inv(covariance)
-        posterior = np.linalg.inv(known + by_prior)
-        pulled = pull + by_prior @ mean
-        evidence = 0.5 * (pulled @ posterior @ pulled - mean @ by_prior @ mean)
-        evidence -= 0.5 * np.linalg.slogdet(np.eye(7) + covariance @ known)[1]
-        return float(evidence), posterior @ pulled, posterior
+        by_priors = np.linalg.inv(covariances)
+        posteriors = np.linalg.inv(known + by_priors)
+        weighed = (by_priors @ means[:, :, None])[:, :, 0]
+        estimates = (posteriors @ (pull + weighed)[:, :, None])[:, :, 0]
+        evidence = np.sum((pull + weighed) * estimates, axis=1) - np.sum(means * weighed, axis=1)
+        evidence -= np.linalg.slogdet(np.eye(7) + covariances @ known)[1]
+        return 0.5 * evidence, estimates, posteriors
 
 
 def fit_jointly(
@@ -200,9 +203,9 @@ def _linear_system(
     if np.count_nonzero(is_active) < 8:
         return None
     weights = weights * (is_active / (1.0 + squares / CAUCHY_SCALE**2))[:, None, None]
-    weighted = np.einsum("nia,nij->naj", jacobian, weights)
-    information = np.einsum("naj,njb->ab", weighted, jacobian)
-    return information, np.einsum("naj,nj->na", weighted, errors), squares, is_active
+    weighted = weights @ jacobian
+    information = np.tensordot(weighted, jacobian, ((0, 1), (0, 1)))
+    return information, (weighted * errors[:, :, None]).sum(axis=1), squares, is_active
 
 
 def _shared_noise(
@@ -227,14 +230,13 @@ def weigh_cameras(
 ) -> dict[CameraHypothesis, tuple[float, Vector, Matrix]]:
     """Return the probability of each hypothesis, and the parameters' mean and covariance under
     it."""
-    found = {one: fit.posterior(*prior.of(one)) for one in prior.hypotheses}
-    logs = np.array([evidence + one.log_prior for one, (evidence, *_) in found.items()])
+    hypotheses = prior.hypotheses
+    means, covariances = map(np.array, zip(*map(prior.of, hypotheses), strict=True))
+    evidence, estimates, posteriors = fit.posteriors(means, covariances)
+    logs = evidence + [one.log_prior for one in hypotheses]
     shares = np.exp(logs - logs.max())
-    shares /= shares.sum()
-    return {
-        one: (float(share), mean, covariance)
-        for share, (one, (_, mean, covariance)) in zip(shares, found.items(), strict=True)
-    }
+    found = zip((shares / shares.sum()).tolist(), estimates, posteriors, strict=True)
+    return dict(zip(hypotheses, found, strict=True))
 
 
 def weigh_poses(
