@@ -20,6 +20,7 @@ from topoloc.features.features import Features, Matches
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.guided_kernels import (
+    largest_agreement,
     match_projections,
     predict_from_pixels,
     project_undistorted,
@@ -211,12 +212,6 @@ def count_consistent_displacements(
     The count is the largest number of matches within `within_px` of the displacement of one match.
     `within_px` refers to an image whose longer side is 640 pixels, and scales with the image size.
     """
-    if len(matches) == 0:
-        return 0
     shifts = features.points_img[matches.query_idx] - predicted[matches.train_idx, :2]
-    apart = np.square(shifts[:, None] - shifts[None]).sum(axis=2)
-    return int(
-        np.count_nonzero(
-            apart < (within_px * max(max(camera.width, camera.height) / 640.0, 0.5)) ** 2, axis=1
-        ).max()
-    )
+    scale = max(max(camera.width, camera.height) / 640.0, 0.5)
+    return int(largest_agreement(shifts, np.float32(within_px * scale)))

@@ -44,6 +44,13 @@ def match_projections(
     for k in range(len(key_points)):  # keeps the order within a cell
         order[free[cells[k]]] = k
         free[cells[k]] += 1
+    # by cell, so that the key points of neighbouring cells are read one after the other
+    sorted_points = np.empty((5, len(key_points)), np.float32)
+    for position in range(len(order)):
+        for part in range(5):
+            sorted_points[part, position] = key_points[order[position], part]
+    xs, ys, sizes, cosines, sines = sorted_points
+    near = np.empty(len(key_points), np.int64)
     found = np.full(len(predicted), -1, np.int32)
     similarities = np.zeros(len(predicted), np.float32)
     for n in range(len(predicted)):
@@ -51,46 +58,55 @@ def match_projections(
         if not (x > -radius and y > -radius and x < width + radius and y < height + radius):
             continue
         column, row = int(np.floor(x / radius)), int(np.floor(y / radius))
-        best, second, best_k = np.float32(-2), np.float32(-2), -1
+        size, cosine, sine, count = predicted[n, 2], predicted[n, 3], predicted[n, 4], 0
+        first_column, last_column = max(column - 1, 0), min(column + 2, num_columns)
         for r in range(max(row - 1, 0), min(row + 2, num_rows)):
-            for c in range(max(column - 1, 0), min(column + 2, num_columns)):
-                cell = r * num_columns + c
-                for position in range(starts[cell], starts[cell + 1]):
-                    k = order[position]
-                    dx, dy = key_points[k, 0] - x, key_points[k, 1] - y
-                    scale = key_points[k, 2] / predicted[n, 2]
-                    if (
-                        dx * dx + dy * dy > radius * radius
-                        or scale > max_scale
-                        or scale * max_scale < 1
-                    ):
-                        continue
-                    if (
-                        key_points[k, 3] * predicted[n, 3] + key_points[k, 4] * predicted[n, 4]
-                        < min_cosine
-                    ):
-                        continue
-                    product = np.float32(0)
-                    for d in range(descriptors.shape[1]):
-                        product += descriptors[k, d] * map_descriptors[n, d]
-                    if product > best:
-                        if (
-                            best_k < 0
-                            or abs(key_points[k, 0] - key_points[best_k, 0])
-                            + abs(key_points[k, 1] - key_points[best_k, 1])
-                            > 2
-                        ):
-                            second = best
-                        best, best_k = product, k
-                    elif product > second and (
-                        abs(key_points[k, 0] - key_points[best_k, 0])
-                        + abs(key_points[k, 1] - key_points[best_k, 1])
-                        > 2
-                    ):
-                        second = product
+            first, last = r * num_columns + first_column, r * num_columns + last_column
+            for position in range(starts[first], starts[max(last, first)]):
+                dx, dy = xs[position] - x, ys[position] - y
+                # without branches, most of which no processor could foresee
+                near[count] = position
+                count += int(
+                    (dx * dx + dy * dy <= radius * radius)
+                    & (not cosines[position] * cosine + sines[position] * sine < min_cosine)
+                )
+        best, second, best_k = np.float32(-2), np.float32(-2), -1
+        for position in near[:count]:
+            scale = sizes[position] / size
+            if scale > max_scale or scale * max_scale < 1:
+                continue
+            k, product = order[position], np.float32(0)
+            for d in range(descriptors.shape[1]):
+                product += descriptors[k, d] * map_descriptors[n, d]
+            if product <= second:
+                continue
+            is_apart = best_k < 0 or (
+                abs(key_points[k, 0] - key_points[best_k, 0])
+                + abs(key_points[k, 1] - key_points[best_k, 1])
+                > 2
+            )
+            if product > best:
+                if is_apart:
+                    second = best
+                best, best_k = product, k
+            elif is_apart:
+                second = product
         if best_k >= 0 and best >= min_similarity and best - second >= min_margin:
             found[n], similarities[n] = best_k, best
     return found, similarities
+
+
+@kernel()
+def largest_agreement(shifts, within):
+    """Return the largest number of rows of `shifts` (n, 2) that lie within this distance of one."""
+    most = 0
+    for i in range(len(shifts)):
+        count = 0
+        for j in range(len(shifts)):
+            dx, dy = shifts[i, 0] - shifts[j, 0], shifts[i, 1] - shifts[j, 1]
+            count += int(dx * dx + dy * dy < within * within)
+        most = max(most, count)
+    return most
 
 
 @kernel(error_model="numpy")

@@ -48,7 +48,7 @@ def _seen() -> list[QueryVirtualView]:
     seen = []
     for view in make_virtual_views(WIDE):
         features = view.select_inside(extract_features(view.picture(PICTURE), FeatureConfig()))
-        seen.append(QueryVirtualView(view, features, view.to_image_pixels(features, WIDE)))
+        seen.append(QueryVirtualView.of(view, features, WIDE))
     return seen
 
 
@@ -172,5 +172,5 @@ def test_the_pose_of_both_sides_is_refined_round_by_round_from_one_that_is_near(
 def test_nothing_matched_is_none():
     assert match_virtual_views([], TRUTH.inverse(), WIDE, GUIDED) is None
     side, points = _around()[0]
-    nothing = QueryVirtualView(side.view, Features.empty(64), Features.empty(64))
+    nothing = QueryVirtualView.of(side.view, Features.empty(64), WIDE)
     assert match_virtual_views([(nothing, points)], TRUTH.inverse(), WIDE, GUIDED) is None

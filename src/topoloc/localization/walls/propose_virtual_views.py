@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from topoloc.features.config import MatchingConfig
+from topoloc.features.features import Matches
 from topoloc.features.matching import match_features, match_pooled
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3
@@ -30,6 +31,7 @@ from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search
 from topoloc.localization.walls.upright_pose import estimate_upright_pose
 from topoloc.localization.walls.virtual_view_matching import (
+    Sides,
     VirtualViewSearch,
     count_virtual_views,
     merge_matches,
@@ -129,24 +131,22 @@ def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewPropos
     # Minimum number of matches, over both views, that must agree on one pose to recognise a
     # place.
     min_agreeing = 8
-    config, cam_from_place = walls.search.config.walls, place.inverse()
+    cam_from_place = place.inverse()
     sides = walls.sides_around(cam_from_place)
     matches = [
         match_pooled(
-            side.features.descriptors, m.descriptors, m.points_world, m.radii, config.matching
+            side.features.descriptors,
+            m.descriptors,
+            m.points_world,
+            m.radii,
+            walls.search.config.walls.matching,
         )
         for side, m in sides
     ]
-    found = merge_matches(sides, matches, walls.camera)
-    if found is None:
-        return None
-    seen = walls.camera.normalized_from_img(
-        found.features.points_img[found.matches.query_idx].astype(np.float64)
-    )
-    agreeing = estimate_upright_pose(
-        seen, cam_from_place.apply(found.local_map.points_world[found.matches.train_idx])
-    )
+    agreeing = _find_agreement(sides, matches, cam_from_place)
     if agreeing is None or agreeing[0] < min_agreeing:
+        return None
+    if (found := merge_matches(sides, matches, walls.camera)) is None:
         return None
     return VirtualViewProposal(
         walls.search,
@@ -156,6 +156,18 @@ def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewPropos
         cam_from_world=agreeing[1] @ cam_from_place,
         walls=walls,
     )
+
+
+def _find_agreement(
+    sides: Sides, matches: list[Matches], cam_from_place: Rigid3
+) -> tuple[int, Rigid3] | None:
+    """Return the number of matches of both views that agree on one upright pose, and that pose
+    (cam_from_place)."""
+    if not sides:
+        return None
+    seen = [side.tangents[one.query_idx] for (side, _), one in zip(sides, matches, strict=True)]
+    points = [m.points_world[one.train_idx] for (_, m), one in zip(sides, matches, strict=True)]
+    return estimate_upright_pose(np.concatenate(seen), cam_from_place.apply(np.concatenate(points)))
 
 
 def _fit(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
-from topoloc.localization.walls.upright_pose_kernels import largest_agreement
+from topoloc.localization.walls.upright_pose_kernels import largest_agreement, poses_from_pairs
 
 _NUM_PAIRS = 1500
 _MAX_YAW = math.radians(35.0)
@@ -42,7 +42,9 @@ def estimate_upright_pose(
     """
     if len(seen) < 3:
         return None
-    turns, shifts = _poses_from_pairs(seen, points)
+    pairs = np.random.default_rng(0).integers(0, len(seen), (2, _NUM_PAIRS))
+    limits = _MIN_SEPARATION, _MAX_YAW, _MIN_DEPTH, _MAX_DEPTH
+    turns, shifts = poses_from_pairs(seen, points, pairs, limits)
     if len(turns) == 0:
         return None
     tolerances = _TOLERANCE + _TOLERANCE_SHARE * np.sum(seen**2, axis=1)
@@ -55,41 +57,3 @@ def estimate_upright_pose(
 def _upright_pose(turn: float, shift: Float[np.ndarray, " 3"]) -> Rigid3:
     c, s = math.cos(turn), math.sin(turn)
     return Rigid3(np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]), shift)
-
-
-def _poses_from_pairs(
-    seen: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
-    """Compute rotations about the vertical and translations (cam_from_upright) from pairs of
-    matches.
-
-    The pairs are the same in every call.
-
-    Let d be the depths of the two points, (u, v) their tangents, and ' a difference of the two.
-    With e = d1 - d2 = z' cos - x' sin: v1 d1 - v2 d2 = y' and u1 d1 - u2 d2 = x' cos + z' sin.
-    Eliminating d2 gives a cos + b sin + c = 0.
-    """
-    first, second = np.random.default_rng(0).integers(0, len(seen), (2, _NUM_PAIRS))
-    apart = seen[first] - seen[second]
-    kept = np.abs(apart).max(axis=1) > _MIN_SEPARATION
-    first, second, apart = first[kept], second[kept], apart[kept]
-    (u, v), (du, dv), (dx, dy, dz) = seen[first].T, apart.T, (points[first] - points[second]).T
-    a, b, c = u * dz * dv - v * dz * du - dx * dv, v * dx * du - u * dx * dv - dz * dv, dy * du
-    size = np.hypot(a, b)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        middle, half = np.arctan2(b, a), np.arccos(-c / size)
-    turns, rows = np.concatenate([middle + half, middle - half]), np.tile(np.arange(len(u)), 2)
-    turns = np.angle(np.exp(1j * turns))
-    allowed = np.abs(turns) < _MAX_YAW  # False for NaN
-    turns, rows = turns[allowed], rows[allowed]
-    cos, sin = np.cos(turns), np.sin(turns)
-    e = cos * dz[rows] - sin * dx[rows]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        by_rows = (dy[rows] - v[rows] * e) / dv[rows]
-        by_columns = (cos * dx[rows] + sin * dz[rows] - u[rows] * e) / du[rows]
-    depths = np.where(np.abs(dv[rows]) > np.abs(du[rows]), by_rows, by_columns) + e
-    near = (depths > _MIN_DEPTH) & (depths < _MAX_DEPTH)
-    turns, rows, cos, sin, depths = turns[near], rows[near], cos[near], sin[near], depths[near]
-    x, y, z = points[first[rows]].T
-    turned = np.column_stack([cos * x + sin * z, y, cos * z - sin * x])
-    return turns, depths[:, None] * np.column_stack([u[rows], v[rows], np.ones(len(rows))]) - turned

@@ -39,11 +39,23 @@ class QueryVirtualView:
     """Hold one side view of an image.
 
     `features` are at pixels of the view, `features_in_image` the same at pixels of the image.
+    `tangents` are those of the image's `camera`.
     """
 
     view: VirtualView
     features: Features
     features_in_image: Features
+    camera: Camera
+
+    @staticmethod
+    def of(view: VirtualView, features: Features, camera: Camera) -> QueryVirtualView:
+        """Return a view of an image that `camera` took."""
+        return QueryVirtualView(view, features, view.to_image_pixels(features, camera), camera)
+
+    @cached_property
+    def tangents(self) -> Float[np.ndarray, "n 2"]:
+        """Return the tangents (x / z, y / z) of the features in the image's camera."""
+        return self.camera.normalized_from_img(self.features_in_image.points_img.astype(np.float64))
 
 
 Sides = list[tuple[QueryVirtualView, LocalMap]]
@@ -184,9 +196,7 @@ class VirtualViewSearch:
             features = query.shared.get_or_extract(
                 query, seen_by, partial(_extract_view_features, index.feature_config, view, picture)
             )
-            seen.append(
-                QueryVirtualView(view, features, view.to_image_pixels(features, query.input_camera))
-            )
+            seen.append(QueryVirtualView.of(view, features, query.input_camera))
             named.append(CandidatePlaces.of(view, index, index.similarity(picture, features)))
         apart = num_d_thresh * search.map.d_thresh
         return VirtualViewSearch(
