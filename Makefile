@@ -25,6 +25,9 @@ demo: $(VENV)/installed-core
 
 install: $(VENV)/installed-all
 
+# Compiled modules are kept: a test run starts hundreds of processes.
+test test-slow: export PYTHONDONTWRITEBYTECODE =
+
 # The type checker keeps one processor busy: beside it, another compiles once what the tests' processes would each compile.
 test: $(VENV)/installed-test
 	@$(MAKE) --no-print-directory --jobs 2 lint kernels
