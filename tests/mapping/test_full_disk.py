@@ -102,21 +102,28 @@ def test_with_few_file_handles_an_edit_is_one_line_or_done(edited: Path):
 
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     used, outcomes = max(map(int, os.listdir("/proc/self/fd"))) + 1, set[str]()
-    for more in range(12):
-        before = {one.name: one.read_bytes() for one in edited.parent.iterdir()}
-        try:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (used + more, limits[1]))
-            _edit(edited)
-            outcomes.add("done")
-            continue
-        except MapError as error:
-            text = str(error)
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-        assert {one.name: one.read_bytes() for one in edited.parent.iterdir()} == before
-        assert "Too many open files; raise the limit (ulimit -n)" in text
-        assert ".part" not in text
-        outcomes.add("refused")
+    held = [os.open(os.devnull, os.O_RDONLY)]  # so that no lower handle is free
+    while held[-1] < used - 1:
+        held.append(os.open(os.devnull, os.O_RDONLY))
+    try:
+        for more in range(12):
+            before = {one.name: one.read_bytes() for one in edited.parent.iterdir()}
+            try:
+                resource.setrlimit(resource.RLIMIT_NOFILE, (used + more, limits[1]))
+                _edit(edited)
+                outcomes.add("done")
+                continue
+            except MapError as error:
+                text = str(error)
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+            assert {one.name: one.read_bytes() for one in edited.parent.iterdir()} == before
+            assert "Too many open files; raise the limit (ulimit -n)" in text
+            assert ".part" not in text
+            outcomes.add("refused")
+    finally:
+        for handle in held:
+            os.close(handle)
     assert outcomes == {"done", "refused"}
 
 
