@@ -28,13 +28,14 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
-@pytest.mark.parametrize("job", ["old-files", "demo"])
+@pytest.mark.parametrize("job", ["old-files", pytest.param("demo", marks=pytest.mark.slow)])
 def test_a_job_has_no_worse_figure(job: str):
     """These jobs need no recordings beside those of the repository."""
     done = run("--quick", "--only", job)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow  # tests/test_recordings.py maps and asks the same recordings
 def test_another_session_in_the_zed_lab(shared: Path):
     done = run("--quick", "--only", "evaluate", "--shared", shared)
     assert done.returncode == 0, done.stdout + done.stderr
