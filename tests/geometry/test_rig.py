@@ -1,3 +1,4 @@
+import functools
 import re
 from pathlib import Path
 
@@ -40,7 +41,11 @@ RIGS = {
     "fisheye": StereoRig(WIDE, WIDE, TILT),
     "unlike": StereoRig(CAMERAS["RADIAL"], WIDE, TILT),
 }
-RECTIFICATIONS = {name: rectify(rig) for name, rig in RIGS.items()}
+
+
+@functools.cache
+def rectification_of(name: str) -> Rectification:
+    return rectify(RIGS[name])
 
 
 def euroc_camera(path: Path) -> tuple[Camera, Rigid3]:
@@ -82,7 +87,7 @@ def sample(image_map: np.ndarray, x: float, y: float) -> np.ndarray:
     st.floats(0.5, 50.0),
 )
 def test_a_point_has_one_row_in_both_rectified_images(name, x, y, depth):
-    rig, rectification = RIGS[name], RECTIFICATIONS[name]
+    rig, rectification = RIGS[name], rectification_of(name)
     rectified = rectification.rig
     pixel = np.array([[x * (rectified.left.width - 2), y * (rectified.left.height - 2)]])
     point_rectified = rectified.left.rays_from_img(pixel) * depth
@@ -103,7 +108,7 @@ def test_a_point_has_one_row_in_both_rectified_images(name, x, y, depth):
 
 @pytest.mark.parametrize("name", sorted(RIGS))
 def test_rectified_images_have_no_black_border_and_waste_little(name):
-    rig, rectification = RIGS[name], RECTIFICATIONS[name]
+    rig, rectification = RIGS[name], rectification_of(name)
     shares = []
     for camera, image_map in (
         (rig.left, rectification.left_map),
@@ -122,7 +127,7 @@ def test_rectified_images_have_no_black_border_and_waste_little(name):
 
 
 def test_rotation_and_view_agree_with_opencv():
-    rig, rectification = RIGS["distorted"], RECTIFICATIONS["distorted"]
+    rig, rectification = RIGS["distorted"], rectification_of("distorted")
     motion = rig.right_from_left
     cameras = (
         rig.left.matrix(),
