@@ -16,7 +16,7 @@ from built_corridor import WIDE, WalkAhead, seen_ahead
 from topoloc.localization.map_facts.map_building import build_map
 
 OPENING = Path(__file__).with_name("opening.py")
-NUM_MUTATIONS = 32  # the first seeds with each kind of change at least three times
+NUM_MUTATIONS = 37  # the first with each of _KINDS and flipped bits three times or more
 NUM_SLOW_MUTATIONS = 100
 
 
