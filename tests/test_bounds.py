@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import topoloc
 from built_room import built_room

@@ -11,117 +11,82 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from topoloc.atlas.manifest import check_tile_id
-    from topoloc.atlas.tile_fetcher import TilePending
+    from topoloc.atlas.manifest import check_tile_id as check_tile_id
+    from topoloc.atlas.tile_fetcher import TilePending as TilePending
     from topoloc.bounds import (
-        Above,
-        AtLeast,
-        Between,
-        describe_ranges,
-        suggest_name,
-        with_setting,
+        Above as Above,
+        AtLeast as AtLeast,
+        Between as Between,
+        describe_ranges as describe_ranges,
+        suggest_name as suggest_name,
+        with_setting as with_setting,
     )
-    from topoloc.evaluation.metrics import format_length
-    from topoloc.evaluation.node_matching import NodeMatcher
-    from topoloc.features.feature_types import check_available, parse_feature_types
-    from topoloc.features.network_files import NetworkInfo, cache_folder, read_bytes
-    from topoloc.json_data import Finite, decode_json
-    from topoloc.mapping.node_images import read_node_image
+    from topoloc.evaluation.metrics import format_length as format_length
+    from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
+    from topoloc.features.feature_types import (
+        check_available as check_available,
+        parse_feature_types as parse_feature_types,
+    )
+    from topoloc.features.network_files import (
+        NetworkInfo as NetworkInfo,
+        cache_folder as cache_folder,
+        read_bytes as read_bytes,
+    )
+    from topoloc.json_data import Finite as Finite, decode_json as decode_json
+    from topoloc.mapping.node_images import read_node_image as read_node_image
     from topoloc.recordings.atomic import (
-        atomic_write,
-        remove_stale_files,
-        temporary_folder,
-        write_bytes,
-        write_folder,
-        write_text,
+        atomic_write as atomic_write,
+        remove_stale_files as remove_stale_files,
+        temporary_folder as temporary_folder,
+        write_bytes as write_bytes,
+        write_folder as write_folder,
+        write_text as write_text,
     )
-    from topoloc.recordings.calibration import parse_calibration, replace_cameras
-    from topoloc.recordings.camera_json import CameraCalibration, read_camera_json
-    from topoloc.recordings.depth_images import read_depth_image, resize_depth
+    from topoloc.recordings.calibration import (
+        parse_calibration as parse_calibration,
+        replace_cameras as replace_cameras,
+    )
+    from topoloc.recordings.camera_json import (
+        CameraCalibration as CameraCalibration,
+        read_camera_json as read_camera_json,
+    )
+    from topoloc.recordings.depth_images import (
+        read_depth_image as read_depth_image,
+        resize_depth as resize_depth,
+    )
     from topoloc.recordings.format import (
-        RecordingFormat,
-        list_images,
-        match_times,
-        natural_key,
-        read_ground_truth,
-        times_from_rate,
+        RecordingFormat as RecordingFormat,
+        list_images as list_images,
+        match_times as match_times,
+        natural_key as natural_key,
+        read_ground_truth as read_ground_truth,
+        times_from_rate as times_from_rate,
     )
-    from topoloc.recordings.formats.video import Video, silence_opencv
+    from topoloc.recordings.formats.video import Video as Video, silence_opencv as silence_opencv
     from topoloc.recordings.image_io import (
-        MAX_PIXELS,
-        EncodedImage,
-        exif_focal_length,
-        image_size,
+        MAX_PIXELS as MAX_PIXELS,
+        EncodedImage as EncodedImage,
+        exif_focal_length as exif_focal_length,
+        image_size as image_size,
     )
-    from topoloc.recordings.open import find_format, split_selection
+    from topoloc.recordings.open import (
+        find_format as find_format,
+        split_selection as split_selection,
+    )
     from topoloc.recordings.recording import (
-        DepthImages,
-        Recording,
-        as_monocular,
-        has_scale,
-        scale_poses,
+        DepthImages as DepthImages,
+        Recording as Recording,
+        as_monocular as as_monocular,
+        has_scale as has_scale,
+        scale_poses as scale_poses,
     )
-    from topoloc.recordings.ros_calibration import RosCalibration
-    from topoloc.recordings.stored_images import encode_jpeg
-    from topoloc.recordings.text_files import parse_relative_path, read_text
-    from topoloc.removed_settings import parse_tables
-
-__all__ = [
-    "MAX_PIXELS",
-    "Above",
-    "AtLeast",
-    "Between",
-    "CameraCalibration",
-    "DepthImages",
-    "EncodedImage",
-    "Finite",
-    "NetworkInfo",
-    "NodeMatcher",
-    "Recording",
-    "RecordingFormat",
-    "RosCalibration",
-    "TilePending",
-    "Video",
-    "as_monocular",
-    "atomic_write",
-    "cache_folder",
-    "check_available",
-    "check_tile_id",
-    "decode_json",
-    "describe_ranges",
-    "encode_jpeg",
-    "exif_focal_length",
-    "find_format",
-    "format_length",
-    "has_scale",
-    "image_size",
-    "list_images",
-    "match_times",
-    "natural_key",
-    "parse_calibration",
-    "parse_feature_types",
-    "parse_relative_path",
-    "parse_tables",
-    "read_bytes",
-    "read_camera_json",
-    "read_depth_image",
-    "read_ground_truth",
-    "read_node_image",
-    "read_text",
-    "remove_stale_files",
-    "replace_cameras",
-    "resize_depth",
-    "scale_poses",
-    "silence_opencv",
-    "split_selection",
-    "suggest_name",
-    "temporary_folder",
-    "times_from_rate",
-    "with_setting",
-    "write_bytes",
-    "write_folder",
-    "write_text",
-]
+    from topoloc.recordings.ros_calibration import RosCalibration as RosCalibration
+    from topoloc.recordings.stored_images import encode_jpeg as encode_jpeg
+    from topoloc.recordings.text_files import (
+        parse_relative_path as parse_relative_path,
+        read_text as read_text,
+    )
+    from topoloc.removed_settings import parse_tables as parse_tables
 
 _NAMES = {
     "topoloc.atlas.manifest": "check_tile_id",
@@ -152,6 +117,7 @@ _NAMES = {
     "topoloc.removed_settings": "parse_tables",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from topoloc.features.config import MatchingConfig
 from topoloc.features.matching import Matcher, find_similar_pairs, match_features, match_pooled

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from geometry_strategies import CAMERAS, random_rigid
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from topoloc.geometry.absolute_pose import (
     AbsolutePose,

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 from geometry_strategies import random_rigid, rigids
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import (

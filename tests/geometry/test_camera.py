@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from geometry_strategies import CAMERAS, FISHEYE_195_DEG
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import MODELS, Camera

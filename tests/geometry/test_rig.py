@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from geometry_strategies import CAMERAS
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera

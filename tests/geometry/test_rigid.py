@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 from geometry_strategies import rigids, rotation_vectors, tangents, vectors
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from topoloc.errors import TrajectoryError

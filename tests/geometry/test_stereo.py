@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 from geometry_strategies import CAMERAS
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import (

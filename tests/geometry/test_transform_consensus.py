@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from geometry_strategies import random_rigid, rigids, tangents
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import (

@@ -16,8 +16,7 @@ from doubled_room import ELSEWHERE, twice
 from tiny_world import CAMERA
 from topoloc.geometry.alignment import translation_error
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization import localizer as localizer_module
-from topoloc.localization import propose
+from topoloc.localization import localizer as localizer_module, propose
 from topoloc.localization.belief import Belief, Hypothesis
 from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, SimilarPlacesConfig
 from topoloc.localization.fitted_weights import load_fitted_weights

@@ -7,8 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference

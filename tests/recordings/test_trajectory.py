@@ -2,8 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tiny_recordings import assert_same_pose, kitti_row, pose, tum_line
 from topoloc.errors import TopolocError, TrajectoryError

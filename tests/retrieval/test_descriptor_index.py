@@ -7,8 +7,7 @@ import threading
 import faiss
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from topoloc.retrieval.descriptor_index import (
     DescriptorIndex,

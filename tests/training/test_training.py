@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from topoloc_training.classifier_config import TrainingConfig
 from topoloc_training.training import Task, fit, hold_out

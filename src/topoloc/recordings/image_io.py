@@ -26,6 +26,7 @@ from jaxtyping import Float32, UInt16
 from PIL import (  # importing the readers registers them in Pillow
     BmpImagePlugin,  # noqa: F401
     ExifTags,
+    Image as Pillow,
     ImageFile,
     ImageOps,
     JpegImagePlugin,  # noqa: F401
@@ -34,7 +35,6 @@ from PIL import (  # importing the readers registers them in Pillow
     TiffImagePlugin,  # noqa: F401
     WebPImagePlugin,  # noqa: F401
 )
-from PIL import Image as Pillow
 
 from topoloc.errors import UnreadableImageError
 from topoloc.recordings.frame import Image

@@ -43,8 +43,10 @@ from topoloc.localization.open_map import OpenMap
 from topoloc.localization.query import Query, QueryImage
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search, verify
-from topoloc.localization.walls import propose_virtual_views as propose_walls_module
-from topoloc.localization.walls import virtual_view_matching
+from topoloc.localization.walls import (
+    propose_virtual_views as propose_walls_module,
+    virtual_view_matching,
+)
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 from topoloc.mapping.build import BuildConfig

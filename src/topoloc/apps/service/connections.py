@@ -7,8 +7,7 @@ from collections.abc import MutableMapping
 from ipaddress import ip_network
 from typing import Any
 
-from h11 import DONE
-from h11 import Request as RequestHead
+from h11 import DONE, Request as RequestHead
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 

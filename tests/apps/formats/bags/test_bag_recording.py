@@ -27,8 +27,7 @@ from bag_writing import (
 )
 
 from built_room import built_room
-from topoloc.apps.formats.bags import bag as bag_module
-from topoloc.apps.formats.bags import messages
+from topoloc.apps.formats.bags import bag as bag_module, messages
 from topoloc.errors import (
     CalibrationError,
     MissingExtraError,
