@@ -12,11 +12,10 @@ import pytest
 from room_frames import FrameList, stereo_frame
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.localization.map_facts.map_building import build_map
+from topoloc.localization.map_facts.map_building import build_map, check_common_world
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import with_poses
-from topoloc.slam.world_checks import check_common_world
 
 ONE_FROM_TWO = Rigid3(exp_so3(np.array([0.1, -0.7, 0.2])), np.array([2.0, -1.0, 0.5]))
 
