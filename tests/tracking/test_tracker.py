@@ -19,10 +19,10 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
+from topoloc.recordings.frame_preparation import downscale_image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.stream_result import StreamedPose
 from topoloc.tracking.tracker import Tracker
-from topoloc.tracking.tracker_state import downscale_image
 
 CAMERA = tiny_world.CAMERA
 NOTHING = np.random.default_rng(3).integers(0, 255, (CAMERA.height, CAMERA.width), dtype=np.uint8)

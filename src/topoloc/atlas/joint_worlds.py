@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -43,10 +42,12 @@ def place_tiles(
         for tile in reversed(ordered)
         if tile.atlas_from_world is not None
     }
-    all_adjusted = adjust_joins(joins, {tile.tile_id: tile.world for tile in ordered}, known)
+    adjusted, joint_poses = adjust_joins(
+        joins, {tile.tile_id: tile.world for tile in ordered}, known
+    )
     placed: list[Tile] = []
     for tile in ordered:
-        joint = all_adjusted.places.get(tile.world)
+        joint = joint_poses.get(tile.world)
         pose = tile.atlas_from_world or known.get(tile.world)
         if pose is None and joint is not None and joint.joint in known:
             pose = known[joint.joint] @ joint.joint_from_world
@@ -56,7 +57,7 @@ def place_tiles(
             else _geo_box(origin, pose, tile.box_world)
         )
         placed.append(replace(tile, joint=joint, atlas_from_world=pose, geo_box=box))
-    return tuple(placed), all_adjusted.joins
+    return tuple(placed), adjusted
 
 
 def _place_by_georeference(tile: Tile, origin: GeoPoint | None) -> Tile:
@@ -88,18 +89,11 @@ def geo_box(places: Sequence[GeoPoint]) -> tuple[float, float, float, float]:
     return min(lats), min(lons), max(lats), max(lons)
 
 
-@dataclass(frozen=True, eq=False)
-class AdjustedJoins:
-    """Hold the joins with residuals, and the joint pose of each joined world, by name."""
-
-    joins: tuple[Join, ...]
-    places: Mapping[str, JointPose]
-
-
 def adjust_joins(
     joins: Sequence[Join], worlds: Mapping[str, str], atlas_from_worlds: Mapping[str, Rigid3]
-) -> AdjustedJoins:
-    """Adjust all joins together and drop those that contradict others.
+) -> tuple[tuple[Join, ...], dict[str, JointPose]]:
+    """Adjust all joins together and drop those that contradict others. Return the joins with their
+    residuals, and the joint pose of each joined world, by name.
 
     Args:
         worlds: the world name of each tile, by tile id.
@@ -122,7 +116,7 @@ def adjust_joins(
     used = [
         replace(join, residual=residual) for join, residual in zip(kept, residuals, strict=True)
     ]
-    return AdjustedJoins(tuple(sorted([*used, *dropped], key=lambda join: join.pair)), places)
+    return tuple(sorted([*used, *dropped], key=lambda join: join.pair)), places
 
 
 def _first_inconsistent_join(

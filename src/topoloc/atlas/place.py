@@ -205,12 +205,8 @@ def _edit_with_tile_name(edit: Callable[[Path], T], path: Path, name: str) -> T:
 
 
 def _copy_map(atlas: Atlas, stored: StoredFile, path: Path) -> None:
-    try:
+    with AtlasError.at(f"cannot copy {stored.name} of {atlas.store.where}", OSError):
         shutil.copyfile(atlas.store.local_path(stored.name, stored.sha256), path)
-    except OSError as error:
-        raise AtlasError(
-            f"cannot copy {stored.name} of {atlas.store.where}: {error.strerror}"
-        ) from None
     if sha256_of(path) != stored.sha256:
         raise AtlasError(
             f"{stored.name} of {atlas.store.where} is not the file that was added: its checksum is"

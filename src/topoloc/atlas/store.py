@@ -131,7 +131,7 @@ class FolderStore:
     def put(self, name: str, path: Path) -> None:
         """See `Store.put`."""
         target = self.folder / name
-        try:
+        with AtlasError.at(f"cannot write {target}", OSError):
             target.parent.mkdir(parents=True, exist_ok=True)
             with suppress(FileNotFoundError):
                 if target.stat().st_size == path.stat().st_size:
@@ -139,8 +139,6 @@ class FolderStore:
                     return
             with atomic_write(target) as temporary:
                 shutil.copyfile(path, temporary)
-        except OSError as error:
-            raise AtlasError(f"cannot write {target}: {error.strerror}") from error
 
     def local_path(self, name: str, sha256: str) -> Path:
         """See `Store.local_path`."""
@@ -170,11 +168,9 @@ class FolderStore:
     @contextmanager
     def _lock(self) -> Iterator[None]:
         """Hold the writer lock. The operating system frees the lock of a terminated process."""
-        try:
+        with AtlasError.at(f"cannot write {self.folder}", OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise AtlasError(f"cannot write {self.folder}: {error.strerror}") from None
         try:
             if fcntl is not None:
                 with suppress(OSError):  # without locks, concurrent writers may lose tiles
@@ -190,8 +186,5 @@ def sha256_of(path: Path) -> str:
     Raises:
         AtlasError: the file cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise AtlasError(f"cannot read {path}: {error.strerror}") from None
+    with AtlasError.at(f"cannot read {path}", OSError), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

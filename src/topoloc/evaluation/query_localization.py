@@ -20,7 +20,7 @@ from topoloc.mapping.config import Progress
 from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.node_ids import NodeId
-from topoloc.recordings.frame import Image, StereoSequence
+from topoloc.recordings.frame import StereoSequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,11 +178,6 @@ def find_frames_with_truth(sequence: StereoSequence) -> list[int]:
     return frames
 
 
-def create_image_reader(sequence: StereoSequence, index: int) -> Callable[[], Image]:
-    """Return a function that reads the image of a frame again."""
-    return lambda: sequence[index].image
-
-
 def find_neighbour_ids(
     topomap: TopoMetricMap, distances: Float[np.ndarray, " nodes"]
 ) -> frozenset[NodeId]:
@@ -223,7 +218,11 @@ def _localize(
             f"{frame.name}: no calibration; put a camera.json into the recording's folder"
         )
     result = localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns)
-    reader = create_image_reader(sequence, index)
     return EvaluatedQuery(
-        frame.name, result, None, recording=label, read_image=reader, camera=frame.camera
+        frame.name,
+        result,
+        None,
+        recording=label,
+        read_image=lambda: sequence[index].image,
+        camera=frame.camera,
     )

@@ -33,7 +33,7 @@ from topoloc.features.learned_kernels import (
     sample_descriptors,
     sample_levels,
 )
-from topoloc.features.network_files import find_network, open_network
+from topoloc.features.network_files import NetworkInfo, open_network
 
 _RADIUS = 4  # grid steps to each side in which the most similar descriptor is searched
 
@@ -177,7 +177,7 @@ def compute_cell_means(
 
 def check_network(network: str) -> None:
     """Check that the network can be opened. Raises the errors of `extract_learned`."""
-    _session_for_size(network, find_network(network), 1, None, os.getpid())
+    _session_for_size(network, NetworkInfo.of_name(network).find_file(), 1, None, os.getpid())
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +198,7 @@ def run_network(
     height, width = image.shape
     padding = np.array([(0, -side % _SIDE_MULTIPLE) for side in (height, width)])
     grey = np.pad(image, padding, mode="edge").astype(np.float32) / np.float32(255.0)
-    number, path = num_threads or compiled.num_threads(), find_network(network)
+    number, path = num_threads or compiled.num_threads(), NetworkInfo.of_name(network).find_file()
     session = _session_for_size(network, path, number, grey.shape, os.getpid())
     names = [output.name for output in session.get_outputs()]
     outputs = dict(zip(names, session.run(names, {"image": grey[None, None]}), strict=True))

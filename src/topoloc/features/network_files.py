@@ -131,16 +131,6 @@ NETWORKS = {
 }
 
 
-def find_network(name: str) -> Path:
-    """Return the ONNX file of a network, from the package or else from the cache.
-
-    Raises:
-        WeightsError: the network is unknown or not installed. The text names the command that
-            installs it.
-    """
-    return NetworkInfo.of_name(name).find_file()
-
-
 def cache_folder() -> Path:
     """Return the folder of downloaded weights: $TOPOLOC_CACHE, or else `topoloc` in the user's
     cache folder."""
@@ -194,10 +184,8 @@ def open_network(
 
 def read_bytes(path: Path) -> bytes:
     """Return the content of a file. Raises WeightsError if it cannot be read or is empty."""
-    try:
+    with WeightsError.at(f"cannot read {path}", OSError):
         data = path.read_bytes()
-    except OSError as error:
-        raise WeightsError(f"cannot read {path}: {error.strerror}") from error
     if not data:
         raise WeightsError(f"{path} is empty")
     return data

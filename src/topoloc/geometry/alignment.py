@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import TrajectoryError
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, positions_of
 
 # A spread below this fraction of the longest one, or below a micrometre, is due to rounding: the
 # points lie on one line.
@@ -83,7 +83,7 @@ def align_scaled_poses(
             fix no scale.
     """
     _check_lengths(world_a_from_cams, world_b_from_cams)
-    positions_a, positions_b = _positions(world_a_from_cams), _positions(world_b_from_cams)
+    positions_a, positions_b = positions_of(world_a_from_cams), positions_of(world_b_from_cams)
     try:
         return align_similarity(positions_a, positions_b)
     except TrajectoryError:
@@ -113,7 +113,7 @@ def align_trajectories(
             stands or moves straight. Use `align_poses` then.
     """
     _check_lengths(world_a_from_cams, world_b_from_cams)
-    return align_points(_positions(world_a_from_cams), _positions(world_b_from_cams))
+    return align_points(positions_of(world_a_from_cams), positions_of(world_b_from_cams))
 
 
 def align_poses(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence[Rigid3]) -> Rigid3:
@@ -130,7 +130,7 @@ def align_poses(world_a_from_cams: Sequence[Rigid3], world_b_from_cams: Sequence
     _check_lengths(world_a_from_cams, world_b_from_cams)
     if len(world_a_from_cams) == 0:
         raise TrajectoryError("no common pose to align the trajectories by")
-    positions_a, positions_b = _positions(world_a_from_cams), _positions(world_b_from_cams)
+    positions_a, positions_b = positions_of(world_a_from_cams), positions_of(world_b_from_cams)
     centre_a, centre_b = positions_a.mean(axis=0), positions_b.mean(axis=0)
     correlation = (positions_a - centre_a).T @ (positions_b - centre_b) / _SIGMA_TRANSLATION**2
     for a, b in zip(world_a_from_cams, world_b_from_cams, strict=True):
@@ -196,8 +196,8 @@ def absolute_trajectory_errors(
         true_from_estimated = align_trajectories(true_world_from_cams, world_from_cams)
     except TrajectoryError:
         true_from_estimated = align_poses(true_world_from_cams, world_from_cams)
-    positions = true_from_estimated.apply(_positions(world_from_cams))
-    return np.linalg.norm(positions - _positions(true_world_from_cams), axis=1)
+    positions = true_from_estimated.apply(positions_of(world_from_cams))
+    return np.linalg.norm(positions - positions_of(true_world_from_cams), axis=1)
 
 
 def relative_drift(
@@ -213,7 +213,7 @@ def relative_drift(
         TrajectoryError: the lengths differ.
     """
     _check_lengths(true_world_from_cams, world_from_cams)
-    path_lengths = compute_path_lengths(_positions(true_world_from_cams))
+    path_lengths = compute_path_lengths(positions_of(true_world_from_cams))
     lengths = KITTI_LENGTHS if path_lengths[-1] >= _MIN_KITTI_LENGTH else SHORT_LENGTHS
     translations, rotations = [], []
     for length in lengths:
@@ -232,10 +232,6 @@ def nearest_rotation(correlation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray,
     """Return the rotation R that maximises tr(R' C)."""
     u, _, vt = np.linalg.svd(correlation)
     return u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-
-
-def _positions(world_from_cams: Sequence[Rigid3]) -> Float[np.ndarray, "n 3"]:
-    return np.array([pose.translation for pose in world_from_cams], dtype=np.float64).reshape(-1, 3)
 
 
 def _check_lengths(a: Sized, b: Sized) -> None:

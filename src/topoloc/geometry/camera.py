@@ -275,7 +275,5 @@ class Camera:
         model = str(values.get("model", "PINHOLE"))
         kind = _JSON.get(model, _JSON[""])
         width, height, *params = astuple(decode_json(values, kind, CalibrationError, name))
-        try:
+        with CalibrationError.at(name):
             return Camera(model, int(width), int(height), tuple(params))
-        except CalibrationError as error:
-            raise CalibrationError(f"{name}: {error}") from None

@@ -14,13 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.rigid import Rigid3
+from topoloc.node_ids import LazySequence
 
 PoseConversion = Callable[[Rigid3], Rigid3]
 
@@ -160,24 +160,12 @@ def _parse_numbers(convention: str, value: str, count: int) -> list[float]:
     return numbers
 
 
-@dataclass(frozen=True, eq=False)
-class LazyPoses(Sequence[Rigid3]):
-    """Hold one row of numbers per pose. `to_pose` converts a row when it is accessed: a file may
+def lazy_poses(
+    rows: Float[np.ndarray, "n c"], to_pose: Callable[[Float[np.ndarray, " c"]], Rigid3]
+) -> LazySequence[Rigid3]:
+    """Return one pose for each row of numbers. A row is converted when it is accessed: a file may
     hold a million poses, and a recording uses few of them."""
-
-    rows: Float[np.ndarray, "n c"]
-    to_pose: Callable[[Float[np.ndarray, " c"]], Rigid3]
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @overload
-    def __getitem__(self, index: int) -> Rigid3: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Rigid3]: ...
-    def __getitem__(self, index: int | slice) -> Rigid3 | Sequence[Rigid3]:
-        rows, is_slice = self.rows[index], isinstance(index, slice)
-        return LazyPoses(rows, self.to_pose) if is_slice else self.to_pose(rows)
+    return LazySequence(lambda: len(rows), lambda row: to_pose(rows[row]))
 
 
 def pose_from_quaternion(row: Float[np.ndarray, "7"]) -> Rigid3:
@@ -194,7 +182,7 @@ def _pose_from_matrix(row: Float[np.ndarray, "12"]) -> Rigid3:
 
 def poses_from_matrices(
     numbers: Float[np.ndarray, "n 12"], tolerance: float
-) -> tuple[LazyPoses, Bool[np.ndarray, " n"]]:
+) -> tuple[LazySequence[Rigid3], Bool[np.ndarray, " n"]]:
     """Return the poses of the upper 3x4 rows of matrices, and whether each 3x3 part is a rotation
     within the tolerance.
 
@@ -210,4 +198,4 @@ def poses_from_matrices(
     for _ in range(4):
         rotations = 0.5 * rotations @ (3.0 * np.eye(3) - rotations.transpose(0, 2, 1) @ rotations)
     matrices[:, :, :3] = rotations
-    return LazyPoses(matrices.reshape(-1, 12), _pose_from_matrix), is_rotation
+    return lazy_poses(matrices.reshape(-1, 12), _pose_from_matrix), is_rotation

@@ -7,7 +7,7 @@ the left: ``exp(xi) @ a_from_b`` (Sola et al., *A micro Lie theory*, 2018).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -245,6 +245,11 @@ class _PoseJson(Struct, frozen=True):
     def __post_init__(self) -> None:
         if not abs(np.linalg.norm(self.quat_wxyz) - 1.0) < 1e-3:
             raise ValueError("quat_wxyz is not of unit length")
+
+
+def positions_of(world_from_cams: Iterable[Rigid3]) -> Float[np.ndarray, "n 3"]:
+    """Return the translations of poses, one row each."""
+    return np.array([pose.translation for pose in world_from_cams], dtype=np.float64).reshape(-1, 3)
 
 
 def inverse_covariance(

@@ -20,6 +20,9 @@ from topoloc.geometry.rigid import Rigid3
 
 _NUM_ITERATIONS = 10
 _MIN_STEP = 1e-9
+# Estimates agree if they differ by no more than this, all six residuals together, in sigma. One
+# correct pair in a thousand does not.
+_MAX_SIGMAS = 4.8
 
 
 def diagonal_covariance(metres: float, degrees: float) -> Float[np.ndarray, "6 6"]:
@@ -63,14 +66,13 @@ class TransformConsensus:
     covariance: Float[np.ndarray, "6 6"]
     is_inlier: Bool[np.ndarray, " n"]
     num_independent: int
-    max_sigmas: float
 
     def is_consistent(self, a_from_b: Rigid3, covariance: Float[np.ndarray, "6 6"]) -> bool:
         """Return whether an estimate agrees with the transform."""
         return a_from_b.inverse().is_same(
             self.a_from_b.inverse(),
             covariance=covariance + self.covariance,
-            max_square=self.max_sigmas**2,
+            max_square=_MAX_SIGMAS**2,
         )
 
     def between(
@@ -88,9 +90,6 @@ def find_consensus(
     image_ids: Int[np.ndarray, "n 2"] | None = None,
     *,
     rival_share: float = 0.5,
-    min_independent: int = 3,
-    max_sigmas: float = 4.8,
-    max_hypotheses: int = 300,
 ) -> TransformConsensus | None:
     """Return the transform that the estimates support. Return None if the support is too small, or
     if another transform has nearly as much.
@@ -104,44 +103,36 @@ def find_consensus(
             independent. Default: all are independent.
         rival_share: the consensus is rejected if this fraction of its number of independent
             estimates, and at least two, agrees on another transform.
-        min_independent: minimum number of independent estimates that agree.
-        max_sigmas: estimates agree if they differ by no more than this (all six residuals together,
-            in sigma). One correct pair in a thousand does not.
-        max_hypotheses: maximum number of hypotheses. With more estimates, this many are drawn with
-            a fixed seed.
     """
+    min_independent = 3  # minimum number of independent estimates that agree
     rival_sigmas = 8.0  # estimates that differ from the consensus by more than this contradict it
     num = len(a_from_bs)
     if num < min_independent:
         return None
     if image_ids is None:
         image_ids = np.column_stack([np.arange(num), np.arange(num)])
-    distances = _pairwise_distances(a_from_bs, covariances, max_hypotheses)
-    best, agreeing = select_hypothesis(distances <= max_sigmas, image_ids)
+    distances = _pairwise_distances(a_from_bs, covariances)
+    best, agreeing = select_hypothesis(distances <= _MAX_SIGMAS, image_ids)
     if agreeing < min_independent:
         return None
-    is_inlier = distances[best] <= max_sigmas
+    is_inlier = distances[best] <= _MAX_SIGMAS
     a_from_b, covariance = _refine_transform(a_from_bs, covariances, is_inlier)
     sigmas = _distances(a_from_b, covariance, a_from_bs, covariances)
-    is_inlier, others = sigmas <= max_sigmas, sigmas > rival_sigmas
+    is_inlier, others = sigmas <= _MAX_SIGMAS, sigmas > rival_sigmas
     num_independent = _count_independent(is_inlier, image_ids)
-    _, rivals = select_hypothesis((distances <= max_sigmas) & others, image_ids)
+    _, rivals = select_hypothesis((distances <= _MAX_SIGMAS) & others, image_ids)
     if num_independent < min_independent or rivals >= max(rival_share * num_independent, 2):
         return None
     a_from_b, covariance = _refine_transform(a_from_bs, covariances, is_inlier)
-    return TransformConsensus(
-        a_from_b,
-        covariance * np.count_nonzero(is_inlier) / num_independent,
-        is_inlier,
-        num_independent,
-        max_sigmas,
-    )
+    covariance = covariance * np.count_nonzero(is_inlier) / num_independent
+    return TransformConsensus(a_from_b, covariance, is_inlier, num_independent)
 
 
 def _pairwise_distances(
-    a_from_bs: Sequence[Rigid3], covariances: Float[np.ndarray, "n 6 6"], max_hypotheses: int
+    a_from_bs: Sequence[Rigid3], covariances: Float[np.ndarray, "n 6 6"]
 ) -> Float[np.ndarray, "h n"]:
     """Return for each hypothesis (row) the distances of all estimates, in sigma of both."""
+    max_hypotheses = 300  # of more estimates this many are drawn, with a fixed seed
     num = len(a_from_bs)
     tried = np.arange(num)
     if num > max_hypotheses:

@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
-from topoloc.mapping.storage.entries import LazySequence
 from topoloc.mapping.storage.point_encoding import dequantize_descriptors, quantize_descriptors
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.node_ids import LazySequence
 
 # A node counts as quantized if the median norm of its stored descriptors is at most this many times
 # the norm expected for the step.

@@ -18,10 +18,9 @@ from jaxtyping import Int
 
 from topoloc.mapping.node_drafts import observe_node
 from topoloc.mapping.nodes import find_nearest_nodes
-from topoloc.mapping.storage.entries import LazySequence
 from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode, VirtualNodes
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes
-from topoloc.node_ids import NodeId, Row
+from topoloc.node_ids import LazySequence, NodeId, Row
 from topoloc.retrieval.coarse import CoarseModel
 
 _PER_VECTOR_ARRAYS = ("vectors", "centres", "cell_vectors")

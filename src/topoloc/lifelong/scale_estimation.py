@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from topoloc.geometry.alignment import compute_path_lengths
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.geometry.transform_consensus import select_hypothesis
 from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.localization.result import Localization
@@ -198,7 +198,7 @@ def scale_to_metres(
     root of the distance. Frames whose scale has a relative sigma above `max_sigma` are left out.
     """
     answers = _collect_localized_frames(odom, localized)
-    positions = np.array([pose.translation for pose in odom.values()])
+    positions = positions_of(odom.values())
     path_lengths, pairs = compute_path_lengths(positions), _select_pairs(answers)
     if len(pairs) == 0:
         return {}
@@ -229,9 +229,10 @@ def _estimate_scale_profile(
     rows = np.linspace(0, num - 1, min(num, max_knots)).astype(int)
     knots = np.unique(path_lengths[rows])
     metre = float(np.exp(np.median(measured)))
-    spans = zip(a.path_lengths, b.path_lengths, strict=True)
-    weights = [_interpolation_weights(np.linspace(u, v, 9), knots) for u, v in spans]
-    mean = np.stack([one.mean(axis=0) for one in weights])
+    # The mean weight of each knot in the linear interpolation between the two localizations.
+    between = np.linspace(a.path_lengths, b.path_lengths, 9)
+    hats = (np.interp(between, knots, hat) for hat in np.eye(len(knots)))
+    mean = np.stack([hat.mean(axis=0) for hat in hats], axis=1)
     steps = drift * np.sqrt(np.maximum(np.diff(knots) * metre, 1e-9))
     difference = np.diff(np.eye(len(knots)), axis=0) / steps[:, None]
     matrix = np.concatenate([mean / sigmas[:, None], difference])
@@ -261,26 +262,14 @@ def _collect_localized_frames(
 ) -> _LocalizedFrames:
     row_of = {index: row for row, index in enumerate(odom)}
     rows = np.array([row_of[index] for index in localized], np.int64)
-    path_lengths = compute_path_lengths(np.array([pose.translation for pose in odom.values()]))
+    path_lengths = compute_path_lengths(positions_of(odom.values()))
     poses, found = [odom[index] for index in localized], list(localized.values())
     return _LocalizedFrames(
         rows,
-        np.array([pose.translation for pose in poses]).reshape(-1, 3),
+        positions_of(poses),
         np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
-        np.array([answer.world_from_cam.translation for answer in found]).reshape(-1, 3),
+        positions_of(answer.world_from_cam for answer in found),
         np.array([answer.world_from_cam.rotation for answer in found]).reshape(-1, 3, 3),
         path_lengths[rows],
         np.array([answer.position_sigma_m for answer in found]),
     )
-
-
-def _interpolation_weights(
-    at: Float[np.ndarray, " m"], knots: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, "m k"]:
-    """Return each knot's weight in the linear interpolation at each value."""
-    right = np.clip(np.searchsorted(knots, at), 1, max(len(knots) - 1, 1))
-    share = np.clip((at - knots[right - 1]) / (knots[right] - knots[right - 1]), 0.0, 1.0)
-    weights = np.zeros((len(at), len(knots)))
-    weights[np.arange(len(at)), right - 1] = 1.0 - share
-    weights[np.arange(len(at)), right] += share
-    return weights

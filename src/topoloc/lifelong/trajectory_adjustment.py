@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.alignment import compute_path_lengths
-from topoloc.geometry.rigid import Rigid3, exp_so3, log_so3
+from topoloc.geometry.rigid import Rigid3, exp_so3, log_so3, positions_of
 from topoloc.localization.result import Localization
 from topoloc.slam.bundle.bundle_adjustment import PosePrior, adjust_bundle
 from topoloc.slam.keyframes import FramePose, KeyFrame
@@ -111,9 +111,7 @@ def _metres_per_unit(before: Sequence[Rigid3], after: Sequence[Rigid3]) -> Float
     """Return the scale of the motion at each key frame, in metres per unit, by the path length
     between its neighbours."""
     path_lengths = [
-        compute_path_lengths(
-            np.array([pose.inverse().translation for pose in poses]).reshape(-1, 3)
-        )
+        compute_path_lengths(positions_of(pose.inverse() for pose in poses))
         for poses in (before, after)
     ]
     num_neighbours = 3  # on either side
@@ -137,7 +135,7 @@ def correct_trajectory(
     }
     if not answered:
         return dict(world_from_cams)
-    lengths = compute_path_lengths(np.array([pose.translation for pose in poses]))
+    lengths = compute_path_lengths(positions_of(poses))
     at = lengths[list(answered)]
     errors = [_pose_error(poses[row], answer) for row, answer in answered.items()]
     corrections = _estimate_corrections(errors, list(answered.values()), at, d_thresh)

@@ -123,10 +123,8 @@ class Provenance:
         """
         read = asdict(decode_json(data, _ProvenanceJson, ResultError, "no result"))
         if read["camera"] is not None:
-            try:
+            with ResultError.at("no result", CalibrationError):
                 read["camera"] = Camera.from_json(read["camera"])
-            except CalibrationError as error:
-                raise ResultError(f"no result: {error}") from None
         return Provenance(**read)
 
 

@@ -163,10 +163,8 @@ def _is_number(text: str) -> bool:
 
 
 def _parse_geo_point(path: Path, line: int, values: Sequence[float]) -> GeoPoint:
-    try:
+    with GeoreferenceError.at(f"{path}, line {line}"):
         return GeoPoint(*values)
-    except GeoreferenceError as error:
-        raise GeoreferenceError(f"{path}, line {line}: {error}") from None
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from topoloc.bounds import Above, AtLeast
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.mapping.storage.entries import NodeSummary
 
 # The default D_thresh is this share of the scene's median depth. The parallax between nodes is then
@@ -59,7 +59,7 @@ class NodePoses:
     def of(world_from_nodes: list[Rigid3]) -> NodePoses:
         """Stack poses (world_from_node) into arrays."""
         return NodePoses(
-            np.array([p.translation for p in world_from_nodes]).reshape(-1, 3),
+            positions_of(world_from_nodes),
             np.array([p.rotation for p in world_from_nodes]).reshape(-1, 3, 3),
         )
 
@@ -72,7 +72,10 @@ def node_distances(
     world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float
 ) -> Float[np.ndarray, " nodes"]:
     """Return D_total of Eq. 1 (metres) between a camera and each node."""
-    return _distances(world_from_cam.rotation, world_from_cam.translation, nodes, lambda_rot)
+    d_translation = np.linalg.norm(nodes.centres - world_from_cam.translation, axis=1)
+    traces = np.einsum("nij,ij->n", nodes.rotations, world_from_cam.rotation)
+    d_rot = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
+    return d_translation + lambda_rot * d_rot
 
 
 def node_distances_for_any_roll(
@@ -84,20 +87,8 @@ def node_distances_for_any_roll(
     """
     x, y, z = world_from_cam.rotation.T
     rolls = (np.column_stack(axes) for axes in ((x, y, z), (y, -x, z), (-x, -y, z), (-y, x, z)))
-    centre = world_from_cam.translation
-    return np.min([_distances(roll, centre, nodes, lambda_rot) for roll in rolls], axis=0)
-
-
-def _distances(
-    rotation: Float[np.ndarray, "3 3"],
-    centre: Float[np.ndarray, " 3"],
-    nodes: NodePoses,
-    lambda_rot: float,
-) -> Float[np.ndarray, " nodes"]:
-    d_translation = np.linalg.norm(nodes.centres - centre, axis=1)
-    traces = np.einsum("nij,ij->n", nodes.rotations, rotation)
-    d_rot = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
-    return d_translation + lambda_rot * d_rot
+    poses = (Rigid3(roll, world_from_cam.translation) for roll in rolls)
+    return np.min([node_distances(pose, nodes, lambda_rot) for pose in poses], axis=0)
 
 
 def select_node_frames(

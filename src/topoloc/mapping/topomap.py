@@ -40,20 +40,6 @@ from topoloc.retrieval.coarse import CoarseModel
 if TYPE_CHECKING:
     from topoloc.mapping.storage.map_file import MapFile
 
-__all__ = [
-    "CorrelatedErrors",
-    "Edge",
-    "Edit",
-    "Layer",
-    "NodeSummary",
-    "PlaceImage",
-    "Repetitions",
-    "Session",
-    "TopoMetricMap",
-    "TopoNode",
-    "VirtualNodes",
-]
-
 
 @dataclass(frozen=True)
 class NextIds:

@@ -19,7 +19,7 @@ from topoloc.features.features import Features
 from topoloc.features.matching import match_features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import points_from_depth
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.points.metric_points import MetricPoints, select_certain_points
 
 
@@ -153,7 +153,7 @@ def select_source_images(world_from_cams: Sequence[Rigid3], index: int, step: fl
     max_turn = 0.6  # radians between the viewing directions; beyond it hardly any feature matches
     # Distances of the other images, in units of the median distance of consecutive images.
     steps = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 34.0, 55.0)
-    centres = np.array([pose.translation for pose in world_from_cams])
+    centres = positions_of(world_from_cams)
     axes = np.array([pose.rotation[:, 2] for pose in world_from_cams])
     distances = np.linalg.norm(centres - centres[index], axis=1)
     usable = np.flatnonzero((axes @ axes[index] > np.cos(max_turn)) & (distances > 0.5 * step))
@@ -169,7 +169,6 @@ def select_source_images(world_from_cams: Sequence[Rigid3], index: int, step: fl
 def compute_median_step(world_from_cams: Sequence[Rigid3]) -> float:
     """Return the median distance (m) of consecutive images, without pairs taken at one place.
     Return 0 if there is none."""
-    centres = np.array([pose.translation for pose in world_from_cams]).reshape(-1, 3)
-    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(positions_of(world_from_cams), axis=0), axis=1)
     moved = steps[steps > 1e-6]
     return float(np.median(moved)) if len(moved) else 0.0

@@ -13,7 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.points.point_tracking_kernels import refine_tracks, select_cell_corners
@@ -40,6 +40,50 @@ def track_points(
     )  # fmt: skip
     found = np.ascontiguousarray(found[:, 0], np.float32)
     return found, (status[:, 0] > 0) & np.isfinite(found).all(axis=1)
+
+
+def follow_points(
+    previous: UInt8[np.ndarray, "h w"],
+    current: UInt8[np.ndarray, "h w"],
+    points_img: Float32[np.ndarray, "n 2"],
+    shifts_px: Float[np.ndarray, "n 2"],
+    reference: Float32[np.ndarray, "h w"],
+    points_ref: Float32[np.ndarray, "n 2"],
+    depths: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]],
+    *,
+    patch_half_px: int = 5,
+    max_shift_px: float = 2.5,
+) -> tuple[Int[np.ndarray, " m"], AlignedPoints]:
+    """Track points from the previous image to the current one, and align them with the reference.
+
+    Args:
+        shifts_px: the expected motion of the points in the image, NaN if unknown.
+        depths: the depths of the points in the reference and in the current image, whose ratio is
+            the scale of a patch.
+        patch_half_px, max_shift_px: as of `align_with_reference`.
+
+    Returns:
+        The rows of the points that match the reference, and these points.
+    """
+    limit = np.array(current.shape[::-1]) / 2.0
+    moved = np.clip(np.nan_to_num(shifts_px), -limit, limit)
+    found, is_found = track_points(
+        previous, current, points_img, (points_img + moved).astype(np.float32)
+    )
+    rows = np.flatnonzero(is_found)
+    scales = np.clip(depths[0] / np.maximum(depths[1], 1e-3), 0.5, 2.0).astype(np.float32)
+    limits = {"patch_half_px": patch_half_px, "max_shift_px": max_shift_px}
+    aligned = align_with_reference(
+        reference,
+        current.astype(np.float32),
+        points_ref[rows],
+        found[rows],
+        scales[rows],
+        **limits,
+    )
+    kept = aligned.is_matched
+    columns = (column[kept] for column in vars(aligned).values())
+    return rows[kept], AlignedPoints(*columns)
 
 
 @dataclass(frozen=True, eq=False)

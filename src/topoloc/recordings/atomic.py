@@ -33,11 +33,8 @@ def write_text(path: Path, text: str) -> None:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write the whole file. Raises TopolocError if it cannot be written."""
-    try:
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(data)
-    except OSError as error:
-        raise TopolocError(f"cannot write {path}: {error.strerror}") from error
+    with TopolocError.at(f"cannot write {path}", OSError), atomic_write(path) as temporary:
+        temporary.write_bytes(data)
 
 
 @contextmanager

@@ -44,15 +44,13 @@ def read_camera_json(path: Path) -> CameraCalibration:
     text = read_text(path, CalibrationError, "no such camera file")
     whole = decode_json(text, dict[str, Any], CalibrationError, str(path))
     data = decode_json(whole, _CameraFile, CalibrationError, str(path))
-    try:
+    with CalibrationError.at(path):
         if data.left is None and data.right is None:
             camera = Camera.from_json(whole)
             rig = None if data.baseline is None else StereoRig.rectified(camera, data.baseline)
         else:
             rig = data.stereo_rig()
             camera = rig.left
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from None
     return CameraCalibration(camera, rig, data.depth_factor)
 
 

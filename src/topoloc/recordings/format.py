@@ -38,7 +38,7 @@ def list_images(folder: Path, suffix: str = "") -> list[Path]:
     Raises:
         RecordingError: the folder is missing or contains no image.
     """
-    try:
+    with RecordingError.at(folder, OSError):
         paths = [
             path
             for path in folder.iterdir()
@@ -46,8 +46,6 @@ def list_images(folder: Path, suffix: str = "") -> list[Path]:
             and path.stem.endswith(suffix)
             and not path.name.startswith(".")
         ]
-    except OSError as error:
-        raise RecordingError(f"{folder}: {error.strerror}") from None
     if not paths:
         raise RecordingError(f"{folder}: no pictures in this folder")
     return sorted(paths, key=lambda path: natural_key(path.name))

@@ -82,14 +82,21 @@ def undistort_frame(frame: StereoFrame, max_side_px: int) -> PreparedFrame:
     """
     view = prepare_frame(frame, with_depth=False)
     camera, grey = view.camera, view.grey
-    scale = max_side_px / max(grey.shape)
-    if scale < 1.0:
-        width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-        grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-        camera = camera.rescaled(width, height)
+    grey, camera = downscale_image(grey, camera, max_side_px)
     if camera.is_distorted:
         grey, camera = _remap(grey, _undistortion_map(camera)), camera.undistorted()
     return PreparedFrame(grey, grey, camera, view.view_from_cam)
+
+
+def downscale_image(
+    grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int
+) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
+    """Return the image and its camera, reduced if a side is longer than `max_side_px`."""
+    scale = max_side_px / max(grey.shape)
+    if scale >= 1.0:
+        return grey, camera
+    size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA), camera.rescaled(*size)
 
 
 @lru_cache(maxsize=4)

@@ -222,9 +222,7 @@ def read_left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
 def recording_notes(sequence: StereoSequence) -> list[str]:
     """Return notes for the user on a recording that could be opened, such as truncated or guessed
     data."""
-    while isinstance(sequence, SequenceView):
-        sequence = sequence.base
-    return list(getattr(sequence, "notes", ()))
+    return list(getattr(_base_of(sequence), "notes", ()))
 
 
 def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoSequence:
@@ -236,6 +234,13 @@ def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoS
     """
     poses = sequence.poses
     return SequenceView(sequence, list(indices), [poses[index] for index in indices])
+
+
+def _base_of(sequence: StereoSequence) -> StereoSequence:
+    """Return the sequence whose frames a view shows."""
+    while isinstance(sequence, SequenceView):
+        sequence = sequence.base
+    return sequence
 
 
 def _depth_image(depth: DepthImages, index: int, camera: Camera) -> DepthImage:
@@ -269,16 +274,14 @@ def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
 
 def find_source_path(sequence: StereoSequence) -> str | None:
     """Return the folder or file of a sequence, or None."""
-    while isinstance(sequence, SequenceView):
-        sequence = sequence.base
-    return str(sequence.root) if isinstance(sequence, Recording) else None
+    base = _base_of(sequence)
+    return str(base.root) if isinstance(base, Recording) else None
 
 
 def find_depth_units(sequence: StereoSequence) -> float | None:
     """Return the units per metre of the depth images of a recording on disk, or None."""
-    while isinstance(sequence, SequenceView):
-        sequence = sequence.base
-    depth = sequence.depth if isinstance(sequence, Recording) else None
+    base = _base_of(sequence)
+    depth = base.depth if isinstance(base, Recording) else None
     return depth and depth.units_per_metre
 
 

@@ -115,7 +115,5 @@ class RosCalibration:
 
     def _make_camera(self, model: str, matrix: np.ndarray, coefficients: list[float]) -> Camera:
         params = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *coefficients)
-        try:
+        with CalibrationError.at(self.name):
             return Camera(model, self.width, self.height, tuple(float(value) for value in params))
-        except CalibrationError as error:
-            raise CalibrationError(f"{self.name}: {error}") from None

@@ -205,10 +205,8 @@ def _mounting(path: Path, section: str) -> Rigid3 | None:
     for key in ("T_cam_imu", "T_imu_cam", "T_BS"):
         if yaml_numbers(section, key):
             numbers = require_numbers(path, section, 16, key)
-            try:
+            with CalibrationError.at(f"{path}, {key}", TrajectoryError):
                 mounting = Rigid3.from_matrix(np.array(numbers).reshape(4, 4))
-            except TrajectoryError as error:
-                raise CalibrationError(f"{path}, {key}: {error}") from None
             return mounting.inverse() if key == "T_cam_imu" else mounting
     return None
 
@@ -237,10 +235,8 @@ def _opencv_camera(
 
 
 def _camera(path: Path, model: str, size: tuple[float, float], params: list[float]) -> Camera:
-    try:
+    with CalibrationError.at(path, CalibrationError, ValueError, OverflowError):
         return Camera(model, int(size[0]), int(size[1]), tuple(params))
-    except (CalibrationError, ValueError, OverflowError) as error:
-        raise CalibrationError(f"{path}: {error}") from None
 
 
 def _image_size(text: str) -> tuple[float, float] | None:
@@ -254,10 +250,8 @@ def _image_size(text: str) -> tuple[float, float] | None:
 
 
 def _rig(path: Path, left: Camera, right: Camera, right_from_left: np.ndarray) -> StereoRig:
-    try:
+    with CalibrationError.at(path, CalibrationError, TrajectoryError):
         rig = StereoRig(left, right, Rigid3.from_matrix(right_from_left))
-    except (CalibrationError, TrajectoryError) as error:
-        raise CalibrationError(f"{path}: {error}") from None
     if rig.baseline > _MAX_BASELINE:
         raise CalibrationError(
             f"{path}: a baseline of {rig.baseline:g} m; is it in millimetres? Metres are needed"

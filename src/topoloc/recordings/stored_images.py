@@ -32,11 +32,9 @@ def read_stored_image(owner: str, data: bytes, max_size: tuple[int, int]) -> Ima
         MapError: the image is damaged or larger. The message names its owner.
     """
     encoded = EncodedImage("its image", data)
-    try:
+    with MapError.at(f"{owner} is damaged", UnreadableImageError):
         width, height = image_size(encoded)
         if width > max_size[0] or height > max_size[1]:
             fault = f"its image is {width}x{height}, more than {max_size[0]}x{max_size[1]}"
             raise MapError(f"{owner} is damaged: {fault}")
         return read_image(encoded)
-    except UnreadableImageError as error:
-        raise MapError(f"{owner} is damaged: {error}") from None

@@ -19,6 +19,8 @@ _NUM_FINE_DECIMALS = 7
 # Maximum number of digits before the decimal point. Parsing an integer of a million digits takes
 # minutes.
 _MAX_DIGITS = 25
+# Up to ten digits are seconds, not nanoseconds. These fit into 64 bits as nanoseconds.
+_PLAIN_SECONDS = re.compile(r"[0-8]?[0-9]{1,9}(?:\.[0-9]{1,9})?")
 _DECIMAL_COMMA = re.compile(r"(?<![^\s;])([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)(?=[\s;]|$)")
 _TIME_AND_NAME = re.compile(r"([^\s,;]+)[\s,;]+(.+?\.[A-Za-z]\w{2,3}(?=[\s,;]|$)|[^\s,;]+)")
 
@@ -93,32 +95,16 @@ def read_numeric_table(
 def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:
     """Parse times as `parse_times`, if all are written alike, such as ``1403636579.763555584``.
     Return None otherwise."""
-    width = len(lines[0].split(None, 1)[0])
-    text = "".join([line[: width + 1] for line in lines])
-    if not text.isascii():
+    tokens = [line.split(None, 1)[0] for line in lines]
+    lengths = {len(token.partition(".")[2]) for token in tokens}
+    if len(lengths) > 1 or not all(map(_PLAIN_SECONDS.fullmatch, tokens)):
         return None
-    characters = np.frombuffer(text.encode("ascii"), np.uint8)
-    if characters.size != len(lines) * (width + 1):
-        return None
-    *columns, last = np.ascontiguousarray(characters.reshape(len(lines), -1).T)
-    if not ((last == ord(" ")) | (last == ord("\t"))).all():
-        return None
-    dots = [number for number, column in enumerate(columns) if column[0] == ord(".")]
-    at = dots[0] if dots else width
-    digits = columns[:at] + columns[at + 1 :]
-    is_aligned = not dots or (columns[at] == ord(".")).all()
-    # Up to ten digits are seconds, not nanoseconds.
-    if not is_aligned or not 1 <= at <= 10 or len(digits) - at > 9:
-        return None
-    t_ns = np.zeros(len(lines), dtype=np.int64)
-    for column in digits:
-        if column.min() < ord("0") or column.max() > ord("9"):
-            return None
-        t_ns = 10 * t_ns + (column - ord("0"))
-    t_ns *= 10 ** (9 - (len(digits) - at))
+    num_decimals = lengths.pop()
+    units = np.array([int(token.replace(".", "")) for token in tokens], np.int64)
+    t_ns = units * 10 ** (9 - num_decimals)
     steps = np.diff(t_ns)
     step_s = float(np.median(steps)) / NANOSECONDS_PER_SECOND if len(steps) else 0.0
-    is_fine = len(digits) - at >= _NUM_FINE_DECIMALS
+    is_fine = num_decimals >= _NUM_FINE_DECIMALS
     in_seconds = is_fine or _find_digits(t_ns[-1] / NANOSECONDS_PER_SECOND, step_s) == 9
     return t_ns.tolist() if in_seconds and (steps > 0).all() else None
 

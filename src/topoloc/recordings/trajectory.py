@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.alignment import align_scaled_poses
 from topoloc.geometry.pose_conventions import (
-    LazyPoses,
     PoseConventions,
+    lazy_poses,
     pose_from_quaternion,
     poses_from_matrices,
 )
@@ -70,7 +70,7 @@ class Trajectory:
         A pose is computed when it is read. A quaternion need not be of unit length; reading the
         pose of one without length raises TrajectoryError.
         """
-        return Trajectory(LazyPoses(rows, pose_from_quaternion), t_ns)
+        return Trajectory(lazy_poses(rows, pose_from_quaternion), t_ns)
 
     @staticmethod
     def read(path: Path) -> Trajectory:
@@ -244,10 +244,8 @@ def align_to_trajectory(sequence: StereoSequence, path: Path) -> StereoSequence:
     both = [(a, b) for a, b in pairs if a is not None and b is not None]
     if not both:
         raise TrajectoryError(f"{path}: no frame has a pose in it and in {sequence.name}")
-    try:
+    with TrajectoryError.at(path):
         scale, world_from_model = align_scaled_poses([b for _, b in both], [a for a, _ in both])
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
     scaled = scale_poses(sequence, scale).poses
     return with_poses(sequence, [pose and world_from_model @ pose for pose in scaled])
 

@@ -19,8 +19,12 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.errors import RecordingError
-from topoloc.geometry.alignment import absolute_trajectory_errors, relative_drift
-from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.alignment import (
+    absolute_trajectory_errors,
+    compute_path_lengths,
+    relative_drift,
+)
+from topoloc.geometry.rigid import Rigid3, positions_of
 from topoloc.points.disparity import MeasuredView, measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
@@ -89,7 +93,7 @@ class SlamResult:
         """Return statistics of the first recording, and its errors if it has ground truth."""
         poses = self.poses[0]
         known = [pose for pose in poses if pose is not None]
-        steps = np.diff(np.array([pose.translation for pose in known]).reshape(-1, 3), axis=0)
+        length_m = compute_path_lengths(positions_of(known))[-1] if known else 0.0
         residuals = self.right_residuals_px[np.isfinite(self.right_residuals_px)]
         facts: dict[str, Any] = {
             "num_frames": len(poses),
@@ -98,7 +102,7 @@ class SlamResult:
             "num_loops": self.num_loops,
             "num_submaps": self.num_submaps,
             "num_joined": self.num_joined,
-            "length_m": round(float(np.linalg.norm(steps, axis=1).sum()), 3),
+            "length_m": round(float(length_m), 3),
             "disparity_bias_px": round(self.disparity_bias_px[0], 3),
             "right_residual_px": round(float(np.median(residuals)), 3) if len(residuals) else None,
         }

@@ -16,7 +16,7 @@ from topoloc.geometry.absolute_pose import AbsolutePose, AbsolutePoseConfig, est
 from topoloc.geometry.rig import ray_covariances
 from topoloc.geometry.rigid import Rigid3
 from topoloc.points.disparity import MeasuredView
-from topoloc.points.point_tracking import align_with_reference, track_points
+from topoloc.points.point_tracking import follow_points
 from topoloc.slam.keyframes import KeyFrame, Landmarks
 from topoloc.slam.motion_prediction import Prediction
 
@@ -190,28 +190,22 @@ class StepEstimator:
             measured.stereo.project(pose.apply(self.points_world))[:, :2]
             for pose in (self.last.cam_from_world, predicted)
         )
-        limit = np.array([measured.view.camera.width, measured.view.camera.height]) / 2.0
-        moved = np.clip(np.nan_to_num(after - before), -limit, limit)
-        guesses = (tracks.points_img + moved).astype(np.float32)
-        found, is_found = track_points(
-            self.last.measured.view.grey, measured.view.grey, tracks.points_img, guesses
-        )
-        tracks = replace(tracks, points_img=found).select(is_found)
-        # The scale of each landmark's patch relative to the last key frame, from the depths.
-        before, now = (
-            pose.apply(self.landmarks.positions[tracks.landmark_ids])[:, 2]
+        in_reference, now = (
+            pose.apply(self.points_world)[:, 2]
             for pose in (self.reference.cam_from_world, predicted)
         )
-        aligned = align_with_reference(
-            self.reference_image,
-            measured.left,
-            tracks.points_ref,
+        rows, aligned = follow_points(
+            self.last.measured.view.grey,
+            measured.view.grey,
             tracks.points_img,
-            np.clip(before / np.maximum(now, 1e-3), 0.5, 2.0).astype(np.float32),
+            after - before,
+            self.reference_image,
+            tracks.points_ref,
+            (in_reference, now),
             patch_half_px=self.patch_half_px,
         )
-        tracks = replace(tracks, points_img=aligned.points_img, sigmas_px=aligned.sigmas_px)
-        return tracks.select(aligned.is_matched)
+        found = {"points_img": aligned.points_img, "sigmas_px": aligned.sigmas_px}
+        return replace(tracks.select(rows), **found)
 
     def estimate_pose(self, tracks: Tracks) -> AbsolutePose | None:
         """Estimate the pose that enough points agree on. None if there is none."""

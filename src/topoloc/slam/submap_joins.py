@@ -19,7 +19,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float, Int
 
-from topoloc.geometry.rigid import Rigid3, inverse_covariance
+from topoloc.geometry.rigid import Rigid3, inverse_covariance, positions_of
 from topoloc.geometry.transform_consensus import (
     TransformConsensus,
     diagonal_covariance,
@@ -253,14 +253,12 @@ def _find_overlapping_views(
         first_from_second @ ends[1].cam_from_world @ keyframes[b].cam_from_world.inverse()
         for b in others
     ]
-    (places, rotations), (other_places, other_rotations) = (
-        (
-            np.array([pose.translation for pose in poses]),
-            np.array([pose.rotation for pose in poses]),
-        )
+    rotations, other_rotations = (
+        np.array([pose.rotation for pose in poses])
         for poses in (first_from_ones, first_from_others)
     )
     turned = np.einsum("aij,bij->ab", rotations, other_rotations)
+    places, other_places = map(positions_of, (first_from_ones, first_from_others))
     apart = np.linalg.norm(places[:, None] - other_places, axis=2)
     nearest = np.argsort(
         np.where(turned > _MIN_ROTATION_TRACE, apart, np.inf), axis=None, kind="stable"

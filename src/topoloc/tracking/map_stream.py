@@ -28,6 +28,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.query import StageClock
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.recordings.frame import to_grey
+from topoloc.recordings.frame_preparation import downscale_image
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.motion import MotionState, update_motion
@@ -49,7 +50,6 @@ from topoloc.tracking.tracker_state import (
     compute_direction_uncertainty,
     compute_motion_covariance,
     compute_smoothed_covariance,
-    downscale_image,
     fade_offset,
     noise_floor,
 )

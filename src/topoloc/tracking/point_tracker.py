@@ -19,7 +19,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import ray_covariances
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.points.point_tracking import align_with_reference, track_points
+from topoloc.points.point_tracking import follow_points
 
 # Position noise across the ray. The pixel defines the ray, so this only regularises the covariance.
 _RAY_SIGMA_PX = 0.1
@@ -118,22 +118,20 @@ class PointTracker:
             self._camera.img_from_cam(pose.apply(points_world))
             for pose in (self._last_from_world, initial_pose)
         )
-        limit = np.array([self._camera.width, self._camera.height]) / 2.0
-        guesses = (
-            self._last_points_img + np.clip(np.nan_to_num(after - before), -limit, limit)
-        ).astype(np.float32)
-        found, is_found = track_points(self._last_grey, grey, self._last_points_img, guesses)
-        rows, found = self._rows[is_found], found[is_found]
-        depths = [
-            pose.apply(self._inlier_points.points_world[rows])[:, 2]
-            for pose in (self._cam_from_world, initial_pose)
-        ]
-        scales = np.clip(depths[0] / np.maximum(depths[1], 1e-3), 0.5, 2.0).astype(np.float32)
-        points_ref = self._inlier_points.points_img[rows]
-        aligned = align_with_reference(
-            self._reference, grey.astype(np.float32), points_ref, found, scales, max_shift_px=4.0
+        in_reference, now = (
+            pose.apply(points_world)[:, 2] for pose in (self._cam_from_world, initial_pose)
         )
-        return rows[aligned.is_matched], aligned.points_img[aligned.is_matched]
+        rows, aligned = follow_points(
+            self._last_grey,
+            grey,
+            self._last_points_img,
+            after - before,
+            self._reference,
+            self._inlier_points.points_img[self._rows],
+            (in_reference, now),
+            max_shift_px=4.0,
+        )
+        return self._rows[rows], aligned.points_img
 
     def _estimate_pose(
         self, points_img: Float32[np.ndarray, "n 2"], rows: np.ndarray

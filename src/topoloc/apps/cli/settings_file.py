@@ -66,10 +66,8 @@ def read_settings(path: str | None) -> Settings:
     value. The text names file and key."""
     if path is None:
         return Settings({})
-    try:
+    with ConfigError.at(path):
         configs = parse_tables(_parse_file(path), _find_class, f"{path}: ")
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
     return Settings({type(config): config for config in configs})
 
 
@@ -98,10 +96,8 @@ def with_option(config: T, key: str, value: Any, option: str) -> T:
     The text names the option."""
     if value is None:
         return config
-    try:
+    with UsageError.at(option, ConfigError):
         return with_setting(config, key, value)
-    except ConfigError as error:
-        raise UsageError(f"{option}: {error}") from None
 
 
 def settings_text(tables: Sequence[str]) -> str:

@@ -150,11 +150,9 @@ def _import_converter() -> Callable[[str, bytes, Path, dict[str, str]], object]:
 
 def _write_network(name: str, write: Callable[[Path], object]) -> Path:
     path = cache_folder() / f"{name}.onnx"
-    try:
+    with WeightsError.at(f"cannot write {path}", OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as part:
             write(part)
             NetworkInfo.of_file(part)
-    except OSError as error:
-        raise WeightsError(f"cannot write {path}: {error.strerror}") from error
     return path

@@ -176,18 +176,14 @@ _RECORD_LENGTHS = {
 
 def _camera(camera: Any, model: Path) -> Camera:
     size, params = (int(camera.width), int(camera.height)), tuple(map(float, camera.params))
-    try:
+    with CalibrationError.at(model):
         return Camera.from_colmap(str(camera.model_name), *size, params)
-    except CalibrationError as error:
-        raise CalibrationError(f"{model}: {error}") from None
 
 
 def _world_from_cam(image: Any, model: Path) -> Rigid3:
     matrix = np.asarray(image.cam_from_world().matrix(), dtype=np.float64)
-    try:
+    with TrajectoryError.at(f"{model}, {image.name}"):
         return Rigid3.from_matrix(matrix).inverse()
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{model}, {image.name}: {error}") from None
 
 
 def times_from_names(names: list[str]) -> list[int]:

@@ -103,10 +103,8 @@ def _camera(row: tuple[Any, ...], file: Path) -> Camera:
         raise RecordingError(f"{file}: damaged, an invalid camera")
     name = _CAMERA_MODELS[model] if 0 <= model < len(_CAMERA_MODELS) else f"number {model}"
     numbers = struct.unpack(f"<{len(params) // 8}d", params)
-    try:
+    with CalibrationError.at(f"{file}: camera {number}"):
         return Camera.from_colmap(name, width, height, numbers)
-    except CalibrationError as error:
-        raise CalibrationError(f"{file}: camera {number}: {error}") from None
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_colmap_database, ("images",))

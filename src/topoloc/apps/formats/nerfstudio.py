@@ -123,7 +123,7 @@ def _camera(data: dict[str, Any], where: str) -> Camera:
     w, h, k1, k2, k3, k4 = int(lens.w), int(lens.h), lens.k1, lens.k2, lens.k3, lens.k4
     p1, p2, fl_y = lens.p1, lens.p2, lens.fl_x if lens.fl_y is None else lens.fl_y
     params = (lens.fl_x, fl_y, lens.cx, lens.cy)
-    try:
+    with CalibrationError.at(where):
         if lens.camera_model.lower().endswith("fisheye"):
             return Camera.from_colmap("OPENCV_FISHEYE", w, h, (*params, k1, k2, k3, k4))
         if k4 != 0.0:  # OpenCV's model has no fourth radial coefficient, its k4 is a divisor
@@ -134,8 +134,6 @@ def _camera(data: dict[str, Any], where: str) -> Camera:
         if (k1, k2, p1, p2) == (0.0, 0.0, 0.0, 0.0):
             return Camera.from_colmap("PINHOLE", w, h, params)
         return Camera.from_colmap("OPENCV", w, h, (*params, k1, k2, p1, p2))
-    except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from None
 
 
 def _depth(frames: list[_Frame], unit: float, file: Path, where: list[str]) -> DepthImages | None:

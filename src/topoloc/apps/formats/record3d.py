@@ -115,10 +115,8 @@ def _cameras(data: _Metadata, images: list[Path], file: Path) -> list[Camera]:
         raise CalibrationError(
             f"{file}: {len(numbers)} perFrameIntrinsicCoeffs for {len(images)} images"
         )
-    try:
+    with CalibrationError.at(file):
         return [Camera.pinhole(w, h, *row).rescaled(width, height) for row in numbers]
-    except CalibrationError as error:
-        raise CalibrationError(f"{file}: {error}") from None
 
 
 def _times(data: _Metadata, count: int, file: Path) -> list[int]:

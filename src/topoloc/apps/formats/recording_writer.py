@@ -40,11 +40,9 @@ class RecordingWriter:
         self._times: TextIO | None = None
         self._truth: TextIO | None = None
         self._subfolders: dict[str, str] = {}
-        try:
+        with TopolocError.at(f"cannot write {folder}", OSError):
             folder.mkdir(exist_ok=True)
             other = next((path.name for path in folder.iterdir()), None)
-        except OSError as error:
-            raise TopolocError(f"cannot write {folder}: {error.strerror}") from None
         if other is not None:
             raise TopolocError(
                 f"cannot write {folder}: it is not empty and has {other}; use a new folder"
@@ -84,15 +82,13 @@ class RecordingWriter:
         self.num_frames += 1
 
     def _write_lines(self, frame: StereoFrame, times: TextIO) -> None:
-        try:
+        with TopolocError.at(f"cannot write {self.folder}", OSError):
             if self._truth is not None and frame.world_from_cam is not None:
                 trajectory = Trajectory([frame.world_from_cam], [frame.t_ns])
                 self._truth.write(trajectory.to_tum(header=False))
                 self._truth.flush()
             times.write(f"{Decimal(frame.t_ns).scaleb(-9):.9f}\n")
             times.flush()
-        except OSError as error:
-            raise TopolocError(f"cannot write {self.folder}: {error.strerror}") from None
 
     def _frame_images(self, frame: StereoFrame) -> dict[str, Image | UInt16[np.ndarray, "h w"]]:
         images: dict[str, Image | UInt16[np.ndarray, "h w"]] = {"left": frame.image}
@@ -106,7 +102,7 @@ class RecordingWriter:
         """Create the folders, the calibration, the truth and the times. Return the latter."""
         own = "left" if "right" in images else "rgb" if "depth" in images else "images"
         self._subfolders = {kind: own if kind == "left" else kind for kind in images}
-        try:
+        with TopolocError.at(f"cannot write {self.folder}", OSError):
             for name in self._subfolders.values():
                 (self.folder / name).mkdir()
             if frame.camera is not None:
@@ -117,8 +113,6 @@ class RecordingWriter:
                 self._truth.write(Trajectory([], []).to_tum())
             self._times = (self.folder / "times.txt").open("x", encoding="utf-8")
             return self._times
-        except OSError as error:
-            raise TopolocError(f"cannot write {self.folder}: {error.strerror}") from None
 
 
 def calibration_json(frame: StereoFrame, camera: Camera) -> dict[str, Any]:

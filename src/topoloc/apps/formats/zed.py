@@ -207,10 +207,8 @@ def _camera(
     coefficients = [_number(path, conf[section], section, key, 0.0) for key in names]
     is_full = any(coefficients[4:])
     params = (*intrinsics, *coefficients[: 8 if is_full else 4])
-    try:
+    with CalibrationError.at(f"{path}, {section}"):
         return Camera("FULL_OPENCV" if is_full else "OPENCV", *size, params)
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}, {section}: {error}") from None
 
 
 def _number(

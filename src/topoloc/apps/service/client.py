@@ -223,10 +223,8 @@ def _encode_image(image: ImageInput) -> tuple[str, bytes]:
 
         pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
         return "image", cv2.imencode(".png", pixels)[1].tobytes()
-    try:
+    with ServiceError.at(image, OSError):
         return Path(image).name, Path(image).read_bytes()
-    except OSError as error:
-        raise ServiceError(f"{image}: {error.strerror}") from None
 
 
 def _retry_delay_s(response: httpx.Response, attempt: int) -> float | None:

@@ -182,9 +182,7 @@ def _cache_path(name: str, sha256: str) -> Path:
 @contextmanager
 def _cache_file(path: Path) -> Iterator[Path]:
     """Yield a new file in the cache folder. Raises ObjectStoreError if it cannot be written."""
-    try:
+    with ObjectStoreError.at(f"cannot keep {path}", OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary:
             yield temporary
-    except OSError as error:
-        raise ObjectStoreError(f"cannot keep {path}: {error.strerror or error}") from error

@@ -43,10 +43,8 @@ def create_results_scene(path: Path) -> Scene:
     views, count = list[View](), 0
     for place, line in _number_lines(path, read_text(path, ResultError)):
         count += 1
-        try:
+        with ResultError.at(place):
             result, extras = _parse_result(line)
-        except ResultError as error:
-            raise ResultError(f"{place}: {error}") from None
         if isinstance(result, Localization):
             t_ns, camera = result.provenance.t_ns, result.provenance.camera
             views.append(
@@ -105,12 +103,10 @@ def _read_evaluation(path: Path, evaluation: Mapping[str, Any]) -> list[ResultSe
 
 def _answer_to_json(place: str, line: Any) -> Mapping[str, Any]:
     """Return a result as JSON with its validated keys only, because it goes into a page."""
-    try:
+    with ResultError.at(place, ResultError, TrajectoryError):
         result, extras = _parse_result(line)
         answer = result.to_json(extras.query) | to_builtins(extras)
         for key in ("smoothed", "true_world_from_cam"):
             if answer.get(key) is not None:
                 answer[key] = Rigid3.from_json(answer[key], key).to_json()
-    except (ResultError, TrajectoryError) as error:
-        raise ResultError(f"{place}: {error}") from None
     return answer

@@ -15,28 +15,11 @@ from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
-from topoloc.node_ids import NodeId, Row, as_rows
+from topoloc.node_ids import LazySequence, NodeId
 from topoloc.retrieval.coarse import CoarseModel
 
 K = TypeVar("K")
 T = TypeVar("T")
-
-
-class LazySequence(Sequence[T]):
-    """Show a sequence of `length()` entries. Each is the result of `read` for its row, at every
-    access."""
-
-    def __init__(self, length: Callable[[], int], read: Callable[[Row], T]) -> None:
-        self._length, self._read = length, read
-
-    def __len__(self) -> int:
-        return self._length()
-
-    def __getitem__(self, index: Any) -> Any:
-        rows = range(len(self))[index]  # raises IndexError
-        return (
-            [*map(self._read, as_rows(rows))] if isinstance(rows, range) else self._read(Row(rows))
-        )
 
 
 def overlay(base: Sequence[T], changed: Mapping[int, T], added: Sequence[T]) -> LazySequence[T]:

@@ -22,7 +22,6 @@ from topoloc.mapping.storage.entries import (
     CorrelatedErrors,
     Edge,
     LazyMapping,
-    LazySequence,
     NodeSummary,
     PlaceImage,
     Repetitions,
@@ -45,7 +44,7 @@ from topoloc.mapping.validation import (
     check_count,
     pose_from_bytes,
 )
-from topoloc.node_ids import NodeId, Row
+from topoloc.node_ids import LazySequence, NodeId, Row
 
 T = TypeVar("T")
 MAX_ID = 2**53

@@ -121,10 +121,8 @@ def read_sensor(path: Path) -> Sensor:
     text = read_yaml(path)
     camera = kalibr_camera(path, text)
     mounting = np.array(require_numbers(path, text, 16, "T_BS")).reshape(4, 4)
-    try:
+    with CalibrationError.at(path, TrajectoryError):
         return Sensor(camera, Rigid3.from_matrix(mounting))
-    except TrajectoryError as error:
-        raise CalibrationError(f"{path}: {error}") from None
 
 
 def _rig(mav: Path, left: Sensor, right: Sensor) -> StereoRig:

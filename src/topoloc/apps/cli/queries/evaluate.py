@@ -240,10 +240,8 @@ def _read_rigid(path: Path) -> Rigid3:
     matrices = [value for value in values if isinstance(value, list)]
     if len(matrices) != 1:
         raise TrajectoryError(f"{path}: one 4x4 matrix is needed")
-    try:
+    with TrajectoryError.at(path):
         return Rigid3.from_matrix(matrices[0])
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
 
 
 def _print(evaluation: dict[str, Any]) -> None:

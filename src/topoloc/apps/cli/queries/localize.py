@@ -190,10 +190,8 @@ class Command:
         return localizer if near is None else localizer.near(near)
 
     def _parse_near(self) -> GeoPositionPrior | None:
-        try:
+        with UsageError.at("--near", AtlasError):
             return None if self.near is None else GeoPositionPrior.parse(self.near)
-        except AtlasError as error:
-            raise UsageError(f"--near: {error}") from None
 
     def _check_usage(self, live: str | None) -> None:
         if self.streams.stream and self.streams.single:

@@ -176,11 +176,8 @@ def _list_parts(folder: Path) -> list[Path]:
 
 
 def _open_file(path: Path) -> MessageFile:
-    try:
-        with path.open("rb") as file:
-            begin = file.read(16)
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from None
+    with RecordingError.at(path, OSError), path.open("rb") as file:
+        begin = file.read(16)
     for magic, (module, name) in _READERS.items():
         if begin.startswith(magic):
             try:

@@ -125,10 +125,8 @@ class BagRecording:
 
     def _read_message(self, images: ImageMessages, index: int) -> tuple[Any, str]:
         name = f"{self.bag.path}, {images.topic.name} at {self.names[index]}"
-        try:
+        with UnreadableImageError.at(name, RecordingError):
             return decode(images.topic, self.bag.read(images.refs[index])), name
-        except RecordingError as error:
-            raise UnreadableImageError(f"{name}: {error}") from None
 
 
 def open_bag(

@@ -63,10 +63,8 @@ class ChunkedBytes:
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def __post_init__(self) -> None:
-        try:
+        with RecordingError.at(self.path, OSError):
             self._descriptor = os.open(self.path, os.O_RDONLY)
-        except OSError as error:
-            raise RecordingError(f"{self.path}: {error.strerror}") from None
         weakref.finalize(self, os.close, self._descriptor)
         self.size = os.fstat(self._descriptor).st_size
 
@@ -95,10 +93,8 @@ class ChunkedBytes:
         if chunk != WHOLE_FILE and self.chunks[chunk].is_compressed:
             return self._read_decompressed(chunk, offset + length)[offset : offset + length]
         start = 0 if chunk == WHOLE_FILE else self.chunks[chunk].start
-        try:
+        with RecordingError.at(self.path, OSError):
             data = os.pread(self._descriptor, length, start + offset)
-        except OSError as error:
-            raise RecordingError(f"{self.path}: {error.strerror}") from None
         if len(data) != length:  # shorter than when it was opened
             raise TruncatedFileError
         return data
