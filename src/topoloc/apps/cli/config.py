@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from topoloc.apps.cli.output import UsageError
+from topoloc.apps.cli.output import UsageError, option
 from topoloc.apps.cli.settings_file import all_tables, settings_text
 
 _HEADER = """\
@@ -22,10 +22,7 @@ _HEADER = """\
 class Command:
     """Arguments of `topoloc config`."""
 
-    command: Annotated[
-        tyro.conf.Positional[str | None],
-        tyro.conf.arg(metavar="COMMAND", help_behavior_hint="(default: all)"),
-    ] = None
+    command: Annotated[tyro.conf.Positional[str | None], option("COMMAND", "all")] = None
     """Only the settings of this command: build, slam, localize, evaluate, explain or train."""
 
     def run(self) -> int:

@@ -31,6 +31,7 @@ from topoloc.apps.cli.output import (
     UsageError,
     check_outputs,
     import_report_writer,
+    option,
     print_recordings,
     progress_bar,
     write_json,
@@ -56,9 +57,7 @@ class Command:
 
     out: Annotated[str, tyro.conf.arg(metavar="DIR")] = "topoloc-demo"
     """Output folder of map, results, trajectories and report.html."""
-    recordings: Annotated[
-        str | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: the shipped ones)")
-    ] = None
+    recordings: Annotated[str | None, option("DIR", "the shipped ones")] = None
     """Recordings of `topoloc simulate demo` instead of the shipped ones."""
     json: File = None
     """Write the evaluation as JSON to this file (- for standard output)."""

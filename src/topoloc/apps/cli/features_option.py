@@ -6,8 +6,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Annotated
 
-import tyro
-
 from topoloc import (
     Atlas,
     AtlasConfig,
@@ -19,32 +17,26 @@ from topoloc import (
     TopoMetricMap,
     WeightsError,
 )
-from topoloc.apps.cli.output import UsageError, print_warning
+from topoloc.apps.cli.output import UsageError, option, print_warning
 from topoloc.apps.query_camera import CameraOfSize, parse_camera_option
 from topoloc.plugin import check_available, parse_feature_types
 
 BUILD_FEATURES = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="surf|sift|learned|both|KIND[,KIND]",
-        help_behavior_hint="(default: both if a network is installed)",
-    ),
+    str | None, option("surf|sift|learned|both|KIND[,KIND]", "both if a network is installed")
 ]
 QUERY_FEATURES = Annotated[
     str | None,
-    tyro.conf.arg(
-        metavar="surf|learned|both|KIND[,KIND]",
-        help_behavior_hint="(default: all of the map)",
+    option(
+        "surf|learned|both|KIND[,KIND]",
+        "all of the map",
         help="Feature types of the map to use, in order. The next one is used if the pose is"
         " unclear.",
     ),
 ]
 CoarseOption = Annotated[
     str | None,
-    tyro.conf.arg(
-        metavar="NAME",
-        help_behavior_hint="(default: the map's)",
-        help="Coarse localizer to use. `topoloc info` lists those of the map.",
+    option(
+        "NAME", "the map's", help="Coarse localizer to use. `topoloc info` lists those of the map."
     ),
 ]
 

@@ -19,46 +19,47 @@ from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequen
 from topoloc.apps.cli import printable
 from topoloc.plugin import remove_stale_files, write_text
 
+
+def option(metavar: str, default: str = "", **more: Any) -> Any:
+    """Describe an option of a command: its placeholder in the help, and its default in words if
+    that is not a value. `more` are further arguments of `tyro.conf.arg`."""
+    hint = f"(default: {default})" if default else ""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, **more)
+
+
 # A switch: no `--no-...`, and no "(default: False)" in the help.
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
 # An optional path.
-File = Annotated[str | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+File = Annotated[str | None, option("FILE")]
 Format = Annotated[
     str | None,
-    tyro.conf.arg(
-        metavar="NAME",
-        help_behavior_hint="(default: recognised)",
+    option(
+        "NAME",
+        "recognised",
         help="Format of the recordings: kitti, euroc, tum, seven_scenes, nerfstudio,"
         " stray_scanner, record3d, colmap, colmap_database, rosbag, mcap, zed, video or folder.",
     ),
 ]
 CameraOption = Annotated[
     str | None,
-    tyro.conf.arg(
-        metavar="FILE|fx,fy,cx,cy",
-        help_behavior_hint="(default: that of the recording)",
+    option(
+        "FILE|fx,fy,cx,cy",
+        "that of the recording",
         help="Calibration that replaces the recordings' own: camera.json, OpenCV's or Kalibr's"
         " YAML, SN*.conf, or `fx,fy,cx,cy`.",
     ),
 ]
 Topics = Annotated[
     str | None,
-    tyro.conf.arg(
-        metavar="ROLE=TOPIC,...",
-        help_behavior_hint="(default: guessed)",
+    option(
+        "ROLE=TOPIC,...",
+        "guessed",
         help="Topics of a bag: left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom.",
     ),
 ]
 # A Ray cluster.
-RayOption = Annotated[
-    str | None, tyro.conf.arg(metavar="HOST:PORT|auto|local", help_behavior_hint="(default: none)")
-]
-PosesOption = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="CONVENTION[,CONVENTION]", help_behavior_hint="(default: world_from_cam, metres)"
-    ),
-]
+RayOption = Annotated[str | None, option("HOST:PORT|auto|local", "none")]
+PosesOption = Annotated[str | None, option("CONVENTION[,CONVENTION]", "world_from_cam, metres")]
 _COLUMNS = (
     "recording",
     "localized",

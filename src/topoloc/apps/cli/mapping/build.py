@@ -31,6 +31,7 @@ from topoloc.apps.cli.output import (
     Topics,
     UsageError,
     check_outputs,
+    option,
     print_line,
     print_waiting,
     progress_bar,
@@ -54,9 +55,7 @@ class Command:
     PATH. With --ray each recording becomes a tile of the atlas that is named last."""
     trajectory: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(
-            metavar="truth|slam|FILE", help_behavior_hint="(default: truth if available, else slam)"
-        ),
+        option("truth|slam|FILE", "truth if available, else slam"),
     ] = ()
     """Source of the poses: `truth` (the recording's own), `slam`, or a TUM or KITTI file. Once for
     all recordings, or once for each."""
@@ -69,10 +68,7 @@ class Command:
     """Map a recording if fewer than half of its frames have a pose."""
     format: Format = None
     camera: CameraOption = None
-    images: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: images/ beside the model)"),
-    ] = None
+    images: Annotated[str | None, option("FOLDER", "images/ beside the model")] = None
     """Images of a COLMAP model."""
     scale: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -84,16 +80,10 @@ class Command:
     """Metres in a unit of the recordings' own poses, for models without a metric scale; or a
     measured distance between the cameras of two images."""
     topics: Topics = None
-    d_thresh: Annotated[
-        float | None,
-        tyro.conf.arg(metavar="METRES", help_behavior_hint="(default: from the visible depth)"),
-    ] = None
+    d_thresh: Annotated[float | None, option("METRES", "from the visible depth")] = None
     """Metres between nodes (D_thresh of the paper's Eq. 1)."""
     lambda_rot: Annotated[
-        float | None,
-        tyro.conf.arg(
-            name="lambda", metavar="M/RAD", help_behavior_hint="(default: a node every 2 degrees)"
-        ),
+        float | None, option("M/RAD", "a node every 2 degrees", name="lambda")
     ] = None
     """Weight of rotation against translation (lambda of Eq. 1)."""
     features: BUILD_FEATURES = None
@@ -102,16 +92,11 @@ class Command:
     ray: RayOption = None
     """Ray cluster that maps each recording separately: `auto` is the one on this machine, `local` a
     temporary one of this machine's processors. An interrupted run continues."""
-    world: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")
-    ] = None
+    world: Annotated[str | None, option("NAME", "each its own")] = None
     """With --ray, the common world of all recordings' poses."""
     replace: Flag = False
     """With --ray, replace a tile of the same id."""
-    split: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="FRAMES[,SHARED]", help_behavior_hint="(default: each whole)"),
-    ] = None
+    split: Annotated[str | None, option("FRAMES[,SHARED]", "each whole")] = None
     """With --ray, split longer recordings into pieces of FRAMES frames in one world. Successive
     pieces share SHARED frames (default: a tenth)."""
     join: Flag = False

@@ -18,6 +18,7 @@ from topoloc.apps.cli.output import (
     UsageError,
     catch_stop_signals,
     check_outputs,
+    option,
     progress_bar,
     write_json,
 )
@@ -42,36 +43,18 @@ class Command:
     """Source: a connected ZED, the simulator CARLA, or any camera or stream that OpenCV opens."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
     """Folder of the recording, new or empty."""
-    source: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="SOURCE", help_behavior_hint="(default: 0; for a ZED its SDK if installed)"
-        ),
-    ] = None
+    source: Annotated[str | None, option("SOURCE", "0; for a ZED its SDK if installed")] = None
     """Device number or /dev/video0, rtsp:// or http:// URL, GStreamer pipeline, or a video file."""
-    camera: Annotated[
-        str | None, tyro.conf.arg(metavar="FILE|fx,fy,cx,cy", help_behavior_hint="")
-    ] = None
+    camera: Annotated[str | None, option("FILE|fx,fy,cx,cy")] = None
     """Calibration: SN*.conf of a ZED without its SDK; camera.json, OpenCV's or Kalibr's YAML, or
     four numbers of a webcam."""
-    size: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="WxH", help_behavior_hint="(default: the device's; ZED 2560x720, CARLA 800x600)"
-        ),
-    ] = None
+    size: Annotated[str | None, option("WxH", "the device's; ZED 2560x720, CARLA 800x600")] = None
     """Requested image size; for a ZED that of both images side by side."""
-    fps: Annotated[
-        float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: all)")
-    ] = None
+    fps: Annotated[float | None, option("N", "all")] = None
     """Maximum number of frames a second."""
-    frames: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: until Ctrl-C)")
-    ] = None
+    frames: Annotated[int | None, option("N", "until Ctrl-C")] = None
     """Number of frames after which the recording ends."""
-    jpeg: Annotated[
-        int | None, tyro.conf.arg(metavar="1-100", help_behavior_hint="(default: PNG)")
-    ] = None
+    jpeg: Annotated[int | None, option("1-100", "PNG")] = None
     """JPEG quality of the images."""
     carla: tyro.conf.OmitArgPrefixes[CarlaConfig] = field(default_factory=CarlaConfig)
     json: File = None

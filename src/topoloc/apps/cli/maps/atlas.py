@@ -17,6 +17,7 @@ from topoloc.apps.cli.output import (
     Flag,
     RayOption,
     UsageError,
+    option,
     print_fields,
     print_line,
     write_json,
@@ -37,22 +38,12 @@ class Command:
     atlas: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ATLAS")]
     """The atlas: a folder. With the extra `cluster` also a prefix of an object store, such as
     s3://bucket/campus."""
-    names: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="MAP|TILE ...", help_behavior_hint=""),
-    ] = ()
+    names: Annotated[tyro.conf.Positional[tuple[str, ...]], option("MAP|TILE ...")] = ()
     """`create` and `add` copy these map files. `remove` removes these tiles. `join` compares these
     tiles with the others (default: all with each other)."""
-    id: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="NAME", help_behavior_hint="(default: the file's name without .topo)"
-        ),
-    ] = None
+    id: Annotated[str | None, option("NAME", "the file's name without .topo")] = None
     """`create`, `add`: the id of the tile, for one map."""
-    world: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: each its own)")
-    ] = None
+    world: Annotated[str | None, option("NAME", "each its own")] = None
     """`create`, `add`: the world that all these maps share, for example the parts of one
     recording."""
     replace: Flag = False
@@ -100,7 +91,7 @@ class Command:
             raise UsageError("--id names the tile of one map")
         joining = ("join", "create --join", "add --join")
         action = f"{self.action}{' --join' if self.join else ''}"
-        for option, actions in {
+        for name, actions in {
             "id": ("create", "add"),
             "world": ("create", "add"),
             "replace": ("add",),
@@ -109,9 +100,9 @@ class Command:
             "config": joining,
             "ray": joining,
         }.items():
-            is_given = getattr(self, option) not in (None, False)
+            is_given = getattr(self, name) not in (None, False)
             if is_given and self.action not in actions and action not in actions:
-                raise UsageError(f"--{option} belongs to {' and '.join(actions)}")
+                raise UsageError(f"--{name} belongs to {' and '.join(actions)}")
 
 
 def show_atlas(atlas: Atlas, check: bool, json: str | None) -> int:

@@ -14,6 +14,7 @@ from topoloc.apps.cli.output import (
     File,
     UsageError,
     check_outputs,
+    option,
     print_warning,
     progress_bar,
     write_json,
@@ -37,16 +38,10 @@ class Command:
     """The file to write, such as points.ply, map.geojson, map.mcap, walk.tum or walk.kitti. COLMAP
     and nerfstudio need a folder."""
     format: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="colmap|nerfstudio|ply|geojson|mcap|tum|kitti",
-            help_behavior_hint="(default: by OUT's suffix)",
-        ),
+        str | None, option("colmap|nerfstudio|ply|geojson|mcap|tum|kitti", "by OUT's suffix")
     ] = None
     """The format. A folder is written for COLMAP unless this is nerfstudio."""
-    session: Annotated[
-        int | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: all)")
-    ] = None
+    session: Annotated[int | None, option("ID", "all")] = None
     """Export only the nodes of this session of a map (`topoloc info --json` lists the sessions)."""
     tile: TileOption = None
     """Export only this tile of an atlas, in its own world."""

@@ -13,6 +13,7 @@ from topoloc.apps.cli.output import (
     File,
     UsageError,
     check_outputs,
+    option,
     print_fields,
     print_waiting,
     write_json,
@@ -26,9 +27,7 @@ class Command:
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file, which is replaced by a georeferenced one. Or an atlas, with `--tile`."""
-    origin: Annotated[
-        str | None, tyro.conf.arg(metavar="LAT,LON,H,HEADING", help_behavior_hint="")
-    ] = None
+    origin: Annotated[str | None, option("LAT,LON,H,HEADING")] = None
     """Position of the first mapping image (degrees, metres above the ellipsoid) and its heading in
     degrees clockwise from true north."""
     gnss: File = None
@@ -37,13 +36,9 @@ class Command:
     points: File = None
     """Three or more known points: lines of `x,y,z,lat,lon,h`, with x, y, z in metres in the map's
     world."""
-    up: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="x|-x|y|-y|z|-z",
-            help_behavior_hint="(default: the axis nearest to the cameras' up)",
-        ),
-    ] = None
+    up: Annotated[str | None, option("x|-x|y|-y|z|-z", "the axis nearest to the cameras' up")] = (
+        None
+    )
     """The axis of the map's world that points up. --points does not need it."""
     tile: TileOption = None
     """The tile of an atlas. Tiles that share its world or are joined with it are then georeferenced

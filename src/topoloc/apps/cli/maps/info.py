@@ -29,6 +29,7 @@ from topoloc.apps.cli.output import (
     Flag,
     UsageError,
     check_outputs,
+    option,
     print_fields,
     print_line,
     write_json,
@@ -52,9 +53,7 @@ class Command:
     """Also check all data of the map, and that its nodes agree with their neighbours. In an atlas,
     compare every file with its checksum. The exit status is 1 if there is a fault."""
 
-    graph: Annotated[
-        str | None, tyro.conf.arg(metavar="FILE.graphml|FILE.geojson", help_behavior_hint="")
-    ] = None
+    graph: Annotated[str | None, option("FILE.graphml|FILE.geojson")] = None
     """Write nodes, junctions and the paths between them to this file. GeoJSON needs a georeferenced
     map."""
 

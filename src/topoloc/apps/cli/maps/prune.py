@@ -9,7 +9,14 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from topoloc import open_place, prune
-from topoloc.apps.cli.output import File, UsageError, check_outputs, print_line, print_waiting
+from topoloc.apps.cli.output import (
+    File,
+    UsageError,
+    check_outputs,
+    option,
+    print_line,
+    print_waiting,
+)
 from topoloc.apps.cli.tile_option import TileOption, run_for_each_tile
 
 
@@ -19,12 +26,7 @@ class Command:
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file, which is replaced. Or an atlas, whose tiles are replaced one by one."""
-    max_mb: Annotated[
-        float | None,
-        tyro.conf.arg(
-            metavar="N", help_behavior_hint="(default: remove only landmarks that are gone)"
-        ),
-    ] = None
+    max_mb: Annotated[float | None, option("N", "remove only landmarks that are gone")] = None
     """Maximum size of the map file in megabytes. In an atlas it holds for each tile. Every node
     keeps its most useful landmarks. Redundant nodes are removed before nodes keep too few."""
     descriptors: Literal["fine", "coarse"] = "fine"

@@ -20,6 +20,7 @@ from topoloc.apps.cli.output import (
     Topics,
     UsageError,
     check_outputs,
+    option,
     print_line,
     progress_bar,
     write_json,
@@ -41,12 +42,7 @@ class Command:
     recording joins the tile that its images match."""
     trajectory: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="truth|slam|map|FILE",
-            help_behavior_hint=(
-                "(default: truth if there is one, slam for stereo or RGB-D, else map)"
-            ),
-        ),
+        option("truth|slam|map|FILE", "truth if there is one, slam for stereo or RGB-D, else map"),
     ] = None
     """Source of the poses: `truth` (the recording's own, in any metric world), `slam` (stereo or
     RGB-D), or a TUM or KITTI file. `map` localizes each image in the map, as in a stream, and
@@ -56,15 +52,11 @@ class Command:
     format: Format = None
     camera: CameraOption = None
     topics: Topics = None
-    light: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: from the images)")
-    ] = None
+    light: Annotated[str | None, option("NAME", "from the images")] = None
     """Name of the illumination, such as `evening`. Sessions of one name have one illumination."""
-    joined: Annotated[str | None, tyro.conf.arg(metavar="FILE.tum", help_behavior_hint="")] = None
+    joined: Annotated[str | None, option("FILE.tum")] = None
     """Write the poses of the (one) recording in the map's world to this TUM file."""
-    tile: Annotated[
-        str | None, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from the images)")
-    ] = None
+    tile: Annotated[str | None, option("ID", "from the images")] = None
     """The tile of an atlas that all recordings join."""
     ray: RayOption = None
     """The Ray cluster that updates different tiles of an atlas in parallel, as in `topoloc

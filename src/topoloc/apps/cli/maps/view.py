@@ -12,7 +12,14 @@ from typing import Annotated, Any
 import tyro
 
 from topoloc import Atlas, TopoMetricMap, open_place
-from topoloc.apps.cli.output import File, UsageError, check_outputs, print_warning, write_json
+from topoloc.apps.cli.output import (
+    File,
+    UsageError,
+    check_outputs,
+    option,
+    print_warning,
+    write_json,
+)
 from topoloc.apps.cli.tile_option import TileOption, select_world
 from topoloc.apps.viewer.document import ResultSet, SceneBudget, create_document
 from topoloc.apps.viewer.page import find_browser, write_scene_page, write_screenshot
@@ -29,10 +36,7 @@ class Command:
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file or an atlas. Of an atlas, the tiles of the shared world with most nodes are
     shown."""
-    results: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="RESULTS ...", help_behavior_hint=""),
-    ] = ()
+    results: Annotated[tyro.conf.Positional[tuple[str, ...]], option("RESULTS ...")] = ()
     """Files to show in it: results of `topoloc localize` and `topoloc evaluate` (JSON),
     trajectories (TUM, KITTI)."""
     out: File = None

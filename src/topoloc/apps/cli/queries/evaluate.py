@@ -34,6 +34,7 @@ from topoloc.apps.cli.output import (
     UsageError,
     check_outputs,
     import_report_writer,
+    option,
     print_fields,
     print_line,
     print_recordings,
@@ -53,10 +54,7 @@ class Command:
 
     map: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP|ATLAS")]
     """The map file, or an atlas."""
-    sequences: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="SEQ ...", help_behavior_hint=""),
-    ] = ()
+    sequences: Annotated[tyro.conf.Positional[tuple[str, ...]], option("SEQ ...")] = ()
     """Recordings with true poses. PATH@1::2 selects every second frame of PATH from frame 1 on."""
     tile: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="(atlases only)")

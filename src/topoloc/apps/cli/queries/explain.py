@@ -25,7 +25,7 @@ from topoloc.apps.cli.features_option import (
     open_localizer,
     parse_camera,
 )
-from topoloc.apps.cli.output import File, UsageError, check_outputs, print_line, write_json
+from topoloc.apps.cli.output import File, UsageError, check_outputs, option, print_line, write_json
 from topoloc.apps.cli.settings_file import read_settings, with_option
 from topoloc.apps.query_camera import select_frame_camera
 from topoloc.apps.report.explanation import Explanation, explain, explanation_to_json
@@ -42,11 +42,7 @@ class Command:
     image: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IMAGE")]
     """The image, or one frame of a recording, as in walk@17."""
     camera: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="FILE|fx,fy,cx,cy|map|unknown",
-            help_behavior_hint="(default: that of the recording)",
-        ),
+        str | None, option("FILE|fx,fy,cx,cy|map|unknown", "that of the recording")
     ] = None
     """Calibration of the image, as in `topoloc localize`."""
     coarse: CoarseOption = None

@@ -27,6 +27,7 @@ from topoloc.apps.cli.output import (
     UsageError,
     catch_stop_signals,
     open_recording,
+    option,
     print_line,
 )
 from topoloc.apps.cli.queries.query_answers import QueryFrame, capture_frames, format_answer
@@ -46,12 +47,7 @@ class Command:
     """A map file, or an atlas."""
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
     """A webcam's number or device, an address (rtsp://, http://), a video, or a recording."""
-    camera: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="FILE|fx,fy,cx,cy|map", help_behavior_hint="(default: that of the recording)"
-        ),
-    ] = None
+    camera: Annotated[str | None, option("FILE|fx,fy,cx,cy|map", "that of the recording")] = None
     """Calibration of the images: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in
     pixels, or `map` for that of the map."""
     format: Format = None
@@ -61,7 +57,7 @@ class Command:
     """Feature types of the map to use, in order. The next one is used if the pose is unclear."""
     plain: Flag = False
     """Print readable lines instead of JSON."""
-    ros: Annotated[int | None, tyro.conf.arg(metavar="DOMAIN", help_behavior_hint="")] = None
+    ros: Annotated[int | None, option("DOMAIN")] = None
     """Also publish the poses in this ROS 2 domain: /topoloc/pose, and TF from map to
     topoloc_camera."""
     config: File = None

@@ -43,6 +43,7 @@ from topoloc.apps.cli.output import (
     check_outputs,
     interruptible,
     open_recording,
+    option,
     print_line,
     print_warning,
     progress_bar,
@@ -81,7 +82,7 @@ class StreamOptions:
     odometry: File = None
     """Poses of the stream from external odometry (TUM format, any world). They predict the next
     pose."""
-    max_jump: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
+    max_jump: Annotated[float | None, option("METRES")] = None
     """Use the paper's rule instead of the motion model: a pose farther than this from the previous
     one is replaced by it."""
 
@@ -99,11 +100,7 @@ class Command:
     """Images, folders of images, videos, recordings. PATH@0:100 selects the first hundred frames of
     PATH. Or one live camera: a device number, rtsp:// or http:// URL, or GStreamer pipeline."""
     camera: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="FILE|fx,fy,cx,cy|map|unknown",
-            help_behavior_hint="(default: that of the recording)",
-        ),
+        str | None, option("FILE|fx,fy,cx,cy|map|unknown", "that of the recording")
     ] = None
     """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels,
     `map` for the map's camera, `unknown` to estimate the focal length."""
@@ -111,9 +108,7 @@ class Command:
     topics: Topics = None
     coarse: CoarseOption = None
     features: QUERY_FEATURES = None
-    max_ms: Annotated[
-        float | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: no limit)")
-    ] = None
+    max_ms: Annotated[float | None, option("N", "no limit")] = None
     """Time limit for an image in milliseconds. The first hypothesis is always tested."""
     near: Annotated[
         str | None, tyro.conf.arg(metavar="LAT,LON,METRES", help_behavior_hint="(atlases only)")

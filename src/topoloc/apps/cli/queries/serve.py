@@ -21,7 +21,7 @@ from topoloc import (
     warm_up,
 )
 from topoloc.apps.cli.features_option import QUERY_FEATURES, open_localizer
-from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, catch_stop_signals
+from topoloc.apps.cli.output import File, Flag, RayOption, UsageError, catch_stop_signals, option
 from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.cluster.config import ReplicasConfig
 from topoloc.apps.service.config import ServiceConfig
@@ -109,24 +109,16 @@ class Command:
     behind_proxy: Flag = False
     """A proxy in front of the service speaks TLS with the clients."""
     features: QUERY_FEATURES = None
-    memory_mb: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 512)")
-    ] = None
+    memory_mb: Annotated[int | None, option("N", "512")] = None
     """Megabytes of maps in memory. The least recently used map is closed first."""
-    workers: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a processor)")
-    ] = None
+    workers: Annotated[int | None, option("N", "one a processor")] = None
     """Images that are localized in parallel."""
-    max_queue: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 32)")
-    ] = None
+    max_queue: Annotated[int | None, option("N", "32")] = None
     """Requests that may wait for a worker. Further ones are refused for the moment."""
     ray: RayOption = None
     """Ray cluster whose machines answer, by Ray Serve: `auto` is the one on this machine, `local` a
     temporary one."""
-    replicas: Annotated[
-        str | None, tyro.conf.arg(metavar="N|LEAST-MOST", help_behavior_hint="(default: 1)")
-    ] = None
+    replicas: Annotated[str | None, option("N|LEAST-MOST", "1")] = None
     """With --ray, the number of processes. LEAST-MOST adapts it to the load."""
     config: File = None
     """TOML file with all other settings, as printed by `topoloc config serve`."""
