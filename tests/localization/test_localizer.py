@@ -170,6 +170,11 @@ class _FromBelow:
         return [NodeScore(node_id, -float(node_id)) for node_id in range(num_candidates)]
 
 
+def test_without_all_nodes_there_is_no_map(localizer: Localizer):
+    with pytest.raises(EmptyMapError, match="no node of the map remains"):
+        localizer.without(one.node_id for one in localizer.topomap.summaries)
+
+
 def test_a_coarse_localizer_of_one_s_own_answers_instead_of_the_map_s(localizer: Localizer):
     own = _FromBelow()
     without = localizer.topomap.with_first_layer(coarse_models={})

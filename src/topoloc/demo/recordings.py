@@ -105,5 +105,5 @@ ROLES: dict[str, Role] = {
 
 
 def find_missing_recordings(folder: Path) -> list[str]:
-    """The names of the demo's recordings that are not in `folder`."""
+    """Return the names of the demo's recordings that are not in `folder`."""
     return [name for name in ROLES if not (folder / name).is_dir()]

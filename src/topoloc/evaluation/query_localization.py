@@ -31,13 +31,13 @@ class Evaluation:
 
     @cached_property
     def by_recording(self) -> dict[str, list[EvaluatedQuery]]:
-        """The answers of each recording by its name, in the order of the queries."""
+        """Return the answers of each recording by its name, in the order of the queries."""
         return group_by_recording(self.answers)
 
     @cached_property
     def world_fits(self) -> list[WorldFit]:
-        """For each recording whose errors one rigid transform explains, that transform: its truth
-        is then given in another world than the map's."""
+        """Return, for each recording whose errors one rigid transform explains, that transform: its
+        truth is then given in another world than the map's."""
         fits = [fit_worlds(answers) for answers in self.by_recording.values()]
         return [fit for fit in fits if fit is not None]
 

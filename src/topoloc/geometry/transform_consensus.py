@@ -18,8 +18,6 @@ from jaxtyping import Bool, Float, Int
 
 from topoloc.geometry.rigid import Rigid3
 
-_NUM_ITERATIONS = 10
-_MIN_STEP = 1e-9
 # Estimates agree if they differ by no more than this, all six residuals together, in sigma. One
 # correct pair in a thousand does not.
 _MAX_SIGMAS = 4.8
@@ -233,15 +231,16 @@ def _refine_transform(
 ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
     """Return the weighted least squares solution over the inliers, starting from the most certain
     one, and its covariance. The covariance is scaled up to the scatter of the inliers."""
+    num_iterations, min_step = 10, 1e-9
     rows = np.flatnonzero(is_inlier).tolist()
     chosen, informations = [a_from_bs[k] for k in rows], np.linalg.inv(covariances[rows])
     mean = chosen[int(np.argmax(np.linalg.slogdet(informations).logabsdet))]
     covariance = np.linalg.inv(informations.sum(axis=0))
-    for _ in range(_NUM_ITERATIONS):
+    for _ in range(num_iterations):
         residuals = _residuals(mean, chosen)
         step = covariance @ np.einsum("nij,nj->i", informations, residuals)
         mean = Rigid3.exp(step) @ mean
-        if np.abs(step).max() < _MIN_STEP:
+        if np.abs(step).max() < min_step:
             break
     residuals = _residuals(mean, chosen)
     square = float(np.einsum("ni,nij,nj->", residuals, informations, residuals))

@@ -138,7 +138,7 @@ class Belief:
 
         Other proposals of nodes may repeat, confirm or find these again.
         """
-        return [one for one in self.hypotheses if not one.evidence.is_from_virtual_views]
+        return [one for one in self.hypotheses if one.evidence.is_of_nodes]
 
     def ranked(self, weights: RivalWeights) -> list[Hypothesis]:
         """Return the hypotheses, sorted by their least margin over the others.

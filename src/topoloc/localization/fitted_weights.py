@@ -170,7 +170,7 @@ class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):
 
         It is NaN for virtual views, whose evidence is of another kind.
         """
-        if evidence.is_from_virtual_views:
+        if not evidence.is_of_nodes:
             return math.nan
         even_share, doubt = _log_even_share(evidence), _log_doubt(evidence)
         return self.odds * log_odds + self.even_share * even_share + self.doubt * doubt
@@ -297,7 +297,7 @@ class FittedWeights:
 
     def of(self, evidence: Evidence) -> EvidenceWeights | VirtualViewWeights:
         """Return the weights of this evidence: of the map's nodes, or of virtual views."""
-        return self.walls if evidence.is_from_virtual_views else self.evidence
+        return self.evidence if evidence.is_of_nodes else self.walls
 
     def log_odds(self, evidence: Evidence) -> float:
         """Return the log-odds that a pose with this evidence is right."""

@@ -197,6 +197,7 @@ class Localizer:
         Raises:
             AtlasError: this is an atlas.
             KeyError: the map has no node with such an id.
+            EmptyMapError: no node remains.
         """
         return Localizer(self.context.without(node_ids))
 

@@ -85,10 +85,12 @@ class OpenMap:
     def without(self, rows: Iterable[Row]) -> OpenMap:
         """Return the same map without these nodes. The other rows keep their numbers.
 
-        Loaded nodes are shared. Virtual views are not used.
+        Loaded nodes are shared. Virtual views are not used. Raises EmptyMapError if none remains.
         """
         other = copy.copy(self)
         other._masked_rows = sorted(set(rows))
+        if len(other._masked_rows) == len(self.node_ids):
+            raise EmptyMapError("no node of the map remains")
         other.coarse = _MaskedCoarseLocalizer(self.coarse, frozenset(other._masked_rows))
         other.__dict__["walls"] = None
         return other

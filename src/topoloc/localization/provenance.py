@@ -48,9 +48,9 @@ class Evidence:
     num_lesser_side: Count | None = None
 
     @property
-    def is_from_virtual_views(self) -> bool:
-        """Return whether the pose was found by virtual views, not by the map's nodes."""
-        return self.num_distinct is not None
+    def is_of_nodes(self) -> bool:
+        """Return whether the pose was found by the map's nodes, not by virtual views."""
+        return self.num_distinct is None
 
     @property
     def precision_probability(self) -> float:
@@ -59,7 +59,7 @@ class Evidence:
         It is 1 for a pose of the nodes, whose log-odds include the precision already. A single wall
         may leave a pose imprecise although the place is certain.
         """
-        return probability_within_tolerance(self.doubt) if self.is_from_virtual_views else 1.0
+        return 1.0 if self.is_of_nodes else probability_within_tolerance(self.doubt)
 
 
 def probability_within_tolerance(doubt: float) -> float:

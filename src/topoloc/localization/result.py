@@ -89,10 +89,10 @@ class Localization:
         return True
 
     @property
-    def is_from_virtual_views(self) -> bool:
-        """Return whether the place was recognised by virtual views, because nearby nodes show
-        another side."""
-        return self.evidence is not None and self.evidence.is_from_virtual_views
+    def is_of_nodes(self) -> bool:
+        """Return whether the place was recognised by the map's nodes, not by virtual views, which
+        serve where nearby nodes show another side."""
+        return self.evidence is None or self.evidence.is_of_nodes
 
     @property
     def position_sigma_m(self) -> float:

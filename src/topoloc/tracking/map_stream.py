@@ -212,7 +212,7 @@ class MapStream:
             tracked.moved_errors + scale * compute_motion_covariance(tracked.motion),
             is_alone,
             is_tracked=True,
-            is_refutable=not reference.found.is_from_virtual_views,
+            is_refutable=reference.found.is_of_nodes,
         )
 
     def _update_with_localization(

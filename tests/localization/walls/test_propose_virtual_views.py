@@ -320,7 +320,7 @@ def test_walls_that_look_alike_elsewhere_have_less_for_them():
     )
     assert _is_pose(once[0].world_from_cam, truth)
     assert len(twice) >= 2
-    assert all(hypothesis.evidence.is_from_virtual_views for hypothesis in (*once, *twice))
+    assert not any(hypothesis.evidence.is_of_nodes for hypothesis in (*once, *twice))
     assert once[0].log_odds > twice[0].log_odds + 0.5
     assert twice[0].log_odds >= twice[1].log_odds
     ways = [hypothesis.world_from_cam.translation[1] for hypothesis in twice]

@@ -122,7 +122,7 @@ def _evaluate_pose(tried: TriedProposal, result: Localization | NotLocalized) ->
         return EvaluatedPose(tried, probability, verdict)
     if tried.world_from_cam is None:
         verdict = f"no pose: the {len(tried.fit.matches)} matches agree on none"
-    elif tried.refined is None and tried.source != "walls":
+    elif tried.refined is None:
         verdict = "the same as an earlier pose"
     else:
         verdict = "rejected: too few of the points that must be visible were found"

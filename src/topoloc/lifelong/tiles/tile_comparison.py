@@ -57,7 +57,7 @@ class TileTransform:
     """Hold the transform between two maps and the evidence for it.
 
     The covariance belongs to the left perturbation of `first_from_second` (m, rad). `num_agreeing`
-    images support the transform. They are images of both maps (`is_from_shared_images`), or nodes
+    images support the transform. They are images of both maps (`shares_images`), or nodes
     of one map localized in the other. `num_near` nodes should be localized, and `num_recognised` of
     them are. In three quarters of these nodes, at least the share `agreeing` of the matches agrees
     with the pose.
@@ -69,7 +69,7 @@ class TileTransform:
     num_near: int = 0
     num_recognised: int = 0
     agreeing: float = 0.0
-    is_from_shared_images: bool = False
+    shares_images: bool = False
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def compare_tiles(
     """
     shared = estimate_by_shared_images(first.topomap, second.topomap)
     if shared is not None:
-        return TileTransform(*shared, is_from_shared_images=True)
+        return TileTransform(*shared, shares_images=True)
     queries = _NodeQueries(first, second), _NodeQueries(second, first)
     common = [kind for kind in first.vectors if kind in second.vectors]
     if not common or not any(one.is_possible for one in queries):

@@ -116,7 +116,7 @@ class PairResult:
     def __str__(self) -> str:
         if isinstance(self.found, NotJoined):
             return self.found.reason
-        if self.found.is_from_shared_images:
+        if self.found.shares_images:
             return f"joined, by {self.found.num_agreeing} pictures that are part of both"
         return (
             f"joined, {self.found.num_agreeing} nodes agree, {self.found.num_recognised} of"
@@ -131,7 +131,7 @@ class PairResult:
         return row | {
             "joined": True,
             "num_agreeing": found.num_agreeing,
-            "same_pictures": found.is_from_shared_images,
+            "same_pictures": found.shares_images,
             "num_near": found.num_near,
             "num_recognised": found.num_recognised,
             "agreeing": round(found.agreeing, 3),
