@@ -124,7 +124,7 @@ def test_joins_do_not_move_what_knows_its_place_on_earth():
         "b": Rigid3.identity(),
         "d": Rigid3(np.eye(3), np.array([1000.0, 0.0, 0.0])),
     }
-    _, places = adjust_joins(
+    adjusted, places = adjust_joins(
         [_join("b", "c", num_agreeing=30), _join("c", "d", num_agreeing=10)], EACH_ITS_OWN, on_earth
     )
     assert [join.residual is None for join in adjusted] == [False, True]
