@@ -14,7 +14,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weights
-from topoloc.localization.map_facts.correlated_errors import find_correlated_error_share
+from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasurement
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.query import Query, QueryImage, StageClock, reduce_image
@@ -54,8 +54,8 @@ class FeatureTypeContext:
         """
         opened = OpenMap(topomap, coarse or config.coarse, kind)
         c, weights = config.for_feature_type(opened.kind), weights or _select_weights(opened)
-        rho = find_correlated_error_share(topomap, kind, c.guided, c.pose, weights.shared_errors)
-        return FeatureTypeContext(opened, c, weights, rho)
+        rho = ErrorShareMeasurement(topomap, kind, c.guided, c.pose, weights.shared_errors)
+        return FeatureTypeContext(opened, c, weights, rho.find())
 
 
 def _select_weights(opened: OpenMap) -> FittedWeights:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from topoloc.localization.guided import GuidedConfig
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts import correlated_errors
 from topoloc.localization.map_facts.correlated_errors import (
+    ErrorShareMeasurement,
     covariance_inflation,
 )
 from topoloc.mapping.topomap import TopoMetricMap
@@ -61,13 +61,13 @@ def test_nodes_out_of_place_have_correlated_errors_and_nodes_in_place_do_not(
 def measurings(monkeypatch: pytest.MonkeyPatch) -> list[TopoMetricMap]:
     """The maps that were measured since."""
     measured: list[TopoMetricMap] = []
-    measure = correlated_errors.measure_correlated_error_share
+    measure = ErrorShareMeasurement.measure
 
-    def told(topomap: TopoMetricMap, *settings: Any) -> float:
-        measured.append(topomap)
-        return measure(topomap, *settings)
+    def told(measurement: ErrorShareMeasurement) -> float:
+        measured.append(measurement.topomap)
+        return measure(measurement)
 
-    monkeypatch.setattr(correlated_errors, "measure_correlated_error_share", told)
+    monkeypatch.setattr(ErrorShareMeasurement, "measure", told)
     return measured
 
 
@@ -154,7 +154,7 @@ def test_the_first_query_computes_nothing_of_the_map(
         raise AssertionError("a digest of the nodes, or what the map knows, at a query")
 
     monkeypatch.setattr("topoloc.mapping.nodes.hashlib.sha256", never)
-    monkeypatch.setattr(correlated_errors, "measure_correlated_error_share", never)
+    monkeypatch.setattr(ErrorShareMeasurement, "measure", never)
     assert localizer.localize(frame.image, frame.camera).localized
     localizer.context.first.map.moves(0)
     with pytest.raises(AssertionError, match="a digest of the nodes"):

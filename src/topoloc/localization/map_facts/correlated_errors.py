@@ -15,7 +15,7 @@ measured again.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -58,117 +58,87 @@ def covariance_inflation(num_inliers: int, rho: float) -> float:
     return 1.0 + num_inliers * rho
 
 
-def find_correlated_error_share(
-    topomap: TopoMetricMap,
-    kind: str,
-    guided: GuidedConfig,
-    pose: AbsolutePoseConfig,
-    weights: CorrelatedErrorWeights,
-) -> float:
-    """Return rho of the map, from its file if the digest matches, and measured otherwise.
+@dataclass(frozen=True, eq=False)
+class ErrorShareMeasurement:
+    """Measure rho of a map for a feature type (see the module docstring).
 
-    Args:
-        kind: the feature type.
-        guided, pose: settings of query matching and pose estimation.
+    `guided` and `pose` are the settings of query matching and pose estimation.
     """
-    known = topomap.layers[kind].shared_errors
-    if known is not None and known.digest == _digest(topomap, guided, pose, weights):
-        return known.rho
-    return measure_correlated_error_share(topomap, kind, guided, pose, weights)
 
+    topomap: TopoMetricMap
+    kind: str
+    guided: GuidedConfig
+    pose: AbsolutePoseConfig
+    weights: CorrelatedErrorWeights
 
-def measure_stored_error_share(
-    topomap: TopoMetricMap,
-    kind: str,
-    guided: GuidedConfig,
-    pose: AbsolutePoseConfig,
-    weights: CorrelatedErrorWeights,
-) -> CorrelatedErrors:
-    """Measure rho and return it with its digest, to be stored in the map."""
-    rho = measure_correlated_error_share(topomap, kind, guided, pose, weights)
-    return CorrelatedErrors(rho, _digest(topomap, guided, pose, weights))
+    def find(self) -> float:
+        """Return rho from the map's file if the digest matches, and measure it otherwise."""
+        known = self.topomap.layers[self.kind].shared_errors
+        if known is not None and known.digest == self._digest():
+            return known.rho
+        return self.measure()
 
+    def measure_stored(self) -> CorrelatedErrors:
+        """Measure rho and return it with its digest, to be stored in the map."""
+        return CorrelatedErrors(self.measure(), self._digest())
 
-def measure_correlated_error_share(
-    topomap: TopoMetricMap,
-    kind: str,
-    guided: GuidedConfig,
-    pose: AbsolutePoseConfig,
-    weights: CorrelatedErrorWeights,
-) -> float:
-    """Measure rho of the map (see the module docstring)."""
-    poses = topomap.node_poses
-    lambda_rot, d_thresh = topomap.config.lambda_rot, topomap.config.d_thresh
-    nodes = topomap.layers[kind].nodes
-    rows = np.unique(
-        np.linspace(0, len(topomap.summaries) - 1, _SETTINGS["num_nodes"]).round().astype(int)
-    )
-    num_helpers, min_inliers = _SETTINGS["num_helpers"], _SETTINGS["min_inliers"]
-    for min_distance in _SETTINGS["min_distances"]:
-        rhos = []
-        for row in as_rows(rows):
-            node = nodes[row]
-            distances = node_distances(node.summary.world_from_cam, poses, lambda_rot)
-            order = np.argsort(distances, kind="stable")
-            helpers = order[distances[order] > min_distance * d_thresh][:num_helpers]
-            rho = _error_share_of_node(
-                node, [nodes[int(k)] for k in helpers], guided, pose, min_inliers
-            )
-            if rho is not None:
-                rhos.append(rho)
-        if len(rhos) >= _SETTINGS["min_nodes"]:
-            return max(
-                weights.factor * float(np.percentile(rhos, _SETTINGS["percentile"])), weights.least
-            )
-    return weights.unknown
+    def measure(self) -> float:
+        """Measure rho."""
+        poses, config = self.topomap.node_poses, self.topomap.config
+        nodes = self.topomap.layers[self.kind].nodes
+        rows = np.linspace(0, len(self.topomap.summaries) - 1, _SETTINGS["num_nodes"])
+        for min_distance in _SETTINGS["min_distances"]:
+            rhos = []
+            for row in as_rows(np.unique(rows.round().astype(int))):
+                distances = node_distances(
+                    nodes[row].summary.world_from_cam, poses, config.lambda_rot
+                )
+                order = np.argsort(distances, kind="stable")
+                is_far = distances[order] > min_distance * config.d_thresh
+                helpers = order[is_far][: _SETTINGS["num_helpers"]]
+                rho = self._measure_at_node(nodes[row], [nodes[int(k)] for k in helpers])
+                if rho is not None:
+                    rhos.append(rho)
+            if len(rhos) >= _SETTINGS["min_nodes"]:
+                rho = float(np.percentile(rhos, _SETTINGS["percentile"]))
+                return max(self.weights.factor * rho, self.weights.least)
+        return self.weights.unknown
 
+    def _digest(self) -> str:
+        """Return a digest of all inputs of rho."""
+        settings = {
+            "guided": asdict(self.guided),
+            "pose": asdict(self.pose) | {"confidence": 0.999, "max_refinement_steps": 10},
+            "config": _SETTINGS | to_builtins(self.weights),
+            "nodes": asdict(self.topomap.config.nodes),
+        }
+        return compute_nodes_digest(
+            self.topomap.summaries, json.dumps([_METHOD, settings], sort_keys=True).encode()
+        )
 
-def _digest(
-    topomap: TopoMetricMap,
-    guided: GuidedConfig,
-    pose: AbsolutePoseConfig,
-    weights: CorrelatedErrorWeights,
-) -> str:
-    """Return a digest of all inputs of rho."""
-    settings = {
-        "guided": asdict(guided),
-        "pose": asdict(pose) | {"confidence": 0.999, "max_refinement_steps": 10},
-        "config": _SETTINGS | to_builtins(weights),
-        "nodes": asdict(topomap.config.nodes),
-    }
-    return compute_nodes_digest(
-        topomap.summaries, json.dumps([_METHOD, settings], sort_keys=True).encode()
-    )
+    def _measure_at_node(self, node: TopoNode, helpers: list[TopoNode]) -> float | None:
+        """Estimate rho from the pose of one node, localized with the points of `helpers`.
 
-
-def _error_share_of_node(
-    node: TopoNode,
-    helpers: list[TopoNode],
-    guided: GuidedConfig,
-    config: AbsolutePoseConfig,
-    min_inliers: int,
-) -> float | None:
-    """Estimate rho from the pose of one node, localized with the points of `helpers`.
-
-    None if they have too few points in common.
-    """
-    if not helpers:
-        return None
-    cam_from_world = node.summary.world_from_cam.inverse()
-    local_map = LocalMap.concatenate([LocalMap.of_node(helper) for helper in helpers])
-    matches = match_guided(node.features, local_map, cam_from_world, node.camera, guided)
-    if len(matches) < min_inliers:
-        return None
-    found: AbsolutePose | None = estimate_absolute_pose(
-        node.features.points_img[matches.query_idx].astype(np.float64),
-        local_map.points_world[matches.train_idx],
-        node.camera,
-        config,
-        point_covariances=local_map.covariances[matches.train_idx],
-        start=cam_from_world,
-    )
-    if found is None or np.count_nonzero(found.inliers) < min_inliers:
-        return None
-    error: Float[np.ndarray, " 6"] = (found.cam_from_world @ cam_from_world.inverse()).log()
-    square = float(error @ np.linalg.solve(found.covariance, error))
-    return (square / _MEDIAN_CHI_SQUARE_6 - 1.0) / np.count_nonzero(found.inliers)
+        None if they have too few points in common.
+        """
+        if not helpers:
+            return None
+        min_inliers = _SETTINGS["min_inliers"]
+        cam_from_world = node.summary.world_from_cam.inverse()
+        local_map = LocalMap.concatenate([LocalMap.of_node(helper) for helper in helpers])
+        matches = match_guided(node.features, local_map, cam_from_world, node.camera, self.guided)
+        if len(matches) < min_inliers:
+            return None
+        found: AbsolutePose | None = estimate_absolute_pose(
+            node.features.points_img[matches.query_idx].astype(np.float64),
+            local_map.points_world[matches.train_idx],
+            node.camera,
+            self.pose,
+            point_covariances=local_map.covariances[matches.train_idx],
+            start=cam_from_world,
+        )
+        if found is None or np.count_nonzero(found.inliers) < min_inliers:
+            return None
+        error: Float[np.ndarray, " 6"] = (found.cam_from_world @ cam_from_world.inverse()).log()
+        square = float(error @ np.linalg.solve(found.covariance, error))
+        return (square / _MEDIAN_CHI_SQUARE_6 - 1.0) / np.count_nonzero(found.inliers)

@@ -16,7 +16,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import select_hypothesis
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import load_fitted_weights
-from topoloc.localization.map_facts.correlated_errors import measure_stored_error_share
+from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasurement
 from topoloc.localization.map_facts.repetition import digest_of
 from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
@@ -100,14 +100,12 @@ def with_map_statistics(topomap: TopoMetricMap, progress: Progress | None = None
 
 def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
     """Measure rho of a map for a feature type."""
-    config_of_type = LocalizerConfig().for_feature_type(find_feature_type(kind))
-    return measure_stored_error_share(
-        topomap,
-        kind,
-        config_of_type.guided,
-        config_of_type.pose,
-        load_fitted_weights(kind).shared_errors,
+    c, weights = (
+        LocalizerConfig().for_feature_type(find_feature_type(kind)),
+        load_fitted_weights(kind),
     )
+    rho = ErrorShareMeasurement(topomap, kind, c.guided, c.pose, weights.shared_errors)
+    return rho.measure_stored()
 
 
 def with_repetitions(topomap: TopoMetricMap, progress: Progress | None = None) -> TopoMetricMap:
