@@ -199,7 +199,7 @@ def test_every_module_loads_without_extras_but_learned_classifiers_and_figures()
     modules, learning, asked = json.loads(answer.stdout)
     assert "topoloc.localization.localizer" in modules
     assert "topoloc.retrieval.cnn_fc" in learning
-    assert "topoloc.retrieval.network_config" not in learning
+    assert "topoloc.retrieval.network_images" not in learning
     drawing = {
         f"topoloc.apps.report.{name}"
         for name in ("figures", "map_figure", "report", "weak_regions_figure", "weak_regions_page")

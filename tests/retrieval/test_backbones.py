@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from topoloc.retrieval.backbones import Backbone, normalize_images
-from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_images import BackboneName
 
 
 # Parameters as torchvision's documentation of each model states them; 4.65 million of

@@ -16,8 +16,7 @@ from topoloc.errors import MapError, TrainingError
 from topoloc.retrieval.backbones import Backbone
 from topoloc.retrieval.cnn_fc import CnnFc
 from topoloc.retrieval.coarse import CoarseModel, open_coarse_localizer
-from topoloc.retrieval.network_config import NetworkInputConfig
-from topoloc.retrieval.network_images import decode_stored_image
+from topoloc.retrieval.network_images import NetworkInputConfig, decode_stored_image
 from topoloc_training import cnn_fc, frozen_maps, training
 from topoloc_training.classifier_config import AugmentationConfig, CnnFcConfig, TrainingConfig
 from topoloc_training.cnn_fc import calibrated_temperature, soft_labels

@@ -17,8 +17,7 @@ from topoloc.errors import TrainingError
 from topoloc.lifelong.session_content import update_coarse_models
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel, open_coarse_localizer
-from topoloc.retrieval.network_config import NetworkInputConfig
-from topoloc.retrieval.network_images import decode_stored_image
+from topoloc.retrieval.network_images import NetworkInputConfig, decode_stored_image
 from topoloc_training import cnn_fc, cnn_nn
 from topoloc_training.classifier_config import (
     AugmentationConfig,

@@ -19,7 +19,7 @@ from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import write_bytes
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.network_config import NetworkInputConfig
+from topoloc.retrieval.network_images import NetworkInputConfig
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.settings import LEARNED, Bench, sequence_digest
 from topoloc_paper.stage_code import MAPPING, TEACHING_MODULES, learning

@@ -24,8 +24,12 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc.retrieval.coarse import Image
 from topoloc.retrieval.inference import BATCH_SIZE, to_channels_last
-from topoloc.retrieval.network_config import BackboneName, NetworkInputConfig
-from topoloc.retrieval.network_images import ImageShape, prepare_network_images
+from topoloc.retrieval.network_images import (
+    BackboneName,
+    ImageShape,
+    NetworkInputConfig,
+    prepare_network_images,
+)
 from topoloc_paper.pose_losses import beta_loss, learnt_loss, reprojection_loss
 from topoloc_training.augmentation import augment
 from topoloc_training.classifier_config import AugmentationConfig, TrainingConfig

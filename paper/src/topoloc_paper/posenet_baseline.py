@@ -16,7 +16,7 @@ import numpy as np
 
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.retrieval.network_config import NetworkInputConfig
+from topoloc.retrieval.network_images import NetworkInputConfig
 from topoloc_paper.asking import queries_of
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.maps import MapKind, built, path_of

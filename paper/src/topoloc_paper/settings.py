@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from topoloc.recordings.frame import StereoSequence
-from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_images import BackboneName
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.stages import StageStore, digest_of
 from topoloc_paper.stored_answers import pose_to_json

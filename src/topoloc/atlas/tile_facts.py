@@ -31,8 +31,6 @@ def find_other_facts(tile: Tile, path: Path) -> list[str]:
 def map_facts(topomap: TopoMetricMap) -> dict[str, Any]:
     """Return the entries of a tile that follow from its map."""
     centres = np.array([summary.world_from_cam.translation for summary in topomap.summaries])
-    session_ids = [summary.session_id for summary in topomap.summaries]
-    _, first_rows = np.unique(session_ids, return_index=True)
     known = topomap.georeference
     return {
         "map_id": topomap.id,
@@ -40,7 +38,7 @@ def map_facts(topomap: TopoMetricMap) -> dict[str, Any]:
         "kinds": tuple(topomap.kinds),
         "num_nodes": len(topomap.summaries),
         "sessions": tuple(sorted({summary.recording for summary in topomap.summaries})),
-        "focal_px": max(float(topomap.nodes[row].camera.fx) for row in first_rows),
+        "focal_px": topomap.max_focal_length_px(),
         "box_world": np.array([centres.min(axis=0), centres.max(axis=0)]),
         "georeference": known,
         "geo_box": None if known is None else geo_box([*map(known.geopoint, centres)]),

@@ -6,7 +6,7 @@ Nodes are identified by their rows.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -75,8 +75,10 @@ class OpenMap:
         self._local_map = CachedNodes(lambda row: LocalMap.of_node(self._nodes[row]))
         self._moves = CachedNodes(self._find_moves)
         self._template = CachedNodes(lambda row: NodeTemplate.of_node(self._nodes[row]))
-        self._stored_moves = _stored_moves(topomap)
-        self.focal = self._max_focal_length()
+        known = topomap.repetitions
+        is_current = known is not None and known.digest == digest_of(topomap.summaries)
+        self._stored_moves = dict(known.moves) if known is not None and is_current else None
+        self.focal = topomap.max_focal_length_px()
         self._predicted_at_nodes: tuple[Camera, CachedNodes[Float32[np.ndarray, "n 5"]]] | None = (
             None
         )
@@ -201,15 +203,6 @@ class OpenMap:
         spread = np.unique(np.linspace(0, len(near) - 1, NUM_NEIGHBOURS).round().astype(int))
         return find_repetition_shifts(node, self.local_map(as_rows(near[spread])))
 
-    def _max_focal_length(self) -> float:
-        """Return the focal length (pixels) of the finest mapping camera.
-
-        Each recording is assumed to have one camera.
-        """
-        summaries = self.topomap.summaries
-        first_rows = {summaries[row].session_id: row for row in reversed(range(len(summaries)))}
-        return max(self._nodes[row].camera.fx for row in first_rows.values())
-
     def distances(self, world_from_cam: Rigid3) -> Float[np.ndarray, " nodes"]:
         """Return D_total of Eq. 1 (metres) between a camera and each node, for any camera roll."""
         distances = node_distances_for_any_roll(world_from_cam, self.node_poses, self.lambda_rot)
@@ -234,13 +227,3 @@ class _MaskedCoarseLocalizer:
         return [candidate for candidate in ranked if candidate.row not in self._masked_rows][
             :num_candidates
         ]
-
-
-def _stored_moves(topomap: TopoMetricMap) -> Mapping[NodeId, Float[np.ndarray, "k 4 4"]] | None:
-    """Return the map's stored moves by node id, None if they belong to other nodes."""
-    known = topomap.repetitions
-    return (
-        dict(known.moves)
-        if known is not None and known.digest == digest_of(topomap.summaries)
-        else None
-    )

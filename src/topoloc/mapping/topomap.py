@@ -178,6 +178,15 @@ class TopoMetricMap:
         """Return the poses of all nodes as arrays."""
         return NodePoses.of([summary.world_from_cam for summary in self.summaries])
 
+    def max_focal_length_px(self) -> float:
+        """Return the focal length (pixels) of the finest mapping camera.
+
+        Each session is assumed to have one camera.
+        """
+        rows = range(len(self.summaries))
+        first_rows = {self.summaries[row].session_id: row for row in reversed(rows)}
+        return max(float(self.nodes[row].camera.fx) for row in first_rows.values())
+
     def find_neighbours(self, poses: list[Rigid3], max_neighbours: int) -> list[list[int]]:
         """Return for each of these poses the nearest others of them, by the distance of Eq. 1.
 

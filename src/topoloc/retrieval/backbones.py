@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad, relu6
 
-from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_images import BackboneName
 
 # Statistics of ImageNet, for the pretrained networks. The input is (RGB in [0, 1] - mean)
 # / deviation.

@@ -20,8 +20,12 @@ from topoloc.node_ids import Row
 from topoloc.retrieval.backbones import Backbone, has_wide_classifier
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, read_setting
 from topoloc.retrieval.inference import Predictor, load_network_weights
-from topoloc.retrieval.network_config import BackboneName, ClassifierNetworkConfig
-from topoloc.retrieval.network_images import ImageShape, prepare_network_images
+from topoloc.retrieval.network_images import (
+    BackboneName,
+    ClassifierNetworkConfig,
+    ImageShape,
+    prepare_network_images,
+)
 
 NAME = "cnn-fc"
 MAX_OUTPUTS = 100_000

@@ -15,8 +15,7 @@ from topoloc.features.features import Features
 from topoloc.retrieval.coarse import CoarseModel, Image, NodeScore, model_array, read_setting
 from topoloc.retrieval.descriptor_index import DescriptorIndex, Whitening
 from topoloc.retrieval.inference import Predictor, load_network_weights
-from topoloc.retrieval.network_config import NetworkInputConfig
-from topoloc.retrieval.network_images import ImageShape, prepare_network_images
+from topoloc.retrieval.network_images import ImageShape, NetworkInputConfig, prepare_network_images
 
 _CHUNK = 64  # images that pass through the network together
 

@@ -29,9 +29,9 @@ from topoloc.slam.keyframes import (
     Landmarks,
     Motion,
     Observations,
+    triangulate_points,
 )
 from topoloc.slam.step_estimation import LastFrame, Step, Tracks
-from topoloc.slam.triangulation import triangulate_points
 
 _PATCH_HALF_PX = 7
 

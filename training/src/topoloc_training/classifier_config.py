@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from topoloc.bounds import Above, AtLeast, Between
-from topoloc.retrieval.network_config import (
+from topoloc.retrieval.network_images import (
     ClassifierNetworkConfig,
     PooledNetworkConfig,
     VladNetworkConfig,

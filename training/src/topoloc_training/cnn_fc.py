@@ -15,8 +15,7 @@ from topoloc.errors import TrainingError
 from topoloc.retrieval.cnn_fc import NAME, NodeClassifier
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.inference import BATCH_SIZE, to_channels_last
-from topoloc.retrieval.network_config import BackboneName
-from topoloc.retrieval.network_images import prepare_network_images
+from topoloc.retrieval.network_images import BackboneName, prepare_network_images
 from topoloc_training.classifier_config import CnnFcConfig
 from topoloc_training.frozen_maps import FrozenMaps, plain_maps
 from topoloc_training.stored_weights import rounded_to_half, to_arrays

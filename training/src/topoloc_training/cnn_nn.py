@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from topoloc.retrieval.cnn_nn import create_pooled_network
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_images import BackboneName
 from topoloc_training.classifier_config import CnnNnConfig
 from topoloc_training.place_vectors import fit_vectors
 from topoloc_training.training_set import Progress, TrainingSet

@@ -15,7 +15,7 @@ from topoloc.errors import EmptyMapError, TrainingError
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.coarse import CoarseModel
-from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_images import BackboneName
 from topoloc_training.classifier_config import CnnFcConfig, CnnNnConfig, VladNnConfig
 from topoloc_training.training_set import Progress, TrainingSet
 

@@ -15,8 +15,7 @@ from topoloc.retrieval.backbones import Backbone, normalize_images
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.descriptor_index import learn_visual_words
 from topoloc.retrieval.inference import BATCH_SIZE
-from topoloc.retrieval.network_config import BackboneName
-from topoloc.retrieval.network_images import RgbImages, prepare_network_images
+from topoloc.retrieval.network_images import BackboneName, RgbImages, prepare_network_images
 from topoloc.retrieval.vlad_nn import DEPTHS, NetVlad, VladNetwork
 from topoloc_training.classifier_config import TripletConfig, VladNnConfig
 from topoloc_training.place_vectors import fit_vectors

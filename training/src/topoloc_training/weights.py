@@ -26,7 +26,7 @@ from topoloc.errors import WeightsError
 from topoloc.features.network_files import cache_folder
 from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.backbones import NUM_CHANNELS, Backbone
-from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_images import BackboneName
 from topoloc_training.efficientnet_weights import installed_file, is_efficientnet, named_as_backbone
 
 SCRATCH = "scratch"

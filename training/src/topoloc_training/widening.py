@@ -10,7 +10,7 @@ from topoloc.errors import TrainingError
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.retrieval.cnn_fc import NAME, open_model
-from topoloc.retrieval.network_config import BackboneName
+from topoloc.retrieval.network_images import BackboneName
 from topoloc_training.weights import Weights
 
 MAP = "map"
