@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from msgspec import defstruct
 from msgspec.structs import astuple
 
@@ -204,6 +204,17 @@ class Camera:
     def undistorted(self) -> Camera:
         """Return the pinhole camera with the same matrix and size."""
         return Camera.pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    @property
+    def radius_scale(self) -> float:
+        """Return the factor of a radius that is meant for images of 640 pixels, at least 0.5."""
+        return max(max(self.width, self.height) / 640.0, 0.5)
+
+    def is_in_image(self, points_img: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+        """Return which pixels are in the image. NaN is not."""
+        size = np.array([self.width, self.height])
+        with np.errstate(invalid="ignore"):
+            return np.all((points_img >= -0.5) & (points_img < size - 0.5), axis=1)
 
     def with_focal(self, focal: float) -> Camera:
         """Return the camera with this focal length (pixels) in both directions."""

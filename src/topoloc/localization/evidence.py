@@ -288,9 +288,7 @@ def _count_agreeing_matches(
                 camera.img_from_cam(cam_from_world.apply(points_world))
                 - unguided.features.points_img[unguided.matches.query_idx]
             )
-            is_near |= np.linalg.norm(offsets, axis=1) < agreement_px * max(
-                max(camera.width, camera.height) / 640.0, 0.5
-            )
+            is_near |= np.linalg.norm(offsets, axis=1) < agreement_px * camera.radius_scale
     return int(np.count_nonzero(is_near))
 
 

@@ -138,7 +138,7 @@ def _match_predictions(
         features.descriptors,
         float(camera.width),
         float(camera.height),
-        float(config.radius_px * max(max(camera.width, camera.height) / 640.0, 0.5)),
+        float(config.radius_px * camera.radius_scale),
         np.float32(config.max_scale),
         np.float32(np.cos(config.max_turn) if config.max_turn < math.pi else -math.inf),
         np.float32(config.min_similarity),
@@ -160,15 +160,11 @@ def _project_points(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
     """Return the map points in the camera frame (metres) and their pixels, NaN if out of view."""
     if not camera.is_distorted:
-        rotation, translation = (
-            np.ascontiguousarray(cam_from_world.rotation),
-            np.ascontiguousarray(cam_from_world.translation),
-        )
         fx, fy, cx, cy = camera.intrinsics
         return project_undistorted(
             local_map.points_world,
-            rotation,
-            translation,
+            np.ascontiguousarray(cam_from_world.rotation),
+            np.ascontiguousarray(cam_from_world.translation),
             (fx, fy),
             (cx, cy),
             camera.width,
@@ -176,13 +172,7 @@ def _project_points(
         )
     points_cam = cam_from_world.apply(local_map.points_world)
     pixels = camera.img_from_cam(points_cam)
-    with np.errstate(invalid="ignore"):
-        inside = (
-            (pixels >= -0.5).all(axis=1)
-            & (pixels[:, 0] < camera.width - 0.5)
-            & (pixels[:, 1] < camera.height - 0.5)
-        )
-    return points_cam, np.where(inside[:, None], pixels, np.nan)
+    return points_cam, np.where(camera.is_in_image(pixels)[:, None], pixels, np.nan)
 
 
 def predict_key_points(
@@ -213,5 +203,4 @@ def count_consistent_displacements(
     `within_px` refers to an image whose longer side is 640 pixels, and scales with the image size.
     """
     shifts = features.points_img[matches.query_idx] - predicted[matches.train_idx, :2]
-    scale = max(max(camera.width, camera.height) / 640.0, 0.5)
-    return int(largest_agreement(shifts, np.float32(within_px * scale)))
+    return int(largest_agreement(shifts, np.float32(within_px * camera.radius_scale)))

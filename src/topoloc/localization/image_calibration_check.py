@@ -45,16 +45,6 @@ from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
 
-_SUSPECT_LIMITS, _REPORTED_LIMITS = (
-    (3.0, 0.01),
-    (5.0, 0.035),
-)  # sigmas, and share of the focal length or image width
-_ROUNDS, _CONVERGED_CHANGE = 4, 0.003
-_INLIER_RADII_PX, _LEAST_GAIN = (
-    (1.0, 2.0),
-    3.0,
-)  # px for a 640-px image; total gain in sigmas
-
 
 def check_camera_calibrations(
     results: Iterable[Localization | NotLocalized],
@@ -84,6 +74,8 @@ def check_image_calibration(
         The deviation from the calibration, None if it cannot be estimated or there is no
         calibration. And the mismatch, None if the two agree.
     """
+    suspect, reported = (3.0, 0.01), (5.0, 0.035)  # sigmas, share of focal length or image width
+    min_gain = 3.0  # total gain of the image's own camera, in sigmas
     if isinstance(fit.input_camera, UncalibratedCamera):
         return None, None
     if (mismatch := _check_distortion(search, fit)) is not None:
@@ -91,13 +83,13 @@ def check_image_calibration(
     found = _estimate_image_calibration(search, fit)
     if found is None:
         return None, None
-    if not any(_is_calibration_off(fit, found, fit.camera, *_SUSPECT_LIMITS)):
+    if not any(_is_calibration_off(fit, found, fit.camera, *suspect)):
         return compute_intrinsics_deviation(fit.camera, fit.camera, found, fit.node_id), None
     by_calibration, calibrated, first, place = fit, fit.camera, fit.cam_from_world, fit.node_id
     fit, found = _refine_image_calibration(search, fit, found)
     seen = compute_intrinsics_deviation(calibrated, fit.camera, found, place)
-    is_off = _is_calibration_off(fit, found, calibrated, *_REPORTED_LIMITS)
-    if not any(is_off) or _gain(by_calibration, fit) < _LEAST_GAIN:
+    is_off = _is_calibration_off(fit, found, calibrated, *reported)
+    if not any(is_off) or _gain(by_calibration, fit) < min_gain:
         return seen, None
     camera, scale = corrected_camera(fit.camera, found), search.query.scale
     sigma = math.sqrt(
@@ -168,7 +160,8 @@ def _refine_image_calibration(
 
     It does nothing if `guided.num_nodes` is 0.
     """
-    for _ in range(_ROUNDS if search.config.guided.num_nodes else 0):
+    num_rounds, converged_change = 4, 0.003
+    for _ in range(num_rounds if search.config.guided.num_nodes else 0):
         around = _rematch(search, fit, found)
         if not isinstance(around, PoseFit):
             break
@@ -176,7 +169,7 @@ def _refine_image_calibration(
         if again is None:  # no estimate: keep the previous one
             break
         fit, found = around, again
-        if max(abs(math.log(found.scale)), float(np.abs(found.offset).max())) < _CONVERGED_CHANGE:
+        if max(abs(math.log(found.scale)), float(np.abs(found.offset).max())) < converged_change:
             break
     return fit, found
 
@@ -186,23 +179,17 @@ def _gain(before: PoseFit, after: PoseFit) -> float:
 
     It is summed over two radii.
     """
-    counts = [
-        (_count_within_radius(before, px), _count_within_radius(after, px))
-        for px in _INLIER_RADII_PX
-    ]
+    radii_px = 1.0, 2.0  # in an image of 640 pixels
+    counts = [[_count_within_radius(fit, px) for fit in (before, after)] for px in radii_px]
     return sum((then - now) / math.sqrt(max(now, 1)) for now, then in counts)
 
 
 def _count_within_radius(fit: PoseFit, px: float) -> int:
     """Count the points within a radius of their projections, in pixels of a 640-pixel-wide
     image."""
-    seen = fit.inlier_observations(1.0)
-    offsets = fit.camera.img_from_cam(fit.cam_from_world.apply(seen.points_world)) - seen.points_img
-    return int(
-        np.count_nonzero(
-            np.linalg.norm(offsets, axis=1) < px * max(fit.camera.width, fit.camera.height) / 640.0
-        )
-    )
+    errors_px = fit.inlier_observations(1.0).errors_px(fit.camera, fit.cam_from_world)
+    max_error_px = px * max(fit.camera.width, fit.camera.height) / 640.0
+    return int(np.count_nonzero(errors_px < max_error_px))
 
 
 def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibration | None:
@@ -220,14 +207,10 @@ def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibratio
 
 def _rematch(search: Search, fit: PoseFit, found: ImageCalibration) -> PointMatches:
     """Match the points again around the estimated pose and camera."""
-    camera, cam_from_world, config = (
-        corrected_camera(fit.camera, found),
-        found.cam_from_world,
-        search.config,
-    )
-    local_map = search.map.local_map(
-        search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes)
-    )
+    camera, cam_from_world = corrected_camera(fit.camera, found), found.cam_from_world
+    config = search.config
+    rows = search.map.nearest(cam_from_world.inverse(), config.guided.num_nodes)
+    local_map = search.map.local_map(rows)
     matches = match_guided(fit.features, local_map, cam_from_world, camera, config.guided)
     return fit_pose(fit.features, camera, local_map, matches, config.pose, (cam_from_world, camera))
 

@@ -87,6 +87,12 @@ class PointObservations:
             self.points_img[rows], self.points_world[rows], self.covariances[rows]
         )
 
+    def errors_px(self, camera: Camera, cam_from_world: Rigid3) -> Float[np.ndarray, " n"]:
+        """Return the distances of the pixels from the projections of their points."""
+        with np.errstate(invalid="ignore"):
+            projected = camera.img_from_cam(cam_from_world.apply(self.points_world))
+            return np.linalg.norm(projected - self.points_img, axis=1)
+
     def to_image_scale(self, scale: float) -> PointObservations:
         """Return the same points in an image that is `scale` times as wide."""
         points_img = (
@@ -158,6 +164,12 @@ class PoseFit(PointMatches):
     def world_from_cam(self) -> Rigid3:
         """Return the pose."""
         return self.cam_from_world.inverse()
+
+    @property
+    def median_depth(self) -> float:
+        """Return the median depth of the inliers, metres."""
+        points_world = self.local_map.points_world[self.inlier_point_idx]
+        return float(np.median(self.cam_from_world.apply(points_world)[:, 2]))
 
     @cached_property
     def _bounding_box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:

@@ -83,19 +83,15 @@ def is_already_found(proposal: NodeProposal) -> bool:
     search, fit, config = proposal.search, proposal.fit, proposal.search.config
     if not isinstance(fit, PoseFit):
         return False
-    radius_px = config.guided.radius_px * max(max(fit.camera.width, fit.camera.height) / 640.0, 0.5)
+    radius_px = config.guided.radius_px * fit.camera.radius_scale
     for known in search.belief.of_nodes:
         if known.probability < config.evidence.min_probability:
             continue
-        seen = known.fit.inlier_observations(1.0)
-        with np.errstate(invalid="ignore"):
-            apart = np.linalg.norm(
-                fit.camera.img_from_cam(fit.cam_from_world.apply(seen.points_world))
-                - seen.points_img,
-                axis=1,
-            )
+        apart = known.fit.inlier_observations(1.0).errors_px(fit.camera, fit.cam_from_world)
         min_shared = 0.75 * len(apart)  # the rest may be occluded or out of view
-        if np.count_nonzero(apart < radius_px) >= min_shared:
+        with np.errstate(invalid="ignore"):
+            num_shared = np.count_nonzero(apart < radius_px)
+        if num_shared >= min_shared:
             return True
     return False
 

@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
 from topoloc.geometry.rigid import inverse_covariance
@@ -20,12 +20,11 @@ from topoloc.localization.evidence import (
     is_only_imprecise,
 )
 from topoloc.localization.image_calibration_check import check_image_calibration
-from topoloc.localization.pose_fit import PointObservations
+from topoloc.localization.pose_fit import PointMatches, PointObservations
 from topoloc.localization.provenance import Provenance, probability_within_tolerance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
 
-_MIN_DISTANT_ANGLE_DEG = 10.0
 MIN_ALTERNATIVE_RATIO = 0.01  # relative to the best probability; less probable ones are dropped
 
 
@@ -41,10 +40,8 @@ def decide_result(search: Search) -> ResultWithInliers:
     min_probability = search.config.evidence.min_probability
     if not ranked or ranked[0].probability < min_probability:
         return _explain_not_localized(search, ranked), []
-    best, log_odds_margins = (
-        ranked[0],
-        [_log_odds_margin(search, ranked[0], other) for other in ranked[1:]],
-    )
+    best = ranked[0]
+    log_odds_margins = [_log_odds_margin(search, best, other) for other in ranked[1:]]
     others = math.exp(-best.log_odds) + sum(math.exp(-one) for one in log_odds_margins)
     probability = best.evidence.precision_probability / (1.0 + others)
     is_leading = all(
@@ -77,15 +74,15 @@ def decide_final_result(search: Search) -> ResultWithInliers:
         result = replace(result, seen_camera=seen, times_ms=search.query.clock.times_ms())
         return result, [(result, points) for _, points in named]
     covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
-    evidence = replace(
-        best.evidence,
-        doubt=max(best.evidence.doubt, _uncertainty_with_covariance(search, best, covariance)),
+    uncertainty = compute_normalized_uncertainty(
+        covariance, best.fit.median_depth, search.config.evidence
     )
+    evidence = replace(best.evidence, doubt=max(best.evidence.doubt, uncertainty))
     penalized = replace(best, covariance=covariance, evidence=evidence)
     probability = result.probability * probability_within_tolerance(evidence.doubt)
     if probability < search.config.evidence.min_probability:
         refusal = _build_not_localized(
-            search, "too_few_inliers", penalized, f"the calibration is doubtful: {doubt}"
+            search, "too_few_inliers", best.fit, f"the calibration is doubtful: {doubt}"
         )
         return replace(refusal, seen_camera=seen), []
     localization, points = _build_localization(search, penalized, probability)
@@ -98,26 +95,17 @@ def _weigh_camera(
 ) -> ResultWithInliers:
     """Return the result of a camera without calibration, with the probability that the pose is
     within the tolerance whatever its camera may be."""
-    config, seen = search.config.evidence, best.fit.inlier_observations(1.0)
-    depth = float(np.median(best.fit.cam_from_world.apply(seen.points_world)[:, 2]))
-    tolerances = compute_translation_tolerance(depth, config), math.radians(config.max_rotation_deg)
+    config = search.config.evidence
+    max_translation = compute_translation_tolerance(best.fit.median_depth, config)
+    tolerances = max_translation, math.radians(config.max_rotation_deg)
     probability = result.probability * camera.probability_within(*tolerances)
     if probability >= config.min_probability:
         named = _build_localization(search, best, probability)
         return named[0], [named]
-    detail = "a cropped image or another lens would put the camera elsewhere"
+    detail = "a cropped image or another lens would put the camera elsewhere: state --camera"
     if camera.is_contradicted:
-        detail = "the image contradicts all camera models, as a panorama does"
-    return _build_not_localized(search, "too_few_inliers", best, f"{detail}: state --camera"), []
-
-
-def _uncertainty_with_covariance(
-    search: Search, best: Hypothesis, covariance: Float[np.ndarray, "6 6"]
-) -> float:
-    """Compute `Evidence.doubt` of the hypothesis for another covariance."""
-    seen = best.fit.inlier_observations(1.0)
-    depth = float(np.median(best.fit.cam_from_world.apply(seen.points_world)[:, 2]))
-    return compute_normalized_uncertainty(covariance, depth, search.config.evidence)
+        detail = "the image contradicts all camera models, as a panorama does: state --camera"
+    return _build_not_localized(search, "too_few_inliers", best.fit, detail), []
 
 
 def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
@@ -128,30 +116,21 @@ def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> flo
     well.
     """
     by_all = log_odds_margin(best, other, search.weights.rivals)
-    return (
-        min(by_all, best.log_odds - other.log_odds)
-        if _is_unclear_and_distant(search, best, other)
-        else by_all
-    )
+    is_unclear = _is_unclear_and_distant(search, best, other)
+    return min(by_all, best.log_odds - other.log_odds) if is_unclear else by_all
 
 
 def _min_log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
-    return (
-        search.weights.rivals.unclear_lead
-        if _is_unclear_and_distant(search, best, other)
-        else search.weights.rivals.lead
-    )
+    rivals = search.weights.rivals
+    return rivals.unclear_lead if _is_unclear_and_distant(search, best, other) else rivals.lead
 
 
 def _is_unclear_and_distant(search: Search, best: Hypothesis, other: Hypothesis) -> bool:
     """Return whether the best hypothesis is not clear and the other is at another place."""
-    return not search.weights.of(best.evidence).is_clear(best.log_odds) and not (
-        best.world_from_cam.is_same(
-            other.world_from_cam,
-            2.0 * search.config.evidence.max_translation,
-            math.radians(_MIN_DISTANT_ANGLE_DEG),
-        )
-    )
+    if search.weights.of(best.evidence).is_clear(best.log_odds):
+        return False
+    max_distance, max_angle = 2.0 * search.config.evidence.max_translation, math.radians(10.0)
+    return not best.world_from_cam.is_same(other.world_from_cam, max_distance, max_angle)
 
 
 def _build_localization(
@@ -172,7 +151,7 @@ def _build_localization(
         focal_length_px=best.fit.camera.fx * search.query.scale if is_rough else None,
         noise_share=best.noise_share,
         calibrated=search.weights.is_calibrated,
-        provenance=replace(_provenance(search), camera=best.fit.camera if is_rough else None),
+        provenance=_provenance(search, best.fit.camera if is_rough else None),
     )
     return localization, best.fit.inlier_observations(search.query.scale)
 
@@ -187,13 +166,10 @@ def _with_clustered_errors(search: Search, best: Hypothesis) -> Hypothesis:
         return best
     seen = best.fit.inlier_observations(1.0)
     parts = seen.points_img.astype(np.float64), seen.points_world, seen.covariances
-    squared = (
-        compute_variance_inflation(
-            *parts, best.fit.camera, best.fit.cam_from_world, search.config.pose.key_point_sigma_px
-        )
-        ** 2
+    coherence = compute_variance_inflation(
+        *parts, best.fit.camera, best.fit.cam_from_world, search.config.pose.key_point_sigma_px
     )
-    wider = 1.0 + (squared - 1.0) * best.noise_share
+    wider = 1.0 + (coherence**2 - 1.0) * best.noise_share
     return replace(best, covariance=wider * best.covariance, noise_share=best.noise_share / wider)
 
 
@@ -215,80 +191,53 @@ def _ambiguous_result(
     alternatives = tuple(
         Alternative(one.world_from_cam, one.probability, one.node_id) for one, _ in named
     )
+    reason, detail = "too_few_inliers", _describe_imprecision(best)
     if len(alternatives) > 1:
-        detail = (
-            f"as much like node {alternatives[1].node_id} as like node {alternatives[0].node_id}"
-        )
-    else:
-        metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
-        detail = f"in the map, but where is known to {metres:.2f} m only"
-    return _build_not_localized(
-        search,
-        "ambiguous" if len(alternatives) > 1 else "too_few_inliers",
-        best,
-        detail,
-        alternatives,
-    ), named
+        first, second = alternatives[:2]
+        reason = "ambiguous"
+        detail = f"as much like node {second.node_id} as like node {first.node_id}"
+    return _build_not_localized(search, reason, best.fit, detail, alternatives), named
 
 
 def _explain_not_localized(search: Search, ranked: list[Hypothesis]) -> NotLocalized:
     if not ranked:
         first = search.first
-        num_matches, num_inliers = (
-            (len(first.matches), first.num_inliers) if first is not None else (0, 0)
-        )
-        reason: Reason = (
-            "too_few_matches" if num_matches < search.config.min_matches else "too_few_inliers"
-        )
-        return NotLocalized(
-            reason,
-            search.candidate_nodes,
-            num_matches,
-            num_inliers,
-            search.query.clock.times_ms(),
-            _timeout_detail(search),
-            (),
-            _provenance(search),
-        )
+        num_matches = 0 if first is None else len(first.matches)
+        is_enough = num_matches >= search.config.min_matches
+        reason = "too_few_inliers" if is_enough else "too_few_matches"
+        return _build_not_localized(search, reason, first)
     best = ranked[0]
     if is_only_imprecise(best.evidence, search.weights, search.config.evidence):
-        metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
-        return _build_not_localized(
-            search,
-            "too_few_inliers",
-            best,
-            f"in the map, but where is known to {metres:.2f} m only",
-        )
-    return _build_not_localized(search, "not_in_map", best, "")
+        detail = _describe_imprecision(best)
+        return _build_not_localized(search, "too_few_inliers", best.fit, detail)
+    return _build_not_localized(search, "not_in_map", best.fit)
+
+
+def _describe_imprecision(best: Hypothesis) -> str:
+    metres = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
+    return f"in the map, but where is known to {metres:.2f} m only"
 
 
 def _build_not_localized(
     search: Search,
     reason: Reason,
-    best: Hypothesis,
-    detail: str,
+    fit: PointMatches | None,
+    detail: str = "",
     alternatives: tuple[Alternative, ...] = (),
 ) -> NotLocalized:
-    times_ms, detail = (
-        search.query.clock.times_ms(),
-        "; ".join(text for text in (detail, _timeout_detail(search)) if text),
-    )
+    details = detail, "time was up before everything was tried" if search.is_stopped else ""
     return NotLocalized(
         reason,
         search.candidate_nodes,
-        len(best.fit.matches),
-        best.fit.num_inliers,
-        times_ms,
-        detail,
+        0 if fit is None else len(fit.matches),
+        0 if fit is None else fit.num_inliers,
+        search.query.clock.times_ms(),
+        "; ".join(filter(None, details)),
         alternatives,
         _provenance(search),
     )
 
 
-def _provenance(search: Search) -> Provenance:
-    """Return the feature type of the result. The localizer fills in the rest."""
-    return Provenance(features=search.map.kind.name)
-
-
-def _timeout_detail(search: Search) -> str:
-    return "time was up before everything was tried" if search.is_stopped else ""
+def _provenance(search: Search, camera: Camera | None = None) -> Provenance:
+    """Return the feature type and the camera of the result. The localizer fills in the rest."""
+    return Provenance(features=search.map.kind.name, camera=camera)

@@ -165,12 +165,7 @@ def _in_view(
     """Return the points that project into the image, regardless of occlusion."""
     with np.errstate(invalid="ignore"):
         pixels = camera.img_from_cam(cam_from_node.apply(points_node))
-        inside = (
-            (pixels >= -0.5).all(axis=1)
-            & (pixels[:, 0] < camera.width - 0.5)
-            & (pixels[:, 1] < camera.height - 0.5)
-        )
-    return np.flatnonzero(inside)
+    return np.flatnonzero(camera.is_in_image(pixels))
 
 
 def _normal_equations(

@@ -35,12 +35,7 @@ MIN_SHIFT = 0.3
 _NUM_POINTS = 128
 _MIN_SIMILARITY = 0.9
 _CELL = 0.1  # metres
-_MIN_VOTES, _MIN_SELF_SHARE = 12, 0.15
-_MAX_SHIFTS = 6
-_MIN_COPIED, _MIN_COPIED_SHARE = 20, 0.3
-_POSE = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=500)
 _METHOD = 1  # part of the digest: increase if the same nodes give other repetitions
-_MAX_CELL_OFFSET = 1000  # cells in each direction, larger than any shift
 
 
 def digest_of(summaries: Sequence[NodeSummary]) -> str:
@@ -50,7 +45,7 @@ def digest_of(summaries: Sequence[NodeSummary]) -> str:
 
 def has_repetitions(node: LocalMap) -> bool:
     """Return whether a node's own image shows some part twice, as in most repetitive places."""
-    return len(find_repetition_shifts(node, node, _MIN_SELF_SHARE)) > 0
+    return len(find_repetition_shifts(node, node, min_share=0.15)) > 0
 
 
 def find_repetition_shifts(
@@ -66,17 +61,18 @@ def find_repetition_shifts(
             needs half the votes of the first. Parts of a panel may be similar, and a smooth surface
             is similar to itself.
     """
+    min_votes, max_shifts = 12, 6
     points, descriptors = node.points_world[:_NUM_POINTS], node.descriptors[:_NUM_POINTS]
     rows, columns = find_similar_pairs(descriptors, neighbours.descriptors, _MIN_SIMILARITY)
     shifts = neighbours.points_world[columns] - points[rows]
     far = np.linalg.norm(shifts, axis=1) > MIN_SHIFT
     rows, shifts = rows[far], shifts[far]
     found: list[Float[np.ndarray, " 3"]] = []
-    least, left = max(_MIN_VOTES, min_share * len(points)), np.ones(len(shifts), np.bool_)
+    least, left = max(min_votes, min_share * len(points)), np.ones(len(shifts), np.bool_)
     grids = [
         _ShiftVotes.of(shifts, rows, offset) for offset in (0.0, 0.5)
     ]  # overlap: no shift is at a border of both
-    while left.any() and len(found) < _MAX_SHIFTS:
+    while left.any() and len(found) < max_shifts:
         _, voters = max((grid.find_densest_cell(left) for grid in grids), key=lambda most: most[0])
         near = left & (
             np.linalg.norm(shifts - np.median(shifts[voters], axis=0), axis=1) < 1.5 * _CELL
@@ -85,7 +81,7 @@ def find_repetition_shifts(
         if votes < least:
             break
         if not found:
-            least = max(_MIN_VOTES, 0.5 * votes)
+            least = max(min_votes, 0.5 * votes)
         found.append(np.median(shifts[near], axis=0))
         left &= np.linalg.norm(shifts - found[-1], axis=1) > 3.0 * _CELL
     return np.array(found).reshape(-1, 3)
@@ -100,13 +96,14 @@ def find_copy_transform(node: TopoNode, others: LocalMap) -> Rigid3 | None:
     matches = match_features(features.descriptors, others.descriptors, MatchingConfig.nearest())
     alike = 1.0 - matches.distances**2 / 2.0 >= _MIN_SIMILARITY
     rows, columns = matches.query_idx[alike], matches.train_idx[alike]
-    least = max(_MIN_COPIED, _MIN_COPIED_SHARE * len(features))
+    least = max(20, 0.3 * len(features))  # number of copied points
     if len(rows) < least:
         return None
     points_img = features.points_img[rows].astype(np.float64)
     points_world, covariances = others.points_world[columns], others.covariances[columns]
+    config = AbsolutePoseConfig(max_reprojection_error_px=6.0, max_iterations=500)
     found = estimate_absolute_pose(
-        points_img, points_world, node.camera, _POSE, point_covariances=covariances
+        points_img, points_world, node.camera, config, point_covariances=covariances
     )
     if found is None or np.count_nonzero(found.inliers) < least:
         return None
@@ -131,8 +128,9 @@ class _ShiftVotes:
     def of(
         shifts: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], offset: float
     ) -> _ShiftVotes:
-        x, y, z = (np.floor(shifts / (2.0 * _CELL) + offset).astype(np.int64) + _MAX_CELL_OFFSET).T
-        keys = ((x * 2 * _MAX_CELL_OFFSET + y) * 2 * _MAX_CELL_OFFSET + z) * _NUM_POINTS + rows
+        furthest = 1000  # cells in each direction, larger than any shift
+        x, y, z = (np.floor(shifts / (2.0 * _CELL) + offset).astype(np.int64) + furthest).T
+        keys = ((x * 2 * furthest + y) * 2 * furthest + z) * _NUM_POINTS + rows
         order = np.argsort(keys, kind="stable")
         return _ShiftVotes(order, *np.divmod(keys[order], _NUM_POINTS))
 
