@@ -219,10 +219,8 @@ def _refine_pose_and_focal(
     the inliers again."""
     cam_from_world, camera = start
     # a start outside the stated range was found by the residuals
-    lowest, highest = (
-        min(uncalibrated.min_focal, camera.fx),
-        max(uncalibrated.max_focal, camera.fx),
-    )
+    lowest = min(uncalibrated.min_focal, camera.fx)
+    highest = max(uncalibrated.max_focal, camera.fx)
     num_inliers = 0
     for _ in range(_MAX_ROUNDS):
         matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)

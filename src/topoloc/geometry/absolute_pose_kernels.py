@@ -26,21 +26,15 @@ def _whiten_residual(
     u, v, w = x / z, y / z, 1.0 / z
     s00, s01, s11 = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
     if len(point_covariances) > 0:
-        p00, p01, p02 = (
-            point_covariances[i, 0, 0],
-            point_covariances[i, 0, 1],
-            point_covariances[i, 0, 2],
-        )
-        p10, p11, p12 = (
-            point_covariances[i, 1, 0],
-            point_covariances[i, 1, 1],
-            point_covariances[i, 1, 2],
-        )
-        p20, p21, p22 = (
-            point_covariances[i, 2, 0],
-            point_covariances[i, 2, 1],
-            point_covariances[i, 2, 2],
-        )
+        p00 = point_covariances[i, 0, 0]
+        p01 = point_covariances[i, 0, 1]
+        p02 = point_covariances[i, 0, 2]
+        p10 = point_covariances[i, 1, 0]
+        p11 = point_covariances[i, 1, 1]
+        p12 = point_covariances[i, 1, 2]
+        p20 = point_covariances[i, 2, 0]
+        p21 = point_covariances[i, 2, 1]
+        p22 = point_covariances[i, 2, 2]
         a0 = w * (rotation[0, 0] - u * rotation[2, 0])
         a1 = w * (rotation[0, 1] - u * rotation[2, 1])
         a2 = w * (rotation[0, 2] - u * rotation[2, 2])

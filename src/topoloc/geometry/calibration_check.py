@@ -53,16 +53,12 @@ def calibration_equations(
         u, v, w = x / z, y / z, 1.0 / z
         jacobian[0, 0], jacobian[0, 2] = scale * w, -scale * u * w
         jacobian[1, 1], jacobian[1, 2] = scale * w, -scale * v * w
-        jacobian[0, 3], jacobian[0, 4], jacobian[0, 5] = (
-            -scale * u * v,
-            scale * (1.0 + u * u),
-            -scale * v,
-        )
-        jacobian[1, 3], jacobian[1, 4], jacobian[1, 5] = (
-            -scale * (1.0 + v * v),
-            scale * u * v,
-            scale * u,
-        )
+        jacobian[0, 3] = -scale * u * v
+        jacobian[0, 4] = scale * (1.0 + u * u)
+        jacobian[0, 5] = -scale * v
+        jacobian[1, 3] = -scale * (1.0 + v * v)
+        jacobian[1, 4] = scale * u * v
+        jacobian[1, 5] = scale * u
         jacobian[0, 6], jacobian[0, 7] = scale * u, 1.0
         jacobian[1, 6], jacobian[1, 8] = scale * v, 1.0
         for a in range(2):
@@ -79,11 +75,9 @@ def calibration_equations(
                     for k in range(3):
                         spread[a, b] += by_world[a, j] * point_covariances[i, j, k] * by_world[b, k]
         determinant = spread[0, 0] * spread[1, 1] - spread[0, 1] * spread[1, 0]
-        i00, i01, i11 = (
-            spread[1, 1] / determinant,
-            -spread[0, 1] / determinant,
-            spread[0, 0] / determinant,
-        )
+        i00 = spread[1, 1] / determinant
+        i01 = -spread[0, 1] / determinant
+        i11 = spread[0, 0] / determinant
         e0, e1 = scale * u + free[1] - observed[i, 0], scale * v + free[2] - observed[i, 1]
         squares[i] = e0 * e0 * i00 + 2.0 * e0 * e1 * i01 + e1 * e1 * i11
         weight = 1.0 / (1.0 + squares[i] / cauchy_scale**2)

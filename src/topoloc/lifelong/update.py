@@ -45,7 +45,7 @@ from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import SequenceView
 from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_poses
-from topoloc.slam.slam import estimate_slam_poses
+from topoloc.slam.slam import run_slam
 from topoloc.tracking.tracker import Tracker
 
 
@@ -110,7 +110,7 @@ def update(
         if find_poses is not None:
             posed = find_poses(poses_from)
         elif poses_from == "slam":
-            posed = estimate_slam_poses([sequence], progress=progress)[0]
+            posed = run_slam([sequence], progress).apply([sequence])[0]
         else:
             posed = sequence
         if poses_from not in ("map", "slam"):

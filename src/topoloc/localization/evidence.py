@@ -93,7 +93,6 @@ def measure_evidence(
         visible_img: pixels of points that must be found.
     """
     width, height = fit.camera.width, fit.camera.height
-    depths = fit.cam_from_world.apply(fit.local_map.points_world[fit.inlier_point_idx])[:, 2]
     points_img = fit.features.points_img[fit.inlier_query_idx].astype(np.float64)
     found_img = points_img if found_img is None else found_img
     return Evidence(
@@ -103,7 +102,7 @@ def measure_evidence(
         num_visible=num_visible,
         num_by_chance=0,
         spread=compute_inlier_spread(points_img, width, height),
-        doubt=compute_normalized_uncertainty(covariance, float(np.median(depths)), config),
+        doubt=compute_normalized_uncertainty(covariance, fit.median_depth, config),
         even_share=compute_uniform_inlier_ratio(found_img, visible_img, width, height),
     )
 

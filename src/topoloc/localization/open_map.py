@@ -143,12 +143,9 @@ class OpenMap:
 
         They are read from the map if it stores them, and computed otherwise.
         """
-        known = self._stored_moves
-        return (
-            self._moves(row)
-            if known is None
-            else known.get(self.node_ids[row], np.zeros((0, 4, 4)))
-        )
+        if self._stored_moves is None:
+            return self._moves(row)
+        return self._stored_moves.get(self.node_ids[row], np.zeros((0, 4, 4)))
 
     def _find_moves(self, row: Row) -> Float[np.ndarray, "k 4 4"]:
         node = self._nodes[row]
@@ -183,11 +180,9 @@ class OpenMap:
     def _appearance_ranker(self) -> CoarseLocalizer | None:
         """Return the coarse localizer that needs features only, None if the map has none."""
         kind = self.kind.name
-        return (
-            open_map_coarse_localizer(self.topomap, SurfVlad.name, kind)
-            if SurfVlad.name in self.topomap.layers[kind].coarse_models
-            else None
-        )
+        if SurfVlad.name not in self.topomap.layers[kind].coarse_models:
+            return None
+        return open_map_coarse_localizer(self.topomap, SurfVlad.name, kind)
 
     def _find_shifts(self, row: Row) -> Float[np.ndarray, "k 3"]:
         node, poses = self._local_map(row), self.node_poses

@@ -213,10 +213,8 @@ def fit_pose(
     if len(matches) < max(min_matches, MIN_POINTS):
         return PointMatches(features, input_camera, camera, local_map, matches)
     points_img = features.points_img[matches.query_idx].astype(np.float64)
-    points_world, covariances = (
-        local_map.points_world[matches.train_idx],
-        local_map.covariances[matches.train_idx],
-    )
+    points_world = local_map.points_world[matches.train_idx]
+    covariances = local_map.covariances[matches.train_idx]
     if isinstance(input_camera, UncalibratedCamera):
         found = estimate_pose_and_focal(
             points_img,

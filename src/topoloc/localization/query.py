@@ -94,10 +94,8 @@ class StoredFeatures(SharedFeatures):
         Raises:
             KeyError: there are no features of the query's type.
         """
-        known, scale = (
-            self._known[query.feature_config.kind],
-            np.float32(query.image.shape[1] / self._width),
-        )
+        known = self._known[query.feature_config.kind]
+        scale = np.float32(query.image.shape[1] / self._width)
         return replace(
             known,
             points_img=(known.points_img + np.float32(0.5)) * scale - np.float32(0.5),

@@ -114,10 +114,8 @@ def align_with_reference(
         max_shift_px: a point that moves farther than this does not match.
     """
     min_correlation = 0.7  # minimum normalised correlation of the two patches
-    refined, (scores, sigmas) = (
-        np.empty_like(points_img),
-        np.empty((2, len(points_img)), np.float32),
-    )
+    refined = np.empty_like(points_img)
+    scores, sigmas = np.empty((2, len(points_img)), np.float32)
 
     def run(first: int, last: int) -> None:
         refine_tracks(

@@ -164,10 +164,8 @@ def select_cell_corners(strength, is_free, side, top, left, border, threshold, c
     height, width = strength.shape
     count = 0
     for row in range(is_free.shape[0]):
-        first_y, last_y = (
-            max(top + row * side, border),
-            min(top + (row + 1) * side, height - border),
-        )
+        first_y = max(top + row * side, border)
+        last_y = min(top + (row + 1) * side, height - border)
         for column in range(is_free.shape[1]):
             if not is_free[row, column]:
                 continue

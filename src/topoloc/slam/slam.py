@@ -176,18 +176,6 @@ def run_slam(
     )
 
 
-def estimate_slam_poses(
-    sequences: Sequence[StereoSequence], progress: Progress | None = None
-) -> list[StereoSequence]:
-    """Return the recordings with the poses of `run_slam`.
-
-    Raises:
-        RecordingError: a recording has no place in common with the others, or an error of
-            `run_slam`.
-    """
-    return run_slam(sequences, progress).apply(sequences)
-
-
 def _track_recording(
     sequence: StereoSequence, odometry: Odometry, progress: Progress
 ) -> list[FramePose | None]:

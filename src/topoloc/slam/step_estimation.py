@@ -217,10 +217,8 @@ class StepEstimator:
             return None
         points_world = self.landmarks.positions[tracks.landmark_ids]
         # The covariances of the landmarks, as measured by the last key frame.
-        points_cam, rotation = (
-            reference_from_world.apply(points_world),
-            reference_from_world.rotation,
-        )
+        points_cam = reference_from_world.apply(points_world)
+        rotation = reference_from_world.rotation
         sigma_z = sigma_px * points_cam[:, 2] ** 2 / stereo.bf
         covariances = ray_covariances(
             points_cam, sigma_z, stereo.camera, np.full(len(points_cam), 0.1)

@@ -61,11 +61,9 @@ class PointTracker:
         )
         self._inlier_points = inlier_points
         self._reference = grey.astype(np.float32)
-        self._last_grey, self._last_points_img, self._rows = (
-            grey,
-            inlier_points.points_img,
-            np.arange(len(inlier_points)),
-        )
+        self._last_grey = grey
+        self._last_points_img = inlier_points.points_img
+        self._rows = np.arange(len(inlier_points))
         self._last_from_world = cam_from_world
 
     @property
@@ -88,11 +86,9 @@ class PointTracker:
         else:
             return None
         agreeing = rows[pose.inliers]
-        self._last_grey, self._last_points_img, self._rows = (
-            grey,
-            points_img[pose.inliers],
-            agreeing,
-        )
+        self._last_grey = grey
+        self._last_points_img = points_img[pose.inliers]
+        self._rows = agreeing
         self._last_from_world = pose.cam_from_world
         return TrackedMotion(
             cam_from_ref=pose.cam_from_world @ self._cam_from_world.inverse(),

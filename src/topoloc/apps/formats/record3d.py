@@ -63,10 +63,8 @@ def open_record3d(path: Path) -> Recording:
     poses: list[Rigid3 | None] = [
         _pose(row, f"{file}, pose {k}") for k, row in enumerate(data.poses)
     ]
-    names, t_ns = (
-        [one.relative_to(root).as_posix() for one in images],
-        _times(data, len(images), file),
-    )
+    names = [one.relative_to(root).as_posix() for one in images]
+    t_ns = _times(data, len(images), file)
     frames = (names, t_ns, poses, _cameras(data, images, file))
     return Recording.with_cameras(path.resolve().name, root, *frames, depth=_depth(root, images))
 

@@ -29,22 +29,6 @@ from topoloc.node_ids import NodeId
 
 
 @dataclass(frozen=True)
-class ContradictionsConfig:
-    """Configure the comparison of nodes with their neighbours."""
-
-    num_neighbours: int = 4
-    """Number of nearest nodes (Eq. 1) that each node is compared with."""
-    min_inliers: int = 30
-    """Minimum number of common points for a comparison."""
-    max_square: float = 60.0
-    """Minimum squared pose difference of a contradiction, in units of its covariance (6 degrees of
-    freedom)."""
-    min_distance: float = 0.5
-    """Minimum pose difference of a contradiction, in D_thresh (Eq. 1). Both limits must be
-    exceeded."""
-
-
-@dataclass(frozen=True)
 class Contradiction:
     """Report that node `node_id` is `metres` and `degrees` off the pose found with node
     `other_id`."""
@@ -79,39 +63,34 @@ def check_map(path: str | Path) -> list[str]:
         return [str(contradiction) for contradiction in find_contradictions(topomap)]
 
 
-def find_contradictions(
-    topomap: TopoMetricMap, config: ContradictionsConfig | None = None
-) -> list[Contradiction]:
+def find_contradictions(topomap: TopoMetricMap) -> list[Contradiction]:
     """Return one contradiction for each node outside the largest consistent part of the map.
 
     Raises:
         MapError: the map cannot be read.
     """
-    config, poses = config or ContradictionsConfig(), topomap.node_poses
+    num_neighbours = 4  # nearest nodes (Eq. 1) that each node is compared with
+    # Minimum pose difference of a contradiction, in D_thresh (Eq. 1). It must also exceed the
+    # covariance.
+    min_distance = 0.5
+    poses, lambda_rot = topomap.node_poses, topomap.config.lambda_rot
     errors = topomap.first_layer.shared_errors
-    rho = (
-        errors.rho
-        if errors is not None
-        else load_fitted_weights(topomap.kind).shared_errors.unknown
-    )
+    unknown = load_fitted_weights(topomap.kind).shared_errors.unknown
+    rho = unknown if errors is None else errors.rho
     group, found = list(range(len(topomap.summaries))), []
     for row, summary in enumerate(topomap.summaries):
-        order = np.argsort(
-            node_distances(summary.world_from_cam, poses, topomap.config.lambda_rot), kind="stable"
-        )
-        neighbours = [int(k) for k in order if k != row][: config.num_neighbours]
+        distances = node_distances(summary.world_from_cam, poses, lambda_rot)
+        order = np.argsort(distances, kind="stable")
+        neighbours = [int(k) for k in order if k != row][:num_neighbours]
         neighbours += [k for k in (row - 1, row + 1) if 0 <= k < len(group) and k not in neighbours]
         node = topomap.nodes[row]
         for other_row in neighbours:
-            difference = _pose_difference(node, topomap.nodes[other_row], rho, config)
+            difference = _pose_difference(node, topomap.nodes[other_row], rho)
             if difference is None:
                 continue
             is_same, metres, radians = difference
-            if (
-                not is_same
-                and metres + topomap.config.lambda_rot * radians
-                > config.min_distance * topomap.config.d_thresh
-            ):
+            is_far = metres + lambda_rot * radians > min_distance * topomap.config.d_thresh
+            if is_far and not is_same:
                 found.append((row, other_row, metres, radians))
             else:
                 _merge_groups(group, row, other_row)
@@ -119,16 +98,18 @@ def find_contradictions(
 
 
 def _pose_difference(
-    node: TopoNode, other: TopoNode, rho: float, config: ContradictionsConfig
+    node: TopoNode, other: TopoNode, rho: float
 ) -> tuple[bool, float, float] | None:
     """Compare a node's pose with the one found with the points of another node.
 
     Return whether the covariance allows the difference, and the metres and radians. None if they
     have too few points in common.
     """
+    min_inliers = 30  # minimum number of common points
+    max_square = 60.0  # of a difference in units of its covariance (6 degrees of freedom)
     points = LocalMap.of_node(other)
     matches = match_features(node.features.descriptors, points.descriptors, MatchingConfig())
-    if len(matches) < config.min_inliers:
+    if len(matches) < min_inliers:
         return None
     found = estimate_absolute_pose(
         node.features.points_img[matches.query_idx].astype(np.float64),
@@ -137,11 +118,11 @@ def _pose_difference(
         AbsolutePoseConfig(max_reprojection_error_px=8.0),
         point_covariances=points.covariances[matches.train_idx],
     )
-    if found is None or np.count_nonzero(found.inliers) < config.min_inliers:
+    if found is None or np.count_nonzero(found.inliers) < min_inliers:
         return None
     poses = found.cam_from_world.inverse(), node.summary.world_from_cam
     covariance = covariance_inflation(int(np.count_nonzero(found.inliers)), rho) * found.covariance
-    is_same = poses[0].is_same(poses[1], covariance=covariance, max_square=config.max_square)
+    is_same = poses[0].is_same(poses[1], covariance=covariance, max_square=max_square)
     return is_same, translation_error(*poses), rotation_error(*poses)
 
 

@@ -28,7 +28,7 @@ from topoloc.recordings.open import open_sequence
 from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_step, extract_view
 from topoloc.slam.pose_checks import check_pose_coverage, check_poses
-from topoloc.slam.slam import estimate_slam_poses
+from topoloc.slam.slam import run_slam
 
 
 def build_map(
@@ -68,10 +68,8 @@ def build_map(
     several = [sequences] if isinstance(sequences, StereoSequence | str | Path) else sequences
     sequences = [open_sequence(one) if isinstance(one, str | Path) else one for one in several]
     if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
-        sequences, poses_from = (
-            estimate_slam_poses(sequences, progress=progress),
-            ["slam"] * len(sequences),
-        )
+        sequences = run_slam(sequences, progress).apply(sequences)
+        poses_from = ["slam"] * len(sequences)
     sources = poses_from or [""] * len(sequences)
     given = [one for one, source in zip(sequences, sources, strict=True) if source != "slam"]
     for sequence in given:
@@ -100,10 +98,8 @@ def with_map_statistics(topomap: TopoMetricMap, progress: Progress | None = None
 
 def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
     """Measure rho of a map for a feature type."""
-    c, weights = (
-        LocalizerConfig().for_feature_type(find_feature_type(kind)),
-        load_fitted_weights(kind),
-    )
+    c = LocalizerConfig().for_feature_type(find_feature_type(kind))
+    weights = load_fitted_weights(kind)
     rho = ErrorShareMeasurement(topomap, kind, c.guided, c.pose, weights.shared_errors)
     return rho.measure_stored()
 

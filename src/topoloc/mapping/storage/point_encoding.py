@@ -58,10 +58,8 @@ def node_to_arrays(node: TopoNode, kind: str) -> list[np.ndarray]:
 
 def points_from_row(row: Mapping[str, Any], kind: str, schema: int, what: str) -> StoredPoints:
     """Decode the points of a row of `node_points` of this schema. Raises CorruptDataError."""
-    n, size = (
-        check_count(row["num_points"], 0, MAX_POINTS, f"the points of {what}"),
-        find_feature_type(kind).descriptor_size,
-    )
+    n = check_count(row["num_points"], 0, MAX_POINTS, f"the points of {what}")
+    size = find_feature_type(kind).descriptor_size
     if row["descriptor_size"] != size:
         raise CorruptDataError(f"the points of {what} are not described as {kind} is")
     shapes = {

@@ -32,15 +32,11 @@ _LEFT_RIGHT_NAMES = (
     ("image_0", "image_1"),
     ("Infrared_1", "Infrared_2"),
 )
-_DEPTH_WORDS, _NON_IMAGE_WORDS = (
-    ("depth",),
-    ("disparity", "confidence", "mask", "segmentation", "thermal"),
-)
-_REGISTERED_WORDS, _COLOUR_WORDS, _TRUTH_WORDS = (
-    ("aligned", "registered"),
-    ("color", "colour", "rgb"),
-    ("truth", "gt", "mocap", "vicon", "optitrack"),
-)
+_DEPTH_WORDS = ("depth",)
+_NON_IMAGE_WORDS = ("disparity", "confidence", "mask", "segmentation", "thermal")
+_REGISTERED_WORDS = ("aligned", "registered")
+_COLOUR_WORDS = ("color", "colour", "rgb")
+_TRUTH_WORDS = ("truth", "gt", "mocap", "vicon", "optitrack")
 _TRANSPORT_SUFFIXES = ("/compressedDepth", "/compressed")
 
 
