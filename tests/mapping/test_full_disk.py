@@ -16,8 +16,8 @@ import pytest
 from topoloc.errors import MapError
 from topoloc.mapping.edit import edit_map
 from topoloc.mapping.storage import map_file, map_writing
-from topoloc.mapping.storage.failures import sqlite_failures_as_os_errors
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.validation import sqlite_failures_as_os_errors
 
 ON_DISKS = """
 import shutil, subprocess, sys

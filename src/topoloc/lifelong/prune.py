@@ -32,10 +32,10 @@ from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.landmark_statistics import merge_count_statistics
 from topoloc.mapping.storage.entries import overlay
-from topoloc.mapping.storage.failures import describe_failure
 from topoloc.mapping.storage.map_file import MapFile
 from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
+from topoloc.mapping.validation import describe_failure
 from topoloc.recordings.atomic import temporary_file
 
 _PAGE_SLACK_BYTES = 4096  # reserved for an entry in the map's history

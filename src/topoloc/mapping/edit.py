@@ -25,11 +25,11 @@ from typing import Any, TypeVar
 
 from topoloc.errors import MapError
 from topoloc.mapping.sessions import Edit, today
-from topoloc.mapping.storage.failures import describe_failure
 from topoloc.mapping.storage.map_lock import WaitCallback, lock_map_file
 from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.validation import describe_failure
 from topoloc.recordings.atomic import atomic_write, fsync, short_name
 
 T = TypeVar("T")

@@ -24,7 +24,6 @@ from topoloc.errors import (
     MapError,
 )
 from topoloc.json_data import Count, decode_json
-from topoloc.mapping.storage.failures import describe_failure, sqlite_failures_as_os_errors
 from topoloc.mapping.storage.schema import (
     SCHEMA_1,
     SORT_COLUMNS,
@@ -34,7 +33,12 @@ from topoloc.mapping.storage.schema import (
     create_table_statement,
     schema_2_views,
 )
-from topoloc.mapping.validation import CorruptDataError, check_header
+from topoloc.mapping.validation import (
+    CorruptDataError,
+    check_header,
+    describe_failure,
+    sqlite_failures_as_os_errors,
+)
 
 MAX_STEPS = 50_000_000
 """Limit of SQLite's steps in one read. A table of MAX_ROWS rows takes a quarter of them."""

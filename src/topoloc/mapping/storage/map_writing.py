@@ -27,7 +27,6 @@ from topoloc.mapping.config import config_to_text
 from topoloc.mapping.landmark_statistics import encode_statistics
 from topoloc.mapping.sessions import Session, sessions_from_names
 from topoloc.mapping.storage.entries import TopoNode
-from topoloc.mapping.storage.failures import describe_failure, sqlite_failures_as_os_errors
 from topoloc.mapping.storage.map_lock import WaitCallback, no_edit_of
 from topoloc.mapping.storage.point_encoding import compress_array, node_to_arrays
 from topoloc.mapping.storage.schema import (
@@ -41,6 +40,7 @@ from topoloc.mapping.storage.schema import (
     layer_suffix,
 )
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.mapping.validation import describe_failure, sqlite_failures_as_os_errors
 from topoloc.recordings.atomic import atomic_write
 from topoloc.retrieval.coarse import CoarseModel
 
