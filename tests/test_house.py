@@ -34,21 +34,21 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 # The figures of `python tools/house.py .` (`--help` has the rule of each). A ceiling only goes
 # down, unless an issue grants an allowance. The goals stand behind the ceilings.
 CEILINGS = {
-    "lines.core": 39107,  # goal 30000; with the last step of a query
-    "lines.apps": 16057,  # goal 15500
-    "statements.core": 19173,  # goal 13500
-    "statements.apps": 8619,  # goal 7500
+    "lines.core": 38683,  # goal 30000; with the last step of a query
+    "lines.apps": 15917,  # goal 15500
+    "statements.core": 19131,  # goal 13500
+    "statements.apps": 8601,  # goal 7500
     "files_over_300": 1,  # goal 20
     "functions_over_45": 4,  # goal 15
     "folders_over_20": 0,  # goal 0
-    "one_importer": 71,  # goal 50
+    "one_importer": 66,  # goal 50
     "apps.deep_names": 0,  # goal 0
     "apps.public_names": 136,  # goal: at most 120
     "asserts.sum": 3,  # goal 40
     "branches.map_or_atlas": 0,
-    "branches.walls": 10,  # goal 0
-    "constants.all": 434,  # goal 474, localization 25
-    "constants.core/localization": 38,
+    "branches.walls": 0,  # goal 0
+    "constants.all": 419,  # goal 474, localization 25
+    "constants.core/localization": 24,
     "user_docs_bytes": 144889,  # goal 150000
     "readme_lines": 150,  # goal 150
     "architecture_lines": 110,  # goal 110
@@ -57,9 +57,9 @@ FLOORS = {"documented %": 90, "typed %": 95}
 # Modules of topoloc, and how many of OpenCV, Numba, torch, FAISS and ONNX Runtime, that are loaded
 # in a fresh process after an import.
 REACH = {
-    "localizer": (84, 3),  # goal 60
+    "localizer": (81, 3),  # goal 60
     "result": (10, 0),  # goal 10, 0
-    "map": (21, 0),  # goal 20
+    "map": (20, 0),  # goal 20
     "client": (11, 0),  # goal 10, 0
 }
 
