@@ -68,7 +68,8 @@ def highest_probability(covariance: Float[np.ndarray, "6 6"], config: EvidenceCo
     variances = np.diag(covariance)
     metres = math.sqrt(variances[:3].sum()) / config.max_translation
     degrees = math.degrees(math.sqrt(variances[3:].sum())) / config.max_rotation_deg
-    return probability_within_tolerance(0.512 * max(metres, degrees))
+    normal_95_percent = 1.96
+    return probability_within_tolerance(max(metres, degrees) / normal_95_percent)
 
 
 def sample_rows(count: int) -> Int[np.ndarray, " k"]:

@@ -6,15 +6,44 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import product
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Struct
 
+from topoloc.errors import CalibrationError
+from topoloc.json_data import Positive, decode_json
+
+Lens = Literal["none", "radial", "other"]
 Vector = Float[np.ndarray, " 7"]
 Matrix = Float[np.ndarray, "7 7"]
+
+
+class _Priors(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the numbers of `priors.json`: prior odds of a focal length outside its stated range, of
+    a principal point off the centre, and of each lens; standard deviations of the principal point
+    (image sides) and of the distortion."""
+
+    corpus: str
+    command: str
+    date: str
+    unstated_focal: Positive
+    off_centre: Positive
+    lens: dict[Lens, Positive]
+    centred_sigma: Positive
+    off_centre_sigma: Positive
+    no_lens_sigma: Positive
+    lens_sigma: Positive
+
+
+@cache
+def _priors() -> _Priors:
+    path = Path(__file__).parent / "priors.json"
+    return decode_json(path.read_bytes(), _Priors, CalibrationError, str(path))
 
 
 @dataclass(frozen=True)
@@ -24,14 +53,14 @@ class CameraHypothesis:
 
     is_focal_stated: bool = True
     is_centred: bool = True
-    lens: Literal["none", "radial", "other"] = "none"
+    lens: Lens = "none"
 
     @property
     def log_prior(self) -> float:
         """Return the logarithm of the prior probability, but for a constant."""
-        lens = {"none": 0.0, "radial": math.log(0.1), "other": math.log(0.03)}[self.lens]
-        odds = (0.2 ** (not self.is_centred)) * (0.1 ** (not self.is_focal_stated))
-        return math.log(odds) + lens
+        odds = _priors().lens[self.lens]
+        odds *= 1.0 if self.is_centred else _priors().off_centre
+        return math.log(odds if self.is_focal_stated else odds * _priors().unstated_focal)
 
     @property
     def basis(self) -> Float[np.ndarray, "7 k"]:
@@ -57,22 +86,22 @@ class CameraPrior:
     def of(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
         """Return mean and covariance of the parameters under a hypothesis."""
         mean, focal = np.zeros(7), self.stated if hypothesis.is_focal_stated else self.usual
-        # The principal point of a whole image is less than 1 % of its side off the centre.
-        offset = (0.005 if hypothesis.is_centred else 0.15) * self.side
+        priors = _priors()
+        is_centred = hypothesis.is_centred
+        offset = (priors.centred_sigma if is_centred else priors.off_centre_sigma) * self.side
         mean[0] = focal[0]
-        covariance = np.diag([focal[1] ** 2, offset**2, offset**2, *[0.01**2] * 4])
+        covariance = np.diag(np.square([focal[1], offset, offset, *[priors.no_lens_sigma] * 4]))
         if hypothesis.lens != "none":
-            covariance[3:, 3:] += 0.15**2
+            covariance[3:, 3:] += priors.lens_sigma**2
         if hypothesis.lens == "other":
-            covariance[3:, 3:] += 0.15**2 * np.eye(4)
+            covariance[3:, 3:] += priors.lens_sigma**2 * np.eye(4)
         return mean, covariance
 
     @property
     def hypotheses(self) -> list[CameraHypothesis]:
         """Return the hypotheses that differ."""
         focal = (True,) if self.stated == self.usual else (True, False)
-        lenses: tuple[Literal["none", "radial", "other"], ...] = ("none", "radial", "other")
-        return [CameraHypothesis(*one) for one in product(focal, (True, False), lenses)]
+        return [CameraHypothesis(*one) for one in product(focal, (True, False), _priors().lens)]
 
 
 @dataclass(frozen=True, eq=False)
