@@ -28,7 +28,7 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
-@pytest.mark.parametrize("job", ["old-files", pytest.param("demo", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("job", ["old-files", "demo"])
 def test_a_job_has_no_worse_figure(job: str):
     """These jobs need no recordings beside those of the repository."""
     done = run("--quick", "--only", job)
