@@ -232,3 +232,15 @@ def test_a_lens_that_sees_no_wall_near_enough_has_no_side_views(share: float, nu
 def test_a_lens_off_the_middle_may_see_one_side_alone():
     views = make_virtual_views(Camera.pinhole(480, 320, 400.0, 400.0, 120.0, 159.5))
     assert [view.name for view in views] == ["right"]
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_the_nearest_part_of_a_view_ends_at_its_tangent(camera: Camera):
+    for view in make_virtual_views(camera):
+        is_near = np.zeros(view.camera.width, bool)
+        is_near[view.columns_within(2.0)] = True
+        pixels = np.column_stack([np.arange(view.camera.width), np.zeros(view.camera.width)])
+        ahead = np.abs(view.camera.normalized_from_img(pixels)[:, 0])
+        one_pixel = 1.5 / view.camera.fx
+        assert ahead[is_near].max() <= 2.0 + one_pixel
+        assert ahead[~is_near].min() >= 2.0 - one_pixel

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from built_corridor import WIDE, corridor_of_two_kinds
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import MapError
-from topoloc.localization import propose
+from topoloc.localization import propose, schedule
+from topoloc.localization.fitted_weights import NodeStop
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.propose import min_rival_inliers, propose_quick
 from topoloc.localization.query import QueryImage, StageClock
 from topoloc.localization.refine import find_best_case_evidence
-from topoloc.localization.result import Localization
+from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.schedule import TileProposals, TileQuery
 from topoloc.localization.search import Search, verify
@@ -96,3 +99,44 @@ def test_the_best_case_is_no_less_than_the_evidence_found(localizer: Localizer):
 def test_an_image_of_another_place_has_no_quick_proposal(localizer: Localizer):
     (search,) = _searches(localizer, unseen_views(seed=1)[1][0])
     assert propose_quick(search, 20.0) is None
+
+
+@pytest.mark.parametrize("min_inliers", [0, 20])
+def test_nodes_are_given_up_if_retrieval_finds_too_little(
+    localizer: Localizer, monkeypatch: pytest.MonkeyPatch, min_inliers: int
+):
+    (search,) = _searches(localizer, unseen_views(seed=1)[1][0])
+    search.weights = replace(search.weights, stop=NodeStop(min_inliers))
+    asked, match = list[int](), propose.match_predicted
+    monkeypatch.setattr(propose, "match_predicted", lambda *a: asked.append(1) or match(*a))
+    result, _ = _result(TileQuery(localizer.context, [search]).exhaustive())
+    assert isinstance(result, NotLocalized)
+    assert search.num_retrieved < 20
+    assert bool(asked) == (min_inliers == 0)
+
+
+def test_a_probable_pose_keeps_the_search_of_nodes_open(localizer: Localizer):
+    (search,) = _searches(localizer, unseen_views()[0][0])
+    search.weights = replace(search.weights, stop=NodeStop(10_000))
+    proposals = TileQuery(localizer.context, [search]).coarse_only()
+    first = next(proposals)
+    assert search.is_hopeless
+    search.add(verify(first))
+    assert search.best is not None
+    assert search.best.probability > 0.5
+    assert not search.is_hopeless
+
+
+@pytest.mark.parametrize("continues", [True, False])
+def test_earlier_feature_types_are_continued_unless_the_last_one_needs_none(
+    monkeypatch: pytest.MonkeyPatch, continues: bool
+):
+    localizer = Localizer(corridor_of_two_kinds())
+    blank = np.zeros((WIDE.height, WIDE.width), np.uint8)
+    searches = localizer.context.searches(QueryImage(blank, WIDE), StageClock(), FOREVER)
+    first, last = searches
+    last.weights = replace(last.weights, stop=NodeStop(continues_earlier=continues))
+    asked = list[Search]()
+    monkeypatch.setattr(schedule, "propose_more", lambda one: asked.append(one) or [])
+    _result(TileQuery(localizer.context, searches).exhaustive())
+    assert asked == ([last, first] if continues else [last])

@@ -50,6 +50,14 @@ class VirtualView:
         points_img, border = self.points_img, cv2.BORDER_REPLICATE
         return remap(grey, points_img, None, cv2.INTER_LINEAR, borderMode=border)
 
+    def columns_within(self, max_tangent: float) -> slice:
+        """Return the columns whose tangent ahead, off the virtual camera's axis, is at most this.
+        They show the nearest part of the wall."""
+        last = round(max_tangent * self.camera.fx)
+        is_left = self.cam_from_virtual.rotation[0, 2] < 0.0
+        middle = round(self.camera.cx)
+        return slice(0, max(middle + last, 1)) if is_left else slice(max(middle - last, 0), None)
+
     def select_inside(self, features: Features) -> Features:
         """Return the features inside the rendered area. All dense descriptors are kept."""
         columns, rows = np.rint(features.points_img).astype(int).T
@@ -99,7 +107,9 @@ def _make_virtual_view(
     virtual = Camera.pinhole(int(width), int(height), focal, focal, cx, focal * half_height)
     shape = virtual.height, virtual.width
     rays = virtual.rays_from_img(np.indices(shape, np.float64)[::-1].reshape(2, -1).T)
-    points_img = camera.img_from_cam(rays @ cam_from_virtual.rotation.T).reshape(*shape, 2)
+    # the rotation permutes the axes; a product of matrices would wait for BLAS's threads
+    rays_cam = np.column_stack([sign * rays[:, 2], rays[:, 1], -sign * rays[:, 0]])
+    points_img = camera.img_from_cam(rays_cam).reshape(*shape, 2)
     reach = np.isfinite(points_img).all(axis=2) & (points_img >= 0).all(axis=2)
     reach &= (points_img <= [camera.width - 1, camera.height - 1]).all(axis=2)
     kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)

@@ -84,6 +84,25 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
         return log_odds > self.clear_log_odds
 
 
+class WallStop(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold when virtual views, or a candidate place of theirs, are given up.
+
+    First, the parts of both views within `near_tangent` ahead are compared alone (0: never). Of the
+    `num_strong` strongest features of each view, `min_strong` matches must agree on one pose at
+    some place. The same holds at each place for the whole views, where `min_agreeing` matches of
+    all features must agree, too. The defaults are for feature types that these numbers were not
+    fitted to. `corpus` is what they were fitted to.
+    """
+
+    near_tangent: Finite = 0.0
+    num_strong: int = 1
+    min_strong: int = 0
+    min_agreeing: int = 8
+    corpus: str = ""
+    date: str = ""
+    command: str = ""
+
+
 class VirtualViewWeights(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the weights of the evidence for a pose from virtual views (`walls/`), in log-odds.
 
@@ -109,6 +128,7 @@ class VirtualViewWeights(Struct, frozen=True, forbid_unknown_fields=True):
     bias: Finite
     sigma_px: Finite
     few_points: Finite
+    stop: WallStop = WallStop()
 
     @property
     def as_vector(self) -> tuple[float, ...]:
@@ -187,6 +207,22 @@ class ConfirmationWeights(Struct, frozen=True, forbid_unknown_fields=True):
     max_log_odds: Finite = 3.0
     half_weight_matches: Finite = 30.0
     min_log_odds: Finite = 1.4
+
+
+class NodeStop(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold when the nodes of a map are given up (`schedule.py`).
+
+    If the retrieved nodes give fewer than `min_inliers` inliers, a right pose would have shown
+    itself, and only virtual views are compared. Without `continues_earlier`, feature types that
+    precede this one are not continued if it finds no pose. The defaults never give up. `corpus` is
+    what they were fitted to.
+    """
+
+    min_inliers: int = 0
+    continues_earlier: bool = True
+    corpus: str = ""
+    date: str = ""
+    command: str = ""
 
 
 class CorrelatedErrorWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -289,6 +325,7 @@ class FittedWeights:
     walls: VirtualViewWeights
     shared_errors: CorrelatedErrorWeights
     confirmation: ConfirmationWeights
+    stop: NodeStop
 
     @property
     def is_calibrated(self) -> bool:
@@ -323,6 +360,7 @@ class _Groups(Struct, frozen=True, forbid_unknown_fields=True):
     walls: VirtualViewWeights
     shared_errors: CorrelatedErrorWeights
     confirmation: ConfirmationWeights = ConfirmationWeights()
+    stop: NodeStop = NodeStop()
 
 
 class _WeightsFile(Struct, frozen=True, forbid_unknown_fields=True):

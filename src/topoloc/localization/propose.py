@@ -143,7 +143,7 @@ def propose_similar_places(search: Search) -> Iterator[NodeProposal]:
     # are farther away.
     num_d_thresh = 5.0
     config, best, nodes = search.config.look_alikes, search.best, search.map.node_poses
-    if not search.ranked or not config.max_groups:
+    if not search.ranked or not config.max_groups or search.is_hopeless:
         return
     least = min_score_share[0 if search.is_clear else 1] * search.ranked[0].score
     left = [candidate.row for candidate in search.ranked if candidate.score >= least]
@@ -200,6 +200,8 @@ def propose_node_viewpoints(search: Search) -> Iterator[NodeProposal]:
     # fitted.
     max_fits = 6
     max_poses = 4  # number of fitted poses, those with the most inliers, that become proposals
+    if search.is_hopeless:
+        return
     config, query, found = search.config.viewpoints, search.query, []
     features, camera = query.features, query.camera
     with query.clock.stage("matching"):

@@ -1,21 +1,20 @@
 """Schedule the pose proposals for one image: over tiles, feature types and sources.
 
 `Localizer` verifies each proposal and adds its hypothesis to the belief of its search, which is one
-feature type of one tile. The schedule reads the beliefs in between, to skip what they make needless
-and to stop. After the deadline only the proposal at hand is finished.
+feature type of one tile. The schedule skips what the beliefs make needless, and stops. After the
+deadline only the proposal at hand is finished.
 
 **Sources** of a feature type, cheapest first: a prior pose alone; or retrieval, poses of the
-preceding type, node viewpoints, similar places, repetitions and virtual views (`propose.py`,
-`walls/`). If another type follows and the pose is not clear, only retrieval is used.
+preceding type, node viewpoints, similar places, repetitions and virtual views. If another type
+follows and the pose is not clear, only retrieval is used; if `is_hopeless`, virtual views follow.
 
 **Feature types** of a tile: each next one is used if the pose is not settled. If none localizes the
-image, the first one continues with its other sources.
+image, the first one continues with its other sources, unless the last one makes that needless.
 
 **Tiles**: a single one is searched exhaustively. Of several, the index ranks them by the cheapest
 feature type. Unless one leads clearly, the likeliest are searched coarse only, by retrieval, until
 a pose is clear; if none is, the next feature type ranks them. The most promising ones are then
-searched exhaustively until one localizes the image. Last, similar tiles are searched coarse only
-for a rival pose (`tiles/tiles.py`), because perceptual aliasing grows with the number of places.
+searched exhaustively until one localizes the image. Similar tiles may then hold a rival pose.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ from topoloc.localization.tiles.tiles import (
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 
 TileProposals = Generator[Proposal, None, ResultWithInliers]
-"""The proposals of a search in one tile. The generator returns the result."""
+"""Proposals of a search in one tile; returns the result."""
 
 
 def propose(search: Search, prior: Rigid3 | None) -> Iterator[Proposal]:
@@ -133,7 +132,8 @@ class TileQuery:
                 if confirmed[1]:
                     return confirmed
         if first is not last and not outcomes[-1][1] and self.prior is None:
-            yield from _until_late(first, propose_more(first))
+            more = propose_more if last.weights.stop.continues_earlier else propose_virtual_views
+            yield from _until_late(first, more(first))
             confirmed = confirm_hypotheses(first, last)
             if confirmed[1]:
                 return confirmed

@@ -154,6 +154,16 @@ class Search:
             for other in others
         )
 
+    @property
+    def is_hopeless(self) -> bool:
+        """Return whether more proposals of nodes would find nothing, because retrieval found
+        nothing with this feature type and none before it left a probable pose."""
+        least = self.config.evidence.min_probability
+        searches = [self] if self.previous is None else [self, self.previous]
+        found = [one.best for one in searches]
+        is_open = any(best is not None and best.probability >= least for best in found)
+        return not is_open and self.num_retrieved < self.weights.stop.min_inliers
+
     def template(self, node_id: NodeId) -> NodeTemplate:
         """Return the image of a node. The trace collects the nodes without a usable one."""
         template = self.map.template(node_id)

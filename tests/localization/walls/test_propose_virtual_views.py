@@ -3,14 +3,17 @@ nobody else is."""
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from built_corridor import (
     WIDE,
@@ -31,12 +34,13 @@ from topoloc.features.feature_types import (
     default_learned_type,
     find_feature_type,
 )
+from topoloc.features.features import Features
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.belief import Hypothesis
 from topoloc.localization.config import VirtualViewSearchConfig
-from topoloc.localization.fitted_weights import load_fitted_weights
+from topoloc.localization.fitted_weights import WallStop, load_fitted_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.open_map import OpenMap
@@ -47,6 +51,7 @@ from topoloc.localization.walls import (
     propose_virtual_views as propose_walls_module,
     virtual_view_matching,
 )
+from topoloc.localization.walls.place_comparison import Comparison
 from topoloc.localization.walls.propose_virtual_views import propose_virtual_views
 from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 from topoloc.mapping.build import BuildConfig
@@ -287,14 +292,58 @@ def test_a_place_that_is_only_near_is_looked_at_again_from_the_pose_that_it_led_
     assert search.map.walls is not None
     walls = VirtualViewSearch.of(search, search.map.walls)
     away = Rigid3(truth.rotation, truth.translation + np.array([0.0, 2.0, 0.0]))
-    from_there = propose_walls_module._compare_views(walls, away)
-    from_here = propose_walls_module._compare_views(walls, truth)
+    from_there = propose_walls_module._propose(Comparison.of(walls, away))
+    from_here = propose_walls_module._propose(Comparison.of(walls, truth))
     assert from_there is not None
     assert from_here is not None
     again = propose_walls_module._compare_again(from_there)
     assert from_there.num_agreeing < again.num_agreeing
     assert again.num_agreeing > 0.7 * from_here.num_agreeing
     assert propose_walls_module._compare_again(again).num_agreeing >= again.num_agreeing
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_whole_views_are_extracted_only_if_their_nearest_parts_show_a_place(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+):
+    tangents, extract = list[float](), virtual_view_matching._extract_view_features
+
+    def record(*arguments: Any) -> Features:
+        tangents.append(arguments[-1])
+        return extract(*arguments)
+
+    monkeypatch.setattr(virtual_view_matching, "_extract_view_features", record)
+    localizer = Localizer(corridor_of_two_kinds())
+    result = localizer.localize(seen_on_the_way_back(seed)[0][0], WIDE)
+    near = localizer.context.types[-1].weights.walls.stop.near_tangent
+    if seed == 0:
+        assert isinstance(result, Localization)
+        assert tangents == [near, near, math.inf, math.inf]
+    else:
+        assert isinstance(result, NotLocalized)
+        assert tangents == [near, near]
+
+
+def test_places_with_far_fewer_matches_are_not_looked_at_beside_a_clear_pose(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    search, looked = _search(built_corridor(), seen_on_the_way_back()[0][0]), list[int]()
+    look_closer = propose_walls_module._look_closer
+
+    def record(*arguments: Any) -> Any:
+        looked.append(arguments[0].num_strong)
+        return look_closer(*arguments)
+
+    monkeypatch.setattr(propose_walls_module, "_look_closer", record)
+    stop = WallStop(num_strong=320)
+    walls = structs.replace(search.weights.walls, stop=stop)
+    search.weights = replace(search.weights, walls=walls)
+    for proposal in propose_virtual_views(search):
+        search.add(verify(proposal))
+    assert search.is_clear
+    assert search.map.walls is not None
+    assert len(VirtualViewSearch.of(search, search.map.walls).places) > 1
+    assert min(looked) >= 0.5 * max(looked) - 1
 
 
 def test_poses_where_nodes_look_the_same_way_are_left_to_the_nodes(

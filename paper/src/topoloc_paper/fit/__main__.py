@@ -169,6 +169,7 @@ def fit(kind: str, poses: list[TriedPose], step: int, by_recording: bool) -> Fit
         walls,
         fit_shared_errors(poses, load_fitted_weights(FALLBACK_TYPE).shared_errors),
         before.confirmation,
+        before.stop,
     )
     report(poses, before, fitted, held_out)
     print(f"{walls}, fitted to {num_walls} poses ({before.walls})")

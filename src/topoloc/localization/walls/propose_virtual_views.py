@@ -19,8 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from topoloc.features.config import MatchingConfig
-from topoloc.features.features import Matches
-from topoloc.features.matching import match_features, match_pooled
+from topoloc.features.matching import match_features
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
@@ -29,12 +28,11 @@ from topoloc.localization.evidence import measure_evidence
 from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.search import Proposal, Search
-from topoloc.localization.walls.upright_pose import estimate_upright_pose
+from topoloc.localization.walls.place_comparison import Comparison
+from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
 from topoloc.localization.walls.virtual_view_matching import (
-    Sides,
     VirtualViewSearch,
     count_virtual_views,
-    merge_matches,
 )
 
 
@@ -49,7 +47,7 @@ class VirtualViewProposal(Proposal):
     def refine(self) -> PoseFit | None:
         """Return the pose refined with matches of both views.
 
-        None if too few points agree, or the pose is near the map's nodes.
+        None if too few points agree, the pose is near the map's nodes, or was found already.
         """
         walls, search, fit = self.walls, self.search, None
         cam_from_world, min_inliers = self.cam_from_world, search.config.evidence.min_inliers
@@ -60,7 +58,7 @@ class VirtualViewProposal(Proposal):
                 is_guided = radius_px > 0.0
                 found = walls.match(cam_from_world, radius_px) if is_guided else self.fit
                 fit = None if found is None else _fit(walls, found, cam_from_world, max_error_px)
-                if fit is None or fit.num_inliers < min_inliers:
+                if fit is None or fit.num_inliers < min_inliers or _is_found(search, fit):
                     return None
                 cam_from_world = fit.cam_from_world
             return None if _is_seen_by_nodes(search, cam_from_world) else fit
@@ -77,6 +75,7 @@ class VirtualViewProposal(Proposal):
 def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     """Generate the proposals with the most agreeing matches."""
     clear_log_odds = 2.5  # virtual views are skipped if a pose of the nodes has higher log-odds
+    max_hypotheses = 6  # maximum number of pose proposals that are refined
     config, best = search.config.walls, search.best
     is_explained_by_nodes = (
         best is not None
@@ -92,29 +91,56 @@ def propose_virtual_views(search: Search) -> Iterator[Proposal]:
     ):
         return
     with search.query.clock.stage("walls"):
+        if not _may_show_place(search, index):
+            return
         walls = VirtualViewSearch.of(search, index)
-        found = [
-            proposal
-            for place in walls.places
-            if (proposal := _compare_views(walls, place)) is not None
-        ]
-        chosen = _select_best([_compare_again(proposal) for proposal in _select_best(found)])
-    yield from chosen
+        compared = [Comparison.of(walls, place) for place in walls.places]
+        compared.sort(key=lambda one: -one.num_strong)
+    tried = list[VirtualViewProposal]()
+    for one in compared:
+        if len(tried) == max_hypotheses or one.num_strong < _min_strong(search, compared[0]):
+            return
+        with search.query.clock.stage("walls"):
+            proposal = _look_closer(one, tried)
+        if proposal is not None:
+            tried.append(proposal)
+            yield proposal
 
 
-def _select_best(found: list[VirtualViewProposal]) -> list[VirtualViewProposal]:
-    """Return the proposals with the most agreeing matches, at distinct places."""
-    num_hypotheses = 6  # maximum number of pose proposals that are refined
-    kept: list[VirtualViewProposal] = []
-    for proposal in sorted(found, key=lambda one: -one.num_agreeing):
-        search = proposal.walls.search
-        if len(kept) == num_hypotheses:
-            break
-        if not any(
-            _are_near(search, proposal.cam_from_world, other.cam_from_world) for other in kept
-        ):
-            kept.append(proposal)
-    return kept
+def _may_show_place(search: Search, index: VirtualViewIndex) -> bool:
+    """Return whether the nearest parts of the walls alone agree with a candidate place. They take
+    half as long to extract, and a right place shows itself in them."""
+    stop = search.weights.walls.stop
+    if stop.near_tangent <= 0.0:
+        return True
+    near = VirtualViewSearch.of(search, index, stop.near_tangent)
+    return any(Comparison.of(near, place).num_strong >= stop.min_strong for place in near.places)
+
+
+def _min_strong(search: Search, best: Comparison) -> int:
+    """Return the minimum agreement of strong matches at a further place. If virtual views led to a
+    clear pose, far fewer matches than at the best place cannot rival it."""
+    min_share = 0.5
+    least, found = search.weights.walls.stop.min_strong, search.best
+    is_clear = found is not None and search.is_clear and found.evidence.is_from_virtual_views
+    return max(least, round(min_share * best.num_strong)) if is_clear else least
+
+
+def _look_closer(
+    compared: Comparison, tried: list[VirtualViewProposal]
+) -> VirtualViewProposal | None:
+    """Match all features at a place, and again from the pose that it led to. None if too few
+    matches agree, or a pose nearby was tried."""
+
+    def is_new(one: VirtualViewProposal) -> bool:
+        search = one.walls.search
+        return not any(_are_near(search, one.cam_from_world, k.cam_from_world) for k in tried)
+
+    found = _propose(compared)
+    if found is None or not is_new(found):
+        return None
+    found = _compare_again(found)
+    return found if is_new(found) else None
 
 
 def _compare_again(proposal: VirtualViewProposal) -> VirtualViewProposal:
@@ -122,52 +148,23 @@ def _compare_again(proposal: VirtualViewProposal) -> VirtualViewProposal:
 
     The candidate place was only near the pose.
     """
-    again = _compare_views(proposal.walls, proposal.cam_from_world.inverse())
+    again = _propose(Comparison.of(proposal.walls, proposal.cam_from_world.inverse()))
     return again if again is not None and again.num_agreeing > proposal.num_agreeing else proposal
 
 
-def _compare_views(walls: VirtualViewSearch, place: Rigid3) -> VirtualViewProposal | None:
-    """Match both views with their predicted content at a place and fit an upright pose."""
-    # Minimum number of matches, over both views, that must agree on one pose to recognise a
-    # place.
-    min_agreeing = 8
-    cam_from_place = place.inverse()
-    sides = walls.sides_around(cam_from_place)
-    matches = [
-        match_pooled(
-            side.features.descriptors,
-            m.descriptors,
-            m.points_world,
-            m.radii,
-            walls.search.config.walls.matching,
-        )
-        for side, m in sides
-    ]
-    agreeing = _find_agreement(sides, matches, cam_from_place)
-    if agreeing is None or agreeing[0] < min_agreeing:
+def _propose(compared: Comparison) -> VirtualViewProposal | None:
+    agreed = compared.match_all()
+    if agreed is None:
         return None
-    if (found := merge_matches(sides, matches, walls.camera)) is None:
-        return None
+    walls = compared.walls
     return VirtualViewProposal(
         walls.search,
         "walls",
-        found,
-        num_agreeing=agreeing[0],
-        cam_from_world=agreeing[1] @ cam_from_place,
+        agreed.matches,
+        num_agreeing=agreed.num_agreeing,
+        cam_from_world=agreed.cam_from_world,
         walls=walls,
     )
-
-
-def _find_agreement(
-    sides: Sides, matches: list[Matches], cam_from_place: Rigid3
-) -> tuple[int, Rigid3] | None:
-    """Return the number of matches of both views that agree on one upright pose, and that pose
-    (cam_from_place)."""
-    if not sides:
-        return None
-    seen = [side.tangents[one.query_idx] for (side, _), one in zip(sides, matches, strict=True)]
-    points = [m.points_world[one.train_idx] for (_, m), one in zip(sides, matches, strict=True)]
-    return estimate_upright_pose(np.concatenate(seen), cam_from_place.apply(np.concatenate(points)))
 
 
 def _fit(
@@ -248,6 +245,19 @@ def _is_seen_by_nodes(search: Search, cam_from_world: Rigid3) -> bool:
     """Return whether nodes of the map have nearly this pose."""
     distances = search.map.distances(cam_from_world.inverse())
     return bool(distances.min() < search.config.walls.min_distance * search.map.d_thresh)
+
+
+def _is_found(search: Search, fit: PoseFit) -> bool:
+    """Return whether a probable hypothesis of virtual views has this pose. Neighbouring places lead
+    to one pose, and the one with the most agreeing matches comes first."""
+    config = search.config.evidence
+    tolerances = config.max_translation, math.radians(config.max_rotation_deg)
+    return any(
+        one.evidence.is_from_virtual_views
+        and one.probability >= config.min_probability
+        and one.world_from_cam.is_same(fit.world_from_cam, *tolerances)
+        for one in search.belief.hypotheses
+    )
 
 
 def _are_near(search: Search, a_from_world: Rigid3, b_from_world: Rigid3) -> bool:

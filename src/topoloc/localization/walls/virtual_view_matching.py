@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain
@@ -185,17 +186,23 @@ class VirtualViewSearch:
     places: list[Rigid3]
 
     @staticmethod
-    def of(search: Search, index: VirtualViewIndex) -> VirtualViewSearch:
-        """Extract both side views of the query image and select the candidate places."""
+    def of(
+        search: Search, index: VirtualViewIndex, max_tangent: float = math.inf
+    ) -> VirtualViewSearch:
+        """Extract both side views of the query image and select the candidate places.
+
+        Walls beyond `max_tangent` ahead, a tangent off the view's axis, are left out.
+        """
         num_d_thresh = 2.0  # minimum distance between these places, in D_thresh
         query, seen, named = search.query, list[QueryVirtualView](), list[CandidatePlaces]()
         assert isinstance(query.input_camera, Camera)
         for view in make_virtual_views(query.input_camera):
             picture = view.picture(query.grey)
-            seen_by = (view.name, index.feature_config)
-            features = query.shared.get_or_extract(
-                query, seen_by, partial(_extract_view_features, index.feature_config, view, picture)
+            extract = partial(
+                _extract_view_features, index.feature_config, view, picture, max_tangent
             )
+            seen_by = (view.name, index.feature_config, max_tangent)
+            features = query.shared.get_or_extract(query, seen_by, extract)
             seen.append(QueryVirtualView.of(view, features, query.input_camera))
             named.append(CandidatePlaces.of(view, index, index.similarity(picture, features)))
         apart = num_d_thresh * search.map.d_thresh
@@ -247,7 +254,16 @@ class VirtualViewSearch:
 
 
 def _extract_view_features(
-    config: FeatureConfig, view: VirtualView, picture: UInt8[np.ndarray, "a b"]
+    config: FeatureConfig,
+    view: VirtualView,
+    picture: UInt8[np.ndarray, "a b"],
+    max_tangent: float,
 ) -> Features:
-    """Extract the features of a view."""
-    return view.select_inside(extract_from_normalized(normalize_image(picture, config), config))
+    """Extract the features of a view. Those of a part of it have no dense descriptors."""
+    if math.isinf(max_tangent):
+        return view.select_inside(extract_from_normalized(normalize_image(picture, config), config))
+    columns = view.columns_within(max_tangent)
+    part = np.ascontiguousarray(picture[:, columns])
+    features = extract_from_normalized(normalize_image(part, config), config)
+    moved = features.points_img + np.array([columns.start, 0], np.float32)
+    return view.select_inside(replace(features, points_img=moved, dense=None))

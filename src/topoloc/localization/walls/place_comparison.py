@@ -1,0 +1,86 @@
+"""Compare both side views of an image with their predicted content at a candidate place.
+
+Few strong features are matched first. All are matched if enough of these agree on one upright pose
+(`upright_pose.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from topoloc.features.features import Matches
+from topoloc.features.matching import Matcher
+from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.pose_fit import PointMatches
+from topoloc.localization.walls.upright_pose import estimate_upright_pose
+from topoloc.localization.walls.virtual_view_matching import (
+    Sides,
+    VirtualViewSearch,
+    merge_matches,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class AgreedPose:
+    """Hold the matches of both views with one place, and the upright pose that `num_agreeing` of
+    them agree on."""
+
+    matches: PointMatches
+    num_agreeing: int
+    cam_from_world: Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Hold both views beside their predicted content at a place.
+
+    Of the matches of the strongest features, `num_strong` agree on one upright pose. `matchers`
+    match further features of each view.
+    """
+
+    walls: VirtualViewSearch
+    cam_from_place: Rigid3
+    sides: Sides
+    matchers: list[Matcher]
+    num_strong: int
+
+    @staticmethod
+    def of(walls: VirtualViewSearch, place: Rigid3) -> Comparison:
+        """Match the strongest features of both views with the points predicted from a place."""
+        cam_from_place, weights = place.inverse(), walls.search.weights.walls
+        sides, config = walls.sides_around(cam_from_place), walls.search.config.walls.matching
+        matchers = [
+            Matcher(side.features.descriptors, m.descriptors, (m.points_world, m.radii), config)
+            for side, m in sides
+        ]
+        matches = [matcher.match_first(weights.stop.num_strong) for matcher in matchers]
+        agreeing = _find_agreement(sides, matches, cam_from_place)
+        num_strong = 0 if agreeing is None else agreeing[0]
+        return Comparison(walls, cam_from_place, sides, matchers, num_strong)
+
+    def match_all(self) -> AgreedPose | None:
+        """Match all features and return the upright pose that most matches agree on. None if too
+        few do to recognise a place."""
+        stop = self.walls.search.weights.walls.stop
+        matches = [matcher.match_first() for matcher in self.matchers]
+        agreeing = _find_agreement(self.sides, matches, self.cam_from_place)
+        if agreeing is None or agreeing[0] < stop.min_agreeing:
+            return None
+        merged = merge_matches(self.sides, matches, self.walls.camera)
+        if merged is None:
+            return None
+        return AgreedPose(merged, agreeing[0], agreeing[1] @ self.cam_from_place)
+
+
+def _find_agreement(
+    sides: Sides, matches: list[Matches], cam_from_place: Rigid3
+) -> tuple[int, Rigid3] | None:
+    """Return the number of matches of both views that agree on one upright pose, and that pose
+    (cam_from_place)."""
+    if not sides:
+        return None
+    seen = [side.tangents[one.query_idx] for (side, _), one in zip(sides, matches, strict=True)]
+    points = [m.points_world[one.train_idx] for (_, m), one in zip(sides, matches, strict=True)]
+    return estimate_upright_pose(np.concatenate(seen), cam_from_place.apply(np.concatenate(points)))
