@@ -21,10 +21,11 @@ from topoloc.features.matching import match_features
 from topoloc.features.surf_detector_kernels import integral_image
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.guided import count_consistent_displacements
 from topoloc.localization.guided_kernels import match_projections
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.map_facts.map_building import build_map
-from topoloc.localization.walls.upright_pose import estimate_upright_pose
+from topoloc.localization.walls.place_comparison import estimate_upright_pose
 from topoloc.mapping.config import Progress
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import DepthImage, StereoFrame
@@ -71,7 +72,9 @@ def warm_up(
 
         def features() -> None:
             first, second = (extract_features(picture, FeatureConfig()) for picture in pictures[:2])
-            match_features(first.descriptors, second.descriptors, MatchingConfig())
+            matches = match_features(first.descriptors, second.descriptors, MatchingConfig())
+            nowhere = np.zeros((len(second), 5), np.float32)  # maps of SURF alone need this kernel
+            count_consistent_displacements(first, matches, nowhere, _CAMERA, within_px=1.0)
 
         def localize_image(image: UInt8[np.ndarray, "h w"], camera: Camera | None) -> None:
             Localizer(TopoMetricMap.load(map_file)).localize(image, camera)

@@ -2,7 +2,7 @@
 
 This is the last source of proposals. The image's views to the left and right
 (`features/virtual_views.py`) are compared with the virtual views of the map. Candidate places come
-from `virtual_view_index.py`. A pose that matches of both views agree on (`upright_pose.py`) is
+from `virtual_view_index.py`. A pose that matches of both views agree on (`place_comparison.py`) is
 refined in both together (`virtual_view_matching.py`).
 
 Walls repeat, doors above all. So the evidence also counts the key points that match here better

@@ -1,5 +1,5 @@
-"""Numba kernels of `upright_pose.py`: upright poses from pairs of matches, and the pose with the
-most agreeing matches."""
+"""Numba kernels of `place_comparison.py`: upright poses from pairs of matches, and the pose with
+the most agreeing matches."""
 
 from __future__ import annotations
 
