@@ -108,9 +108,8 @@ def ask(localizer: Localizer, frame: StereoFrame) -> Answer:
         return answer | {"kind": "refused", "by": result.reason}
     tried = [one for one in trace.tried if one.hypothesis is not None]
     by = [f"{k.source}:{k.features}" for k in tried if k.hypothesis.evidence == result.evidence]  # pyright: ignore[reportOptionalMemberAccess]
-    of_walls = result.evidence is not None and result.evidence.is_from_virtual_views
     return answer | {
-        "kind": "by virtual views" if of_walls else "by nodes",
+        "kind": "by nodes" if result.is_of_nodes else "by virtual views",
         "by": by[0] if by else "second look or other types",
         "probability": result.probability,
         "position": result.world_from_cam.translation.tolist(),

@@ -122,7 +122,7 @@ def _min_strong(search: Search, best: Comparison) -> int:
     clear pose, far fewer matches than at the best place cannot rival it."""
     min_share = 0.5
     least, found = search.weights.walls.stop.min_strong, search.best
-    is_clear = found is not None and search.is_clear and found.evidence.is_from_virtual_views
+    is_clear = found is not None and search.is_clear and not found.evidence.is_of_nodes
     return max(least, round(min_share * best.num_strong)) if is_clear else least
 
 
@@ -253,7 +253,7 @@ def _is_found(search: Search, fit: PoseFit) -> bool:
     config = search.config.evidence
     tolerances = config.max_translation, math.radians(config.max_rotation_deg)
     return any(
-        one.evidence.is_from_virtual_views
+        not one.evidence.is_of_nodes
         and one.probability >= config.min_probability
         and one.world_from_cam.is_same(fit.world_from_cam, *tolerances)
         for one in search.belief.hypotheses
