@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from topoloc.evaluation.metrics import format_length as format_length
     from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
     from topoloc.features.feature_types import (
-        check_available as check_available,
-        parse_feature_types as parse_feature_types,
+        find_available_types as find_available_types,
     )
     from topoloc.features.network_files import (
         NetworkInfo as NetworkInfo,
@@ -94,7 +93,7 @@ _NAMES = {
     "topoloc.bounds": "Above AtLeast Between describe_ranges suggest_name with_setting",
     "topoloc.evaluation.metrics": "format_length",
     "topoloc.evaluation.node_matching": "NodeMatcher",
-    "topoloc.features.feature_types": "check_available parse_feature_types",
+    "topoloc.features.feature_types": "find_available_types",
     "topoloc.features.network_files": "NetworkInfo cache_folder read_bytes",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.mapping.node_images": "read_node_image",

@@ -9,7 +9,7 @@ The extraction code of a type is loaded when it is used: OpenCV, Numba or ONNX R
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from topoloc.bounds import AtLeast, Between
-from topoloc.errors import FeatureTypeError
+from topoloc.errors import FeatureTypeError, MissingExtraError, WeightsError
 from topoloc.features.features import Features
 
 Normalization = Literal["none", "paper", "wide"]
@@ -255,3 +255,16 @@ def check_available(name: str) -> None:
         from topoloc.features.learned import check_network
 
         check_network(network)
+
+
+def find_available_types(kinds: Iterable[str]) -> list[str]:
+    """Return those of the feature types that can be computed on this installation."""
+
+    def is_available(kind: str) -> bool:
+        try:
+            check_available(kind)
+        except (MissingExtraError, WeightsError):
+            return False
+        return True
+
+    return [kind for kind in kinds if is_available(kind)]

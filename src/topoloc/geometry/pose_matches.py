@@ -71,12 +71,10 @@ class Matches:
         )
 
 
-def refine_pose(
-    cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"], max_steps: int = 10
-) -> Rigid3:
-    """Return the pose that fits the active matches best, starting from a nearby pose, in at most
-    `max_steps` steps."""
-    return Rigid3(*refine(*matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, max_steps))
+def refine_pose(cam_from_world: Rigid3, matches: Matches, active: Bool[np.ndarray, " n"]) -> Rigid3:
+    """Return the pose that fits the active matches best, starting from a nearby pose, in at most 10
+    steps."""
+    return Rigid3(*refine(*matches.kernel_args(cam_from_world), active, CAUCHY_SCALE, 10))
 
 
 def is_non_collinear(points: Float[np.ndarray, "n 3"]) -> bool:

@@ -11,8 +11,10 @@ from topoloc.errors import ConfigError, MissingExtraError, WeightsError
 from topoloc.features.feature_types import (
     SURF,
     FeatureConfig,
+    check_available,
     default_learned_type,
     find_feature_type,
+    parse_feature_types,
 )
 from topoloc.json_data import decode_json
 from topoloc.mapping.nodes import NodeConfig
@@ -70,6 +72,19 @@ class MapConfig:
         the first type if none is learned."""
         kinds = [find_feature_type(kind) for kind in self.kinds]
         return next((one for one in kinds if one.network is not None), kinds[0]).virtual_view_type
+
+    def with_kinds(self, text: str | None) -> MapConfig:
+        """Return the settings with the feature types that a text names (`parse_feature_types`), or
+        with the same ones.
+
+        Raises:
+            FeatureTypeError: one is unknown, or is named twice.
+            MissingExtraError, WeightsError: one is not available on this machine.
+        """
+        first, *others = kinds = self.kinds if text is None else parse_feature_types(text)
+        for kind in kinds:
+            check_available(kind)
+        return replace(self, features=replace(self.features, kind=first), other_kinds=tuple(others))
 
     def feature_config_for(self, kind: str) -> FeatureConfig:
         """Return the feature settings of a type. Other types than the first use their own default

@@ -96,11 +96,11 @@ class LandmarkStatistics:
         is_empty = not self.pulls.any() and bool((np.abs(self.roots) <= _MAX_EMPTY_ROOT).all())
         return len(self.rows) > 0 and is_empty
 
-    def is_reobserved(self, min_seen_share: float = 0.3) -> bool:
-        """Return whether the session saw at least this share of its expected observations. A
-        session in other light may see none of them."""
+    def is_reobserved(self) -> bool:
+        """Return whether the session saw at least 0.3 of its expected observations. A session in
+        other light may see none of them."""
         seen, expected = (counts.sum(dtype=np.int64) for counts in (self.seen, self.expected))
-        return bool(seen >= min_seen_share * expected)
+        return bool(seen >= 0.3 * expected)
 
 
 def merge_count_statistics(statistics: Iterable[LandmarkStatistics]) -> list[LandmarkStatistics]:

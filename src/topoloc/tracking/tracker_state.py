@@ -137,12 +137,10 @@ def compute_direction_uncertainty(predicted: MotionState, depth: float) -> float
     return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
 
 
-def compute_motion_covariance(
-    tracked_motion: TrackedMotion, share: float = 0.05
-) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance of a tracked motion: the noise of the points, and `share` of the motion
+def compute_motion_covariance(tracked_motion: TrackedMotion) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance of a tracked motion: the noise of the points, and a share of the motion
     for wrong depths."""
-    motion = tracked_motion.cam_from_ref
+    motion, share = tracked_motion.cam_from_ref, 0.05
     way, turn = float(np.linalg.norm(motion.translation)), motion.angle()
     return tracked_motion.covariance + np.diag(np.repeat([way**2, turn**2], 3)) * share**2
 

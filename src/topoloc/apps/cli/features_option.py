@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
 from typing import Annotated
 
 from topoloc import (
@@ -13,13 +11,10 @@ from topoloc import (
     FeatureTypeError,
     Localizer,
     LocalizerConfig,
-    MissingExtraError,
     TopoMetricMap,
-    WeightsError,
 )
 from topoloc.apps.cli.output import UsageError, option, print_warning
 from topoloc.apps.query_camera import CameraOfSize, parse_camera_option
-from topoloc.plugin import check_available, parse_feature_types
 
 BUILD_FEATURES = Annotated[
     str | None, option("surf|sift|learned|both|KIND[,KIND]", "both if a network is installed")
@@ -45,17 +40,12 @@ def select_build_features(config: BuildConfig, features: str | None) -> BuildCon
     """Return the configuration with the feature types of the option. Raises UsageError: a type is
     unknown or given twice; MissingExtraError, WeightsError: a type is not available on this
     machine."""
-    kinds = config.kinds
-    if features is not None:
-        try:
-            kinds = parse_feature_types(features)
-        except FeatureTypeError as error:
-            raise UsageError(str(error)) from None
-    for kind in kinds:
-        check_available(kind)
-    return replace(
-        config, features=replace(config.features, kind=kinds[0]), other_kinds=tuple(kinds[1:])
-    )
+    try:
+        return config.with_kinds(features)
+    except FeatureTypeError as error:
+        if features is None:
+            raise
+        raise UsageError(str(error)) from None
 
 
 def open_localizer(
@@ -80,16 +70,3 @@ def parse_camera(localizer: Localizer, text: str) -> CameraOfSize:
         raise UsageError("--camera map: the tiles of an atlas have cameras of their own")
     with localizer.in_tile() as in_tile:
         return parse_camera_option(text, in_tile.topomap)
-
-
-def find_available_types(kinds: Iterable[str]) -> frozenset[str]:
-    """Return those of the feature types that are available on this machine."""
-
-    def is_available(kind: str) -> bool:
-        try:
-            check_available(kind)
-        except (MissingExtraError, WeightsError):
-            return False
-        return True
-
-    return frozenset(kind for kind in kinds if is_available(kind))

@@ -87,11 +87,11 @@ def embedded_head() -> str:
     return f"<style>\n{static_text('viewer.css')}</style>\n{import_map(_data_address)}"
 
 
-def embedded_scene(document: Mapping[str, Any], name: str = "scene") -> str:
-    """Return a scene as well-formed HTML for such a page. `name` is its id on the page."""
+def embedded_scene(document: Mapping[str, Any]) -> str:
+    """Return a scene as well-formed HTML for such a page."""
     return (
-        f'<div data-scene="{name}"><noscript>The scene in 3-D needs JavaScript.</noscript></div>'
-        f'<script type="application/json" id="{name}">{to_script_json(document)}</script>'
+        '<div data-scene="scene"><noscript>The scene in 3-D needs JavaScript.</noscript></div>'
+        f'<script type="application/json" id="scene">{to_script_json(document)}</script>'
         '<script type="module">import { showAll } from "topoloc/apps/viewer"; showAll();</script>'
     )
 
@@ -129,8 +129,8 @@ def find_browser() -> str:
     return found
 
 
-def write_screenshot(page: Path, out: Path, width: int = 1300, height: int = 850) -> None:
-    """Write a PNG of the page in a window of this size (pixels). Raises TopolocError: there is no
+def write_screenshot(page: Path, out: Path) -> None:
+    """Write a PNG of the page in a window of 1300 x 850 pixels. Raises TopolocError: there is no
     browser, it fails, or the file cannot be written."""
     browser = find_browser()
     with tempfile.TemporaryDirectory(prefix="topoloc-view-") as profile:
@@ -142,7 +142,7 @@ def write_screenshot(page: Path, out: Path, width: int = 1300, height: int = 850
             *(["--no-sandbox"] if is_root else []),  # Chromium's sandbox refuses root
             f"--user-data-dir={profile}",
             f"--virtual-time-budget={_VIRTUAL_MS}",
-            f"--window-size={width},{height}",
+            "--window-size=1300,850",
             f"--screenshot={picture}",
             page.resolve().as_uri(),
         ]

@@ -19,8 +19,8 @@ from topoloc.atlas.location_prior import LocationPrior, tiles_in_reach
 from topoloc.atlas.manifest import Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.atlas.tile_fetcher import RETRY_AFTER_S
-from topoloc.errors import AtlasError, MapError, MissingExtraError, WeightsError
-from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig, check_available
+from topoloc.errors import AtlasError, MapError
+from topoloc.features.feature_types import FEATURE_TYPES, FeatureConfig, find_available_types
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
@@ -135,9 +135,7 @@ class AtlasTiles(Tiles):
     @cached_property
     def _ranking_feature_types(self) -> list[str]:
         """Return the available feature types that can rank tiles, cheapest first."""
-        return [
-            kind for kind in FEATURE_TYPES if kind in self.atlas.index.kinds and _is_available(kind)
-        ]
+        return find_available_types(one for one in FEATURE_TYPES if one in self.atlas.index.kinds)
 
     def other_from_world(self, tile_id: str, other_id: str) -> Rigid3 | None:
         """Return the transform from the world of a tile to that of another, None if unknown."""
@@ -199,14 +197,6 @@ class AtlasTiles(Tiles):
         """Return the pose on earth, None if the tile is not georeferenced, alone or by others."""
         known: Georeference | None = self.atlas.manifest.georeference_of(self.atlas.tile(tile_id))
         return None if known is None else known.geopose(world_from_cam)
-
-
-def _is_available(kind: str) -> bool:
-    try:
-        check_available(kind)
-    except (MissingExtraError, WeightsError):
-        return False
-    return True
 
 
 def _join_sigmas(tile: Tile, pose: Localization, other: Tile) -> tuple[float, float]:

@@ -32,11 +32,11 @@ from topoloc import (
     localize_queries,
     with_pose_conventions,
 )
-from topoloc.apps.cli.features_option import find_available_types
 from topoloc.apps.cli.output import open_recording, print_warning
 from topoloc.apps.cluster.config import ClusterConfig
 from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.cluster.tasks import JobProgress, OnJobState, run_on_ray
+from topoloc.plugin import find_available_types
 
 MAX_IMAGES = 50
 """Images of a piece. It takes about a second to open map and recording, much less than these."""
@@ -109,7 +109,7 @@ class RemoteMap:
     def of(localizer: Localizer, tile_id: str, features: str | None) -> RemoteMap:
         """Return the description of this localizer for another process."""
         source, how = localizer.source, (localizer.config, localizer.tile_config, features)
-        return RemoteMap(source, tile_id, find_available_types(source.kinds), *how)
+        return RemoteMap(source, tile_id, frozenset(find_available_types(source.kinds)), *how)
 
     def open(self, notes: list[str]) -> Localizer:
         """Open the same map or atlas here. `notes` receives the problems of its tiles. Raises
@@ -121,7 +121,7 @@ class RemoteMap:
         )
 
     def _check_same_features(self, kinds: Iterable[str]) -> None:
-        other = sorted(find_available_types(kinds) ^ self.kinds)
+        other = sorted(self.kinds.symmetric_difference(find_available_types(kinds)))
         if other:
             lacks = "lacks" if other[0] in self.kinds else "has"
             raise MissingExtraError(
