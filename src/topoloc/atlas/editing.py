@@ -194,7 +194,16 @@ def store_tile(new: NewTile, store: Store) -> Tile:
         previous = [*kept, *new.older]
         previous = select_kept(previous, [one.num_bytes for one in previous])
         placed = PlacesFile(**places, vocabularies=versions)
-        return _describe_tile(new, topomap, stored, placed, tuple(previous))
+        return Tile(
+            new.tile_id,
+            map=stored,
+            places=placed,
+            world=new.world,
+            atlas_from_world=None,
+            recipe=new.recipe,
+            previous=tuple(previous),
+            **map_facts(topomap),
+        )
 
 
 def _store_file(store: Store, name: str, path: Path) -> StoredFile:
@@ -216,26 +225,6 @@ def _restore_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) 
 
 class _TileChangedError(Exception):
     """Signal that another writer changed the tile first."""
-
-
-def _describe_tile(
-    new: NewTile,
-    topomap: TopoMetricMap,
-    stored: StoredFile,
-    places: PlacesFile,
-    previous: tuple[StoredFile, ...],
-) -> Tile:
-    """Return the manifest entry of a map and its stored files."""
-    return Tile(
-        new.tile_id,
-        map=stored,
-        places=places,
-        world=new.world,
-        atlas_from_world=None,
-        recipe=new.recipe,
-        previous=previous,
-        **map_facts(topomap),
-    )
 
 
 def _check_ids_free(manifest: Manifest, new: Sequence[NewTile], replaces: bool) -> None:

@@ -100,9 +100,8 @@ def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> tuple[str, 
     result, node = answer.result, _select_node(answer, topomap)
     evidence = f"{result.num_inliers} inliers of {result.num_matches} matches"
     if isinstance(result, Localization):
-        sigma = float(np.sqrt(max(np.trace(result.camera_covariance[:3, :3]), 0.0)))
         evidence += f", probability {result.probability:.2f}"
-        evidence += f", reported standard deviation {format_length(sigma)}"
+        evidence += f", reported standard deviation {format_length(result.position_sigma_m)}"
     if answer.nearest_node_id not in (None, node and node.summary.node_id):
         evidence += f"; nearest to the truth is node {answer.nearest_node_id}"
     is_right = result.localized == (answer.world_from_cam is not None)
