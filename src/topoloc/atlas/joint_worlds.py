@@ -202,11 +202,10 @@ def _reachable_worlds(
         if name in places:
             continue
         places[name] = place
-        adjoint = place.joint_from_world.adjoint()
         for num_agreeing, to, pose, of_link in links[name]:
             if to not in places:
-                covariance = place.covariance + adjoint @ of_link @ adjoint.T
-                reached = JointPose(anchor, place.joint_from_world @ pose, covariance)
+                moved = place.joint_from_world.transform_covariance(of_link)
+                reached = JointPose(anchor, place.joint_from_world @ pose, place.covariance + moved)
                 count += 1
                 heapq.heappush(queue, (-num_agreeing, count, to, reached))
     return places

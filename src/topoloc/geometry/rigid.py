@@ -193,6 +193,13 @@ class Rigid3:
         ad[:3, 3:] = skew(self.translation) @ self.rotation
         return ad
 
+    def transform_covariance(
+        self, covariance: Float[np.ndarray, "6 6"]
+    ) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of the left perturbation of ``self @ b`` from that of ``b``."""
+        adjoint = self.adjoint()
+        return adjoint @ covariance @ adjoint.T
+
     def angle(self) -> float:
         """Return the rotation angle in radians, in [0, pi]."""
         return float(np.linalg.norm(log_so3(self.rotation)))
@@ -262,8 +269,7 @@ def inverse_covariance(
     adjoint of b_from_a. The translation part belongs to frame b at its origin. Use
     `position_covariance` for the camera's own position.
     """
-    adjoint = a_from_b.inverse().adjoint()
-    return adjoint @ covariance @ adjoint.T
+    return a_from_b.inverse().transform_covariance(covariance)
 
 
 def position_covariance(

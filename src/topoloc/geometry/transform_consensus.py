@@ -46,9 +46,8 @@ def propagate_estimate(
     """
     lengths = (float(np.linalg.norm(motion.translation)) for motion in (c_from_a, b_from_d))
     of_c, of_d = (diagonal_covariance(drift * way, drift_deg * way) for way in lengths)
-    to_c, to_d = c_from_a.adjoint(), (c_from_a @ a_from_b).adjoint()
-    at_c = to_c @ covariance @ to_c.T + of_c
-    return c_from_a @ a_from_b @ b_from_d, at_c + to_d @ of_d @ to_d.T
+    c_from_b, at_c = c_from_a @ a_from_b, c_from_a.transform_covariance(covariance) + of_c
+    return c_from_b @ b_from_d, at_c + c_from_b.transform_covariance(of_d)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +76,7 @@ class TransformConsensus:
         self, c_from_a: Rigid3, b_from_d: Rigid3
     ) -> tuple[Rigid3, Float[np.ndarray, "6 6"]]:
         """Return c_from_d and the covariance of its left perturbation."""
-        adjoint = c_from_a.adjoint()
-        covariance = adjoint @ self.covariance @ adjoint.T
+        covariance = c_from_a.transform_covariance(self.covariance)
         return c_from_a @ self.a_from_b @ b_from_d, 0.5 * (covariance + covariance.T)
 
 

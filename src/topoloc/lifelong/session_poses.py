@@ -226,8 +226,7 @@ def _estimate_noise(odom: Mapping[int, Rigid3], anchors: Mapping[int, Localizati
     for index, pose in odom.items():
         if before is not None:
             step, of_step = _relative_motion(before, pose)
-            adjoint = step.adjoint()
-            moved, spread = step @ moved, adjoint @ spread @ adjoint.T + of_step
+            moved, spread = step @ moved, step.transform_covariance(spread) + of_step
         before = pose
         if index in anchors:
             answer = anchors[index]

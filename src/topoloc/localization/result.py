@@ -110,8 +110,7 @@ class Localization:
 
         It is that of xi in ``true_world_from_cam = world_from_cam @ exp(xi)``.
         """
-        adjoint = self.world_from_cam.inverse().adjoint()
-        return adjoint @ self.covariance @ adjoint.T
+        return self.world_from_cam.inverse().transform_covariance(self.covariance)
 
     def to_json(self, query: str) -> dict[str, Any]:
         """Return one line of the result file, see docs/cli.md."""

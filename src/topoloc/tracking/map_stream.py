@@ -266,10 +266,10 @@ class MapStream:
         self, frame: StreamFrame, tracked: TrackedImage, clock: StageClock
     ) -> StreamedPose:
         world_from_cam, state = tracked.cam_from_world.inverse(), self._hypotheses.leader
-        adjoint, found = world_from_cam.adjoint(), tracked.reference.found
+        found, noise = tracked.reference.found, tracked.moved_errors + tracked.motion.covariance
         result = Localization(
             world_from_cam=world_from_cam,
-            covariance=adjoint @ (tracked.moved_errors + tracked.motion.covariance) @ adjoint.T,
+            covariance=world_from_cam.transform_covariance(noise),
             probability=min(found.probability, self._hypotheses.alternatives()[0].probability),
             node_id=found.node_id,
             candidates=[],

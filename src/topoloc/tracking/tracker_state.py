@@ -127,8 +127,7 @@ class TrackedImage:
     @property
     def moved_errors(self) -> Float[np.ndarray, "6 6"]:
         """Return the covariance of the error of the reference image, moved to this image."""
-        adjoint = self.motion.cam_from_ref.adjoint()
-        return adjoint @ self.reference.errors.total @ adjoint.T
+        return self.motion.cam_from_ref.transform_covariance(self.reference.errors.total)
 
 
 def compute_direction_uncertainty(predicted: MotionState, depth: float) -> float:
@@ -154,12 +153,10 @@ def compute_smoothed_covariance(
     """
     covariance = np.zeros((6, 6))
     if reference is not None:
-        adjoint = reference.smoothed.inverse().adjoint()
-        covariance = adjoint @ reference.covariance @ adjoint.T
+        covariance = reference.smoothed.inverse().transform_covariance(reference.covariance)
     if since is None:
         return covariance
-    adjoint = since.world_from_cam.adjoint()
-    return covariance + adjoint @ since.pose_covariance @ adjoint.T
+    return covariance + since.world_from_cam.transform_covariance(since.pose_covariance)
 
 
 def fade_offset(offset: Rigid3, seconds: float) -> Rigid3:
@@ -204,8 +201,7 @@ class PoseWindow:
         last added image. Return its smoothed cam_from_world. All covariances are those of left
         perturbations."""
         if self._smoothed:
-            adjoint = cam_from_before.adjoint()
-            before = adjoint @ self._covariance @ adjoint.T + motion_covariance
+            before = cam_from_before.transform_covariance(self._covariance) + motion_covariance
             both = before @ np.linalg.solve(before + covariance, covariance)
             self._covariance = (both + both.T) / 2.0  # symmetric up to rounding
         else:

@@ -67,5 +67,4 @@ def camera_covariance_in_world(
 ) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of the camera's position and rotation about the camera, in axes of the
     world. `covariance` is that of the left perturbation about the origin."""
-    at_camera = Rigid3(np.eye(3), -world_from_cam.translation).adjoint()
-    return at_camera @ covariance @ at_camera.T
+    return Rigid3(np.eye(3), -world_from_cam.translation).transform_covariance(covariance)

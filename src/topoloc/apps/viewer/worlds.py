@@ -125,7 +125,7 @@ def transform_answers(
         }
         if "covariance" in moved:
             covariance = np.array(moved["covariance"], np.float64)
-            moved["covariance"] = (pose.adjoint() @ covariance @ pose.adjoint().T).tolist()
+            moved["covariance"] = pose.transform_covariance(covariance).tolist()
         if alternatives:
             placed = [
                 (one, world.world_from_map_of(one.get("tile") or tile_id)) for one in alternatives

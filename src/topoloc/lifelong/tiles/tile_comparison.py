@@ -182,8 +182,7 @@ class _NodeQueries:
             if result is not None:
                 matched = self.target.topomap.row_of(result.node_id)
                 node_from_world = self.target.world_from_node(matched).inverse()
-                adjoint = node_from_world.adjoint()
-                covariance = widened**2 * adjoint @ result.covariance @ adjoint.T
+                covariance = widened**2 * node_from_world.transform_covariance(result.covariance)
                 covariance = covariance + diagonal_covariance(sigma, sigma_deg)
                 pose = node_from_world @ result.world_from_cam
                 yield row, matched, pose, covariance, result.num_inliers
