@@ -243,8 +243,9 @@ class CrowdingWeights(Struct, frozen=True, forbid_unknown_fields=True):
     Its matches are searched within `radius_px` (pixels of an image whose longer side is 640). Of
     chance matches, `chance_share` lies within `near_px` of the prediction. The matches crowd by
     the standard deviations above that. `weight` times the crowding plus `bias` is added to the
-    log-odds, if matches crowd in all parts of the view: of the `cells` (columns, rows) with
-    `min_cell_matches`, the `quantile` of the shares near the prediction is at least `min_share`.
+    log-odds, if matches crowd in all parts of the view: at least `min_full_cells` of the `cells`
+    (columns, rows) have `min_cell_matches`, and the `quantile` of their shares near the prediction
+    is at least `min_share`.
     """
 
     min_log_odds: Finite
@@ -253,6 +254,7 @@ class CrowdingWeights(Struct, frozen=True, forbid_unknown_fields=True):
     chance_share: Finite
     cells: tuple[int, int]
     min_cell_matches: int
+    min_full_cells: int
     quantile: Finite
     min_share: Finite
     weight: Finite

@@ -255,7 +255,9 @@ class Surroundings:
         totals = np.bincount(cells, minlength=num_cells)
         is_full = totals >= weights.min_cell_matches
         shares = np.bincount(cells, is_near, num_cells)[is_full] / totals[is_full]
-        if len(shares) == 0 or np.quantile(shares, weights.quantile) < weights.min_share:
+        if len(shares) < weights.min_full_cells:  # a lone door looks like another one
+            return 0.0
+        if np.quantile(shares, weights.quantile) < weights.min_share:
             return 0.0
         expected = weights.chance_share * len(matches)
         deviation = np.sqrt((1.0 - weights.chance_share) * expected)
