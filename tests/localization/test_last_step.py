@@ -17,11 +17,15 @@ from topoloc.apps.report.explanation import explain, explanation_to_json
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization import schedule
 from topoloc.localization.exact import patch_alignment
+from topoloc.localization.exact.last_step import Surroundings, make_precise
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
+from topoloc.localization.fitted_weights import load_last_step_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
-from topoloc.localization.search import Trace
+from topoloc.localization.result_decision import ResultWithInliers
+from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
 
 
@@ -55,6 +59,29 @@ def test_poses_become_more_exact_and_stay_inside_their_ellipsoids(room: TopoMetr
         assert off @ np.linalg.solve(precise.camera_covariance, off) < 22.5  # 0.1 % of 6 dof
         assert precise.position_sigma_m < first.position_sigma_m
     assert np.mean(after) < 0.8 * np.mean(before)
+
+
+def test_the_second_look_needs_matches_in_most_parts_of_the_view(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
+    """A strip of the image, like a door of another place, is no evidence for the whole view."""
+    seen = list[list[Search]]()
+
+    def keep(searches: list[Search], outcome: ResultWithInliers, has_prior: bool):
+        seen.append(searches)
+        return make_precise(searches, outcome, has_prior)
+
+    monkeypatch.setattr(schedule, "make_precise", keep)
+    image, truth = unseen_views(step=0.75)[0]
+    strip = image.copy()
+    strip[:, image.shape[1] // 2 :] = 128
+    gains = list[float]()
+    for shown in (image, strip):
+        Localizer(room).localize(shown, CAMERA)
+        around = Surroundings.of(seen[-1], truth.inverse(), load_last_step_weights())
+        gains.append(around.compute_gain(truth.inverse()))
+    assert gains[0] > 0.0
+    assert gains[1] == 0.0
 
 
 def test_strong_distortion_is_part_of_the_warp(room: TopoMetricMap):
