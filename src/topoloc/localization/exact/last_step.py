@@ -216,11 +216,6 @@ class Surroundings:
         """Return the camera of the query."""
         return self.searches[0].query.camera
 
-    @property
-    def scale(self) -> float:
-        """Return the pixels of this image for one of an image whose longer side is 640."""
-        return max(max(self.camera.width, self.camera.height) / 640.0, 0.5)
-
     def refine_by_key_points(self, cam_from_world: Rigid3) -> PreciseFit | None:
         """Refine the pose in two rounds: with the first search, then with all and tighter."""
         num_searches = (1, len(self.searches))
@@ -248,16 +243,15 @@ class Surroundings:
         matches = self.match(fit.pose.cam_from_world, weights.radius_px, len(self.searches))
         predicted = self.camera.img_from_cam(fit.pose.cam_from_world.apply(matches.points_world))
         errors_px = np.linalg.norm(predicted - matches.points_img, axis=1)
-        is_near = errors_px < weights.near_px * self.scale
+        is_near = errors_px < weights.near_px * self.camera.radius_scale
         size, counts = [self.camera.width, self.camera.height], np.array(weights.cells)
         columns, rows = np.clip(matches.points_img * counts / size, 0, counts - 1).astype(int).T
         cells, num_cells = rows * counts[0] + columns, int(counts.prod())
         totals = np.bincount(cells, minlength=num_cells)
         is_full = totals >= weights.min_cell_matches
         shares = np.bincount(cells, is_near, num_cells)[is_full] / totals[is_full]
-        if len(shares) < weights.min_full_cells:  # a lone door looks like another one
-            return 0.0
-        if np.quantile(shares, weights.quantile) < weights.min_share:
+        is_whole = len(shares) >= weights.min_full_cells  # a lone door looks like another one
+        if not is_whole or np.quantile(shares, weights.quantile) < weights.min_share:
             return 0.0
         expected = weights.chance_share * len(matches)
         deviation = np.sqrt((1.0 - weights.chance_share) * expected)
@@ -295,7 +289,7 @@ class Surroundings:
             matches.sigmas_px,
             self.camera,
             start,
-            max_error_px * self.scale,
+            max_error_px * self.camera.radius_scale,
         )
         if pose is None or np.count_nonzero(pose.inliers) < self.weights.min_matches:
             return None
