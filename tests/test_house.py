@@ -49,7 +49,7 @@ CEILINGS = {
     "branches.walls": 0,  # goal 0
     "constants.all": 419,  # goal 474, localization 25
     "constants.core/localization": 24,
-    "user_docs_bytes": 144838,  # goal 150000
+    "user_docs_bytes": 145122,  # goal 150000
     "readme_lines": 150,  # goal 150
     "architecture_lines": 110,  # goal 110
 }
