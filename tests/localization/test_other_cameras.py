@@ -179,3 +179,9 @@ def test_a_probability_above_95_percent_has_sigmas_within_the_tolerance(
     highest = highest_probability(np.diag(variances), EvidenceConfig())
     assert (highest > 0.95) <= (metres < 0.25 and degrees < 2.0)
     assert highest > 0.99 or metres > 0.15 or degrees > 1.2, "it must not refuse everything"
+
+
+def test_an_upper_bound_of_the_error_refuses_no_pose():
+    config = EvidenceConfig()
+    variances = np.repeat([1.0, np.deg2rad(20.0) ** 2], 3)
+    assert highest_probability(np.diag(variances), config) == config.min_probability

@@ -62,14 +62,15 @@ def compute_normalized_uncertainty(
 def highest_probability(covariance: Float[np.ndarray, "6 6"], config: EvidenceConfig) -> float:
     """Return the highest probability that agrees with a covariance of cam_from_world.
 
-    The covariance is an upper bound: rho is that of the worse parts of a map. The probability is
-    0.95 if a standard deviation equals its tolerance.
+    The covariance is an upper bound: rho is that of the worse parts of a map. So it alone refuses
+    no pose. The probability is 0.95 if a standard deviation equals its tolerance.
     """
     variances = np.diag(covariance)
     metres = math.sqrt(variances[:3].sum()) / config.max_translation
     degrees = math.degrees(math.sqrt(variances[3:].sum())) / config.max_rotation_deg
     normal_95_percent = 1.96
-    return probability_within_tolerance(max(metres, degrees) / normal_95_percent)
+    within = probability_within_tolerance(max(metres, degrees) / normal_95_percent)
+    return max(within, config.min_probability)
 
 
 def sample_rows(count: int) -> Int[np.ndarray, " k"]:
