@@ -4,7 +4,7 @@ WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY src src
 RUN python -m venv /opt/topoloc \
- && /opt/topoloc/bin/pip install --no-cache-dir --constraint constraints.txt '.[serve,learned]'
+ && /opt/topoloc/bin/pip install --no-cache-dir --constraint constraints.txt .
 
 FROM python:3.12-slim
 COPY --from=build /opt/topoloc /opt/topoloc

@@ -125,8 +125,7 @@ def built_corridor() -> TopoMetricMap:
 
 @once_a_run
 def corridor_of_two_kinds() -> TopoMetricMap:
-    """The same, of SURF and the learned features at hand, which describe the side nodes. Raises
-    MissingExtraError without ONNX Runtime."""
+    """The same, of SURF and the learned features at hand, which describe the side nodes."""
     return build_map(WalkAhead(0), BuildConfig(other_kinds=(default_learned_type(),)))
 
 

@@ -3,30 +3,32 @@ before it is needed."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 import venv
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tyro
 
 import topoloc
-from topoloc.apps.cli import COMMANDS, PLUGIN_PACKAGES, all_commands, main
+from topoloc.apps.cli import COMMANDS, EXAMPLES, PLUGIN_PACKAGES, all_commands, main
 
 ROOT = Path(__file__).parents[1]
-HEAVY = ("cv2", "faiss", "matplotlib", "numba", "numpy", "poselib", "torch", "tyro")
-SERVING = ("fastapi", "uvicorn", "pydantic", "prometheus_client", "python_multipart", "starlette")
+HEAVY = ("cv2", "faiss", "fastapi", "httpx", "matplotlib", "numba", "numpy", "onnxruntime")
+HEAVY += ("poselib", "pydantic", "torch", "tyro", "uvicorn")
 # What the core runs without: the extras, and the tests' own tools.
 FOREIGN = (
     "torch",
     "torchvision",
     "mitsuba",
     "matplotlib",
-    *SERVING,
-    "httpx",
     "cyclonedds",
     "carla",
     "pyzed",
@@ -61,7 +63,7 @@ for name in names:
     try:
         importlib.import_module(name)
     except ModuleNotFoundError as error:
-        assert error.name.split(".")[0] in ("torch", "matplotlib", "mcap", "cyclonedds", *SERVING), (name, error)
+        assert error.name.split(".")[0] in ("torch", "matplotlib", "mcap", "cyclonedds"), (name, error)
         learning.append(name)
 print(json.dumps([names, learning, sorted(Barred.asked)]))
 """  # noqa: E501
@@ -143,11 +145,30 @@ def test_the_version_is_the_one_of_the_package(installed: Path):
     assert (answer.returncode, answer.stdout) == (0, f"{topoloc.__version__}\n")
 
 
+def test_each_example_of_the_help_is_a_command_line_that_parses():
+    examples = [words.split() for group in EXAMPLES.values() for words in group]
+    assert len(examples) == 15
+    for name, *words in examples:
+        tyro.cli(importlib.import_module(COMMANDS[name][0]).Command, args=words)
+
+
+def test_help_and_version_have_their_short_forms(capsys: pytest.CaptureFixture[str]):
+    assert main(["-V"]) == 0
+    assert capsys.readouterr().out == f"{topoloc.__version__}\n"
+    assert main(["help"]) == 0
+    assert "map a place:" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        main(["help", "undo"])
+    assert not stop.value.code
+    assert "usage: topoloc undo" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("args", "complaint"),
     [
         ((), ""),
         (("fly",), "error: unknown command 'fly'"),
+        (("loclize",), "error: unknown command 'loclize'; did you mean localize?"),
         (("simulate", "lab", "out", "--fly"), "--fly"),
         (("info", "x.topo", "--fly"), "--fly"),
     ],
@@ -192,7 +213,7 @@ def test_every_module_loads_without_extras_but_learned_classifiers_and_figures()
     answer = _run(
         sys.executable,
         "-c",
-        f"FOREIGN, SERVING = {FOREIGN}, {SERVING}\n{_IMPORT_ALL}",
+        f"FOREIGN = {FOREIGN}\n{_IMPORT_ALL}",
         **os.environ,
     )
     assert answer.returncode == 0, answer.stderr
@@ -202,20 +223,14 @@ def test_every_module_loads_without_extras_but_learned_classifiers_and_figures()
     assert "topoloc.retrieval.network_images" not in learning
     drawing = {
         f"topoloc.apps.report.{name}"
-        for name in ("figures", "map_figure", "report", "weak_regions_figure", "weak_regions_page")
+        for name in ("certificate_page", "figures", "map_figure", "report", "weak_regions_page")
     }
     others = [
         name
         for name in learning
-        if not name.startswith(("topoloc.retrieval.", "topoloc.apps.service."))
-        and name not in drawing
+        if not name.startswith("topoloc.retrieval.") and name not in drawing
     ]
     assert others == ["topoloc.apps.formats.bags.mcap_file", "topoloc.apps.robots.ros_messages"]
-    assert not {
-        "topoloc.apps.service.client",
-        "topoloc.apps.service.config",
-        "topoloc.atlas.map_cache",
-    } & set(learning), "commands and clients need these"
     assert "torchvision" not in asked
 
 
@@ -225,3 +240,18 @@ def test_public_names_are_there_and_no_others():
         assert getattr(topoloc, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'fly'"):
         topoloc.fly  # noqa: B018 # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_objects_print_as_one_line(room_map: Path, queries: Path):
+    sequence, topomap = topoloc.open_sequence(queries), topoloc.TopoMetricMap.load(room_map)
+    frame, localizer = sequence[0], topoloc.Localizer(topomap)
+    answer = localizer.localize(frame.image, frame.camera)
+    refusal = localizer.localize(np.zeros_like(frame.image), frame.camera)
+    trajectory = topoloc.Trajectory.of_frames(sequence.poses, sequence.t_ns)
+    selected = topoloc.open_sequence(f"{queries}@0:2")
+    for one in (sequence, selected, frame, topomap, answer, refusal, trajectory, frame.camera):
+        assert "\n" not in repr(one)
+        assert type(one).__name__ in repr(one)
+        assert len(repr(one)) < 300
+    assert re.search(r"translation \(.*\) m.* sigma 0\.\d cm, .* p [01]\.\d+", repr(answer))
+    assert "too_few" in repr(refusal)

@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 import json
-import random
 import re
-import shutil
 import sys
-from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
-from topoloc.mapping.edit import kept_path
-
-from .edits import digest
 from .figures import Figure
-from .workplace import FIXTURES, ROOT, JobError, Workplace, last_line, need_module, run
+from .workplace import ROOT, JobError, Workplace, last_line, need_module, run
 
 WEIGHTS = "squeezenet1_1-imagenet-features.pth"
 NUM_DAMAGED = 500
@@ -52,29 +44,28 @@ def paper(work: Workplace) -> Iterator[Figure]:
 
 
 def fuzz(work: Workplace) -> Iterator[Figure]:
-    """Read damaged maps, recordings and undo files; kill edits."""
+    """Read damaged files of every kind; kill edits."""
     small = work.folder / "small.topo"
     work.topoloc("build", work.data("zed_lab/session1@0:40:4"), small, "--features", "surf")
-    picture = next(iter(sorted((Path(work.data("zed_lab/session2")) / "image_0").iterdir())))
-    camera = FIXTURES / "queries" / "camera.json"
-    maps = ("fuzz_maps.py", small, picture, camera, "--mutations", 500)
-    yield _of_script(work, "damaged maps of 500: findings", *maps)
-    recordings = ("fuzz_recordings.py", "--mutations", 2000)
-    yield _of_script(work, "damaged recordings of 2000: findings", *recordings)
+    fuzz = [sys.executable, ROOT / "benchmarks" / "fuzz.py", "--inputs", NUM_DAMAGED]
+    code, out, err = run(fuzz, work.folder, timeout=900)
+    rows = [line.split("|")[1:-1] for line in out.splitlines() if line.startswith("| ")]
+    if not rows:
+        raise JobError(f"fuzz.py: exit status {code}: {last_line(err) or last_line(out)}")
+    for k, outcome in enumerate(cell.strip() for cell in rows[0]):
+        if outcome in ("traceback", "hang", "crash", "memory"):
+            count = sum(int(row[k].replace(",", "")) for row in rows[1:])
+            yield Figure(f"damaged inputs, {NUM_DAMAGED} of each kind: {outcome}", count, "at most")
     yield _of_script(
         work, "killed edits of 50: broken or left", "kill_edits.py", small, "--kills", 50
     )
-    with ThreadPoolExecutor(2) as pool:
-        outcomes = Counter(pool.map(lambda seed: _damaged_undo(work, seed), range(NUM_DAMAGED)))
-    for outcome in ("traceback", "hang", "another map"):
-        name = f"damaged undo files of {NUM_DAMAGED}: {outcome}"
-        yield Figure(name, outcomes[outcome], "at most")
 
 
 def test_slow(work: Workplace) -> Iterator[Figure]:
-    """Run the slow tests."""
+    """Run the slow tests, but for the paper's command, which is the job `paper`."""
     need_module("pytest")
     words = [sys.executable, "-m", "pytest", "-m", "slow", "-x", "-p", "no:cacheprovider"]
+    words += ["--ignore", "tests/paper/test_benchmark_command.py"]
     code, out, err = run(words, ROOT, timeout=900)
     if code != 0:
         raise JobError(last_line(out) or last_line(err))
@@ -92,42 +83,3 @@ def _of_script(work: Workplace, name: str, script: str, *words: object) -> Figur
     if not counts:
         raise JobError(f"{script}: exit status {code}: {last_line(err) or last_line(out)}")
     return Figure(name, max(sum(counts), int(code != 0)), "at most")
-
-
-def _damaged_undo(work: Workplace, seed: int) -> str:
-    """Damage the kept file of a map, run `topoloc undo`, and return the outcome."""
-    folder = work.folder / f"undo{seed}"
-    folder.mkdir()
-    after, before = FIXTURES / "pruned.topo", FIXTURES / "schema_3.topo"
-    path = folder / after.name
-    shutil.copy(after, path)
-    kept = kept_path(path, digest(after), digest(before))
-    kept.write_bytes(_damaged(before.read_bytes(), random.Random(seed)))
-    try:
-        words = [sys.executable, "-m", "topoloc", "undo", path]
-        code, _, err = run(words, folder, timeout=30)
-    except JobError:
-        return "hang"
-    same = path.read_bytes()
-    shutil.rmtree(folder, ignore_errors=True)
-    if "Traceback" in err or code not in (0, 1):
-        return "traceback"
-    known = before if code == 0 else after
-    return "right" if same == known.read_bytes() else "another map"
-
-
-def _damaged(data: bytes, rng: random.Random) -> bytes:
-    """Return bytes with some changed, removed, repeated or zero."""
-    changed, kind = bytearray(data), rng.randrange(4)
-    at = rng.randrange(len(changed)) if rng.random() < 0.5 else rng.randrange(100)
-    if kind == 0:
-        for _ in range(rng.choice((1, 1, 8, 64))):
-            changed[rng.randrange(len(changed))] = rng.randrange(256)
-        changed[at] = rng.randrange(256)
-    elif kind == 1:
-        del changed[at:]
-    elif kind == 2:
-        changed[at : at + 4096] = bytes(len(changed[at : at + 4096]))
-    else:
-        del changed[at : at + rng.randrange(1, 5000)]
-    return bytes(changed)

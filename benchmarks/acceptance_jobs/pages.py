@@ -44,15 +44,19 @@ def pages(work: Workplace) -> Iterator[Figure]:
     work.topoloc("evaluate", zed, session, *fit, "--report", report)
     work.topoloc("explain", zed, image, "--camera", "map", "--out", why)
     work.topoloc("view", zed, "--out", scene)
-    for path in (report, why, scene):
+    certified, promise = work.own_map("zed"), work.folder / "promise.html"
+    found = work.answer("certify", certified, "--walk", session, *fit, "--report", promise)
+    wrong = sum(one["num_wrong"] for one in found["conditions"])
+    yield Figure("certify: wrong answers", wrong, "at most")
+    for path in (report, why, scene, promise):
         yield Figure(f"{path.stem}.html is not empty", int(path.stat().st_size > MIN_BYTES))
     work.topoloc("info", zed, "--check")
     yield Figure("info --check", 1, "at least")
-    yield from _in_browser(work, zed, [report, why, scene])
+    yield from _in_browser(work, zed, [report, why, scene, promise])
 
 
 def _in_browser(work: Workplace, zed: Path, paths: list[Path]) -> Iterator[Figure]:
-    name = "errors on the console of 3 pages"
+    name = "errors on the console of 4 pages"
     program = next((path for browser in BROWSERS if (path := shutil.which(browser))), None)
     try:
         need_module("playwright")

@@ -47,6 +47,10 @@ if TYPE_CHECKING:
         UnreadableImageError as UnreadableImageError,
         WeightsError as WeightsError,
     )
+    from topoloc.evaluation.certification import (
+        Certification as Certification,
+        certify as certify,
+    )
     from topoloc.evaluation.metrics import EvaluatedQuery as EvaluatedQuery
     from topoloc.evaluation.query_localization import (
         Evaluation as Evaluation,
@@ -123,6 +127,7 @@ if TYPE_CHECKING:
     )
     from topoloc.slam.slam import SlamResult as SlamResult, run_slam as run_slam
     from topoloc.tracking.config import TrackerConfig as TrackerConfig
+    from topoloc.tracking.shared_cameras import SharedCameras as SharedCameras
     from topoloc.tracking.stream_result import StreamedPose as StreamedPose
     from topoloc.tracking.tracker import Tracker as Tracker
     from topoloc.tracking.warm_up import warm_up as warm_up
@@ -147,6 +152,7 @@ _NAMES = {
         "ObjectStoreError QueryError RecordingError ResultError ServiceError TopolocError "
         "TrajectoryError UnreadableImageError WeightsError"
     ),
+    "topoloc.evaluation.certification": "Certification certify",
     "topoloc.evaluation.metrics": "EvaluatedQuery",
     "topoloc.evaluation.query_localization": (
         "Evaluation evaluate find_frames_with_truth localize_out_of_map localize_queries"
@@ -170,6 +176,7 @@ _NAMES = {
     "topoloc.localization.provenance": "Provenance",
     "topoloc.localization.result": "Alternative Localization NotLocalized result_from_json",
     "topoloc.localization.search": "Trace TriedProposal",
+    "topoloc.tracking.shared_cameras": "SharedCameras",
     "topoloc.mapping.build": "BuildConfig",
     "topoloc.mapping.edit": "read_history undo_edit",
     "topoloc.mapping.georeference": "GeoreferenceResult georeference",

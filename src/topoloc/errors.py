@@ -36,6 +36,9 @@ class TopolocError(Exception):
     """Report a failure that the user can understand and fix. The text is one line with the problem
     and its place."""
 
+    def __str__(self) -> str:
+        return "\\n".join(super().__str__().splitlines())  # it may quote a text of a file
+
     @classmethod
     @contextmanager
     def at(cls, place: object, *caught: type[Exception]) -> Iterator[None]:

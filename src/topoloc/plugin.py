@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from topoloc.features.network_files import (
         NetworkInfo as NetworkInfo,
         cache_folder as cache_folder,
-        read_bytes as read_bytes,
     )
     from topoloc.json_data import Finite as Finite, decode_json as decode_json
     from topoloc.mapping.node_images import read_node_image as read_node_image
@@ -66,6 +65,7 @@ if TYPE_CHECKING:
         MAX_PIXELS as MAX_PIXELS,
         EncodedImage as EncodedImage,
         exif_focal_length as exif_focal_length,
+        find_white_level as find_white_level,
         image_size as image_size,
     )
     from topoloc.recordings.open import (
@@ -94,7 +94,7 @@ _NAMES = {
     "topoloc.evaluation.metrics": "format_length",
     "topoloc.evaluation.node_matching": "NodeMatcher",
     "topoloc.features.feature_types": "find_available_types",
-    "topoloc.features.network_files": "NetworkInfo cache_folder read_bytes",
+    "topoloc.features.network_files": "NetworkInfo cache_folder",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.mapping.node_images": "read_node_image",
     "topoloc.recordings.atomic": (
@@ -107,7 +107,9 @@ _NAMES = {
         "RecordingFormat list_images match_times natural_key read_ground_truth times_from_rate"
     ),
     "topoloc.recordings.formats.video": "Video silence_opencv",
-    "topoloc.recordings.image_io": ("EncodedImage MAX_PIXELS exif_focal_length image_size"),
+    "topoloc.recordings.image_io": (
+        "EncodedImage MAX_PIXELS exif_focal_length find_white_level image_size"
+    ),
     "topoloc.recordings.open": "find_format split_selection",
     "topoloc.recordings.recording": "DepthImages Recording as_monocular has_scale scale_poses",
     "topoloc.recordings.ros_calibration": "RosCalibration",

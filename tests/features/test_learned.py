@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tiny_network import STRIDE, cells, write_network
-from topoloc.errors import MissingExtraError, WeightsError
+from topoloc.errors import WeightsError
 from topoloc.features import learned
 from topoloc.features.feature_types import check_available, default_learned_type
 from topoloc.features.learned import (
@@ -244,18 +243,6 @@ def test_a_network_that_is_damaged_missing_or_another_is_told_in_one_line(networ
     learned.close_networks()
     network.write_bytes(network.read_bytes()[:500])
     assert "cut short, damaged, or not ONNX" in _refused()
-
-
-def test_without_onnx_runtime_the_extra_is_named(network: Path, monkeypatch: pytest.MonkeyPatch):
-    learned.close_networks()
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    for ask in (
-        lambda: extract_learned(np.zeros((64, 64), np.uint8), *CONFIG),
-        lambda: check_available("xfeat"),
-        default_learned_type,
-    ):
-        with pytest.raises(MissingExtraError, match=r"pip install 'topoloc\[learned\]'"):
-            ask()
 
 
 def test_learned_features_are_those_of_the_network_that_comes_along():

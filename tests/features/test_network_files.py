@@ -3,13 +3,12 @@ line."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 
 from tiny_network import write_network
-from topoloc.errors import MissingExtraError, WeightsError
+from topoloc.errors import WeightsError
 from topoloc.features.network_files import NETWORKS, NetworkInfo
 
 
@@ -58,13 +57,6 @@ def test_damaged_files_are_refused(tmp_path: Path):
             NetworkInfo.of_file(path)
     with pytest.raises(WeightsError, match="No such file"):
         NetworkInfo.of_file(tmp_path / "missing.onnx")
-
-
-def test_without_onnx_runtime_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    path = write_network(tmp_path / "any.onnx")
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(MissingExtraError, match=r"topoloc\[learned\]"):
-        NetworkInfo.of_file(path)
 
 
 def test_the_network_of_our_own_is_shipped():

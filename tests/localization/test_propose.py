@@ -22,6 +22,7 @@ from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, S
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointMatches, PoseFit
+from topoloc.localization.query import QueryImage, StageClock
 from topoloc.localization.refine import NodeProposal, is_already_found
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Proposal, Trace, verify
@@ -193,8 +194,8 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[PointMatches]:
     """The fits to enough matches, found by RANSAC since."""
     found, fit_pose = list[PointMatches](), propose.fit_pose
 
-    def told(*arguments: Any, min_matches: float = 4.0) -> PointMatches:
-        fit = fit_pose(*arguments, min_matches=min_matches)
+    def told(*arguments: Any, min_matches: float = 4.0, **settings: Any) -> PointMatches:
+        fit = fit_pose(*arguments, min_matches=min_matches, **settings)
         found.extend([fit] * (len(fit.matches) >= min_matches))
         return fit
 
@@ -284,3 +285,26 @@ def test_a_pose_that_was_found_already_is_not_followed_up_again(
         assert not is_already_found(replace(proposal, fit=replace(proposal.fit, pose=beside)))
         before = replace(proposal.search, belief=Belief())
         assert not is_already_found(replace(proposal, search=before))
+
+
+# refinement
+
+
+def test_a_clear_pose_is_refined_with_its_own_nodes_if_the_nearest_ones_see_something_else(
+    room: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+):
+    """As around a bend. The farthest node stands for the nearest ones."""
+    localizer, (picture, truth) = Localizer(room), unseen_views()[0]
+    (search, *_) = localizer.context.searches(
+        QueryImage(picture, CAMERA), StageClock(), float("inf")
+    )
+    first = propose.propose_first(search, None)
+    assert isinstance(first, NodeProposal)
+    assert first.fit.num_inliers >= search.config.num_clear_inliers
+    farthest = search.map.nearest(truth, len(room.nodes))[-1:]
+    monkeypatch.setattr(type(search.map), "nearest", lambda *_: farthest)
+    final = first.refine()
+    assert isinstance(final, PoseFit)
+    assert set(final.local_map.node_ids) != {room.summaries[farthest[0]].node_id}
+    assert final.num_inliers >= first.fit.num_inliers
+    assert translation_error(final.world_from_cam, truth) < 0.02

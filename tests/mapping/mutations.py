@@ -82,6 +82,9 @@ def mutate(source: Path, target: Path, seed: int) -> str:
         return _flip(target, rng)
     with closing(sqlite3.connect(target, isolation_level=None)) as database:
         database.text_factory = _text_of
+        # SQLite's own random numbers have no seed
+        database.create_function("random", 0, lambda: int(rng.integers(2**62)))
+        database.create_function("randomblob", 1, lambda n: rng.bytes(max(n, 0)))
         if rng.random() < 0.08:
             script = SCRIPTS[rng.integers(len(SCRIPTS))]
             try:

@@ -4,7 +4,6 @@ of them."""
 from __future__ import annotations
 
 import sqlite3
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import pytest
 from built_room import room_of_two_kinds, unseen_views
 from tiny_world import CAMERA
 from topoloc.errors import FeatureTypeError, WeightsError
-from topoloc.features import learned
 from topoloc.features.feature_types import default_learned_type
 from topoloc.geometry.alignment import translation_error
 from topoloc.localization.localizer import Localizer, LocalizerConfig
@@ -136,13 +134,8 @@ def test_kinds_that_cannot_be_had_are_told_before_the_work(tiny_recording: Path)
         assert not done
 
 
-def test_beside_surf_stand_the_learned_ones_that_are_here_unless_others_are_named(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_beside_surf_stand_the_learned_ones_unless_others_are_named():
     assert MapConfig().kinds == ["surf", default_learned_type()]
-    learned.close_networks()
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    assert MapConfig().kinds == ["surf"]
     assert MapConfig(other_kinds=("sift",)).kinds == ["surf", "sift"]
     sift = MapConfig(other_kinds=("sift",)).feature_config_for("sift")
     assert (sift.kind, sift.max_features) == ("sift", MapConfig().features.max_features)

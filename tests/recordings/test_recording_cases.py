@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from topoloc.errors import CalibrationError
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
+from topoloc.slam.pose_checks import check_poses
 
 
 @pytest.fixture
@@ -76,6 +78,17 @@ def test_a_recording_without_sensor_yaml(cases: Path, is_given: bool):
     assert "no T_cam_imu" in notes[0]
 
 
-def test_a_negative_focal_length_is_named(cases: Path):
-    with pytest.raises(CalibrationError, match=r"camera\.json.* fy = -190"):
-        open_sequence(cases / "icl_negative_fy")
+def test_a_negative_focal_length_is_named_and_mended(cases: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(cases / "icl_negative_fy", tmp_path / "walk"))
+    with pytest.raises(CalibrationError, match=r"camera\.json.* fy = -190 .*write fy = 190$"):
+        open_sequence(folder)
+    file = folder / "camera.json"
+    text = file.read_text().replace("-190", "190")
+    file.unlink()
+    file.write_text(text)
+    assert kind(open_sequence(folder), 0) == "depth"
+
+
+def test_short_steps_accuse_no_poses(cases: Path):
+    """From few points the direction of a short step is wrong by 70 degrees; the poses are right."""
+    check_poses(open_sequence(cases / "colmap_simple_radial_fisheye"))

@@ -47,12 +47,6 @@ def test_frames_without_a_pose_or_all_without_depth(seven_scenes: Path):
     assert sequence[0].depth is None
 
 
-def test_depth_for_some_frames_only(seven_scenes: Path):
-    (seven_scenes / "seq-01" / "frame-000003.depth.png").unlink()
-    with pytest.raises(RecordingError, match="2 colour pictures but 1 with depth"):
-        open_seven_scenes(seven_scenes)
-
-
 def test_several_runs_must_be_told_apart(seven_scenes: Path):
     (seven_scenes / "seq-02").mkdir()
     assert len(open_seven_scenes(seven_scenes)) == 2

@@ -4,11 +4,16 @@ silence."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from aliased_wall import PERIOD, STEP, walk_along
 
 from room_frames import FrameList
+from topoloc.errors import TrajectoryError
+from topoloc.recordings.recording import with_poses
+from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import SlamResult, run_slam
 
 GONE = range(10, 14)
@@ -92,3 +97,23 @@ def test_where_boards_hang_on_the_panels_a_jump_is_followed():
     result = run_slam(walked)
     assert result.num_submaps == 1
     assert np.abs(along_the_wall(walked, result)).max() < 0.1
+
+
+@pytest.mark.parametrize("is_stereo", [True, False])
+@pytest.mark.parametrize("step", [0.06, 0.12])
+def test_equal_panels_accuse_no_poses(step: float, is_stereo: bool):
+    """From panel to panel the images match as well as with the right step, or better."""
+    walked = walk_along([step * k for k in range(40)], [0.1 * k for k in range(40)])
+    alone = [replace(frame, right=None, rig=None) for frame in walked.frames]
+    check_poses(walked if is_stereo else FrameList(alone))
+
+
+@pytest.mark.parametrize("is_stereo", [True, False])
+def test_between_boards_wrong_poses_are_found(is_stereo: bool):
+    walked = walk_along([0.03 * k for k in range(40)], [0.1 * k for k in range(40)], (1.0, 2.0))
+    alone = [replace(frame, right=None, rig=None) for frame in walked.frames]
+    frames = walked if is_stereo else FrameList(alone)
+    check_poses(frames)
+    inverse = [pose.inverse() for pose in frames.poses if pose is not None]
+    with pytest.raises(TrajectoryError, match="inverse"):
+        check_poses(with_poses(frames, list(inverse)))

@@ -38,7 +38,8 @@ def parse_camera_option(
             ``map``, ``unknown`` or ``fx,fy,cx,cy`` (pixels).
     """
     if text == "map" and topomap is not None:
-        return _rescaled_camera(topomap.nodes[0].camera)
+        raw = topomap.sessions[0].camera if topomap.sessions else None
+        return _rescaled_camera(raw or topomap.nodes[0].camera)
     if text == "unknown":
         return UncalibratedCamera.unknown
     calibration = parse_calibration(text, allow_files)

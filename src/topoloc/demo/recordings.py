@@ -62,11 +62,10 @@ def describe_night(evaluation: dict[str, Any]) -> str:
         )
         text += f" {lost} {'is' if lost == 1 else 'are'} not localized ({reasons})."
     false = night["false_accepts"]
-    if false == 0:
-        return text + " No pose is wrong."
+    count = {0: "No pose is", 1: "1 pose is"}.get(false, f"{false} poses are")
     return (
-        text + f" {false} {'pose is' if false == 1 else 'poses are'} wrong by more than"
-        f" {EvaluatedQuery.MAX_TRANSLATION:g} m or {EvaluatedQuery.MAX_ROTATION_DEG:g} degrees."
+        f"{text} {count} wrong by more than {EvaluatedQuery.MAX_TRANSLATION:g} m or"
+        f" {EvaluatedQuery.MAX_ROTATION_DEG:g} degrees."
     )
 
 

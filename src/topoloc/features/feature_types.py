@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from topoloc.bounds import AtLeast, Between
-from topoloc.errors import FeatureTypeError, MissingExtraError, WeightsError
+from topoloc.errors import FeatureTypeError, WeightsError
 from topoloc.features.features import Features
 
 Normalization = Literal["none", "paper", "wide"]
@@ -196,12 +196,8 @@ def find_feature_type(name: str) -> FeatureType:
 
 
 def default_learned_type() -> str:
-    """Return the default learned feature type, whose results are calibrated.
-
-    Raises:
-        MissingExtraError, WeightsError: a requirement of its network is missing.
-    """
-    check_available(LEARNED_TYPES[0].name)
+    """Return the default learned feature type, whose results are calibrated and whose network is in
+    the package."""
     return LEARNED_TYPES[0].name
 
 
@@ -211,7 +207,6 @@ def parse_feature_types(text: str) -> list[str]:
 
     Raises:
         FeatureTypeError: one is unknown, or is named twice.
-        MissingExtraError, WeightsError: the network of the default learned type is missing.
     """
     if text == "both":
         names = [SURF.name, default_learned_type()]
@@ -248,7 +243,7 @@ def check_available(name: str) -> None:
 
     Raises:
         FeatureTypeError: the feature type is unknown.
-        MissingExtraError, WeightsError: a requirement of its network is missing.
+        WeightsError: its network is missing.
     """
     network = find_feature_type(name).network
     if network is not None:
@@ -263,7 +258,7 @@ def find_available_types(kinds: Iterable[str]) -> list[str]:
     def is_available(kind: str) -> bool:
         try:
             check_available(kind)
-        except (MissingExtraError, WeightsError):
+        except WeightsError:
             return False
         return True
 

@@ -139,7 +139,6 @@ def extract_learned(
         num_threads: threads of the network. Default: the number of `set_num_threads`.
 
     Raises:
-        MissingExtraError: ONNX Runtime is not installed.
         WeightsError: the network's file is missing, damaged or of another network.
     """
     height, width = image.shape

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from topoloc.errors import MissingExtraError, WeightsError
+from topoloc.errors import WeightsError
 
 FORMAT_VERSION = 1
 """Version of the contract for inputs and outputs (`topoloc_version` in the metadata)."""
@@ -150,12 +150,11 @@ def open_network(
             memory in advance and adds levels while convolutions write them.
 
     Raises:
-        MissingExtraError: ONNX Runtime is not installed.
         WeightsError: the file is unreadable, not ONNX, breaks the contract, or holds an unknown
             network.
     """
-    with MissingExtraError.on_import("learned features need ONNX Runtime", "learned"):
-        import onnxruntime
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = num_threads

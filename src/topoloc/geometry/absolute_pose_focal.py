@@ -30,6 +30,7 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
     CameraHypothesis,
     CameraPrior,
+    map_variance,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
     Observations,
@@ -72,12 +73,14 @@ def estimate_pose_and_focal(
     *,
     point_covariances: Float[np.ndarray, "n 3 3"],
     start: tuple[Rigid3, Camera] | None = None,
+    correlated_error_share: float = 0.0,
 ) -> tuple[AbsolutePose, Camera] | None:
     """Return cam_from_world and the camera, from n matches of pixels with world points (metres).
     Return None if no pose is found.
 
     Args:
         start: an approximate pose and camera. They are refined, and no others are searched.
+        correlated_error_share: rho of the map (`map_facts/correlated_errors.py`).
 
     The focal length lies in the range of `uncalibrated`. The covariance of the pose includes the
     uncertainty of the focal length.
@@ -101,7 +104,8 @@ def estimate_pose_and_focal(
     if best is None:
         return None
     _, cam_from_world, camera = best
-    found = _choose_camera(cam_from_world, camera, finite, uncalibrated, config)
+    rho = correlated_error_share
+    found = _choose_camera(cam_from_world, camera, finite, uncalibrated, config, rho)
     cam_from_world, camera, belief = found or (cam_from_world, camera, None)
     pose = estimate_absolute_pose(
         points_img,
@@ -122,6 +126,7 @@ def _choose_camera(
     finite: _FiniteMatches,
     uncalibrated: UncalibratedCamera,
     config: AbsolutePoseConfig,
+    correlated_error_share: float,
 ) -> tuple[Rigid3, Camera, CameraBelief] | None:
     """Return the pose and the camera of the likeliest hypothesis, starting from those of a first
     fit. The first fit itself is returned if its hypothesis is the likeliest."""
@@ -134,14 +139,15 @@ def _choose_camera(
         cells_of(finite[0], camera.width, camera.height),
         MAX_THRESHOLD_SCALE * config.max_reprojection_error_px / camera.fx,
     )
-    prior = _camera_prior(uncalibrated, camera.fx)
+    prior = camera_prior(uncalibrated, camera.fx)
     start = np.zeros(7)
     start[1:3] = (camera.cx - first.cx) / camera.fx, (camera.cy - first.cy) / camera.fx
     start[3:] = camera.distortion()[0]
     fit = fit_camera(seen, cam_from_world, start, prior)
     if fit is None:
         return None
-    weighed = weigh_cameras(fit, prior)
+    fit = replace(fit, variance=fit.variance * map_variance(correlated_error_share))
+    weighed = weigh_cameras(fit.likelihood, prior)
     allowed = [one for one in weighed if one.lens != "other"]
     chosen = max(allowed, key=lambda one: weighed[one][0])
     if max(weighed, key=lambda one: weighed[one][0]).lens == "other":
@@ -156,20 +162,21 @@ def _choose_camera(
         return None
     parameters = refit.camera
     belief = weigh_poses(fit, weighed, (chosen, parameters))
-    return refit.cam_from_world, _with_parameters(first, parameters), belief
+    return refit.cam_from_world, with_parameters(first, parameters), belief
 
 
-def _camera_prior(uncalibrated: UncalibratedCamera, focal: float) -> CameraPrior:
+def camera_prior(uncalibrated: UncalibratedCamera, focal: float) -> CameraPrior:
     """Return the prior of a camera relative to one with this focal length."""
     usual = UncalibratedCamera.unknown(uncalibrated.width, uncalibrated.height)
     low, high = (math.log(one / focal) for one in (uncalibrated.min_focal, uncalibrated.max_focal))
     widest = math.log(math.sqrt(usual.min_focal * usual.max_focal) / focal), _LOG_FOCAL_SIGMA
     is_narrow = high - low < 0.999 * math.log(usual.max_focal / usual.min_focal)
     stated = ((low + high) / 2.0, (high - low) / 4.0) if is_narrow else widest
-    return CameraPrior(max(uncalibrated.width, uncalibrated.height) / focal, stated, widest)
+    sides = uncalibrated.width / focal, uncalibrated.height / focal
+    return CameraPrior(sides, stated, widest)
 
 
-def _with_parameters(camera: Camera, parameters: Float[np.ndarray, " 7"]) -> Camera:
+def with_parameters(camera: Camera, parameters: Float[np.ndarray, " 7"]) -> Camera:
     """Return the camera that the parameters describe relative to a pinhole."""
     focal = camera.fx * math.exp(parameters[0])
     cx, cy = camera.cx + camera.fx * parameters[1], camera.cy + camera.fx * parameters[2]

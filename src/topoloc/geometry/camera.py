@@ -82,6 +82,11 @@ class Camera:
             )
         if not np.all(np.isfinite(self.params)):
             raise CalibrationError(f"camera parameters are not finite: {self.params}")
+        if self.fx > 0.0 > self.fy:
+            raise CalibrationError(
+                f"fy = {self.fy:g} is of a camera whose y points up; here it points down: write fy"
+                f" = {-self.fy:g}"
+            )
         if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
             raise CalibrationError(
                 f"camera needs a positive size and focal length, not {self.width}x{self.height}, fx"

@@ -89,6 +89,11 @@ class Rigid3:
         self.rotation: Final = rotation
         self.translation: Final = translation
 
+    def __repr__(self) -> str:
+        turn, t = np.degrees(log_so3(self.rotation)), self.translation
+        shown = ", ".join(f"{one:.4g}" for one in t), ", ".join(f"{one:.4g}" for one in turn)
+        return f"Rigid3(translation ({shown[0]}) m, rotation vector ({shown[1]}) deg)"
+
     @staticmethod
     def identity() -> Rigid3:
         """Return the identity."""

@@ -48,7 +48,7 @@ def merge(
         MapError: a map is missing or damaged, both are one map, the second lacks a feature type of
             the first, or the new file cannot be written.
         TrajectoryError: the maps have too little in common.
-        FeatureTypeError, MissingExtraError, WeightsError: their features are not available here.
+        FeatureTypeError, WeightsError: their features are not available here.
     """
     with TopoMetricMap.load(first) as one, TopoMetricMap.load(second) as other:
         merged, changes = merge_maps(one, other, localizer_config, progress)

@@ -139,8 +139,7 @@ def update_map(
     in the map, and they need no poses.
 
     `progress` is called with a stage's name, steps done and all steps. Raises as `update`, and
-    FeatureTypeError, MissingExtraError or WeightsError if the map's features cannot be extracted on
-    this machine.
+    FeatureTypeError or WeightsError if the map's features cannot be extracted on this machine.
     """
     progress = progress or (lambda stage, done, total: None)
     check_session_is_new(topomap, sequence)

@@ -123,9 +123,10 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
         cells_of(points_img, camera.width, camera.height),
         math.inf,
     )
-    side, calibrated = max(camera.width, camera.height) / camera.fx, np.zeros(7)
+    sides = camera.width / camera.fx, camera.height / camera.fy
+    calibrated = np.zeros(7)
     # standard deviations of the logarithm of the focal length: calibrated or not
-    prior = CameraPrior(side, stated=(0.0, 0.01), usual=(0.0, 0.3))
+    prior = CameraPrior(sides, stated=(0.0, 0.01), usual=(0.0, 0.3))
     joint = linearized_fit(observed, fit.cam_from_world, calibrated)
     if joint is None or _find_distortion(joint, prior, 0.05) is None:
         return None
@@ -147,7 +148,7 @@ def _find_distortion(
     joint: JointFit, prior: CameraPrior, min_probability: float
 ) -> Float[np.ndarray, " 7"] | None:
     """Return the likeliest camera parameters, None unless distortion is probable."""
-    weighed = weigh_cameras(joint, prior)
+    weighed = weigh_cameras(joint.likelihood, prior)
     if sum(weighed[one][0] for one in weighed if one.lens != "none") < min_probability:
         return None
     return max(weighed.values(), key=lambda one: one[0])[1]

@@ -77,8 +77,8 @@ class Localizer:
         EmptyMapError: the map has no node.
         MapError: the map file cannot be read, or the map has no such coarse localizer.
         AtlasError: the atlas is damaged, or has no tile.
-        MissingExtraError, WeightsError: a feature network is not installed, and the map has no
-            other feature type or `config.kinds` names this one.
+        WeightsError: a feature network is not installed, and the map has no other feature type or
+            `config.kinds` names this one.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class Localizer:
     @property
     def unavailable_types(self) -> dict[str, str]:
         """Return the reason for each feature type of the map that cannot be used, for example
-        because its network or ONNX Runtime is not installed. Raises AtlasError: this is an
+        because its network is not installed. Raises AtlasError: this is an
         atlas."""
         return self.context.unavailable_types
 

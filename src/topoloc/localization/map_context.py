@@ -8,7 +8,7 @@ from functools import cached_property
 
 from msgspec import structs
 
-from topoloc.errors import MissingExtraError, WeightsError
+from topoloc.errors import WeightsError
 from topoloc.features.feature_types import check_available, select_stored_types
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
@@ -18,7 +18,7 @@ from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasureme
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.provenance import Provenance
 from topoloc.localization.query import Query, QueryImage, StageClock, reduce_image
-from topoloc.localization.result import NotLocalized, R
+from topoloc.localization.result import Localization, NotLocalized, R
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
 from topoloc.mapping.topomap import TopoMetricMap
@@ -156,8 +156,13 @@ class MapContext:
     def name_outcome(
         self, outcome: ResultWithInliers, camera: Camera | UncalibratedCamera
     ) -> ResultWithInliers:
-        """Return a result and its poses `with_provenance`."""
+        """Return a result and its poses `with_provenance`. A pose below the threshold of the map's
+        certificate is refused."""
         result, poses = outcome
+        certified = self.topomap.certificate
+        least = 0.0 if certified is None else certified.applied_min_probability
+        if isinstance(result, Localization) and result.probability < least:
+            result, poses = _refuse(result, least), []
         return self.with_provenance(result, camera), [
             (self.with_provenance(one, camera), seen) for one, seen in poses
         ]
@@ -193,6 +198,20 @@ class MapContext:
         )
 
 
+def _refuse(result: Localization, least: float) -> NotLocalized:
+    """Return the refusal of a pose below the threshold of the map's certificate."""
+    return NotLocalized(
+        "too_few_inliers",
+        result.candidates,
+        result.num_matches,
+        result.num_inliers,
+        result.times_ms,
+        f"probability {result.probability:.3g}, below the map's certified threshold {least:.3g}",
+        provenance=result.provenance,
+        seen_camera=result.seen_camera,
+    )
+
+
 def select_feature_types(
     topomap: TopoMetricMap, requested: tuple[str, ...] | None
 ) -> tuple[list[str], dict[str, str]]:
@@ -202,15 +221,14 @@ def select_feature_types(
         The available types, and the unavailable types of the map with the reason for each.
 
     Raises:
-        MissingExtraError, WeightsError: a requested type is not available, or no type of the map
-            is.
+        WeightsError: a requested type is not available, or no type of the map is.
     """
     available, unavailable_types, first = list[str](), dict[str, str](), None
     for kind in requested or topomap.kinds:
         try:
             check_available(kind)
             available.append(kind)
-        except (MissingExtraError, WeightsError) as error:
+        except WeightsError as error:
             if requested:
                 raise
             first, unavailable_types[kind] = first or error, str(error)

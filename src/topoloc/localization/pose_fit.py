@@ -203,6 +203,7 @@ def fit_pose(
     config: AbsolutePoseConfig,
     start: tuple[Rigid3, Camera] | None = None,
     min_matches: float = float(MIN_POINTS),
+    correlated_error_share: float = 0.0,
 ) -> PointMatches:
     """Fit a pose by robust PnP, or refine `start` (cam_from_world, camera).
 
@@ -223,6 +224,7 @@ def fit_pose(
             config,
             point_covariances=covariances,
             start=start,
+            correlated_error_share=correlated_error_share,
         )
         pose, camera = found or (None, camera)
     else:

@@ -127,7 +127,8 @@ def _match_and_fit(
         matches = matcher.match_first(max_features)
     matched = query.features, query.input_camera, local_map, matches
     with query.clock.stage("pnp"):
-        fit = fit_pose(*matched, config.pose, min_matches=max(float(config.min_matches), least))
+        least, rho = max(float(config.min_matches), least), search.correlated_error_share
+        fit = fit_pose(*matched, config.pose, min_matches=least, correlated_error_share=rho)
     return NodeProposal(search, source, fit, is_guided=False)
 
 

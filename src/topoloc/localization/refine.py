@@ -8,7 +8,9 @@ among thousands of descriptors.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 
@@ -27,6 +29,7 @@ from topoloc.localization.provenance import Evidence
 from topoloc.localization.result import Localization
 from topoloc.localization.result_decision import ResultWithInliers, decide_final_result
 from topoloc.localization.search import Proposal, Search
+from topoloc.node_ids import NodeId, Row
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +103,9 @@ def refine(proposal: NodeProposal) -> PointMatches:
     """Return the pose refitted to guided matches, or the proposal if it has too few inliers."""
     search, first = proposal.search, proposal.fit
     final = refit_around(search, first)
+    if final.num_inliers < first.num_inliers and _is_clear(first, search):
+        # Around a bend the nearest nodes see another place than the image and the nodes it matched.
+        final = max(final, _refit_with_own_nodes(search, first), key=lambda fit: fit.num_inliers)
     if (
         first.num_inliers < search.config.num_clear_inliers
     ):  # a poor first pose may need a second round to find all points
@@ -110,6 +116,21 @@ def refine(proposal: NodeProposal) -> PointMatches:
             break
         before, final = final.camera, refit_around(search, final)
     return final
+
+
+def _is_clear(first: PointMatches, search: Search) -> TypeGuard[PoseFit]:
+    return isinstance(first, PoseFit) and first.num_inliers >= search.config.num_clear_inliers
+
+
+def _refit_with_own_nodes(search: Search, first: PoseFit) -> PointMatches:
+    """Return the pose refitted to guided matches with the nodes that have most of its inliers."""
+    config = search.config.guided
+    node_ids, counts = np.unique(
+        first.local_map.node_ids[first.inlier_point_idx], return_counts=True
+    )
+    most = node_ids[np.argsort(-counts, kind="stable")[: config.num_nodes]]
+    rows = [search.map.topomap.row_of(NodeId(int(one))) for one in most]
+    return fit_around(search, first.cam_from_world, first.camera, config.radius_px, rows=rows)
 
 
 def refit_around(search: Search, fit: PointMatches) -> PointMatches:
@@ -130,17 +151,21 @@ def fit_around(
     camera: Camera,
     radius_px: float,
     min_matches: float = 0.0,
+    rows: Sequence[Row] | None = None,
 ) -> PointMatches:
-    """Fit a pose to guided matches around a pose, with the points of the nearest nodes."""
+    """Fit a pose to guided matches around a pose, with the points of these nodes (None: of the
+    nearest ones)."""
     query, config, start = search.query, search.config, (cam_from_world, camera)
     with query.clock.stage("matching"):
         guided = replace(config.guided, radius_px=radius_px)
-        rows = search.map.nearest(cam_from_world.inverse(), guided.num_nodes)
+        if rows is None:
+            rows = search.map.nearest(cam_from_world.inverse(), guided.num_nodes)
         local_map = search.map.local_map(rows)
         matches = match_guided(query.features, local_map, *start, guided)
     matched = query.features, query.input_camera, local_map, matches
     with query.clock.stage("pnp"):
-        return fit_pose(*matched, config.pose, start, min_matches)
+        rho = search.correlated_error_share
+        return fit_pose(*matched, config.pose, start, min_matches, rho)
 
 
 def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:

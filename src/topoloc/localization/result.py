@@ -12,10 +12,7 @@ from jaxtyping import Float
 from msgspec import Meta, Struct, structs
 
 from topoloc.errors import ResultError
-from topoloc.geometry.calibration_mismatch import (
-    CalibrationMismatch,
-    IntrinsicsDeviation,
-)
+from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.geodesy import GeoPose
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import Count, Finite, NonNegative, decode_json
@@ -82,6 +79,11 @@ class Localization:
     geopose: GeoPose | None = None
     calibration_doubt: CalibrationMismatch | None = None
     seen_camera: IntrinsicsDeviation | None = None
+
+    def __repr__(self) -> str:
+        sigmas = f"{100 * self.position_sigma_m:.1f} cm, {self.rotation_sigma_deg:.2f} deg"
+        p = f"{self.probability:.3f}, node {self.node_id}"
+        return f"Localization({self.world_from_cam}, sigma {sigmas}, p {p})"
 
     @property
     def localized(self) -> Literal[True]:
@@ -195,6 +197,9 @@ class NotLocalized:
     provenance: Provenance = EMPTY_PROVENANCE
     seen_camera: IntrinsicsDeviation | None = None
 
+    def __repr__(self) -> str:
+        return f"NotLocalized({': '.join(filter(None, [self.reason, self.detail]))})"
+
     @property
     def localized(self) -> Literal[False]:
         """Return False."""
@@ -203,14 +208,8 @@ class NotLocalized:
     def to_json(self, query: str) -> dict[str, Any]:
         """Return one line of the result file, see docs/cli.md."""
         alternatives = [one.to_json() for one in self.alternatives]
-        refusal = {
-            "query": query,
-            "localized": False,
-            "reason": self.reason,
-            "detail": self.detail,
-            "alternatives": alternatives,
-        }
-        return refusal | _evidence_json(self)
+        refusal = {"query": query, "localized": False, "reason": self.reason, "detail": self.detail}
+        return refusal | {"alternatives": alternatives} | _evidence_json(self)
 
     @staticmethod
     def from_json(line: str | bytes | Mapping[str, Any]) -> NotLocalized:

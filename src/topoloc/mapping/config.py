@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 from topoloc.bounds import AtLeast, parse_settings
-from topoloc.errors import ConfigError, MissingExtraError, WeightsError
+from topoloc.errors import ConfigError
 from topoloc.features.feature_types import (
     SURF,
     FeatureConfig,
@@ -52,7 +52,7 @@ class MapConfig:
     features: FeatureConfig = field(default_factory=FeatureConfig)
     other_kinds: tuple[str, ...] | None = None
     """Further feature types of the same nodes. A query uses them if the first type leaves its pose
-    uncertain. None: beside SURF, the default learned type if its network is installed."""
+    uncertain. None: beside SURF, the default learned type."""
     vlad: VladConfig = field(default_factory=VladConfig)
     sides: VirtualNodesConfig = field(default_factory=VirtualNodesConfig)
 
@@ -61,10 +61,7 @@ class MapConfig:
         """Return all feature types, the first type first."""
         if self.other_kinds is not None or self.features.kind != SURF.name:
             return [self.features.kind, *(self.other_kinds or ())]
-        try:
-            return [self.features.kind, default_learned_type()]
-        except (MissingExtraError, WeightsError):
-            return [self.features.kind]
+        return [self.features.kind, default_learned_type()]
 
     @property
     def virtual_view_type(self) -> str:
@@ -79,7 +76,7 @@ class MapConfig:
 
         Raises:
             FeatureTypeError: one is unknown, or is named twice.
-            MissingExtraError, WeightsError: one is not available on this machine.
+            WeightsError: one is not available on this machine.
         """
         first, *others = kinds = self.kinds if text is None else parse_feature_types(text)
         for kind in kinds:

@@ -59,6 +59,7 @@ class NodeDraft:
     points: dict[str, DraftPoints]
     sides: list[TopoNode]
     sources: list[MappingFrame]
+    raw_camera: Camera
 
     def add(self, observed: dict[str, Observations]) -> None:
         """Add the observations of one more image (`observe_draft`)."""
@@ -81,7 +82,8 @@ class NodeDrafts:
     """Hold the draft nodes of a map by row. Most of them are on disk (`disk_list`).
 
     `rows` holds the row of each frame that is a node. `cameras` holds the first camera of each
-    session. `num_points` holds the number of points of each node, by feature type.
+    session, before rectification. `num_points` holds the number of points of each node, by feature
+    type.
     """
 
     disk_list: DiskList[NodeDraft]
@@ -94,7 +96,7 @@ class NodeDrafts:
         """Add a draft as the last row."""
         self.rows[draft.frame] = Row(len(self.disk_list))
         self.world_from_nodes.append(draft.image.world_from_cam)
-        self.cameras.setdefault(draft.frame.session_id, draft.image.camera)
+        self.cameras.setdefault(draft.frame.session_id, draft.raw_camera)
         for kind, points in draft.points.items():
             self.num_points.setdefault(kind, []).append(len(points.features))
         self.disk_list.append(draft)
@@ -136,7 +138,10 @@ def create_node_draft(
         if has_virtual_views and not sources
         else []
     )
-    return NodeDraft(summary, frame, image, template_image, points, sides, [frame, *sources])
+    raw_camera = view.raw_camera or image.camera
+    return NodeDraft(
+        summary, frame, image, template_image, points, sides, [frame, *sources], raw_camera
+    )
 
 
 def observe_draft(

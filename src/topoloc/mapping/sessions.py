@@ -53,8 +53,8 @@ class Session:
     `session_id` never changes and is never reused. Two sessions may have the same name. `recording`
     is the folder or file, if known. `poses_from` is `truth`, `slam`, `map`, the name of a
     trajectory file, or `given` if the caller provided the poses. Times are those of the first and
-    last mapping image, in nanoseconds of the recording's clock. `light` is measured, and
-    `light_name` is set by the user.
+    last mapping image, in nanoseconds of the recording's clock. `camera` is that of its images
+    before rectification. `light` is measured, and `light_name` is set by the user.
     """
 
     session_id: int

@@ -21,6 +21,7 @@ import numpy as np
 from topoloc.errors import FeatureTypeError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
+from topoloc.mapping.certificate import Certificate
 from topoloc.mapping.config import MapConfig
 from topoloc.mapping.nodes import NodePoses, compute_nodes_digest, node_distances
 from topoloc.mapping.sessions import Edit, Session
@@ -87,6 +88,7 @@ class TopoMetricMap:
     - `edits` begins with the build.
     - `map_id` stays the same through all edits. None until the map is saved, and in older files.
     - `georeference` is the pose of the map's world on earth, if known.
+    - `certificate` is what `topoloc certify` measured, if it did.
 
     The sequences and mappings of a loaded map read the file when an entry is accessed. A loaded map
     keeps its file open until `close` or the end of ``with TopoMetricMap.load(path) as topomap``. It
@@ -107,9 +109,14 @@ class TopoMetricMap:
     next_ids: NextIds = NextIds()
     map_id: str | None = None
     georeference: Georeference | None = None
+    certificate: Certificate | None = None
 
     schema_version: ClassVar[int] = SCHEMA_VERSION
     """Schema of the map files that `save` writes."""
+
+    def __repr__(self) -> str:
+        nodes = f"{len(self.summaries)} nodes along {self.length_m:.1f} m"
+        return f"TopoMetricMap({nodes}, features {', '.join(self.layers)}, version {self.version})"
 
     @property
     def kind(self) -> str:
@@ -163,6 +170,16 @@ class TopoMetricMap:
         from topoloc.mapping.storage.integrity_check import describe_map
 
         return describe_map(self, Path(path))
+
+    def describe_certificate(self) -> dict[str, Any] | None:
+        """Return the certificate as JSON, with its promise and whether the map was edited since."""
+        one = self.certificate
+        if one is None:
+            return None
+        return one.to_json() | {
+            "promise": one.promise(),
+            "is_outdated": one.is_outdated(self.version),
+        }
 
     def row_of(self, node_id: NodeId) -> Row:
         """Return the row of a node. Raises KeyError if the map has no node with this id."""

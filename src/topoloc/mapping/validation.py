@@ -9,6 +9,7 @@ import io
 import math
 import os
 import sqlite3
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -211,6 +212,7 @@ def _array_from_npy(data: bytes, what: str) -> np.ndarray:
         TypeError,
         RecursionError,
         MemoryError,
+        tokenize.TokenError,
     ) as error:  # raised by Python's parser if the header is invalid
         raise CorruptDataError(f"{what}: an array without a header") from error
     left = len(data) - stream.tell()

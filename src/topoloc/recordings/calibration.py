@@ -1,12 +1,13 @@
 """Read calibrations and apply them to recordings.
 
-A calibration is a `camera.json`, YAML of OpenCV or Kalibr, or four numbers ``fx,fy,cx,cy`` in
-pixels. Four numbers and some files do not contain the image size. So a calibration is a function of
-the size of the images.
+A calibration is a `camera.json`, YAML of OpenCV, Kalibr, ROS, VINS or ORB-SLAM, or four numbers
+``fx,fy,cx,cy`` in pixels. Four numbers and some files do not contain the image size. So a
+calibration is a function of the size of the images.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -20,11 +21,14 @@ from topoloc.recordings.formats.video import Video
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import image_size
 from topoloc.recordings.recording import Recording
+from topoloc.recordings.slam_settings import camera_files, read_slam_settings
 from topoloc.recordings.stereo_yaml import (
     YAML_SUFFIXES,
     find_right_file,
+    has_slam_settings,
     is_calibration,
     read_calibration_yaml,
+    read_yaml,
 )
 
 CalibrationForSize = Callable[[int, int], CameraCalibration]
@@ -41,13 +45,20 @@ def parse_calibration(text: str | Path, allow_files: bool = True) -> Calibration
         CalibrationError: the text is neither, or the file is not usable. Names the file.
     """
     path = Path(text)
-    if not allow_files or ("," in str(text) and not path.exists()):
+    if not allow_files or ("," in str(text) and not os.path.exists(path)):
         return _parse_intrinsics(str(text))
     if path.suffix.lower() in YAML_SUFFIXES:
-        read_calibration_yaml(path, 1000, 1000)  # raises errors before the first image is read
-        return lambda width, height: read_calibration_yaml(path, width, height)
+        _read_yaml_calibration(path, 1000, 1000)  # raises errors before the first image is read
+        return lambda width, height: _read_yaml_calibration(path, width, height)
     camera_calibration = read_camera_json(path)
     return lambda width, height: camera_calibration
+
+
+def _read_yaml_calibration(path: Path, width: int, height: int) -> CameraCalibration:
+    text = read_yaml(path)
+    if has_slam_settings(text):
+        return read_slam_settings(path, text, (float(width), float(height)))
+    return read_calibration_yaml(path, width, height)
 
 
 def _parse_intrinsics(text: str) -> CalibrationForSize:
@@ -96,7 +107,7 @@ def camera_from_intrinsics(
 
 def find_calibration(folder: Path) -> CalibrationForSize | None:
     """Return the calibration in a recording's folder: camera.json, or the only YAML file with a
-    calibration, or ROS's files of a left and a right camera. Return None if there is none.
+    calibration and the files that belong to it. Return None if there is none.
 
     Raises:
         CalibrationError: the calibration is not usable, or there are several.
@@ -108,8 +119,9 @@ def find_calibration(folder: Path) -> CalibrationForSize | None:
         for path in sorted(folder.iterdir())
         if path.suffix.lower() in YAML_SUFFIXES and path.is_file() and is_calibration(path)
     ]
-    right_files = {find_right_file(path) for path in found}
-    found = [path for path in found if path not in right_files]
+    parts = {find_right_file(path) for path in found}
+    parts.update(file for path in found for file in camera_files(path, read_yaml(path)))
+    found = [path for path in found if path not in parts]
     if len(found) > 1:
         raise CalibrationError(
             f"{folder}: several calibrations ({', '.join(path.name for path in found)}); name one"

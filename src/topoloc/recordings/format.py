@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from warnings import warn
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.image_io import IMAGE_SUFFIXES
 from topoloc.recordings.text_files import parse_times, read_rows
-from topoloc.recordings.trajectory import Trajectory
+from topoloc.recordings.trajectory import Trajectory, has_answers
 
 
 @dataclass(frozen=True)
@@ -59,23 +60,58 @@ def natural_key(name: str) -> list[tuple[int, str]]:
     ]
 
 
-def check_pairs(left: Sequence[Path], right: Sequence[Path]) -> None:
-    """Check that two lists of images correspond frame by frame.
+def complete_lists(num: int | None, *lists: list[Path]) -> list[list[Path]]:
+    """Return lists of images that correspond frame by frame, by the last number of each name.
+    Missing images are listed as well: partners, and gaps in the numbers if there are `num` frames.
 
     Raises:
-        RecordingError: the lengths differ, or the last numbers of two corresponding names differ.
+        RecordingError: less than half of the numbers are in all lists.
     """
-    if len(left) != len(right):
-        raise RecordingError(
-            f"{left[0].parent}: {len(left)} pictures here but {len(right)} in"
-            f" {right[0].parent.name}; every picture needs its partner"
-        )
-    for path, other in zip(left, right, strict=True):
-        if re.findall(r"\d+", path.stem)[-1:] != re.findall(r"\d+", other.stem)[-1:]:
+    series = [list(map(_number, paths)) for paths in lists]
+    found = [dict(zip(*pair, strict=True)) for pair in zip(series, lists, strict=True)]
+    is_unique, numbers = (
+        all(map(len, lists)) and list(map(len, found)) == list(map(len, lists)),
+        series[0],
+    )
+    if any(one != numbers for one in series):
+        every = {number for one in found for number in one}
+        num_common = sum(all(number in one for one in found) for number in every)
+        if not is_unique or 2 * num_common < len(every):
             raise RecordingError(
-                f"{path}: its partner in {other.parent.name} is missing (the next there is"
-                f" {other.name})"
+                f"{lists[0][0].parent}: {len(lists[0])} pictures here but {len(lists[1])} in"
+                f" {lists[1][0].parent.name}, {num_common} with the same last number in their"
+                " names; every picture needs its partner"
             )
+        numbers = numbers if len(numbers) == num else sorted(every, key=natural_key)
+    if is_unique and num is not None and len(numbers) < num and all(numbers):
+        numbers = _fill_gaps(numbers, num)
+    if numbers == series[0] == series[-1]:
+        return list(lists)
+    return [
+        [one.get(number) or _renumbered(paths[0], number) for number in numbers]
+        for one, paths in zip(found, lists, strict=True)
+    ]
+
+
+def _fill_gaps(numbers: list[str], num: int) -> list[str]:
+    """Return `num` numbers: the given ones and those between, or after them if they begin at 0.
+    Return the given ones if that is not their number."""
+    first, last = int(numbers[0]), int(numbers[-1])
+    if last - first + 1 != num and (first != 0 or last >= num):
+        return numbers
+    width = min(map(len, numbers))
+    return [f"{number:0{width}}" for number in range(first, first + num)]
+
+
+def _number(path: Path) -> str:
+    """Return the last number of the name of an image, as it is written. Empty if there is none."""
+    return "".join(re.findall(r"\d+", path.stem)[-1:])
+
+
+def _renumbered(path: Path, number: str) -> Path:
+    """Return the image with another last number."""
+    *_, last = re.finditer(r"\d+", path.stem)
+    return path.with_name(path.name[: last.start()] + number + path.name[last.end() :])
 
 
 def match_times(
@@ -114,6 +150,11 @@ def times_from_rate(num_frames: int, rate_hz: int = 10) -> list[int]:
     return [index * 1_000_000_000 // rate_hz for index in range(num_frames)]
 
 
+def count_times(path: Path) -> int | None:
+    """Return the number of times in a file, or None if there is no file. Raises RecordingError."""
+    return len(read_rows(path, RecordingError)) if path.is_file() else None
+
+
 def read_times(path: Path, num_frames: int) -> list[int]:
     """Read times in nanoseconds from a file with one time in seconds per line. Without a file the
     rate is 10 Hz.
@@ -130,14 +171,18 @@ def read_times(path: Path, num_frames: int) -> list[int]:
     return t_ns
 
 
-def read_ground_truth(tum: Path, kitti_rows: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
+def read_ground_truth(first: Path, others: list[Path], t_ns: list[int]) -> list[Rigid3 | None]:
     """Return the pose of each frame from the first existing file: TUM by time, KITTI rows by frame.
-    Return None for all frames if no file exists.
+    Return None for all frames if no file exists. Answers of a map are no ground truth; a warning
+    names them.
 
     Raises:
         TrajectoryError: the file is malformed, or matches no frame.
     """
-    for path in (tum, *kitti_rows):
-        if path.is_file():
+    for path in (first, *others):
+        if has_answers(path):
+            text = f"{path}: answers of a map, no ground truth; delete its first line to use them"
+            warn(text, stacklevel=2)
+        elif path.is_file():
             return Trajectory.read(path).match_frames(t_ns, path)
     return [None] * len(t_ns)

@@ -53,6 +53,12 @@ class StereoFrame:
     world_from_cam: Rigid3 | None = None
     exif_focal_px: float | None = None
 
+    def __repr__(self) -> str:
+        size = f"{self.image.shape[1]} x {self.image.shape[0]}"
+        parts = {"right": self.right, "depth": self.depth, "pose": self.world_from_cam}
+        held = [name for name, part in parts.items() if part is not None]
+        return f"StereoFrame({self.name!r}, {self.t_ns / 1e9:.3f} s, {', '.join([size, *held])})"
+
 
 @runtime_checkable
 class StereoSequence(Protocol):

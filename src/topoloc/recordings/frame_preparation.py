@@ -96,7 +96,7 @@ class PreparedFrame:
     `picture` is the image for display, and `grey` the image for feature extraction. Both belong to
     `camera`. Stereo pairs are rectified and have `right_grey` and the rectified `rig`. RGB-D frames
     have `depth` in metres, in pixels of `camera`, NaN if unknown. `view_from_cam` is the rotation
-    of the frame's camera by rectification.
+    of the frame's camera by rectification. `raw_camera` is the camera before that.
     """
 
     picture: Image
@@ -106,6 +106,7 @@ class PreparedFrame:
     right_grey: UInt8[np.ndarray, "h w"] | None = None
     rig: StereoRig | None = None
     depth: Float32[np.ndarray, "h w"] | None = None
+    raw_camera: Camera | None = None
 
 
 def prepare_frame(frame: StereoFrame, with_depth: bool = True) -> PreparedFrame:
@@ -180,7 +181,13 @@ def _prepare_stereo(image: Image, right: Image | None, rig: StereoRig) -> Prepar
     if right_grey is not None:
         right_grey = _remap(right_grey, r.right_map)
     return PreparedFrame(
-        picture, to_grey(picture), r.rig.left, r.rectified_from_left, right_grey, r.rig
+        picture,
+        to_grey(picture),
+        r.rig.left,
+        r.rectified_from_left,
+        right_grey,
+        r.rig,
+        raw_camera=rig.left,
     )
 
 

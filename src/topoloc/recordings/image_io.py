@@ -13,7 +13,7 @@ import stat
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -109,7 +109,7 @@ def _decode_webp(path: Path | EncodedImage, factor: int) -> Image:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr)
 
 
-def find_white_level(paths: Sequence[Path]) -> int:
+def find_white_level(paths: Iterable[Path | EncodedImage]) -> int:
     """Return the largest value of a camera of 10, 12, 14 or 16 bits whose 16-bit images these are.
 
     Images that cannot be read are skipped.

@@ -56,6 +56,7 @@ def open_sequence(
     images: str | Path | None = None,
     topics: str | Mapping[str, str] | None = None,
     warn: Callable[[str], None] | None = None,
+    whole_only: bool = False,
 ) -> StereoSequence:
     """Open a recording, or a selection of its frames. Images are read when a frame is accessed.
 
@@ -70,6 +71,8 @@ def open_sequence(
         topics: the topics of a bag: ``left=/cam0/image_raw,right=/cam1/image_raw,pose=/odom``, or a
             dictionary of these.
         warn: called with each note on the recording, such as truncated or guessed data.
+        whole_only: leave out the frames with a missing, empty or truncated image file. A note
+            counts them.
 
     Raises:
         UnknownFormatError: `format` is unknown, or no format recognises the folder.
@@ -78,19 +81,22 @@ def open_sequence(
         TrajectoryError: the recording's ground truth is malformed or matches no frame.
     """
     folder, selection = split_selection(str(path))
-    is_side_by_side = format is None and str(camera).endswith(".conf") and Video.can_open(folder)
-    name = "zed" if is_side_by_side else find_format(path, format)
+    name = find_format(path, format, camera)
     options = {"images": images and Path(images), "topics": topics}
     sequence = _open_recording(folder, name, camera, options)
     if warn is not None:
         for note in recording_notes(sequence):
             warn(note)
-    if selection is None:
+    if selection is not None:
+        indices = parse_selection(selection, len(sequence))
+        if not indices:
+            raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
+        sequence = sequence_subset(sequence, indices)
+    if not whole_only:
         return sequence
-    indices = parse_selection(selection, len(sequence))
-    if not indices:
-        raise RecordingError(f"{path}: none of the {len(sequence)} frames is chosen")
-    return sequence_subset(sequence, indices)
+    from topoloc.recordings.damaged_images import leave_out_damaged  # queries do not need it
+
+    return leave_out_damaged(sequence, warn)
 
 
 def _open_recording(
@@ -109,9 +115,11 @@ def _open_recording(
     return with_calibration(recording_format.open(folder, **given), parse_calibration(camera))
 
 
-def find_format(path: str | Path, format: str | None = None) -> str:
+def find_format(
+    path: str | Path, format: str | None = None, camera: str | Path | None = None
+) -> str:
     """Return the name of the format that `open_sequence` uses. A given `format` is returned after
-    checks.
+    checks. Stereolabs' calibration as `camera` makes a video a side-by-side one.
 
     Raises:
         UnknownFormatError: `format` is not in `FORMATS`, or no format recognises the folder.
@@ -124,6 +132,8 @@ def find_format(path: str | Path, format: str | None = None) -> str:
         raise RecordingError(f"{folder}: no such file or folder")
     if format is not None:
         return format
+    if str(camera).endswith(".conf") and Video.can_open(folder):
+        return "zed"
     if found := next((name for name in FORMATS if load_format(name).can_open(folder)), None):
         return found
     if folder.is_dir() and not any(folder.iterdir()):

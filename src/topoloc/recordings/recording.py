@@ -76,10 +76,13 @@ class Recording:
     ) -> Recording:
         """Return a recording with a camera for each frame, which may be the same for all."""
         scale_and_turn = has_scale, as_stored
-        one = Recording(
-            name, root, names, t_ns, poses, cameras[0], None, depth, None, *scale_and_turn
-        )
+        others = None, depth, None, *scale_and_turn
+        one = Recording(name, root, names, t_ns, poses, cameras[0], *others)
         return one if len(set(cameras)) == 1 else replace(one, camera=None, cameras=cameras)
+
+    def __repr__(self) -> str:
+        others = " of stereo" if self.right else " with depth" if self.depth else ""
+        return f"Recording({str(self.root)!r}, {len(self)} frames{others})"
 
     def __len__(self) -> int:
         return len(self.names)
@@ -87,6 +90,11 @@ class Recording:
     def monocular(self) -> Recording:
         """Return the recording without its right and depth images."""
         return replace(self, right=None, depth=None)
+
+    def paths_of(self, index: int) -> list[Path]:
+        """Return the image files of a frame."""
+        others = [one.paths[index] for one in (self.right, self.depth) if one is not None]
+        return [self.root / self.names[index], *others]
 
     @cached_property
     def _white_level(self) -> int:
@@ -140,6 +148,9 @@ class SequenceView:
     poses: list[Rigid3 | None]
     apart: tuple[list[Rigid3 | None], ...] = ()
 
+    def __repr__(self) -> str:
+        return f"SequenceView({len(self)} frames of {self.base!r})"
+
     @property
     def name(self) -> str:
         """Return the name of the base sequence."""
@@ -192,11 +203,8 @@ def has_scale(sequence: StereoSequence) -> bool:
 
 def scale_poses(sequence: StereoSequence, metres: float) -> StereoSequence:
     """Return the recording with its positions multiplied by `metres`, the metres per unit."""
-    poses = [
-        None if pose is None else Rigid3(pose.rotation, metres * pose.translation)
-        for pose in sequence.poses
-    ]
-    return with_poses(sequence, poses)
+    scaled = (p and Rigid3(p.rotation, metres * p.translation) for p in sequence.poses)
+    return with_poses(sequence, list(scaled))
 
 
 def as_monocular(sequence: StereoSequence) -> StereoSequence:

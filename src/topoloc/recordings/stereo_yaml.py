@@ -65,18 +65,18 @@ def read_yaml(path: Path) -> str:
     return re.sub(r"#.*", "", text)
 
 
-def yaml_word(text: str, key: str, default: str) -> str:
-    """Return the word after a key, or `default`."""
-    found = re.search(rf"^[ \t]*{key}:\s*[\"']?([\w-]+)", text, re.MULTILINE)
+def yaml_word(text: str, key: str, default: str, word: str = r"[\w-]+") -> str:
+    """Return the word after a key, or `default`. `key` and `word` are regular expressions."""
+    found = re.search(rf"^[ \t]*{key}:\s*[\"']?({word})", text, re.MULTILINE)
     return found[1] if found else default
 
 
 def yaml_numbers(text: str, *keys: str) -> list[float]:
     """Return all numbers after the first existing key, up to the next key other than `cols`,
-    `rows`, `dt` or `data`."""
+    `rows`, `dt` or `data`. Keys are regular expressions."""
     for key in keys:
         found = re.search(
-            rf"^[ \t]*{key}:(.*?)(?=^[ \t]*(?!(?:cols|rows|dt|data)\b)[A-Za-z_]\w*:|\Z)",
+            rf"^[ \t]*{key}:(.*?)(?=^[ \t]*(?!(?:cols|rows|dt|data)\b)[A-Za-z_][\w.]*:|\Z)",
             text,
             re.MULTILINE | re.DOTALL,
         )
@@ -97,14 +97,22 @@ def require_numbers(path: Path, text: str, count: int, *keys: str) -> list[float
     return numbers[:count]
 
 
+def has_slam_settings(text: str) -> bool:
+    """Return whether the text has a key of the settings of VINS or ORB-SLAM."""
+    keys = "model_type", "cam0_calib", r"Camera1?\.(?:fx|type)", r"LEFT\.K"
+    return re.search(rf"^({'|'.join(keys)}):", text, re.MULTILINE) is not None
+
+
 def is_calibration(path: Path) -> bool:
     """Return whether a YAML file contains a camera with a known key."""
     try:
         text = read_yaml(path)
     except CalibrationError:
         return False
-    return _is_kalibr(text) or any(
-        yaml_numbers(text, *names[0]) for names in (_LEFT_KEYS, _MONO_KEYS)
+    return (
+        has_slam_settings(text)
+        or _is_kalibr(text)
+        or any(yaml_numbers(text, *names[0]) for names in (_LEFT_KEYS, _MONO_KEYS))
     )
 
 
@@ -131,7 +139,7 @@ def read_calibration_yaml(path: Path, width: int, height: int) -> CameraCalibrat
     rotation = require_numbers(path, motion, 9, "R", "rotation_matrix", "R_right_left")
     translation = require_numbers(path, motion, 3, "T", "translation_vector", "T_right_left")
     right_from_left = np.column_stack([np.reshape(rotation, (3, 3)), translation])
-    return CameraCalibration(left, rig=_rig(path, left, right, right_from_left))
+    return CameraCalibration(left, rig=make_rig(path, left, right, right_from_left))
 
 
 def find_right_file(path: Path) -> Path | None:
@@ -146,7 +154,7 @@ def find_right_file(path: Path) -> Path | None:
 
 def _ros_calibration(path: Path, size: tuple[float, float]) -> RosCalibration:
     text = read_yaml(path)
-    width, height = map(int, _image_size(text) or size)
+    width, height = (int(min(length, 1e9)) for length in _image_size(text) or size)
     numbers = {
         key: np.array(require_numbers(path, text, count, f"{key}_matrix"))
         for key, count in (("camera", 9), ("rectification", 9), ("projection", 12))
@@ -179,7 +187,7 @@ def kalibr_camera(path: Path, section: str) -> Camera:
     if count:
         names = "distortion_coefficients", "distortion_coeffs"
         params += require_numbers(path, section, count, *names)
-    return _camera(path, model, (width, height), params)
+    return make_camera(path, model, (width, height), params)
 
 
 def _is_kalibr(text: str) -> bool:
@@ -197,7 +205,7 @@ def _read_kalibr(path: Path, text: str) -> CameraCalibration:
         motion = (body_from_right.inverse() @ body_from_left).matrix()
     else:
         motion = np.array(require_numbers(path, sections["1"], 16, "T_cn_cnm1")).reshape(4, 4)
-    return CameraCalibration(left, _rig(path, left, right, motion[:3]), None, body_from_left)
+    return CameraCalibration(left, make_rig(path, left, right, motion[:3]), None, body_from_left)
 
 
 def _mounting(path: Path, section: str) -> Rigid3 | None:
@@ -224,17 +232,18 @@ def _opencv_camera(
     coefficients = yaml_numbers(text, *distortion)
     if yaml_word(text, "distortion_model", "") in _FISHEYE_WORDS:
         four = (coefficients + [0.0] * 4)[:4]
-        return _camera(path, "OPENCV_FISHEYE", size, [fx, fy, cx, cy, *four])
+        return make_camera(path, "OPENCV_FISHEYE", size, [fx, fy, cx, cy, *four])
     if any(coefficients[8:]):
         raise CalibrationError(
             f"{path}: {distortion[0]} has {len(coefficients)} numbers; thin prism and tilted models"
             " are not known here"
         )
     model, count = ("OPENCV", 4) if not any(coefficients[4:]) else ("FULL_OPENCV", 8)
-    return _camera(path, model, size, [fx, fy, cx, cy, *(coefficients + [0.0] * 8)[:count]])
+    return make_camera(path, model, size, [fx, fy, cx, cy, *(coefficients + [0.0] * 8)[:count]])
 
 
-def _camera(path: Path, model: str, size: tuple[float, float], params: list[float]) -> Camera:
+def make_camera(path: Path, model: str, size: tuple[float, float], params: list[float]) -> Camera:
+    """Return a camera. Raises CalibrationError with the file name."""
     with CalibrationError.at(path, CalibrationError, ValueError, OverflowError):
         return Camera(model, int(size[0]), int(size[1]), tuple(params))
 
@@ -249,7 +258,8 @@ def _image_size(text: str) -> tuple[float, float] | None:
     return (width[0], height[0]) if width and height else None
 
 
-def _rig(path: Path, left: Camera, right: Camera, right_from_left: np.ndarray) -> StereoRig:
+def make_rig(path: Path, left: Camera, right: Camera, right_from_left: np.ndarray) -> StereoRig:
+    """Return a rig of a plausible baseline. Raises CalibrationError with the file name."""
     with CalibrationError.at(path, CalibrationError, TrajectoryError):
         rig = StereoRig(left, right, Rigid3.from_matrix(right_from_left))
     if rig.baseline > _MAX_BASELINE:

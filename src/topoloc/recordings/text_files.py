@@ -36,8 +36,9 @@ def read_text(path: Path, error: type[TopolocError], missing: str = "no such fil
         raise error(f"{path}: {missing}") from None
     except UnicodeDecodeError:
         raise error(f"{path}: not a text file") from None
-    except OSError as failure:
-        raise error(f"{path}: {failure.strerror}") from None
+    except (OSError, ValueError) as failure:  # ValueError: a name with a null character
+        reason = getattr(failure, "strerror", None) or failure
+        raise error(f"{str(path)[:200]}: {reason}") from None
 
 
 def read_rows(path: Path, error: type[TopolocError]) -> list[tuple[int, list[str]]]:

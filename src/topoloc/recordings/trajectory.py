@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -44,6 +45,7 @@ _TIME_TOLERANCE_NS = 1_000_000
 _ROTATION_TOLERANCE = 1e-2
 _MIN_OVERLAP_SHARE = 0.8  # minimum overlap of two clocks, as a share of the frames' duration
 TUM_HEADER = "# t tx ty tz qx qy qz qw (s, m; world_from_cam)"
+_ANSWERS_HEADER = "# answers of a topoloc map, no ground truth"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,9 @@ class Trajectory:
 
     world_from_cam: Sequence[Rigid3]
     t_ns: list[int] | None = None
+
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self)} poses)"
 
     def __len__(self) -> int:
         return len(self.world_from_cam)
@@ -112,10 +117,8 @@ class Trajectory:
         if t_ns and all(pose is None for pose in poses):
             span = f"{self.t_ns[0] / 1e9:.3f} to {self.t_ns[-1] / 1e9:.3f} s"
             frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
-            raise TrajectoryError(
-                f"{path}: no frame has a pose; it covers {span},"
-                f" {frames}{_clock_hint(self.t_ns, t_ns)}"
-            )
+            hint = f"{frames}{_clock_hint(self.t_ns, t_ns)}"
+            raise TrajectoryError(f"{path}: no frame has a pose; it covers {span}, {hint}")
         return poses
 
     def to_tum(self, header: bool = True) -> str:
@@ -126,10 +129,18 @@ class Trajectory:
         rows = map(tum_line, self.t_ns, self.world_from_cam)
         return "".join(f"{line}\n" for line in [*([TUM_HEADER] if header else []), *rows])
 
-    def write_tum(self, path: Path) -> None:
-        """Write a TUM file atomically. Raises TrajectoryError if the trajectory has no times, and
-        TopolocError if the file cannot be written."""
-        write_text(path, self.to_tum())
+    def write_tum(self, path: Path, are_answers: bool = False) -> None:
+        """Write a TUM file atomically. With `are_answers` its first line says that a map answered
+        these poses, so that they are nobody's ground truth (`has_answers`). Raises TrajectoryError
+        if the trajectory has no times, and TopolocError if the file cannot be written."""
+        write_text(path, f"{_ANSWERS_HEADER}\n" * are_answers + self.to_tum())
+
+
+def has_answers(path: Path) -> bool:
+    """Return whether the poses of a trajectory file are answers of a map."""
+    with suppress(OSError), path.open("rb") as file:
+        return file.read(len(_ANSWERS_HEADER)) == _ANSWERS_HEADER.encode()
+    return False
 
 
 def _read_numeric_trajectory(path: Path) -> Trajectory | None:
@@ -149,42 +160,26 @@ def _trajectory_from_rows(path: Path) -> Trajectory:
     rows = read_rows(path, TrajectoryError)
     num_columns = len(rows[0][1])
     if num_columns not in (8, 12):
-        raise TrajectoryError(
-            f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12"
-        )
+        text = f"{num_columns} columns; a TUM line has 8, a KITTI line 12"
+        raise TrajectoryError(f"{path}, line {rows[0][0]}: {text}")
     for line, tokens in rows:
         if len(tokens) != num_columns:
-            raise TrajectoryError(
-                f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}"
-            )
+            text = f"{len(tokens)} columns, the lines before have {num_columns}"
+            raise TrajectoryError(f"{path}, line {line}: {text}")
     if num_columns == 8:
-        return _timed_trajectory(path, rows, range(1, 8))
+        return timed_trajectory(path, rows, range(1, 8))
     numbers = parse_numbers(path, rows, range(12))
     poses, is_rotation = poses_from_matrices(numbers, _ROTATION_TOLERANCE)
     check_rows(is_rotation, "not a rotation", path, rows)
     return Trajectory(poses)
 
 
-def _timed_trajectory(path: Path, rows: Rows, columns: Sequence[int]) -> Trajectory:
-    """Read rows of a time and the given columns: x, y, z (metres) and a quaternion (x, y, z, w)."""
+def timed_trajectory(path: Path, rows: Rows, columns: Sequence[int]) -> Trajectory:
+    """Read rows of a time and the given columns: x, y, z (metres) and a quaternion (x, y, z, w).
+    Raises TrajectoryError."""
     t_ns, numbers = parse_times(rows, path, TrajectoryError), parse_numbers(path, rows, columns)
     check_rows(_is_unit_quaternion(numbers[:, 3:]), "not a rotation", path, rows)
     return Trajectory.from_quaternions(numbers, t_ns)
-
-
-def read_asl_poses(path: Path) -> Trajectory:
-    """Read the poses of an ASL ground truth data.csv: ``t [ns], px, py, pz, qw, qx, qy, qz``.
-    Further columns are ignored.
-
-    Raises:
-        TrajectoryError: the file is missing or empty, columns are missing, a number is NaN, a
-            rotation is invalid, or times do not increase. Names the line.
-    """
-    rows = read_rows(path, TrajectoryError)
-    for line, tokens in rows:
-        if len(tokens) < 8:
-            raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, a pose has 8")
-    return _timed_trajectory(path, rows, (1, 2, 3, 5, 6, 7, 4))
 
 
 def tum_line(t_ns: int, world_from_cam: Rigid3) -> str:

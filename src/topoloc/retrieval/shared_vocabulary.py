@@ -77,8 +77,10 @@ class SharedVocabulary:
 @cache
 def shared_vocabulary(kind: str) -> SharedVocabulary | None:
     """Return the vocabulary of a feature type, or None if there is none."""
-    path = resources.files("topoloc.retrieval").joinpath(_FOLDER, f"{kind}.npz")
-    if not path.is_file():
+    folder = resources.files("topoloc.retrieval").joinpath(_FOLDER)
+    # the name may come from a file: it is compared, and never a part of a path
+    path = next((one for one in folder.iterdir() if one.name == f"{kind}.npz"), None)
+    if path is None:
         return None
     with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
         words, mean, projection = (

@@ -9,12 +9,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.features.features import Features
-from topoloc.features.matching import match_features
+from topoloc.features.matching import find_similar_pairs, match_features
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
 from topoloc.geometry.alignment import normalized_pose_error, rotation_error
@@ -34,6 +35,40 @@ _DIRECTION_TOLERANCE = math.radians(12.0)  # of a translation without scale
 
 
 @dataclass(frozen=True, eq=False)
+class SimilarFeatures:
+    """Hold pairs of similar features of two views. Unlike a match, a feature may be in several.
+
+    `first` are points in metres or, for a single camera, points on the plane z = 1 of the camera.
+    `last` are on that plane of the last camera, `last_idx` are their features.
+    """
+
+    first: Float[np.ndarray, "n 3"]
+    last: Float[np.ndarray, "n 3"]
+    last_idx: Int[np.ndarray, " n"]
+    max_error: float  # of `last`
+    has_scale: bool
+
+    def num_explained(self, first_from_last: Rigid3) -> int:
+        """Return the number of features of the last view with a pair that fits a step. With scale
+        the point projects onto the feature. Otherwise it lies in front of both cameras and the
+        feature near its epipolar line (Sampson's error)."""
+        last_from_first = first_from_last.inverse()
+        t, rotated = last_from_first.translation, self.first @ last_from_first.rotation.T
+        if self.has_scale:
+            points = rotated + t
+            errors = np.abs(points - points[:, 2:] * self.last).max(axis=1)
+            fits = errors < self.max_error * points[:, 2]
+        else:
+            lines, normals = np.cross(t, rotated), np.cross(self.last, rotated)
+            back = np.cross(self.last, t) @ last_from_first.rotation
+            squares = np.square(np.column_stack([lines[:, :2], back[:, :2]])).sum(axis=1)
+            fits = np.square(np.sum(self.last * lines, axis=1)) < self.max_error**2 * squares
+            for rays in (self.last, rotated):  # the depth in the other camera is positive
+                fits &= np.sum(np.cross(t, rays) * normals, axis=1) > 0.0
+        return len(np.unique(self.last_idx[fits]))
+
+
+@dataclass(frozen=True, eq=False)
 class MeasuredStep:
     """Hold the measured motion between the cameras of two frames.
 
@@ -47,17 +82,29 @@ class MeasuredStep:
     median_depth: float
     has_scale: bool = True
     num_inliers: int = 0
+    similar: SimilarFeatures | None = None
 
     @property
     def translation_tolerance(self) -> float:
         """Return the error of the measured translation, metres."""
         return _TRANSLATION_TOLERANCE + _DEPTH_TOLERANCE * self.median_depth
 
-    def is_informative(self) -> bool:
-        """Return whether the step is long enough to be compared with poses."""
-        return not self.has_scale or not self.first_from_last.is_same(
+    def decides_on(self, step: Rigid3) -> bool:
+        """Return whether the images decide between this and a step of poses: it is long enough, and
+        another one does not explain them nearly as well.
+
+        The direction of a single camera's short step, and a part of its rotation, hardly move the
+        points. Where a texture repeats, the measured step may be that from panel to panel.
+        """
+        if self.has_scale and self.first_from_last.is_same(
             Rigid3.identity(), _MIN_TRANSLATION_RATIO * self.translation_tolerance, _MIN_ROTATION
-        )
+        ):
+            return False
+        if self.similar is None or self.normalized_error(step) < 1.0:
+            return True
+        min_ratio = 0.35  # wrong poses: 0.0 to 0.3 for most steps
+        measured = self.similar.num_explained(self.first_from_last)
+        return self.similar.num_explained(step) < min_ratio * measured
 
     def normalized_error(self, step: Rigid3) -> float:
         """Return the error of a step of poses in units of the tolerance. For a single camera only
@@ -177,6 +224,31 @@ def estimate_step(
         return None
     last_from_first, inliers = motion
     first_from_last = first.view_from_cam.inverse() @ last_from_first.inverse() @ last.view_from_cam
+    similar = _find_similar(first, last, matches.distances[inliers])
     depth = 0.0 if points is None else float(np.median(points[inliers, 2]))
     num_inliers, has_scale = int(np.count_nonzero(inliers)), points is not None
-    return MeasuredStep(first_idx, last_idx, first_from_last, depth, has_scale, num_inliers)
+    return MeasuredStep(
+        first_idx, last_idx, first_from_last, depth, has_scale, num_inliers, similar
+    )
+
+
+def _find_similar(
+    first: ViewFeatures, last: ViewFeatures, distances: Float[np.ndarray, " m"]
+) -> SimilarFeatures:
+    """Return the pairs that are as similar as most inliers, which have these distances of
+    descriptors."""
+    max_pairs, max_error_px = 20_000, 2.0
+    min_similarity = 1.0 - 0.5 * float(np.percentile(distances, 80.0)) ** 2
+    pairs = find_similar_pairs(
+        last.features.descriptors, first.features.descriptors, max(min_similarity, 0.1)
+    )
+    last_idx, first_idx = (rows[:: 1 + len(rows) // max_pairs] for rows in pairs)
+    firsts, lasts = (
+        np.insert(view.camera.normalized_from_img(view.features.points_img[rows]), 2, 1.0, axis=1)
+        for view, rows in ((first, first_idx), (last, last_idx))
+    )
+    if first.points is not None:
+        firsts = first.points.points_cam[first_idx]
+    firsts, lasts = firsts @ first.view_from_cam.rotation, lasts @ last.view_from_cam.rotation
+    has_scale, max_error = first.points is not None, max_error_px / last.camera.fx
+    return SimilarFeatures(firsts, lasts / lasts[:, 2:], last_idx, max_error, has_scale)

@@ -146,7 +146,7 @@ def evaluate_poses(
     ends: list[tuple[Rigid3, Rigid3]] = []
     for step in steps:
         first, last = poses[step.first], poses[step.last]
-        if first is not None and last is not None and step.is_informative():
+        if first is not None and last is not None and step.decides_on(first.inverse() @ last):
             measured.append(step)
             ends.append((first, last))
     num = len(measured)

@@ -16,13 +16,15 @@ from topoloc.bounds import check_bounds
 from topoloc.errors import QueryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import check_image_size
+from topoloc.localization.query import check_image_size, unknown_camera
 from topoloc.localization.result import Localization, NotLocalized, with_time
 from topoloc.recordings.frame_checks import find_time_problem
 from topoloc.retrieval.coarse import Image
 from topoloc.tracking.config import TrackerConfig
 from topoloc.tracking.map_stream import MapStream
+from topoloc.tracking.shared_cameras import SharedCameras
 from topoloc.tracking.stream_result import StreamedPose
 
 _SEARCH_INTERVAL_NS = 1_000_000_000
@@ -36,13 +38,20 @@ class Tracker:
 
     Args:
         localizer: the map or the atlas. The tracked tile stays open until `close`.
+        cameras: estimates the camera of images without calibration. Others may share it.
 
     Raises:
         ConfigError: a value of `config` is out of bounds.
     """
 
-    def __init__(self, localizer: Localizer, config: TrackerConfig | None = None) -> None:
+    def __init__(
+        self,
+        localizer: Localizer,
+        config: TrackerConfig | None = None,
+        cameras: SharedCameras | None = None,
+    ) -> None:
         self.localizer, self.config = localizer, config or TrackerConfig()
+        self.cameras = cameras or SharedCameras(localizer)
         check_bounds(self.config)
         self._tile = ExitStack()
         self.reset()
@@ -63,12 +72,18 @@ class Tracker:
         self._stream: MapStream | None = None
 
     def process(
-        self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None = None
+        self,
+        image: Image,
+        camera: Camera | UncalibratedCamera | None,
+        t_ns: int,
+        odom_from_cam: Rigid3 | None = None,
     ) -> StreamedPose:
         """Localize the next image of the stream. In an atlas each result names its tile, in whose
         world the pose is.
 
         Args:
+            camera: camera model, exact or approximate. None: unknown. An approximate one is
+                estimated from the first images of several places, which are localized alone.
             t_ns: capture time, nanoseconds, after the preceding image. It may be equal only for the
                 same image.
             odom_from_cam: pose from external odometry, in any fixed frame. Only its change from
@@ -80,6 +95,7 @@ class Tracker:
             AtlasError: no tile can be read.
             ObjectStoreError: the object store does not respond.
         """
+        camera = camera or unknown_camera(image)
         check_image_size(image, camera)
         is_same = self._image is not None and np.array_equal(self._image, image)
         self._check_time(t_ns, is_repeat_allowed=is_same)
@@ -109,10 +125,18 @@ class Tracker:
         return self._stream.process_missing(t_ns, result, odom_from_cam)
 
     def _process_in_tile(
-        self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None
+        self,
+        image: Image,
+        camera: Camera | UncalibratedCamera,
+        t_ns: int,
+        odom_from_cam: Rigid3 | None,
     ) -> StreamedPose:
         """Process the image in the tracked tile. If it has given no pose for long, search the other
         tiles."""
+        if isinstance(camera, UncalibratedCamera):
+            if (shared := self.cameras.known.get(camera)) is None:
+                return _without_stream(self.cameras.localize(image, camera, t_ns), t_ns)
+            camera = shared.camera
         answer = None
         if self._stream is not None:
             answer = self._stream.process(image, camera, t_ns, odom_from_cam)
@@ -124,9 +148,7 @@ class Tracker:
         self._last_search_ns = t_ns
         result = self.localizer.localize(image, camera, t_ns=t_ns)
         if not isinstance(result, Localization):
-            return answer or StreamedPose(
-                t_ns, "ambiguous" if result.reason == "ambiguous" else "lost", result
-            )
+            return answer or _without_stream(result, t_ns)
         self._last_localized_ns = t_ns
         return self._enter_tile(result.provenance.tile).process(image, camera, t_ns, odom_from_cam)
 
@@ -149,3 +171,10 @@ class Tracker:
                 f" {self._t_ns / 1e9:.6f} s"
             )
         self._t_ns = t_ns
+
+
+def _without_stream(result: Localization | NotLocalized, t_ns: int) -> StreamedPose:
+    """Return the result of an image that was localized alone."""
+    if isinstance(result, Localization):
+        return StreamedPose(t_ns, "localized", result, result.world_from_cam, result.covariance)
+    return StreamedPose(t_ns, "ambiguous" if result.reason == "ambiguous" else "lost", result)

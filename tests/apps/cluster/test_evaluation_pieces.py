@@ -109,7 +109,9 @@ def test_an_atlas_and_a_tile_that_cannot_be_read(
 def test_failures_are_those_of_the_plain_command(
     cluster: Any, queried_map: Path, complaint: Complaint
 ):
-    (queried_map / "pictures" / "view01.png").write_bytes(b"no picture")
+    for picture in (queried_map / "pictures").glob("view[0-9]*.png"):
+        if picture.name != "view00.png":  # most of them: a few are left out
+            picture.write_bytes(b"no picture")
     for args in (
         (queried_map / "pictures",),
         (queried_map / "nowhere",),

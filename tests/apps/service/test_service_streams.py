@@ -12,6 +12,8 @@ from running_service import Running
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from tiny_world import CAMERA
+
 SESSIONS = "/v1/maps/room/sessions"
 
 
@@ -107,13 +109,14 @@ def test_streams_end_when_nobody_uses_them_and_there_are_not_too_many(
     assert client.post(SESSIONS).status_code == 201
 
 
-def test_a_camera_must_be_known(client: httpx.Client, tiny_recording: Path):
+def test_a_camera_may_be_unknown(client: httpx.Client, tiny_recording: Path):
     session = client.post(SESSIONS).json()["session"]
     answer = client.post(
         f"{SESSIONS}/{session}/pictures",
         content=_pictures(tiny_recording)[0],
         headers={"content-type": "image/png"},
     )
-    assert answer.status_code == 422
-    assert "calibrated" in answer.json()["error"]
+    assert answer.status_code == 200
+    assert answer.json()["state"] == "localized"
+    assert answer.json()["focal_length_px"] == pytest.approx(CAMERA.fx, rel=0.1)
     client.delete(f"{SESSIONS}/{session}")

@@ -377,7 +377,6 @@ def test_walls_that_look_alike_elsewhere_have_less_for_them():
 
 
 def test_learned_features_know_the_walls_where_the_map_has_them(tmp_path: Path):
-    pytest.importorskip("onnxruntime")
     path = tmp_path / "corridor.topo"
     corridor_of_two_kinds().save(path)
     loaded = TopoMetricMap.load(path)

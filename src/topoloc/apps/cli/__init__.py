@@ -18,33 +18,68 @@ from typing import Any, TextIO
 # they gain here, and the last digits would depend on the number of processors.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-_SUMMARIES = {
-    "demo": "map and localize the built-in lab by day, at night and with another camera",
-    "mapping.slam": "compute the trajectory of a stereo or RGB-D recording",
-    "mapping.build": "build a map file from stereo or RGB-D recordings",
-    "queries.localize": "compute 6-DoF poses of images, folders or recordings",
-    "queries.evaluate": "localize a recording with known truth and measure the errors",
-    "queries.explain": "explain the result of an image and give advice",
-    "maps.info": "print the contents of a map file",
-    "maps.atlas": "create, extend and inspect an atlas of many maps",
-    "maps.update": "add recordings to a map: other light, changes, new parts",
-    "maps.merge": "merge two overlapping maps",
-    "maps.prune": "remove outdated and redundant parts of a map, to a size",
-    "maps.history": "print the edits of a map",
-    "maps.undo": "undo the last edit of a map, byte-identical",
-    "maps.view": "show a map and results in 3-D in the browser",
-    "mapping.record": "record a ZED, CARLA, a webcam or a stream to a folder",
-    "maps.export": "export a map or results to COLMAP, nerfstudio, PLY, GeoJSON, MCAP, TUM, KITTI",
-    "maps.georeference": "set the position of a map on earth, for OGC GeoPoses",
-    "queries.serve": "run an HTTP service that localizes images in maps",
-    "queries.follow": "track a webcam, a stream or a recording, one line for each image",
-    "weights": "list, fetch or convert networks of local features",
-    "config": "print all other settings as a TOML file",
+_GROUPS = {
+    "map a place": {
+        "mapping.build": "build a map file from stereo or RGB-D recordings",
+        "mapping.slam": "compute the trajectory of a stereo or RGB-D recording",
+        "mapping.record": "record a ZED, CARLA, a webcam or a stream to a folder",
+        "maps.update": "add recordings to a map: other light, changes, new parts",
+        "maps.merge": "merge two overlapping maps",
+        "maps.atlas": "create, extend and inspect an atlas of many maps",
+    },
+    "localize images": {
+        "queries.localize": "compute 6-DoF poses of images, folders or recordings",
+        "queries.follow": "track a webcam, a stream or a recording, one line for each image",
+        "queries.serve": "run an HTTP service that localizes images in maps",
+    },
+    "know what to expect": {
+        "queries.evaluate": "localize a recording with known truth and measure the errors",
+        "maps.certify": "measure how often answers are wrong, with a bound at 95 % confidence",
+        "queries.explain": "explain the result of an image and give advice",
+        "maps.info": "print the contents of a map file",
+        "maps.view": "show a map and results in 3-D in the browser",
+    },
+    "care for maps": {
+        "maps.prune": "remove outdated and redundant parts of a map, to a size",
+        "maps.history": "print the edits of a map",
+        "maps.undo": "undo the last edit of a map, byte-identical",
+        "maps.georeference": "set the position of a map on earth, for OGC GeoPoses",
+        "maps.export": "export to COLMAP, nerfstudio, PLY, GeoJSON, MCAP, TUM, KITTI",
+    },
+    "try and set up": {
+        "demo": "map and localize the built-in lab by day, at night and with another camera",
+        "weights": "list, fetch or convert networks of local features",
+        "config": "print all other settings as a TOML file",
+    },
+}
+EXAMPLES = {
+    "map a place": (
+        "build office/ office.topo",
+        "slam office/ office.tum",
+        "update office.topo evening/",
+    ),
+    "localize images": (
+        "localize office.topo photo.jpg --camera 525,525,320,240",
+        "localize office.topo photos/ --camera unknown --json poses.jsonl",
+        "serve maps/",
+    ),
+    "know what to expect": (
+        "evaluate office.topo walk/ --report report.html",
+        "certify office.topo --walk walk/ --out-of-map garage/",
+        "explain office.topo photo.jpg --camera map",
+    ),
+    "care for maps": (
+        "prune office.topo --max-mb 20",
+        "undo office.topo",
+        "export office.topo office-colmap/ --format colmap",
+    ),
+    "try and set up": ("demo --out topoloc-demo", "config build", "weights list"),
 }
 # name -> module with a dataclass `Command` of the arguments and its method `run`; line of the help
 COMMANDS = {
     name.rpartition(".")[2]: (f"topoloc.apps.cli.{name}", summary)
-    for name, summary in _SUMMARIES.items()
+    for group in _GROUPS.values()
+    for name, summary in group.items()
 }
 PLUGIN_PACKAGES = {
     "simulate": "topoloc-worlds",
@@ -81,7 +116,9 @@ def _dispatch(args: list[str]) -> int:
     if not args or args[0] in ("-h", "--help"):
         print(_help())
         return 0 if args else 2
-    if args[0] == "--version":
+    if args[0] == "help":
+        return _dispatch([args[1], "--help"] if len(args) > 1 else ["--help"])
+    if args[0] in ("-V", "--version"):
         from importlib.metadata import version
 
         print(version("topoloc"))
@@ -93,7 +130,10 @@ def _dispatch(args: list[str]) -> int:
     if name in PLUGIN_PACKAGES:
         _print_error(f"`topoloc {name}` needs {PLUGIN_PACKAGES[name]}, which is not installed")
     else:
-        _print_error(f"unknown command {name!r}; commands: {', '.join(commands)}")
+        from topoloc.plugin import suggest_name
+
+        hint = suggest_name(name, commands) or f"; commands: {', '.join(commands)}"
+        _print_error(f"unknown command {name!r}{hint}")
     return 2
 
 
@@ -204,10 +244,18 @@ def _discard_output(stream: TextIO) -> None:
 
 def _help() -> str:
     listed = all_commands()
-    width = max(map(len, listed))
-    commands = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in listed.items())
+    width, parts = max(map(len, listed)), list[str]()
+    for title, group in _GROUPS.items():
+        names = [name.rpartition(".")[2] for name in group]
+        lines = [f"  {name:<{width}}  {listed.pop(name)[1]}" for name in names]
+        examples = [f"      topoloc {example}" for example in EXAMPLES[title]]
+        parts.append("\n".join([f"{title}:", *lines, *examples]))
+    if listed:
+        lines = [f"  {name:<{width}}  {text}" for name, (_, text) in listed.items()]
+        parts.append("\n".join(["of other distributions:", *lines]))
     return (
         "usage: topoloc COMMAND ...\n\nMap a place with a stereo or RGB-D camera, then localize"
-        f" single images of it with 6-DoF poses.\n\ncommands:\n{commands}\n\n`topoloc COMMAND"
-        " --help` describes a command, `topoloc --version` prints the version."
+        " single images of it with 6-DoF poses.\n\n"
+        + "\n\n".join(parts)
+        + "\n\n`topoloc help COMMAND` describes a command, `topoloc -V` prints the version."
     )

@@ -154,7 +154,7 @@ def _write_results(out: Path, folder: Path, answers: list[EvaluatedQuery]) -> No
         results = [a.result for a in group]
         poses = [one.world_from_cam if isinstance(one, Localization) else None for one in results]
         trajectory = Trajectory.of_frames(poses, [t_ns[a.query] for a in group])
-        trajectory.write_tum(out / f"{sequence.name}.tum")
+        trajectory.write_tum(out / f"{sequence.name}.tum", are_answers=True)
 
 
 def _print(out: Path, evaluation: dict[str, Any], seconds: str, report: str) -> None:

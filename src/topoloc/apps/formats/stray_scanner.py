@@ -64,6 +64,14 @@ class StrayRecording:
         """Return the recording without its depth images."""
         return replace(self, has_depth=False)
 
+    def paths_of(self, index: int) -> list[Path]:
+        """Return the depth image of a frame."""
+        return [self._depth_path(index)] if self.has_depth else []
+
+    def _depth_path(self, index: int) -> Path:
+        path = self.root / "depth" / f"{self.video_idx[index]:06d}.npy"  # of earlier versions
+        return path if path.is_file() else path.with_suffix(".png")
+
     def read_left_frame(self, index: int) -> StereoFrame:
         """Read one frame without depth. Raises UnreadableImageError."""
         frame = self.video[self.video_idx[index]]
@@ -75,8 +83,7 @@ class StrayRecording:
         frame, camera = self.read_left_frame(index), self.cameras[index]
         if not self.has_depth:
             return frame
-        path = self.root / "depth" / f"{self.video_idx[index]:06d}.npy"  # of earlier versions
-        path = path if path.is_file() else path.with_suffix(".png")
+        path = self._depth_path(index)
         depth = read_depth_image(path, units_per_metre=1000.0)
         confidence = self.root / "confidence" / f"{path.stem}.png"
         if confidence.is_file():

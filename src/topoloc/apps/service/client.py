@@ -9,23 +9,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
+import httpx
 import numpy as np
 
 from topoloc import (
     Camera,
     Localization,
-    MissingExtraError,
     NotLocalized,
     Rigid3,
     ServiceError,
     result_from_json,
 )
-
-if TYPE_CHECKING:
-    import httpx
 
 ImageInput = str | Path | bytes | np.ndarray
 CameraSpec = Camera | str | None
@@ -42,13 +39,10 @@ class Client:
         url: the address, as ``http://127.0.0.1:8571``.
         token: the content of the service's `--token-file`.
         timeout_s: time limit of a response, seconds.
-
-    Raises:
-        MissingExtraError: httpx is not installed.
     """
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 60.0) -> None:
-        self._http = _import_httpx().Client(**_client_options(url, token, timeout_s))
+        self._http = httpx.Client(**_client_options(url, token, timeout_s))
 
     def __enter__(self) -> Client:
         return self
@@ -116,7 +110,7 @@ class AsyncClient:
     """`Client` for programs with an event loop: the same methods as coroutines."""
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 60.0) -> None:
-        self._http = _import_httpx().AsyncClient(**_client_options(url, token, timeout_s))
+        self._http = httpx.AsyncClient(**_client_options(url, token, timeout_s))
 
     async def __aenter__(self) -> AsyncClient:
         return self
@@ -167,13 +161,6 @@ class AsyncClient:
             if (wait_s := _retry_delay_s(response, next(attempts))) is None:
                 return _parse_response(response)
             await asyncio.sleep(wait_s)
-
-
-def _import_httpx() -> Any:
-    with MissingExtraError.on_import("asking a service needs httpx", "serve"):
-        import httpx
-
-        return httpx
 
 
 def _client_options(url: str, token: str | None, timeout_s: float) -> dict[str, Any]:
@@ -256,6 +243,6 @@ def _translate_errors(http: httpx.Client | httpx.AsyncClient) -> Iterator[None]:
     """Convert connection errors to ServiceError."""
     try:
         yield
-    except _import_httpx().HTTPError as error:
+    except httpx.HTTPError as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise ServiceError(f"{http.base_url}: no answer ({text})") from error

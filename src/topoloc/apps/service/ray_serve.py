@@ -70,7 +70,7 @@ def serve_on_ray(
         wait: called when the service runs.
     """
     with connect_to_cluster(address):
-        with MissingExtraError.on_import("replicas need Ray Serve ({})", "cluster,serve"):
+        with MissingExtraError.on_import("replicas need Ray Serve ({})", "cluster"):
             from ray import serve
         logging.getLogger("ray.serve").setLevel(logging.ERROR)
         is_running = bool(serve.status().proxies)

@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 from starlette.requests import HTTPConnection, Request
 
 from topoloc import (
-    CalibrationError,
     Localization,
     Localizer,
     MapCache,
@@ -27,7 +26,6 @@ from topoloc import (
     TopolocError,
     Tracker,
     TrackerConfig,
-    UncalibratedCamera,
 )
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.logs import Metrics, log
@@ -111,10 +109,6 @@ class Streams:
             image, camera = self._query_handler.decode_query(
                 named, stream.tracker.localizer.topomap
             )
-            if isinstance(camera, UncalibratedCamera):
-                raise CalibrationError(
-                    "a stream needs a calibrated camera: `map`, fx,fy,cx,cy or a JSON object"
-                )
             return stream.tracker.process(image, camera, t_ns).to_json(query_request.picture.name)
         finally:
             stream.last_used = time.monotonic()

@@ -95,6 +95,7 @@ def _describe_map(topomap: TopoMetricMap, num_shown: int) -> dict[str, Any]:
         "num_points_shown": num_shown,
         "length_m": topomap.length_m,
         "sessions": sessions,
+        "certificate": topomap.describe_certificate(),
     }
 
 

@@ -19,6 +19,7 @@ from topoloc.errors import CalibrationError
 from topoloc.json_data import Positive, decode_json
 
 Lens = Literal["none", "radial", "other"]
+Axes = Literal["", "x", "y", "xy"]
 Vector = Float[np.ndarray, " 7"]
 Matrix = Float[np.ndarray, "7 7"]
 
@@ -26,18 +27,19 @@ Matrix = Float[np.ndarray, "7 7"]
 class _Priors(Struct, frozen=True, forbid_unknown_fields=True):
     """Hold the numbers of `priors.json`: prior odds of a focal length outside its stated range, of
     a principal point off the centre, and of each lens; standard deviations of the principal point
-    (image sides) and of the distortion."""
+    (image sides) and of the distortion; growth of the variance with rho of the map."""
 
     corpus: str
     command: str
     date: str
     unstated_focal: Positive
-    off_centre: Positive
+    off_centre: dict[Axes, Positive]
     lens: dict[Lens, Positive]
     centred_sigma: Positive
     off_centre_sigma: Positive
     no_lens_sigma: Positive
     lens_sigma: Positive
+    map_variance: Positive
 
 
 @cache
@@ -46,40 +48,47 @@ def _priors() -> _Priors:
     return decode_json(path.read_bytes(), _Priors, CalibrationError, str(path))
 
 
+def map_variance(correlated_error_share: float) -> float:
+    """Return the factor of a camera estimate's variance in a map with this rho: its points have
+    errors in common, which one image does not show."""
+    return 1.0 + _priors().map_variance * min(correlated_error_share, 1.0)
+
+
 @dataclass(frozen=True)
 class CameraHypothesis:
-    """Hold what is assumed of a camera: whether its focal length is in the stated range, whether
-    its principal point is in the image centre, and the kind of distortion."""
+    """Hold what is assumed of a camera: whether its focal length is in the stated range, the axes
+    in which its principal point is off the image centre, and the kind of distortion."""
 
     is_focal_stated: bool = True
-    is_centred: bool = True
+    off_centre: Axes = ""
     lens: Lens = "none"
 
     @property
     def log_prior(self) -> float:
         """Return the logarithm of the prior probability, but for a constant."""
         odds = _priors().lens[self.lens]
-        odds *= 1.0 if self.is_centred else _priors().off_centre
+        odds *= _priors().off_centre[self.off_centre]
         return math.log(odds if self.is_focal_stated else odds * _priors().unstated_focal)
 
     @property
     def basis(self) -> Float[np.ndarray, "7 k"]:
-        """Return the directions in which the parameters are estimated."""
+        """Return the directions in which the parameters are estimated. A principal point off in one
+        axis is estimated in both, because that of a camera is off by a per cent in the other."""
         eye = np.eye(7)
         radial = np.array([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]]).T
         lens = {"none": eye[:, :0], "radial": radial, "other": eye[:, 3:]}[self.lens]
-        return np.hstack([eye[:, :1], eye[:, :0] if self.is_centred else eye[:, 1:3], lens])
+        return np.hstack([eye[:, : 3 if self.off_centre else 1], lens])
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """Hold the priors of the parameters. `side` is the longer side of the image, in focal lengths.
+    """Hold the priors of the parameters. `sides` are width and height, in focal lengths.
 
     `stated` and `usual` are mean and standard deviation of the logarithm of the focal length, by
     its stated range and without it. They are equal if no range is stated.
     """
 
-    side: float
+    sides: tuple[float, float]
     stated: tuple[float, float]
     usual: tuple[float, float]
 
@@ -87,10 +96,14 @@ class CameraPrior:
         """Return mean and covariance of the parameters under a hypothesis."""
         mean, focal = np.zeros(7), self.stated if hypothesis.is_focal_stated else self.usual
         priors = _priors()
-        is_centred = hypothesis.is_centred
-        offset = (priors.centred_sigma if is_centred else priors.off_centre_sigma) * self.side
+        offsets = [
+            side * priors.off_centre_sigma
+            if axis in hypothesis.off_centre
+            else max(self.sides) * priors.centred_sigma
+            for axis, side in zip("xy", self.sides, strict=True)
+        ]
         mean[0] = focal[0]
-        covariance = np.diag(np.square([focal[1], offset, offset, *[priors.no_lens_sigma] * 4]))
+        covariance = np.diag(np.square([focal[1], *offsets, *[priors.no_lens_sigma] * 4]))
         if hypothesis.lens != "none":
             covariance[3:, 3:] += priors.lens_sigma**2
         if hypothesis.lens == "other":
@@ -100,8 +113,31 @@ class CameraPrior:
     @property
     def hypotheses(self) -> list[CameraHypothesis]:
         """Return the hypotheses that differ."""
-        focal = (True,) if self.stated == self.usual else (True, False)
-        return [CameraHypothesis(*one) for one in product(focal, (True, False), _priors().lens)]
+        focal, odds = (True,) if self.stated == self.usual else (True, False), _priors()
+        return [CameraHypothesis(*one) for one in product(focal, odds.off_centre, odds.lens)]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraLikelihood:
+    """Hold what images show of the camera parameters: `information`, and `pull`, the information
+    times the estimate by the images alone."""
+
+    information: Matrix
+    pull: Vector
+
+    def posteriors(
+        self, means: Float[np.ndarray, "k 7"], covariances: Float[np.ndarray, "k 7 7"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 7"], Float[np.ndarray, "k 7 7"]]:
+        """Return the logarithm of the evidence of each of k priors, and the parameters' mean and
+        covariance under it."""
+        by_priors = np.linalg.inv(covariances)
+        posteriors = np.linalg.inv(self.information + by_priors)
+        weighed = (by_priors @ means[:, :, None])[:, :, 0]
+        pull = self.pull + weighed
+        estimates = (posteriors @ pull[:, :, None])[:, :, 0]
+        evidence = np.sum(pull * estimates, axis=1) - np.sum(means * weighed, axis=1)
+        evidence -= np.linalg.slogdet(np.eye(7) + covariances @ self.information)[1]
+        return 0.5 * evidence, estimates, posteriors
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float
 from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
     CameraHypothesis,
+    CameraLikelihood,
     CameraPrior,
     Matrix,
     Vector,
@@ -103,20 +104,11 @@ class JointFit:
         """Return the shift of the pose for a change of the camera parameters."""
         return -np.linalg.solve(self.information[:6, :6], self.information[:6, 6:])
 
-    def posteriors(
-        self, means: Float[np.ndarray, "k 7"], covariances: Float[np.ndarray, "k 7 7"]
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 7"], Float[np.ndarray, "k 7 7"]]:
-        """Return the logarithm of the evidence of each of k priors, and the parameters' mean and
-        covariance under it."""
+    @cached_property
+    def likelihood(self) -> CameraLikelihood:
+        """Return what the observations show of the camera, whatever the pose."""
         known = self.information[6:, 6:] + self.information[6:, :6] @ self.pose_by_camera
-        known, pull = known / self.variance, self.pull / self.variance
-        by_priors = np.linalg.inv(covariances)
-        posteriors = np.linalg.inv(known + by_priors)
-        weighed = (by_priors @ means[:, :, None])[:, :, 0]
-        estimates = (posteriors @ (pull + weighed)[:, :, None])[:, :, 0]
-        evidence = np.sum((pull + weighed) * estimates, axis=1) - np.sum(means * weighed, axis=1)
-        evidence -= np.linalg.slogdet(np.eye(7) + covariances @ known)[1]
-        return 0.5 * evidence, estimates, posteriors
+        return CameraLikelihood(known / self.variance, self.pull / self.variance)
 
 
 def fit_jointly(
@@ -158,11 +150,11 @@ def fit_camera(
 ) -> JointFit | None:
     """Fit pose and all camera parameters. Radial distortion comes first, because from far away the
     other terms lead astray. None if the observations do not fix the pose."""
-    wide = CameraHypothesis(False, False, "radial")
+    wide = CameraHypothesis(False, "xy", "radial")
     fit = fit_jointly(seen, cam_from_world, camera, prior.of(wide), wide.basis)
     if fit is None:
         return None
-    wide = CameraHypothesis(False, False, "other")
+    wide = CameraHypothesis(False, "xy", "other")
     return fit_jointly(seen, fit.cam_from_world, fit.camera, prior.of(wide), wide.basis)
 
 
@@ -226,13 +218,13 @@ def _shared_noise(
 
 
 def weigh_cameras(
-    fit: JointFit, prior: CameraPrior
+    seen: CameraLikelihood, prior: CameraPrior
 ) -> dict[CameraHypothesis, tuple[float, Vector, Matrix]]:
     """Return the probability of each hypothesis, and the parameters' mean and covariance under
     it."""
     hypotheses = prior.hypotheses
     means, covariances = map(np.array, zip(*map(prior.of, hypotheses), strict=True))
-    evidence, estimates, posteriors = fit.posteriors(means, covariances)
+    evidence, estimates, posteriors = seen.posteriors(means, covariances)
     logs = evidence + [one.log_prior for one in hypotheses]
     shares = np.exp(logs - logs.max())
     found = zip((shares / shares.sum()).tolist(), estimates, posteriors, strict=True)

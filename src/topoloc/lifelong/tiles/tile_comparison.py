@@ -98,8 +98,7 @@ def compare_tiles(
 
     Raises:
         MapError: a map cannot be read.
-        FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
-            this machine.
+        FeatureTypeError, WeightsError: the maps' features cannot be compared on this machine.
     """
     shared = estimate_by_shared_images(first.topomap, second.topomap)
     if shared is not None:

@@ -164,8 +164,7 @@ def join_tiles(
 
     Raises:
         AtlasError: there is no such atlas or tile, or the atlas cannot be written.
-        FeatureTypeError, MissingExtraError, WeightsError: the maps' features cannot be compared on
-            this machine.
+        FeatureTypeError, WeightsError: the maps' features cannot be compared on this machine.
     """
     atlas = Atlas.open(where)
     wanted = {atlas.tile(tile_id).tile_id for tile_id in tile_ids} or set(atlas.manifest.by_id)

@@ -52,6 +52,7 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
         "map": topomap.id,
         "version": topomap.version,
         "georeference": None if topomap.georeference is None else topomap.georeference.to_json(),
+        "certificate": topomap.describe_certificate(),
         "bytes": path.stat().st_size,
         "num_nodes": len(topomap.summaries),
         "num_points": sum(s.num_points for s in topomap.summaries),

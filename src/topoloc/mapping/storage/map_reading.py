@@ -15,6 +15,7 @@ from topoloc.features.feature_types import find_feature_type
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.json_data import Finite, decode_json
+from topoloc.mapping.certificate import Certificate
 from topoloc.mapping.config import CONFIG_VERSION, MapConfig, config_from_text
 from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
 from topoloc.mapping.sessions import Edit, Session
@@ -92,6 +93,7 @@ def _read_contents(file: MapFile) -> TopoMetricMap:
         next_ids=parse_settings(NextIds, _decode_fact(facts, "next_ids", dict, {}), "next_ids"),
         map_id=map_id,
         georeference=None if of_earth is None else Georeference.from_json(of_earth),
+        certificate=_decode_fact(facts, "certificate", Certificate, None),
     )
 
 

@@ -188,6 +188,8 @@ class _Writer:
             facts["kind_of_sides"] = json.dumps(topomap.sides.kind)
         if topomap.georeference is not None:
             facts["georeference"] = json.dumps(topomap.georeference.to_json())
+        if topomap.certificate is not None:
+            facts["certificate"] = json.dumps(topomap.certificate.to_json())
         for kind, layer in topomap.layers.items():
             if layer.shared_errors is not None:
                 key = f"shared_errors{layer_suffix(kind, topomap.kind)}"

@@ -27,8 +27,8 @@ from topoloc.recordings.calibration import (
 from topoloc.recordings.format import RecordingFormat, match_times
 from topoloc.recordings.recording import Recording, RightImages
 from topoloc.recordings.stereo_yaml import kalibr_camera, read_yaml, require_numbers
-from topoloc.recordings.text_files import read_file_list
-from topoloc.recordings.trajectory import read_asl_poses
+from topoloc.recordings.text_files import read_file_list, read_rows
+from topoloc.recordings.trajectory import Trajectory, timed_trajectory
 
 EXPECTED_FILES = "mav0/ with cam0/data.csv, or cam0/data.csv"
 MAX_TRUTH_GAP, MAX_PAIR_DELAY_MS = 0.05, 1
@@ -146,10 +146,25 @@ def _read_ground_truth(mav: Path, t_ns: list[int], sensor: Sensor) -> list[Rigid
     path = next((path for path in paths if path.is_file()), None)
     if path is None:
         return [None] * len(t_ns)
-    poses = read_asl_poses(path).interpolate(t_ns, MAX_TRUTH_GAP)
+    poses = _read_asl_poses(path).interpolate(t_ns, MAX_TRUTH_GAP)
     if all(world_from_body is None for world_from_body in poses):
         raise TrajectoryError(f"{path}: none of the {len(t_ns)} frames has a pose")
     return [pose and pose @ sensor.body_from_cam for pose in poses]
+
+
+def _read_asl_poses(path: Path) -> Trajectory:
+    """Read the poses of an ASL ground truth data.csv: ``t [ns], px, py, pz, qw, qx, qy, qz``.
+    Further columns are ignored.
+
+    Raises:
+        TrajectoryError: the file is missing or empty, columns are missing, a number is NaN, a
+            rotation is invalid, or times do not increase. Names the line.
+    """
+    rows = read_rows(path, TrajectoryError)
+    for line, tokens in rows:
+        if len(tokens) < 8:
+            raise TrajectoryError(f"{path}, line {line}: {len(tokens)} columns, a pose has 8")
+    return timed_trajectory(path, rows, (1, 2, 3, 5, 6, 7, 4))
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_euroc, ("calibration",))

@@ -23,7 +23,8 @@ from topoloc.recordings.calibration import (
 from topoloc.recordings.camera_json import FILE_NAME, CameraCalibration
 from topoloc.recordings.format import (
     RecordingFormat,
-    check_pairs,
+    complete_lists,
+    count_times,
     list_images,
     read_ground_truth,
     read_times,
@@ -55,8 +56,7 @@ def open_folder(path: Path, calibration: CalibrationForSize | None = None) -> Re
         calibration: replaces the calibration in the folder.
 
     Raises:
-        RecordingError: there are no images, or the numbers of left, right or depth images and times
-            differ.
+        RecordingError: there are no images, most have no partner, or the number of times differs.
         CalibrationError: the calibration of stereo or RGB-D images is missing or not usable.
         TrajectoryError: the ground truth is malformed or matches no frame.
     """
@@ -72,7 +72,7 @@ def open_folder(path: Path, calibration: CalibrationForSize | None = None) -> Re
     folder = next((path / name for name in ("", *_MONO) if _has_images(path / name)), None)
     if folder is None:
         raise RecordingError(f"{path}: no pictures in this folder")
-    images = list_images(folder)
+    (images,) = complete_lists(count_times(path / "times.txt"), list_images(folder))
     return _make_recording(path, images, calibration and calibration(*first_image_size(images)))
 
 
@@ -80,7 +80,8 @@ def _open_pairs(
     path: Path, name: str, other: str, calibration: CalibrationForSize | None
 ) -> Recording:
     """Open the images of two folders, the second one with right or depth images."""
-    images, others = list_images(path / name), list_images(path / other)
+    lists = [list_images(path / folder) for folder in (name, other)]
+    images, others = complete_lists(count_times(path / "times.txt"), *lists)
     found = calibration and calibration(*first_image_size(images))
     is_stereo, right, depth = (name, other) in _STEREO, None, None
     if is_stereo and found and found.rig:
@@ -97,7 +98,6 @@ def _open_pairs(
         raise CalibrationError(
             f"{path / FILE_NAME}: {kind} ({name}/, {other}/) needs this file, with a {need}"
         )
-    check_pairs(images, others)
     return _make_recording(path, images, found, right, depth)
 
 

@@ -17,14 +17,15 @@ from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.calibration import first_image_size
 from topoloc.recordings.format import (
     RecordingFormat,
-    check_pairs,
+    complete_lists,
+    count_times,
     list_images,
     read_ground_truth,
     read_times,
 )
-from topoloc.recordings.image_io import image_size
 from topoloc.recordings.recording import Recording, RightImages
 from topoloc.recordings.text_files import read_text
 
@@ -44,22 +45,21 @@ def open_kitti(path: Path) -> Recording:
     camera.
 
     Raises:
-        RecordingError: there are no images, or the numbers of left images, right images and times
-            differ.
+        RecordingError: there are no images, most have no partner, or the number of times differs.
         CalibrationError: calib.txt is missing or not usable.
         TrajectoryError: the ground truth is malformed or matches no frame.
     """
     pair = next((pair for pair in _PAIRS if (path / f"image_{pair[0]}").is_dir()), None)
     if pair is None:
         raise RecordingError(f"{path}: not a KITTI folder, which has {EXPECTED_FILES}")
-    left = list_images(path / f"image_{pair[0]}")
+    folders = [path / f"image_{number}" for number in pair]
+    lists = [list_images(folder) for folder in folders if folder.is_dir()]
+    left, *others = complete_lists(count_times(path / "times.txt"), *lists)
     projections = read_calib(path / "calib.txt")
-    size = image_size(left[0])
+    size = first_image_size(left)
     camera, shift = _camera(path, projections, pair[0], size)
     right = None
-    if (path / f"image_{pair[1]}").is_dir():
-        right_paths = list_images(path / f"image_{pair[1]}")
-        check_pairs(left, right_paths)
+    if others:
         right_camera, right_shift = _camera(path, projections, pair[1], size)
         # P of the colour cameras has some millimetres in y and z, too. The images are still
         # rectified to equal rows.
@@ -70,7 +70,7 @@ def open_kitti(path: Path) -> Recording:
                 " left of the left one"
             )
         rig = replace(StereoRig.rectified(camera, baseline), right=right_camera)
-        right = RightImages(right_paths, rig)
+        right = RightImages(others[0], rig)
     t_ns = read_times(path / "times.txt", len(left))
     poses = _read_ground_truth(path, t_ns, Rigid3(np.eye(3), -shift))
     names = [f"{file.parent.name}/{file.name}" for file in left]
@@ -114,13 +114,12 @@ def _camera(
 
 
 def _read_ground_truth(path: Path, t_ns: list[int], cam0_from_cam: Rigid3) -> list[Rigid3 | None]:
+    if any(poses := read_ground_truth(path / "truth.tum", [], t_ns)):
+        return poses
     absolute = path.resolve()
     rows = [path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"]
-    poses = read_ground_truth(path / "truth.tum", rows, t_ns)
-    if (path / "truth.tum").is_file():
-        return poses
     # KITTI's rows are the poses of camera 0 for all image folders.
-    return [pose @ cam0_from_cam if pose is not None else None for pose in poses]
+    return [pose and pose @ cam0_from_cam for pose in read_ground_truth(rows[0], rows[1:], t_ns)]
 
 
 FORMAT = RecordingFormat(EXPECTED_FILES, can_open, open_kitti)

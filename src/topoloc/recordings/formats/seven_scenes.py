@@ -15,7 +15,7 @@ import numpy as np
 from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.recordings.format import RecordingFormat, list_images
+from topoloc.recordings.format import RecordingFormat, list_images, natural_key
 from topoloc.recordings.recording import DepthImages, Recording
 
 EXPECTED_FILES = "frame-*.color.png or .jpg with .pose.txt, or one seq-* folder of these"
@@ -38,22 +38,17 @@ def open_seven_scenes(path: Path) -> Recording:
     times 1/30 s.
 
     Raises:
-        RecordingError: there is no sequence, there are several, or depth exists for some frames
-            only.
+        RecordingError: there is no sequence, or there are several.
         TrajectoryError: a .pose.txt contains no pose.
     """
     run = _find_run(path)
-    colour = list_images(run, ".color")
-    stems = [file.name.partition(".color")[0] for file in colour]
     files = {file.name for file in run.iterdir()}
-    stems_with_depth = [stem for stem in stems if f"{stem}.depth.png" in files]
-    if stems_with_depth and len(stems_with_depth) != len(stems):
-        raise RecordingError(
-            f"{run}: {len(stems)} colour pictures but {len(stems_with_depth)} with depth; every"
-            " picture needs its partner"
-        )
+    colour = list_images(run, ".color")
+    numbered = {file.name.partition(".color")[0]: file.name for file in colour}
+    with_depth = {name.removesuffix(".depth.png") for name in files if name.endswith(".depth.png")}
+    stems = sorted({*numbered, *with_depth}, key=natural_key)
     depth = None
-    if stems_with_depth:
+    if with_depth:
         depth_paths = [run / f"{stem}.depth.png" for stem in stems]
         depth = DepthImages(depth_paths, UNITS_PER_METRE, DEPTH_CAMERA, COLOUR_FROM_DEPTH)
     poses = [
@@ -62,7 +57,7 @@ def open_seven_scenes(path: Path) -> Recording:
     ]
     t_ns = [_frame_number(run / stem) * 1_000_000_000 // RATE_HZ for stem in stems]
     name = f"{run.resolve().parent.name}/{run.resolve().name}"
-    names = [file.name for file in colour]
+    names = [numbered.get(stem, f"{stem}.color{colour[0].suffix}") for stem in stems]
     return Recording(name, run, names, t_ns, poses, COLOUR_CAMERA, depth=depth)
 
 

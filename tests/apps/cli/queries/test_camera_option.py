@@ -155,3 +155,17 @@ def test_a_scale_is_that_of_the_poses(tiny_recording: Path, tmp_path: Path):
         nodes = TopoMetricMap.load(tmp_path / f"{scale}.topo").nodes
         medians.append(float(np.median(np.concatenate([node.points_cam[:, 2] for node in nodes]))))
     assert medians[1] == pytest.approx(3.0 * medians[0], rel=0.02)
+
+
+def test_map_is_the_camera_of_the_recording_before_rectification(shared: Path, tmp_path: Path):
+    recording, target = shared / "data/euroc/v1_01_part", tmp_path / "hall.topo"
+    words = ["build", f"{recording}@0:10", str(target), "--features", "surf"]
+    assert main([*words, "--trajectory", "slam"]) == 0
+    photo = sorted((recording / "mav0/cam0/data").iterdir())[4]
+    shutil.copy(photo, tmp_path / "raw.png")
+    out = tmp_path / "a.json"
+    words = ["localize", str(target), str(tmp_path / "raw.png"), "--json", str(out)]
+    assert main([*words, "--camera", "map"]) == 0
+    answer = json.loads(out.read_text())
+    assert answer["localized"]
+    assert np.linalg.norm(answer["world_from_cam"]["translation"]) < 0.05

@@ -51,7 +51,7 @@ def test_the_newest_pictures_are_localized(
 @pytest.mark.parametrize(
     ("inputs", "status", "said"),
     [
-        (["rtsp://127.0.0.1:9/none"], 2, "has no calibration"),
+        (["rtsp://127.0.0.1:9/none"], 1, "does not answer"),
         (["rtsp://127.0.0.1:9/none", "--camera", NUMBERS], 1, "does not answer"),
         (
             ["rtsp://127.0.0.1:9/none", "http://127.0.0.1:9/a", "--camera", NUMBERS],

@@ -161,9 +161,16 @@ def test_streams_that_cannot_be_are_one_line(
     assert "times.txt" in complaint("localize", room_map, broken)
     (tmp_path / "film.mp4").write_bytes(b"no film")
     assert "film.mp4" in complaint("localize", room_map, tmp_path / "film.mp4")
-    assert "--camera" in complaint(
-        "localize", room_map, shutil.copy(stream / "walk.avi", tmp_path / "alone.avi")
-    )
+
+
+def test_a_video_without_calibration(room_map: Path, stream: Path, tmp_path: Path):
+    shutil.copy(stream / "walk.avi", tmp_path / "alone.avi")
+    words = [str(room_map), str(tmp_path / "alone.avi"), "--json", str(tmp_path / "a.json")]
+    assert main(["localize", *words]) == 0
+    lines = [json.loads(line) for line in (tmp_path / "a.json").read_text().splitlines()]
+    assert {line["state"] for line in lines} == {"localized"}
+    focals = [line["focal_length_px"] for line in lines]
+    assert np.median(focals) == pytest.approx(CAMERA.fx, rel=0.02)
 
 
 def test_options_that_contradict_are_wrong_usage(

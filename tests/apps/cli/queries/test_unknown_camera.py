@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc.apps.cli import main
+from topoloc.geometry.camera import Camera
 
 
 def _lines(path: Path) -> list[dict]:
@@ -47,6 +49,44 @@ def test_the_focal_length_is_found_with_the_pose(
         for line, truth in found
     ]
     assert np.median(errors) < 0.05
+
+
+def test_photos_of_one_camera_share_it(room_map: Path, queries: Path, tmp_path: Path):
+    folder, camera = tmp_path / "photos", tmp_path / "camera.json"
+    folder.mkdir()
+    for picture in queries.glob("*.png"):  # a fifth of the width cut off at the left
+        cut = cv2.imread(str(picture))[:, CAMERA.width // 5 :]
+        cv2.imwrite(str(folder / picture.name), cut)
+    words = [str(room_map), str(folder), "--json", str(tmp_path / "a.json")]
+    assert main(["localize", *words, "--save-camera", str(camera)]) == 0
+    found, width = Camera.from_json(camera.read_text()), CAMERA.width
+    assert found.fx == pytest.approx(CAMERA.fx, rel=0.02)
+    assert found.cx == pytest.approx(CAMERA.cx - width // 5, abs=0.01 * width)
+    by_estimate = _lines(tmp_path / "a.json")
+    assert main(["localize", *words, "--camera", str(camera)]) == 0
+    for line, again, (_, truth) in zip(
+        by_estimate, _lines(tmp_path / "a.json"), unseen_views(), strict=True
+    ):
+        if again["localized"]:
+            assert line["localized"]
+            for one in (line, again):
+                moved = np.array(one["world_from_cam"]["translation"]) - truth.translation
+                assert np.linalg.norm(moved) < 0.1
+
+
+def test_a_stream_learns_its_camera(
+    room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for picture in queries.glob("*.png"):
+        (folder / picture.name).write_bytes(picture.read_bytes())
+    assert main(["follow", str(room_map), str(folder), "--camera", "unknown"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    found = [line for line in lines if line["state"] in ("localized", "tracked")]
+    assert len(found) >= 0.8 * len(lines)
+    assert "focal_length_px" in found[0], "the first image is localized alone"
+    assert "focal_length_px" not in found[-1], "the last one by the camera of the stream"
 
 
 def test_a_calibrated_picture_has_no_such_entry(room_map: Path, queries: Path, tmp_path: Path):

@@ -121,7 +121,8 @@ def image(
     pixels: np.ndarray, t_ns: int, encoding: str | None = None, frame: str = "left_optical"
 ) -> dict[str, Any]:
     """A sensor_msgs/Image, its rows padded by three bytes."""
-    encoding = encoding or ("mono8" if pixels.ndim == 2 else "rgb8")
+    grey = f"mono{8 * pixels.itemsize}"
+    encoding = encoding or (grey if pixels.ndim == 2 else "rgb8")
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
     data = np.pad(rows, ((0, 0), (0, 3)))
     fields = {
@@ -221,9 +222,10 @@ def write_stereo_bag(
     sequence: StereoSequence,
     poses: Callable[[Write, int, Rigid3], None] = by_tf,
     is_compressed: bool = False,
+    factor: int = 0,
 ) -> Path:
     """A stereo recording of rectified pairs as a bag. Its messages are written some milliseconds
-    after their own times."""
+    after their own times. With a `factor` its pixels have 16 bits."""
     with bag_writer(path, kind) as write:
         for index in range(len(sequence)):
             frame = sequence[index]
@@ -231,6 +233,8 @@ def write_stereo_bag(
             assert frame.rig is not None
             now = frame.t_ns + 7_000_000 + index % 3 * 1_000_000
             for topic, pixels in ((LEFT, frame.image), (RIGHT, frame.right)):
+                if factor:
+                    pixels = pixels.astype(np.uint16) * factor
                 if is_compressed:
                     write(
                         f"{topic}/compressed",

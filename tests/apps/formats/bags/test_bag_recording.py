@@ -477,3 +477,18 @@ def test_opening_reads_no_picture(kind: str, tmp_path: Path, monkeypatch: pytest
     read.clear()
     assert sequence[7].image[3, 3] == 7
     assert 2 * 2_000_000 < sum(read) < 2 * 2_100_000
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+@pytest.mark.parametrize("factor", [4, 16, 64, 257])
+def test_bits_in_use_are_those_of_the_whole_recording(
+    walk: StereoSequence, bag_of: BagOf, factor: int, is_compressed: bool
+):
+    """A camera of 10, 12, 14 or 16 bits, whose darkest images may use less."""
+    sequence = open_sequence(bag_of("ros2", factor=factor, is_compressed=is_compressed))
+    for index in range(len(walk)):
+        read, frame = sequence[index], walk[index]
+        for pixels, expected in ((read.image, frame.image), (read.right, frame.right)):
+            assert pixels is not None
+            assert expected is not None
+            np.testing.assert_allclose(pixels.astype(float), expected.astype(float), atol=1.5)

@@ -34,6 +34,7 @@ from topoloc.apps.cli.output import (
     option,
     print_line,
     print_waiting,
+    print_warning,
     progress_bar,
     write_json,
 )
@@ -141,9 +142,12 @@ class Command:
 
     def _make_map(self, map_job: MapJob, target: Path) -> int:
         with progress_bar() as progress:
-            topomap, poses_from = map_job.make(progress)
+            tell = None if self.json == "-" else print_line
+            topomap, poses_from = map_job.make(progress, tell)
         topomap.save(target, print_waiting)
         info = topomap.describe(target)
+        if info["num_nodes"] == 1:
+            print_warning(f"{target}: one node, the camera moved less than --d-thresh")
         if self.json != "-":
             size = f"{info['num_nodes']} nodes, {info['num_points']} points"
             source = " and ".join(sorted(set(poses_from)))

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from importlib.metadata import version
@@ -30,7 +30,7 @@ from topoloc import (
     with_pose_conventions,
     with_trajectory,
 )
-from topoloc.apps.cli.output import UsageError, open_recording, print_line
+from topoloc.apps.cli.output import UsageError, describe_recording, open_recording, print_line
 from topoloc.apps.cluster.remote import Progress
 from topoloc.apps.formats.colmap import estimate_metric_scale
 from topoloc.plugin import has_scale, scale_poses, split_selection
@@ -72,11 +72,14 @@ class MapJob:
     images: str | None = None
     topics: str | None = None
 
-    def make(self, progress: Progress) -> tuple[TopoMetricMap, list[str]]:
+    def make(
+        self, progress: Progress, tell: Callable[[str], None] | None = None
+    ) -> tuple[TopoMetricMap, list[str]]:
         """Return the map and the source of each recording's poses. Warnings go to standard error.
-        Raises UsageError: the options contradict each other or the recordings; TopolocError: see
-        `open_sequence`, `run_slam` and `build_map`."""
-        sequences, poses_from = self._open()
+        `tell` is called with how each recording was understood. Raises UsageError: the options
+        contradict each other or the recordings; TopolocError: see `open_sequence`, `run_slam` and
+        `build_map`."""
+        sequences, poses_from = self._open(tell)
         is_slam = poses_from[0] == "slam"
         if is_slam:
             result = run_slam(sequences, progress)
@@ -130,13 +133,16 @@ class MapJob:
             )
         return trajectories
 
-    def _open(self) -> tuple[list[StereoSequence], list[str]]:
+    def _open(self, tell: Callable[[str], None] | None) -> tuple[list[StereoSequence], list[str]]:
         """Return the recordings with their poses and the sources of these. With `slam` the poses
         are computed later."""
         sequences = [
-            open_recording(path, self.format, self.camera, self.topics, self.images)
+            open_recording(path, self.format, self.camera, self.topics, self.images, True)
             for path in self.recordings
         ]
+        if tell is not None:
+            for path, sequence in zip(self.recordings, sequences, strict=True):
+                tell(describe_recording(path, self.format, self.camera, sequence))
         has_truth = all(any(sequence.poses) for sequence in sequences)
         default = ("truth" if has_truth else "slam",)
         trajectories = self._for_each(self.pose_options.trajectory or default)

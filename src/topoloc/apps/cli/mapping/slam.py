@@ -16,8 +16,10 @@ from topoloc.apps.cli.output import (
     Format,
     Topics,
     check_outputs,
+    describe_recording,
     open_recording,
     print_fields,
+    print_line,
     progress_bar,
     write_json,
 )
@@ -40,7 +42,10 @@ class Command:
 
     def run(self) -> int:
         check_outputs([self.out, self.json])
-        sequence = open_recording(self.sequence, self.format, self.camera, self.topics)
+        words = self.sequence, self.format, self.camera, self.topics
+        sequence = open_recording(*words, whole_only=True)
+        if self.json != "-":
+            print_line(describe_recording(*words[:3], sequence))
         start = time.perf_counter()
         with progress_bar() as progress:
             result = run_slam(sequence, progress)

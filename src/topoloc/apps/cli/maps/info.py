@@ -107,9 +107,18 @@ def _print(info: dict[str, Any]) -> None:
             ),
             ("Eq. 1", f"D_thresh {d_thresh:.3g} m, lambda {lambda_rot:.3g} m/rad"),
             ("features", kinds),
+            ("certificate", _describe_certificate(info["certificate"])),
             *([("check", info["check"])] if "check" in info else []),
         ]
     )
+
+
+def _describe_certificate(certificate: dict[str, Any] | None) -> str:
+    if certificate is None:
+        return "none (topoloc certify measures how often answers are wrong)"
+    if certificate["is_outdated"]:
+        return f"outdated: of version {certificate['map_version']}. {certificate['promise']}"
+    return f"{certificate['date']}: {certificate['promise']}"
 
 
 def _format_coarse(facts: dict[str, Any], default: str) -> str:

@@ -47,9 +47,8 @@ class SessionUpdateOptions:
 
     def open_session(self) -> OpenSessionUpdate:
         """Open the recording and print its notes to standard error. Raises RecordingError."""
-        return OpenSessionUpdate(
-            self, open_recording(self.recording, self.format, self.camera, self.topics)
-        )
+        words = self.recording, self.format, self.camera, self.topics
+        return OpenSessionUpdate(self, open_recording(*words, whole_only=True))
 
 
 class OpenSessionUpdate:

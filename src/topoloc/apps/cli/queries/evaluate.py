@@ -164,7 +164,7 @@ class Command:
 
     def _open_recordings(self) -> list[tuple[QueryRecording, StereoSequence]]:
         """Open the recordings, those with true poses first."""
-        map_from_truth = _read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
+        map_from_truth = read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         paths, count = [*self.sequences, *self.elsewhere], len(self.sequences)
         how = (self.format, self.camera, self.topics, self.poses)
         recordings = [
@@ -231,7 +231,7 @@ def _unique_labels(paths: Sequence[str], sequences: Sequence[StereoSequence]) ->
     return next((names for names in choices if len(set(names)) == len(names)), list(paths))
 
 
-def _read_rigid(path: Path) -> Rigid3:
+def read_rigid(path: Path) -> Rigid3:
     """Read a 4x4 matrix, alone or as the only matrix of a JSON object."""
     data = decode_json(read_text(path, TrajectoryError), Any, TrajectoryError, str(path))
     values = data.values() if isinstance(data, dict) else [data]

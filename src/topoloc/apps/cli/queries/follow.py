@@ -36,8 +36,6 @@ from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.robots.ros_publisher import RosPublisher
 from topoloc.plugin import as_monocular
 
-_NEED = "a stream needs a calibration: --camera FILE, fx,fy,cx,cy or map"
-
 
 @dataclass(frozen=True)
 class Command:
@@ -47,9 +45,11 @@ class Command:
     """A map file, or an atlas."""
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
     """A webcam's number or device, an address (rtsp://, http://), a video, or a recording."""
-    camera: Annotated[str | None, option("FILE|fx,fy,cx,cy|map", "that of the recording")] = None
+    camera: Annotated[
+        str | None, option("FILE|fx,fy,cx,cy|map|unknown", "that of the recording")
+    ] = None
     """Calibration of the images: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in
-    pixels, or `map` for that of the map."""
+    pixels, `map` for that of the map, or `unknown` to estimate it from the first images."""
     format: Format = None
     topics: Topics = None
     """Topic of a bag: left=/cam0/image_raw."""
@@ -64,8 +64,6 @@ class Command:
     """TOML file with all other settings, as printed by `topoloc config follow`."""
 
     def run(self) -> int:
-        if self.camera == "unknown":
-            raise UsageError(_NEED)
         settings = read_settings(self.config)
         localizer = open_localizer(
             self.map, settings.of(LocalizerConfig), self.features, settings.of(AtlasConfig)
@@ -85,7 +83,7 @@ class Command:
             for frame in frames:
                 if stop.is_set():
                     break
-                answer = frame.localize(localizer, tracker, of_size, _NEED)
+                answer = frame.localize(tracker.cameras, tracker, of_size)
                 result = answer.result
                 if robots is not None and isinstance(result, Localization):
                     robots.publish(frame.t_ns, result.world_from_cam, result.covariance)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -21,6 +22,7 @@ from topoloc import (
     LocalizerConfig,
     NotLocalized,
     QueryError,
+    SharedCameras,
     StereoSequence,
     TopolocError,
     Tracker,
@@ -55,7 +57,9 @@ from topoloc.apps.cli.queries.query_answers import (
     capture_frames,
     exit_status,
     format_answer,
+    learn_cameras,
     report_calibrations,
+    report_cameras,
     summarize_stream,
     to_trajectory,
 )
@@ -63,10 +67,6 @@ from topoloc.apps.cli.settings_file import Settings, read_settings, with_option
 from topoloc.apps.formats.live import LiveSource, is_live
 from topoloc.apps.query_camera import CameraOfSize
 from topoloc.plugin import as_monocular, find_format, split_selection
-
-_NEED = (
-    "a stream needs a calibration: --camera FILE, --camera fx,fy,cx,cy or --camera map; or --single"
-)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,10 @@ class Command:
         str | None, option("FILE|fx,fy,cx,cy|map|unknown", "that of the recording")
     ] = None
     """Calibration of the queries: a camera.json, YAML of OpenCV or Kalibr, `fx,fy,cx,cy` in pixels,
-    `map` for the map's camera, `unknown` to estimate the focal length."""
+    `map` for the map's camera, `unknown` to estimate it from all images of one size."""
+    save_camera: File = None
+    """Write the camera that is estimated from images without calibration to this file
+    (camera.json)."""
     format: Format = None
     topics: Topics = None
     coarse: CoarseOption = None
@@ -131,7 +134,7 @@ class Command:
         live = next((path for path in self.inputs if is_live(path)), None)
         self._check_usage(live)
         inputs = (self.map, *self.inputs, self.streams.odometry, self.config)
-        check_outputs([self.json, self.tum], inputs)
+        check_outputs([self.json, self.tum, self.save_camera], inputs)
         near, settings = self._parse_near(), read_settings(self.config)
         tracking = settings.of(TrackerConfig)
         if self.streams.max_jump is not None:
@@ -144,17 +147,17 @@ class Command:
             raise UsageError(f"{live} is a live source, which must be the only input")
         queries = [] if live else [self._open_query(path) for path in self.inputs]
         total = sum(len(query.frames) for query in queries)
-        coming = _localize_queries(localizer, tracking, queries, camera)
+        cameras = SharedCameras(localizer)
+        coming = _localize_queries(cameras, tracking, queries, camera)
         if live:
-            if camera is None:
-                raise UsageError(f"{live} has no calibration: --camera gives it")
-            tracker = None if self.streams.single else Tracker(localizer, tracking)
-            coming = _localize_live(localizer, tracker, live, camera)
+            tracker = None if self.streams.single else Tracker(localizer, tracking, cameras)
+            coming = _localize_live(cameras, tracker, live, camera)
         start, answers = time.perf_counter(), self._print_answers(coming, total)
         self._write_files(answers)
         if any(answer.streamed for answer in answers) and self.json != "-":
             print(summarize_stream(answers, time.perf_counter() - start))
         report_calibrations(answers)
+        report_cameras(cameras, self.save_camera, sys.stderr if self.json == "-" else sys.stdout)
         return exit_status(answers)
 
     def _print_answers(self, coming: Iterator[QueryAnswer], total: int) -> list[QueryAnswer]:
@@ -233,7 +236,8 @@ class Command:
             tiles = {answer.result.provenance.tile for answer in answers if answer.result.localized}
             if len(tiles) > 1:
                 print_warning(f"{self.tum}: poses of {len(tiles)} tiles, each in its tile's world")
-            to_trajectory(answers, self.streams.smoothed).write_tum(Path(self.tum))
+            poses = to_trajectory(answers, self.streams.smoothed)
+            poses.write_tum(Path(self.tum), are_answers=True)
             files.append(self.tum)
         return files
 
@@ -248,19 +252,20 @@ class _Query:
 
 
 def _localize_queries(
-    localizer: Localizer,
+    cameras: SharedCameras,
     tracking: TrackerConfig,
     queries: list[_Query],
     camera_of_size: CameraOfSize | None,
 ) -> Iterator[QueryAnswer]:
+    learn_cameras(cameras, [one for query in queries for one in query.frames], camera_of_size)
     for query in queries:
-        tracker = Tracker(localizer, tracking) if query.is_stream else None
+        tracker = Tracker(cameras.localizer, tracking, cameras) if query.is_stream else None
         for frame in query.frames:
             if len(queries) > 1:
                 name = query.path if len(query.frames) == 1 else f"{query.path}/{frame.name}"
                 frame = replace(frame, name=name)
             try:
-                yield frame.localize(localizer, tracker, camera_of_size, _NEED)
+                yield frame.localize(cameras, tracker, camera_of_size)
             except (QueryError, CalibrationError) as error:
                 text = f"{frame.name}: {error}"
                 if query.is_stream or len(queries) == len(query.frames) == 1:
@@ -271,7 +276,10 @@ def _localize_queries(
 
 
 def _localize_live(
-    localizer: Localizer, tracker: Tracker | None, source: str, camera_of_size: CameraOfSize
+    cameras: SharedCameras,
+    tracker: Tracker | None,
+    source: str,
+    camera_of_size: CameraOfSize | None,
 ) -> Iterator[QueryAnswer]:
     """Yield results until the source ends or the process is interrupted. Images that arrive during
     a query are skipped. Raises RecordingError if the source does not respond or stalls."""
@@ -279,7 +287,7 @@ def _localize_live(
         live = stack.enter_context(LiveSource(source))
         stop, count = stack.enter_context(catch_stop_signals()), 0
         for frame in capture_frames(live, stop):
-            yield frame.localize(localizer, tracker, camera_of_size, _NEED)
+            yield frame.localize(cameras, tracker, camera_of_size)
             count += 1
         if not stop.is_set():
             print_warning(f"{source} ended after {live.num_read} images, {count} were localized")

@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 from topoloc import (
-    CalibrationError,
     Localization,
-    Localizer,
     NotLocalized,
     Rigid3,
+    SharedCameras,
     StereoFrame,
     StreamedPose,
+    TopolocError,
     Tracker,
     Trajectory,
     UncalibratedCamera,
     UnreadableImageError,
     check_camera_calibrations,
 )
-from topoloc.apps.cli.output import print_line, print_warning
+from topoloc.apps.cli.output import print_line, print_warning, write_text
 from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
 
@@ -42,31 +44,47 @@ class QueryFrame:
 
     def localize(
         self,
-        localizer: Localizer,
+        cameras: SharedCameras,
         tracker: Tracker | None,
         camera_of_size: CameraOfSize | None,
-        need: str,
     ) -> QueryAnswer:
-        """Localize the image, with a tracker as the next of a stream. Raises CalibrationError: an
-        image of a stream has no calibration. The text is `need`; QueryError: the size of the image
-        is not that of its camera."""
+        """Localize the image, with a tracker as the next of a stream. Raises QueryError: the size
+        of the image is not that of its camera."""
         t_ns = self.t_ns if self.has_time else None
         try:
             frame = self.read()
         except UnreadableImageError as error:
             refusal = NotLocalized("unreadable", detail=str(error))
-            refusal, streamed = localizer.with_provenance(refusal, t_ns=t_ns), None
+            refusal, streamed = cameras.localizer.with_provenance(refusal, t_ns=t_ns), None
             if tracker is not None:
                 streamed = tracker.process_missing(self.t_ns, refusal, self.odom_from_cam)
             return QueryAnswer(self.name, self.t_ns, refusal, streamed)
         camera = select_frame_camera(frame, camera_of_size)
-        if tracker is None:
-            result = localizer.localize(frame.image, camera, t_ns=t_ns)
-            return QueryAnswer(self.name, self.t_ns, result)
+        if tracker is not None:
+            streamed = tracker.process(frame.image, camera, self.t_ns, self.odom_from_cam)
+            return QueryAnswer(self.name, self.t_ns, streamed.result, streamed)
         if isinstance(camera, UncalibratedCamera):
-            raise CalibrationError(need)
-        streamed = tracker.process(frame.image, camera, self.t_ns, self.odom_from_cam)
-        return QueryAnswer(self.name, self.t_ns, streamed.result, streamed)
+            result = cameras.localize(frame.image, camera, t_ns)
+        else:
+            result = cameras.localizer.localize(frame.image, camera, t_ns=t_ns)
+        return QueryAnswer(self.name, self.t_ns, result)
+
+
+def learn_cameras(
+    cameras: SharedCameras, frames: Sequence[QueryFrame], camera_of_size: CameraOfSize | None
+) -> None:
+    """Estimate the camera of frames without calibration from images spread over them."""
+    golden_ratio = 0.618034  # any first few are spread, too
+    for k in range(min(len(frames), 20)):
+        row = int(k * golden_ratio % 1.0 * len(frames))
+        try:
+            frame = frames[row].read()
+        except UnreadableImageError:
+            continue
+        camera = select_frame_camera(frame, camera_of_size)
+        if not isinstance(camera, UncalibratedCamera):
+            return
+        cameras.localize(frame.image, camera)
 
 
 def capture_frames(live: LiveSource, stop: threading.Event) -> Iterator[QueryFrame]:
@@ -129,6 +147,26 @@ def report_calibrations(answers: list[QueryAnswer]) -> None:
     for verdict in check_camera_calibrations(answer.result for answer in answers):
         if verdict.is_contradicted:
             print_warning(str(verdict))
+
+
+def report_cameras(cameras: SharedCameras, path: str | None, stream: Any) -> None:
+    """Print the cameras that were estimated, and write the only one to a file. Raises TopolocError:
+    it is not one."""
+    known = cameras.known
+    for camera, shared in known.items():
+        print_line(f"camera of the images of {camera.width}x{camera.height}: {shared}", stream)
+    if path is None:
+        return
+    if len(known) != 1:
+        fault = f"the images are of {len(known)} cameras, localize them one by one"
+        if not known:
+            fault = (
+                "no camera was estimated; that takes images without calibration, at least five"
+                " localized at four places"
+            )
+        raise TopolocError(f"{path}: not written: {fault}")
+    (shared,) = known.values()
+    write_text(Path(path), json.dumps(shared.camera.to_json()) + "\n")
 
 
 def format_answer(answer: QueryAnswer) -> str:

@@ -66,7 +66,7 @@ class QueryRecording:
         """Open the recording. Notes about it go to standard error. Raises the errors of
         `open_sequence`; UsageError: the pose convention is unknown."""
         reading = PoseConventions.of(self.poses)
-        sequence = open_recording(self.path, self.format, self.camera, self.topics)
+        sequence = open_recording(self.path, self.format, self.camera, self.topics, whole_only=True)
         return sequence if self.is_out_of_map else with_pose_conventions(sequence, reading)
 
     def frames(self, sequence: StereoSequence) -> list[int]:

@@ -14,7 +14,6 @@ from topoloc import (
     Localizer,
     LocalizerConfig,
     MapCache,
-    MissingExtraError,
     TopolocError,
     TrackerConfig,
     set_num_threads,
@@ -134,8 +133,8 @@ class Command:
         for name in ("memory_mb", "workers", "max_queue"):
             config = with_option(config, name, getattr(self, name), f"--{name.replace('_', '-')}")
         read_token(self.token_file)
-        with MissingExtraError.on_import("a service needs {}", "serve"):
-            from topoloc.apps.service.application import Address, serve
+        from topoloc.apps.service.application import Address, serve
+
         if self.ray is not None:
             return self._run_on_ray(self.ray, settings, config)
         cert, key = (None if path is None else Path(path) for path in (self.tls_cert, self.tls_key))

@@ -7,6 +7,7 @@ may belong to the full sensor: binning and the region of interest are applied.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -52,17 +53,25 @@ _COMPRESSED_DEPTH = struct.Struct("<iff")
 _RVL_SIZE = struct.Struct("<II")
 
 
-def decode_image(message: Any, name: str) -> Image:
-    """Return the image of a message, grey (H, W) or RGB (H, W, 3), uint8. Raises
-    UnreadableImageError: damaged, of an encoding that is no picture, or of more than 100
-    megapixels."""
+def image_file(message: Any, name: str) -> EncodedImage | None:
+    """Return the image of a message as a file, if it is compressed or has 16 bits, else None.
+    Raises UnreadableImageError."""
     if not hasattr(message, "encoding"):
-        return read_image(EncodedImage(name, _message_bytes(message, name)))
+        return EncodedImage(name, _message_bytes(message, name))
+    if str(message.encoding) not in ("mono16", "16UC1"):
+        return None
+    return EncodedImage(name, cv2.imencode(".pgm", _decode_pixels(message, name)[0])[1].tobytes())
+
+
+def decode_image(message: Any, name: str, white: Callable[[], int] | None = None) -> Image:
+    """Return the image of a message, grey (H, W) or RGB (H, W, 3), uint8. `white` returns that of
+    `read_image`, and is not called for raw images of 8 bits. Raises UnreadableImageError: damaged,
+    of an encoding that is no picture, or of more than 100 megapixels."""
+    if file := image_file(message, name):
+        return read_image(file, white=white and white())
     pixels, to_rgb = _decode_pixels(message, name)
     if pixels.dtype == np.float32:
         raise UnreadableImageError(f"{name}: pixels of encoding 32FC1 are depth, not a picture")
-    if pixels.dtype == np.uint16:
-        return cv2.convertScaleAbs(pixels, alpha=1.0 / 257.0)
     if to_rgb is None:
         return np.array(pixels)
     try:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +36,7 @@ from topoloc.apps.formats.bags.bag_calibration import (
     read_camera_info,
     read_image_size,
 )
-from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image
+from topoloc.apps.formats.bags.bag_images import decode_depth, decode_image, image_file
 from topoloc.apps.formats.bags.bag_poses import camera_poses, read_transform_tree
 from topoloc.apps.formats.bags.messages import decode, frame_id, header_stamp_ns, num_header_bytes
 from topoloc.apps.formats.bags.topics import (
@@ -45,7 +47,9 @@ from topoloc.apps.formats.bags.topics import (
 )
 from topoloc.plugin import (
     CameraCalibration,
+    EncodedImage,
     RecordingFormat,
+    find_white_level,
     match_times,
     resize_depth,
 )
@@ -85,6 +89,18 @@ class BagRecording:
         """Notes for the user."""
         return self.bag.notes
 
+    @cached_property
+    def _white_level(self) -> int:
+        """That of the whole recording, so that dark images stay darker than others."""
+        return find_white_level(self._sample_files())
+
+    def _sample_files(self) -> Iterator[EncodedImage]:
+        for row in range(0, len(self), max(1, len(self) // 5)):
+            with suppress(UnreadableImageError):
+                if (file := image_file(*self._read_message(self.left, row))) is None:
+                    return
+                yield file
+
     def __len__(self) -> int:
         return len(self.t_ns)
 
@@ -118,7 +134,7 @@ class BagRecording:
 
     def _read_image(self, images: ImageMessages, index: int, camera: Camera | None) -> Image:
         message, name = self._read_message(images, index)
-        image = decode_image(message, name)
+        image = decode_image(message, name, lambda: self._white_level)
         if camera is not None:
             _check_size(name, image.shape, camera)
         return image

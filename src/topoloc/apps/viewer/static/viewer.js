@@ -207,6 +207,10 @@ export class Viewer {
   tellSummary() {
     const { name, map } = this.document;
     const said = [`${map.num_nodes} nodes, ${map.num_points.toLocaleString("en")} points, ${map.length_m.toFixed(0)} m mapped.`];
+    if (map.certificate) {
+      const outdated = map.certificate.is_outdated ? " (outdated: the map was edited since)" : "";
+      said.push(`Certified: ${map.certificate.promise}${outdated}.`);
+    }
     if (map.num_points_shown < 0.99 * map.num_points) said.push(`${map.num_points_shown.toLocaleString("en")} of the points are shown.`);
     if (map.sessions.length > 1) said.push(`Sessions: ${map.sessions.map((one) => one.name).join(", ")}.`);
     this.tell(name, said);

@@ -1,5 +1,5 @@
 // The webcam, and a stream of its pictures that the service follows: one on the way at a time, so that no line forms.
-import { askAbout, streamAddress, subprotocols } from "topoloc/page/asking";
+import { streamAddress, subprotocols } from "topoloc/page/asking";
 
 const MAX_WIDTH = 640;
 const MAX_TRACK = 6000; // positions that are drawn
@@ -68,26 +68,13 @@ export class Live {
   }
 
   async begin(run, map, camera) {
-    const calibrated = await this.calibrated(run, map, camera);
-    if (this.run !== run) return;
     const socket = (run.socket = new WebSocket(streamAddress(map), subprotocols()));
     socket.onopen = () => {
-      socket.send(JSON.stringify({ camera: calibrated }));
+      socket.send(JSON.stringify({ camera }));
       this.next(run);
     };
     socket.onmessage = (event) => this.hear(run, JSON.parse(event.data));
     socket.onclose = (event) => this.end(run, new Error(event.reason || "The stream has ended."));
-  }
-
-  /** A stream needs a calibrated camera: where there is none, that of the first picture that is recognised. */
-  async calibrated(run, map, camera) {
-    if (camera !== "exif" && camera !== "unknown") return camera;
-    while (this.run === run) {
-      const answer = await askAbout(map, "localize", await this.picture(), camera);
-      if (answer.localized && answer.camera) return answer.camera;
-      if (this.run === run) this.told.said(answer, this.track);
-    }
-    return camera;
   }
 
   async next(run) {

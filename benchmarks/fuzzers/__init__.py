@@ -1,0 +1,1 @@
+"""Damaged inputs by kind, and one harness that reads them in child processes."""

@@ -1,0 +1,260 @@
+"""Measure what a user may rely on: how often a map's answers are wrong, with a confidence bound.
+
+Three kinds of images are localized: walks through the place, images of elsewhere, and images of
+places beside the map. The last kind is the hardest, and costs no recording: all nodes that show
+what an image of the map or of a walk shows are hidden. `certified_answers.py` derives the
+certificate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from msgspec import structs
+
+from topoloc.errors import CalibrationError, MapError, TrajectoryError
+from topoloc.evaluation.certified_answers import (
+    CertifiedAnswers,
+    derive_certificate,
+    find_pieces,
+)
+from topoloc.evaluation.metrics import EvaluatedQuery
+from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
+from topoloc.evaluation.world_alignment import fit_worlds
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.lifelong.node_localization import sample_evenly
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.query import QueryImage
+from topoloc.mapping.certificate import Certificate
+from topoloc.mapping.config import Progress
+from topoloc.mapping.edit import WaitCallback, edit_map
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.node_ids import NodeId, Row
+from topoloc.recordings.frame import StereoSequence
+
+_MAX_IMAGES = 200  # of the map, and of the walks
+_MIN_SEEN_SHARE, _MAX_SCALE = 0.2, 3.0
+"""A node shows what an image shows if this share of its points is in view there, at a distance
+that differs by less than this factor."""
+_NUM_POINTS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Certification:
+    """Hold a certificate and the answers that it follows from, by condition."""
+
+    certificate: Certificate
+    conditions: list[CertifiedAnswers]
+
+    @property
+    def blind_spots(self) -> list[Rigid3]:
+        """Return one pose (world_from_cam) of each piece of the walks of which no image was
+        localized."""
+        found = list[Rigid3]()
+        for one in self.conditions:
+            if one.kind == "walk" and one.has_truth:
+                seen = {
+                    piece
+                    for piece, answer in zip(one.pieces, one.answers, strict=True)
+                    if answer.result.localized
+                }
+                poses = {
+                    piece: answer.world_from_cam
+                    for piece, answer in zip(one.pieces, one.answers, strict=True)
+                }
+                found += [pose for piece, pose in poses.items() if piece not in seen and pose]
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the certificate, its promise, the blind spots (world_from_cam) and all answers as
+        JSON."""
+        return self.certificate.to_json() | {
+            "promise": self.certificate.promise(),
+            "blind_spots": [pose.to_json() for pose in self.blind_spots],
+            "answers": [
+                answer.to_json() | {"condition": one.name, "piece": piece}
+                for one in self.conditions
+                for piece, answer in zip(one.pieces, one.answers, strict=True)
+            ],
+        }
+
+
+def certify(
+    path: str | Path,
+    walks: Sequence[StereoSequence] = (),
+    out_of_map: Sequence[StereoSequence] = (),
+    map_from_truth: Rigid3 | None = None,
+    max_wrong_share: float = 0.01,
+    is_applied: bool = False,
+    config: LocalizerConfig | None = None,
+    progress: Progress | None = None,
+    on_wait: WaitCallback | None = None,
+) -> Certification:
+    """Measure the answers of a map and store the certificate in its file.
+
+    Args:
+        walks: recordings of the place that are not in the map, with or without known poses.
+        out_of_map: recordings of other places.
+        map_from_truth: transform from the world of the walks' poses into the map's (m).
+        max_wrong_share: the requested limit of the share of wrong pieces.
+        is_applied: from now on, answers below the threshold are refused.
+        config: settings of the localizer.
+        progress: called with a name, images done and images in all.
+        on_wait: called once before waiting for another edit of the map.
+
+    Raises:
+        MapError: the map cannot be read or written, or was edited meanwhile; nothing is stored.
+        TrajectoryError: a walk is of another place, or its poses are in another world.
+        CalibrationError: a recording has no camera.
+    """
+    config = config or LocalizerConfig()
+    with TopoMetricMap.load(path) as topomap:
+        localizer, measured = Localizer(replace(topomap, certificate=None), config), topomap.file
+        conditions = [
+            *_localize_walks(localizer, walks, map_from_truth, progress),
+            *_localize_beside_map(localizer, walks, map_from_truth, progress),
+            *(_localize_elsewhere(localizer, one, progress) for one in out_of_map),
+        ]
+    certificate = derive_certificate(conditions, config, max_wrong_share, is_applied)
+    with edit_map(path, on_wait) as edit:
+        file = edit.topomap.file
+        if measured is None or file is None or file.digest != measured.digest:
+            raise MapError(f"map {path} was edited meanwhile: certify it again")
+        certificate = structs.replace(certificate, map_version=edit.topomap.free_ids.edit)
+        edit.commit(replace(edit.topomap, certificate=certificate), "certify")
+    return Certification(certificate, conditions)
+
+
+def _localize_walks(
+    localizer: Localizer,
+    walks: Sequence[StereoSequence],
+    map_from_truth: Rigid3 | None,
+    progress: Progress | None,
+) -> Iterator[CertifiedAnswers]:
+    """Localize the walks. Raises TrajectoryError."""
+    for walk in walks:
+        has_truth = any(walk.poses)
+        if has_truth:
+            answers = localize_queries(localizer, walk, map_from_truth, progress)
+        else:
+            answers = localize_out_of_map(localizer, walk, progress)
+        if not any(one.result.localized for one in answers):
+            raise TrajectoryError(
+                f"{walk.name}: none of {len(answers)} images is localized. If it is of another"
+                " place, give it by --out-of-map; else the map does not show it: topoloc update"
+            )
+        fit = fit_worlds(answers) if has_truth else None
+        if fit is not None:
+            raise TrajectoryError(
+                f"{walk.name}: its poses are in another world than the map. `topoloc evaluate"
+                " --fit-map-from-truth FILE` writes the transform; certify with --map-from-truth"
+            )
+        yield CertifiedAnswers(
+            walk.name,
+            "walk",
+            has_truth,
+            answers,
+            find_pieces(localizer.topomap.config, answers, has_truth),
+        )
+
+
+def _localize_elsewhere(
+    localizer: Localizer, sequence: StereoSequence, progress: Progress | None
+) -> CertifiedAnswers:
+    answers = localize_out_of_map(localizer, sequence, progress)
+    pieces = find_pieces(localizer.topomap.config, answers, False)
+    return CertifiedAnswers(sequence.name, "out_of_map", True, answers, pieces)
+
+
+def _localize_beside_map(
+    localizer: Localizer,
+    walks: Sequence[StereoSequence],
+    map_from_truth: Rigid3 | None,
+    progress: Progress | None,
+) -> Iterator[CertifiedAnswers]:
+    """Localize images of the map and of the walks, without the nodes that show the same."""
+    of_map, of_walks = list[_HiddenImage](), list[_HiddenImage]()
+    for row in sample_evenly(localizer.topomap.rows, _MAX_IMAGES):
+        of_map.append(_HiddenImage.of_node(localizer.topomap, row))
+    frames = [(walk, i) for walk in walks for i, pose in enumerate(walk.poses) if pose is not None]
+    for walk, i in sample_evenly(frames, _MAX_IMAGES):
+        of_walks.append(_HiddenImage.of_frame(walk, i, map_from_truth))
+    for name, images in (("map", of_map), ("walks", of_walks)):
+        answers, label = list[EvaluatedQuery](), f"{name}, surroundings removed"
+        for done, one in enumerate(images):
+            hidden = find_nodes_in_view(localizer.topomap, one.world_from_cam, one.camera)
+            if len(hidden) < len(localizer.topomap.summaries):
+                result, _ = localizer.without(hidden).localize_query(one.read())
+                answers.append(
+                    EvaluatedQuery(
+                        one.name, result, one.world_from_cam, recording=label, camera=one.camera
+                    )
+                )
+            if progress is not None:
+                progress(label, done + 1, len(images))
+        if answers:
+            pieces = find_pieces(localizer.topomap.config, answers, True)
+            yield CertifiedAnswers(label, "surroundings_removed", True, answers, pieces)
+
+
+@dataclass(frozen=True, eq=False)
+class _HiddenImage:
+    """Hold an image with a known pose in the map's world. `read` returns the query."""
+
+    name: str
+    world_from_cam: Rigid3
+    camera: Camera
+    read: Callable[[], QueryImage]
+
+    @staticmethod
+    def of_node(topomap: TopoMetricMap, row: Row) -> _HiddenImage:
+        """Return a node's stored features as a query: the map does not hold its whole image."""
+        node = topomap.nodes[row]
+
+        def read() -> QueryImage:
+            features = {kind: one.nodes[row].features for kind, one in topomap.layers.items()}
+            return QueryImage.of_features(features, node.camera)
+
+        return _HiddenImage(node.summary.name, node.summary.world_from_cam, node.camera, read)
+
+    @staticmethod
+    def of_frame(walk: StereoSequence, index: int, map_from_truth: Rigid3 | None) -> _HiddenImage:
+        """Return a frame with a pose. Raises CalibrationError: it has no camera."""
+        frame, pose = walk[index], walk.poses[index]
+        if frame.camera is None or pose is None:
+            raise CalibrationError(f"{frame.name}: no calibration and pose; both are needed")
+        camera = frame.camera
+        world_from_cam = pose if map_from_truth is None else map_from_truth @ pose
+        return _HiddenImage(
+            frame.name, world_from_cam, camera, lambda: QueryImage(walk[index].image, camera)
+        )
+
+
+def find_nodes_in_view(
+    topomap: TopoMetricMap, world_from_cam: Rigid3, camera: Camera
+) -> list[NodeId]:
+    """Return the nodes of which a fifth of the points is in view of a camera, at a distance that
+    differs by less than a factor of three. Walls do not hide points here, so these are too many
+    rather than too few."""
+    cam_from_world, found = world_from_cam.inverse(), list[NodeId]()
+    for row in topomap.rows:
+        node = topomap.nodes[row]
+        points = node.points_cam[:: max(1, len(node.points_cam) // _NUM_POINTS)].astype(float)
+        if len(points) == 0:
+            continue
+        seen = (cam_from_world @ node.summary.world_from_cam).apply(points)
+        pixels = camera.img_from_cam(seen)
+        with np.errstate(invalid="ignore"):
+            is_in_view = (pixels >= 0.0).all(axis=1) & (pixels < [camera.width, camera.height]).all(
+                axis=1
+            )
+        ratios = np.linalg.norm(seen, axis=1) / np.linalg.norm(points, axis=1)
+        is_in_view &= (ratios < _MAX_SCALE) & (ratios > 1.0 / _MAX_SCALE)
+        if np.mean(is_in_view) >= _MIN_SEEN_SHARE:
+            found.append(node.summary.node_id)
+    return found

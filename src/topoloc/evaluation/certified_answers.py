@@ -1,0 +1,271 @@
+"""Derive the certificate of a map from answers: independent pieces, and a bound of wrong ones.
+
+Images of one walk are not independent: neighbours see the same things and fail together. So images
+near each other form one piece, and a piece is wrong if any of its answers is. Of n pieces with k
+wrong ones, Clopper and Pearson (*Biometrika* 26, 1934) give an upper bound of the share.
+
+The threshold of the probability is the least one whose bound keeps a limit. The share of wrong
+pieces falls as the threshold rises, so the bound also holds for the chosen threshold (Bates et al.,
+"Distribution-free, risk-controlling prediction sets", *J. ACM* 68, 2021; Angelopoulos et al.,
+"Conformal risk control", *ICLR* 2024).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from itertools import groupby
+from math import exp, lgamma, log, log1p
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from topoloc.evaluation.metrics import EvaluatedQuery
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import encode_json
+from topoloc.localization.localizer import LocalizerConfig
+from topoloc.localization.result import Localization
+from topoloc.mapping.certificate import Certificate, CertifiedCondition, ConditionKind
+from topoloc.mapping.config import MapConfig
+from topoloc.mapping.nodes import NodePoses, node_distances
+from topoloc.mapping.sessions import today
+from topoloc.recordings.frame import to_grey
+
+MAX_TRANSLATION, MAX_ROTATION_DEG = 0.25, 2.0
+"""A pose further off than either (metres, degrees) is wrong: the probability is about these."""
+CONFIDENCE = 0.95
+_CHI_SQUARE_6_AT_95 = 12.592
+_PIECE_D_THRESH = 5.0
+"""Images further apart than this many D_thresh (Eq. 1) are independent: no node serves both."""
+_THUMBNAIL_PX = 32
+_SAME_CORRELATION = 0.5
+"""Correlation of the thumbnails of images without poses from which on they show the same."""
+
+
+def pieces_by_pose(
+    poses: Sequence[Rigid3], d_thresh: float, lambda_rot: float
+) -> Int[np.ndarray, " n"]:
+    """Return the number of the piece of each pose (world_from_cam). A pose joins the nearest first
+    pose of a piece within five D_thresh, also if the walk comes back later."""
+    firsts, numbers = list[Rigid3](), list[int]()
+    for pose in poses:
+        distances = node_distances(pose, NodePoses.of(firsts), lambda_rot)
+        nearest = int(np.argmin(distances)) if firsts else -1
+        if not firsts or distances[nearest] > _PIECE_D_THRESH * d_thresh:
+            nearest = len(firsts)
+            firsts.append(pose)
+        numbers.append(nearest)
+    return np.array(numbers, int)
+
+
+def thumbnail(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, " 1024"]:
+    """Return a small copy of an image with zero mean and unit length."""
+    small = cv2.resize(grey, (_THUMBNAIL_PX, _THUMBNAIL_PX), interpolation=cv2.INTER_AREA)
+    values = small.astype(float).ravel()
+    values -= values.mean()
+    return values / max(float(np.linalg.norm(values)), 1e-9)
+
+
+def pieces_by_look(thumbnails: Float[np.ndarray, "n 1024"]) -> Int[np.ndarray, " n"]:
+    """Return the number of the piece of each image, by its thumbnail. An image joins the piece
+    whose first image looks most like it, if it does."""
+    firsts, numbers = list[int](), list[int]()
+    for row, one in enumerate(thumbnails):
+        likeness = thumbnails[firsts] @ one
+        nearest = int(np.argmax(likeness)) if firsts else -1
+        if not firsts or likeness[nearest] < _SAME_CORRELATION:
+            nearest = len(firsts)
+            firsts.append(row)
+        numbers.append(nearest)
+    return np.array(numbers, int)
+
+
+def max_share(num_wrong: int, num: int, confidence: float) -> float:
+    """Return Clopper and Pearson's upper bound of a share of which `num_wrong` of `num` were seen:
+    the share at which so few are as improbable as the confidence allows."""
+    if num_wrong >= num:
+        return 1.0
+    counts = range(num_wrong + 1)
+    log_ways = [lgamma(num + 1) - lgamma(k + 1) - lgamma(num - k + 1) for k in counts]
+
+    def probability_of_so_few(share: float) -> float:
+        logs = zip(counts, log_ways, strict=True)
+        return sum(exp(ways + k * log(share) + (num - k) * log1p(-share)) for k, ways in logs)
+
+    low, high = num_wrong / num, 1.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        if probability_of_so_few(middle) > 1.0 - confidence:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Hold, for each piece of one condition, the highest probability of a wrong answer, -1 if there
+    is none."""
+
+    worst: Float[np.ndarray, " n"]
+
+    @staticmethod
+    def of(numbers: Sequence[int], wrong: Sequence[float]) -> Pieces:
+        """Return the pieces of images. `numbers` are those of their pieces, `wrong` the probability
+        of an answer that is wrong, else -1."""
+        pairs = sorted(zip(numbers, wrong, strict=True))
+        groups = groupby(pairs, key=lambda pair: pair[0])
+        return Pieces(np.array([max(one for _, one in group) for _, group in groups], float))
+
+    def num_wrong(self, min_probability: float) -> int:
+        """Return how many pieces hold a wrong answer at a threshold of the probability."""
+        return int(np.count_nonzero(self.worst >= min_probability))
+
+    def find_threshold(self, lowest: float, limit: float, confidence: float) -> float | None:
+        """Return the least threshold that keeps the limit of the wrong share. If the pieces are too
+        few for the limit, none of them may be wrong. None: only a threshold above 1 does."""
+        limit = max(limit, max_share(0, len(self.worst), confidence))
+        for threshold in [lowest, *np.nextafter(np.unique(self.worst), 2.0).tolist()]:
+            is_kept = max_share(self.num_wrong(threshold), len(self.worst), confidence) <= limit
+            if threshold >= lowest and is_kept:
+                return threshold if threshold <= 1.0 else None
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class CertifiedAnswers:
+    """Hold the answers of one condition. `pieces` are the numbers of their independent pieces."""
+
+    name: str
+    kind: ConditionKind
+    has_truth: bool
+    answers: list[EvaluatedQuery]
+    pieces: list[int]
+
+    def wrong_probabilities(self) -> list[float]:
+        """Return the probability of each wrong answer, -1 for each other image."""
+        return [_probability(one) if is_wrong(one) else -1.0 for one in self.answers]
+
+    def facts(self, min_probability: float, confidence: float) -> CertifiedCondition:
+        """Return the figures at a threshold of the probability."""
+        wrong, num_pieces = self.wrong_probabilities(), len(set(self.pieces))
+        num_wrong_pieces = Pieces.of(self.pieces, wrong).num_wrong(min_probability)
+        given = [one for one in self.answers if _probability(one) >= min_probability]
+        refused = [one for one in self.answers if not one.result.localized]
+        return CertifiedCondition(
+            self.name,
+            self.kind,
+            self.has_truth,
+            len(self.answers),
+            num_pieces,
+            len(given),
+            sum(one >= min_probability for one in wrong) if self.has_truth else 0,
+            num_wrong_pieces if self.has_truth else 0,
+            max_share(num_wrong_pieces, num_pieces, confidence) if self.has_truth else None,
+            sum(_is_inside(one) for one in given if self.has_truth and not is_wrong(one)),
+            _median_ms(given),
+            _median_ms(refused),
+        )
+
+
+def derive_certificate(
+    conditions: Sequence[CertifiedAnswers],
+    config: LocalizerConfig,
+    max_wrong_share: float,
+    is_applied: bool,
+) -> Certificate:
+    """Return the certificate that follows from the answers, of map version 0.
+
+    Images of the place and others are bounded apart, because their shares depend on the user. So
+    each bound has half of the error probability.
+    """
+    groups = list[Pieces]()
+    for is_of_place in (True, False):
+        numbers, wrong = list[int](), list[float]()
+        for row, one in enumerate(conditions):
+            if one.has_truth and (one.kind == "walk") == is_of_place:
+                numbers += [row * 10**6 + number for number in one.pieces]
+                wrong += one.wrong_probabilities()
+        if numbers:
+            groups.append(Pieces.of(numbers, wrong))
+    confidence = 1.0 - (1.0 - CONFIDENCE) / max(len(groups), 1)
+    lowest = config.evidence.min_probability
+    found = [one.find_threshold(lowest, max_wrong_share, confidence) for one in groups]
+    known = [one for one in found if one is not None]
+    threshold = max([lowest, *known]) if len(known) == len(found) else None
+    level = lowest if threshold is None else threshold
+    bounds = [max_share(one.num_wrong(level), len(one.worst), confidence) for one in groups]
+    right = [
+        _probability(answer)
+        for one in conditions
+        if one.has_truth
+        for answer in one.answers
+        if answer.result.localized and not is_wrong(answer)
+    ]
+    cameras = [one.camera for condition in conditions for one in condition.answers if one.camera]
+    return Certificate(
+        map_version=0,
+        program=version("topoloc"),
+        date=today(),
+        settings=_changed_settings(config),
+        cameras=[_describe_camera(camera) for camera in dict.fromkeys(cameras)],
+        confidence=CONFIDENCE,
+        max_wrong_share=max(bounds, default=None),
+        requested_share=max_wrong_share,
+        min_probability=threshold,
+        lost_share=float(np.mean(np.array(right) < level)) if right else 0.0,
+        is_applied=is_applied,
+        conditions=[one.facts(level, confidence) for one in conditions],
+    )
+
+
+def is_wrong(answer: EvaluatedQuery) -> bool:
+    """Return whether an answer has a pose beyond 0.25 m or 2 degrees, or of another place."""
+    if not isinstance(answer.result, Localization):
+        return False
+    truth, pose = answer.world_from_cam, answer.result.world_from_cam
+    return truth is None or not truth.is_same(pose, MAX_TRANSLATION, math.radians(MAX_ROTATION_DEG))
+
+
+def find_pieces(config: MapConfig, answers: Sequence[EvaluatedQuery], by_pose: bool) -> list[int]:
+    """Return the number of the independent piece of each image."""
+    poses = [one.world_from_cam for one in answers if one.world_from_cam is not None]
+    if by_pose and len(poses) == len(answers):
+        return pieces_by_pose(poses, config.d_thresh, config.lambda_rot).tolist()
+    read = [one.read_image for one in answers]
+    looks = [thumbnail(to_grey(one())) for one in read if one is not None]
+    return pieces_by_look(np.array(looks)).tolist()
+
+
+def _probability(answer: EvaluatedQuery) -> float:
+    """Return the probability of a pose, -1 for a refusal."""
+    return answer.result.probability if isinstance(answer.result, Localization) else -1.0
+
+
+def _is_inside(answer: EvaluatedQuery) -> bool:
+    """Return whether the true pose is inside the 95 % ellipsoid of the answer."""
+    if not isinstance(answer.result, Localization) or answer.world_from_cam is None:
+        return False
+    error = (answer.world_from_cam @ answer.result.world_from_cam.inverse()).log()
+    square = float(error @ np.linalg.solve(answer.result.covariance, error))
+    return square < _CHI_SQUARE_6_AT_95
+
+
+def _median_ms(answers: Sequence[EvaluatedQuery]) -> float | None:
+    times = [one.result.times_ms["total"] for one in answers]
+    return float(np.median(times)) if times else None
+
+
+def _describe_camera(camera: Camera) -> str:
+    return f"{camera.width}x{camera.height}, {camera.model}, f {camera.fx:.0f} px"
+
+
+def _changed_settings(config: LocalizerConfig) -> dict[str, Any]:
+    """Return the settings that are not the default."""
+    default = encode_json(LocalizerConfig())
+    return {key: value for key, value in encode_json(config).items() if value != default[key]}

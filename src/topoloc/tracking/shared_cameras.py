@@ -1,0 +1,232 @@
+"""Estimate one camera from several of its images, while they are localized.
+
+Each image without calibration is localized alone first, and its inliers show something of focal
+length, principal point and distortion (`geometry/joint_camera/joint_fit.py`). Images of several
+places together fix them: their information is added, with Cauchy's weights against images that
+disagree. As soon as the camera is known well enough, images are localized by it, in the time of a
+calibrated image. An image that contradicts it, such as a crop or a zoom, is localized alone again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from topoloc.geometry.absolute_pose_focal import camera_prior, with_parameters
+from topoloc.geometry.calibration_check import MIN_IMAGES, MIN_PLACES
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.clustered_errors import cells_of
+from topoloc.geometry.joint_camera.camera_hypotheses import (
+    CameraHypothesis,
+    CameraLikelihood,
+    CameraPrior,
+    Matrix,
+    Vector,
+)
+from topoloc.geometry.joint_camera.joint_fit import (
+    JointFit,
+    Observations,
+    fit_camera,
+    linearized_fit,
+    weigh_cameras,
+)
+from topoloc.geometry.pose_matches import CAUCHY_SCALE
+from topoloc.geometry.rigid import Rigid3, inverse_covariance
+from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
+from topoloc.localization.localizer import Localizer
+from topoloc.localization.pose_fit import PointObservations
+from topoloc.localization.query import QueryImage, unknown_camera
+from topoloc.localization.result import Localization, NotLocalized, with_time
+from topoloc.retrieval.coarse import Image
+
+
+@dataclass(frozen=True, eq=False)
+class SharedCamera:
+    """Hold a camera that images share, and the standard deviations (pixels) of its focal length and
+    principal point. `covariance` is that of the parameters of `joint_fit.py`."""
+
+    camera: Camera
+    covariance: Matrix
+    num_images: int
+
+    def __str__(self) -> str:
+        focal, x, y = self.camera.fx * np.sqrt(np.diag(self.covariance)[:3])
+        lens = ""
+        if self.camera.is_distorted:
+            lens = f", k1 = {self.camera.params[-1]:.3f} +- {math.sqrt(self.covariance[3, 3]):.3f}"
+        return (
+            f"f = {self.camera.fx:.1f} +- {focal:.1f} px, principal point ({self.camera.cx:.1f} +-"
+            f" {x:.1f}, {self.camera.cy:.1f} +- {y:.1f}){lens}, from {self.num_images} images"
+        )
+
+
+class SharedCameras:
+    """Localize images without calibration, and estimate their cameras from them.
+
+    Images of one size and one range of focal lengths, such as that of their EXIF data, have one
+    camera. `known` holds the cameras that the images fix by now.
+    """
+
+    def __init__(self, localizer: Localizer) -> None:
+        self.localizer = localizer
+        self._estimates: dict[UncalibratedCamera, _CameraEstimate] = {}
+
+    @property
+    def known(self) -> dict[UncalibratedCamera, SharedCamera]:
+        """Return the cameras that the images fix."""
+        return {
+            camera: each.shared
+            for camera, each in self._estimates.items()
+            if each.shared is not None
+        }
+
+    def localize(
+        self, image: Image, camera: UncalibratedCamera | None = None, t_ns: int | None = None
+    ) -> Localization | NotLocalized:
+        """Localize an image by the camera that it shares with others, or alone. See
+        `Localizer.localize`."""
+        camera = camera or unknown_camera(image)
+        if camera not in self._estimates:
+            self._estimates[camera] = _CameraEstimate(self.localizer, camera)
+        result = self._estimates[camera].localize(image)
+        return result if t_ns is None else with_time(result, t_ns)
+
+
+class _CameraEstimate:
+    """Hold what images show of one camera. `shared` is None until they fix it."""
+
+    def __init__(self, localizer: Localizer, uncalibrated: UncalibratedCamera) -> None:
+        self.localizer, self.uncalibrated = localizer, uncalibrated
+        side = float(max(uncalibrated.width, uncalibrated.height))
+        self._reference = uncalibrated.with_focal(side)
+        self._prior = camera_prior(uncalibrated, side)
+        self._seen: list[CameraLikelihood] = []
+        self._places = set[str]()
+        self._viewpoints: list[Rigid3] = []
+        self.shared: SharedCamera | None = None
+
+    def localize(self, image: Image) -> Localization | NotLocalized:
+        """Localize an image by the shared camera, or alone."""
+        result = None if self.shared is None else self._localize_by(self.shared, image)
+        if result is None:
+            result, named = self.localizer.localize_query(QueryImage(image, self.uncalibrated))
+            self._learn(result, named)
+        return result
+
+    def _localize_by(self, shared: SharedCamera, image: Image) -> Localization | None:
+        """Return the pose by the shared camera, None if there is none or the image contradicts
+        it. The camera's uncertainty is added to the covariance."""
+        result, named = self.localizer.localize_query(QueryImage(image, shared.camera))
+        if not isinstance(result, Localization) or result.calibration_doubt is not None:
+            return None
+        self._learn(result, named)
+        cam_from_world, of_pose = result.world_from_cam.inverse(), np.zeros((6, 6))
+        seen = self._observations(named[0][1])
+        fit = linearized_fit(seen, cam_from_world, self._parameters(shared.camera))
+        if fit is not None:
+            of_pose = fit.pose_by_camera @ shared.covariance @ fit.pose_by_camera.T
+        covariance = result.covariance + inverse_covariance(cam_from_world, of_pose)
+        return replace(result, covariance=covariance, focal_length_px=shared.camera.fx)
+
+    def _learn(
+        self,
+        result: Localization | NotLocalized,
+        named: list[tuple[Localization, PointObservations]],
+    ) -> None:
+        """Add what an image shows of the camera, and estimate the camera again."""
+        max_images, min_probability = 20, 0.9  # more images change little, and cost time
+        is_clear = isinstance(result, Localization) and result.probability >= min_probability
+        if not is_clear or len(self._seen) >= max_images:
+            return
+        fit = self._fit(*named[0])
+        if fit is None:
+            return
+        self._seen.append(fit.likelihood)
+        self._places.add(f"{named[0][0].provenance.tile}/{named[0][0].node_id}")
+        self._add_viewpoint(*named[0])
+        if len(self._seen) >= MIN_IMAGES and len(self._places) >= MIN_PLACES:
+            self.shared = self._estimate()
+
+    def _add_viewpoint(self, result: Localization, inliers: PointObservations) -> None:
+        """Count the viewpoint unless one is known from which the same points are seen alike."""
+        max_share, max_angle = 0.2, math.radians(15.0)
+        pose = result.world_from_cam
+        depth = float(np.median(pose.inverse().apply(inliers.points_world)[:, 2]))
+        if not any(pose.is_same(one, max_share * depth, max_angle) for one in self._viewpoints):
+            self._viewpoints.append(pose)
+
+    def _fit(self, result: Localization, inliers: PointObservations) -> JointFit | None:
+        found = result.provenance.camera
+        if found is None:
+            return None
+        start = self._parameters(found)
+        return fit_camera(
+            self._observations(inliers), result.world_from_cam.inverse(), start, self._prior
+        )
+
+    def _observations(self, inliers: PointObservations) -> Observations:
+        rows = np.linspace(0, len(inliers) - 1, 256)  # their noise is the smallest error
+        seen = inliers.select(np.unique(rows.astype(int)))
+        points_img, camera = seen.points_img.astype(np.float64), self._reference
+        return Observations(
+            camera.normalized_from_img(points_img),
+            self.localizer.config.pose.key_point_sigma_px / camera.fx,
+            seen.points_world,
+            seen.covariances,
+            cells_of(points_img, camera.width, camera.height),
+            math.inf,
+        )
+
+    def _parameters(self, camera: Camera) -> Vector:
+        """Return the parameters of a camera relative to the reference."""
+        reference, parameters = self._reference, np.zeros(7)
+        parameters[0] = math.log(camera.fx / reference.fx)
+        parameters[1] = (camera.cx - reference.cx) / reference.fx
+        parameters[2] = (camera.cy - reference.cy) / reference.fx
+        parameters[3:] = camera.distortion()[0]
+        return parameters
+
+    def _estimate(self) -> SharedCamera | None:
+        """Return the likeliest camera, None if none of the hypotheses explains the images or the
+        focal length remains uncertain."""
+        max_focal_sigma = 0.01  # more moves a pose by several of its sigmas
+        together = combine_likelihoods(self._seen, self._prior, len(self._viewpoints))
+        weighed = weigh_cameras(together, self._prior)
+        chosen = max(weighed, key=lambda one: weighed[one][0])
+        _, mean, covariance = weighed[chosen]
+        if chosen.lens == "other" or math.sqrt(covariance[0, 0]) > max_focal_sigma:
+            return None
+        mean[3:] = mean[3:].mean() if chosen.lens == "radial" else 0.0  # as cameras are modelled
+        return SharedCamera(with_parameters(self._reference, mean), covariance, len(self._seen))
+
+
+def combine_likelihoods(
+    seen: list[CameraLikelihood], prior: CameraPrior, num_viewpoints: int
+) -> CameraLikelihood:
+    """Return what images show together. Images that disagree have smaller weights (Cauchy). Images
+    of one viewpoint share the errors of its points, so the information is scaled to the number of
+    viewpoints, and to the scatter of the images beyond their noise."""
+    median_chi_square = 6.346  # of seven
+    mean, covariance = prior.of(CameraHypothesis(False, "xy", "other"))
+    each = [one.posteriors(mean[None], covariance[None]) for one in seen]
+    estimates, inverse = (
+        np.stack([one[1][0] for one in each]),
+        np.linalg.inv(np.stack([one[2][0] for one in each])),
+    )
+    centre, squares = np.median(estimates, axis=0), np.zeros(len(seen))
+    weights = np.ones(len(seen))
+    for _ in range(10):
+        residuals = estimates - centre
+        squares = np.einsum("ni,nij,nj->n", residuals, inverse, residuals)
+        scatter = max(1.0, float(np.median(squares)) / median_chi_square)
+        weights = 1.0 / (1.0 + squares / scatter / (CAUCHY_SCALE**2 * 3.5))
+        weighted = weights[:, None, None] * inverse
+        pulls = np.einsum("nij,nj->i", weighted, estimates)
+        centre = np.linalg.solve(weighted.sum(axis=0), pulls)
+    scatter = max(1.0, float(np.median(squares)) / median_chi_square) * len(seen) / num_viewpoints
+    return CameraLikelihood(
+        np.einsum("n,nij->ij", weights / scatter, np.stack([one.information for one in seen])),
+        np.einsum("n,ni->i", weights / scatter, np.stack([one.pull for one in seen])),
+    )

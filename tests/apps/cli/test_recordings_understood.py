@@ -1,0 +1,45 @@
+"""Commands say how they understood a recording; answers are not taken for its ground truth."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from topoloc.apps.cli import main
+
+
+def test_answers_beside_a_recording_are_no_ground_truth(
+    room_map: Path,
+    tiny_recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    walk = Path(shutil.copytree(tiny_recording, tmp_path / "walk"))
+    truth = walk / "truth.tum"
+    truth.unlink()
+    assert main(["localize", str(room_map), str(walk), "--tum", str(truth)]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(room_map), str(walk)]) == 1
+    warning, error = capsys.readouterr().err.splitlines()
+    assert f"{truth}: answers of a map, no ground truth; delete its first line" in warning
+    assert "no frame has a known pose" in error
+    truth.write_text("".join(truth.read_text().splitlines(keepends=True)[1:]))
+    assert main(["evaluate", str(room_map), str(walk)]) == 0
+    assert " cm" in capsys.readouterr().out
+
+
+def test_build_prints_how_it_understood_a_recording_and_warns_of_a_still_camera(
+    tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    source = f"{tiny_recording}@0:2"
+    command = ["build", source, str(tmp_path / "a.topo"), "--features", "surf", "--d-thresh", "9"]
+    assert main(command) == 0
+    printed = capsys.readouterr()
+    understood = "kitti, 2 stereo pairs of 320 x 240 in 0.1 s, f 260 px, poses of 2 frames"
+    assert printed.out.splitlines()[0] == f"{source}: {understood}"
+    assert "one node, the camera moved less than --d-thresh" in printed.err
+    assert main([*command, "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["num_nodes"] == 1
