@@ -110,7 +110,9 @@ def check_image_calibration(
 def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | None:
     """Return the mismatch if the residuals show distortion that the calibration leaves out.
 
-    A linear estimate is enough where they show none.
+    A linear estimate is enough where they show none. It gives distortion that is there a small
+    probability, but less than this threshold in none of 300 images through two lenses, and in 87 %
+    of 150 images without (`benchmarks/inputs.py`, six places).
     """
     seen, camera = fit.inlier_observations(1.0), fit.camera
     seen = seen.select(np.unique(np.linspace(0, len(seen) - 1, 256).astype(int)))
@@ -128,7 +130,7 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
     # standard deviations of the logarithm of the focal length: calibrated or not
     prior = CameraPrior(sides, stated=(0.0, 0.01), usual=(0.0, 0.3))
     joint = linearized_fit(observed, fit.cam_from_world, calibrated)
-    if joint is None or _find_distortion(joint, prior, 0.05) is None:
+    if joint is None or _find_distortion(joint, prior, 0.012) is None:
         return None
     joint = fit_camera(observed, fit.cam_from_world, calibrated, prior)
     found = None if joint is None else _find_distortion(joint, prior, 0.99)

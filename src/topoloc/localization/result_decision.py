@@ -9,7 +9,11 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import compute_variance_inflation
-from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
+from topoloc.geometry.joint_camera.camera_hypotheses import (
+    CameraBelief,
+    CameraHypothesis,
+    WeighedCamera,
+)
 from topoloc.geometry.rigid import inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis, log_odds_margin
@@ -21,7 +25,7 @@ from topoloc.localization.evidence import (
 )
 from topoloc.localization.image_calibration_check import check_image_calibration
 from topoloc.localization.pose_fit import PointMatches, PointObservations
-from topoloc.localization.provenance import Provenance, probability_within_tolerance
+from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
 
@@ -79,7 +83,9 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     )
     evidence = replace(best.evidence, doubt=max(best.evidence.doubt, uncertainty))
     penalized = replace(best, covariance=covariance, evidence=evidence)
-    probability = result.probability * probability_within_tolerance(evidence.doubt)
+    shifted = WeighedCamera(CameraHypothesis(), 1.0, doubt.shift, best.covariance)
+    camera = CameraBelief(shifted.hypothesis, [shifted])
+    probability = result.probability * _probability_within(search, best, camera)
     if probability < search.config.evidence.min_probability:
         refusal = _build_not_localized(
             search, "too_few_inliers", best.fit, f"the calibration is doubtful: {doubt}"
@@ -95,17 +101,21 @@ def _weigh_camera(
 ) -> ResultWithInliers:
     """Return the result of a camera without calibration, with the probability that the pose is
     within the tolerance whatever its camera may be."""
-    config = search.config.evidence
-    max_translation = compute_translation_tolerance(best.fit.median_depth, config)
-    tolerances = max_translation, math.radians(config.max_rotation_deg)
-    probability = result.probability * camera.probability_within(*tolerances)
-    if probability >= config.min_probability:
+    probability = result.probability * _probability_within(search, best, camera)
+    if probability >= search.config.evidence.min_probability:
         named = _build_localization(search, best, probability)
         return named[0], [named]
     detail = "a cropped image or another lens would put the camera elsewhere: state --camera"
     if camera.is_contradicted:
         detail = "the image contradicts all camera models, as a panorama does: state --camera"
     return _build_not_localized(search, "too_few_inliers", best.fit, detail), []
+
+
+def _probability_within(search: Search, best: Hypothesis, camera: CameraBelief) -> float:
+    """Return the probability that a camera moves the pose by less than the tolerances."""
+    config = search.config.evidence
+    max_translation = compute_translation_tolerance(best.fit.median_depth, config)
+    return camera.probability_within(max_translation, math.radians(config.max_rotation_deg))
 
 
 def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:
