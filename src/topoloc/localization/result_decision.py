@@ -13,8 +13,10 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraBelief,
     CameraHypothesis,
     WeighedCamera,
+    map_variance,
 )
 from topoloc.geometry.rigid import inverse_covariance
+from topoloc.geometry.rolling_shutter import find_rotation
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis, log_odds_margin
 from topoloc.localization.evidence import (
@@ -73,8 +75,13 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     if best.fit.pose.camera is not None:
         return _weigh_camera(search, best, result, best.fit.pose.camera)
     with search.query.clock.stage("calibration"):
+        best, frame_rotation_deg = _undo_rotation(search, best)
         seen, doubt = check_image_calibration(search, best.fit)
     if doubt is None:
+        if frame_rotation_deg is not None:
+            result, points = _build_localization(search, best, result.probability)
+            result = replace(result, frame_rotation_deg=frame_rotation_deg)
+            named = [(result, points)]
         result = replace(result, seen_camera=seen, times_ms=search.query.clock.times_ms())
         return result, [(result, points) for _, points in named]
     covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
@@ -94,6 +101,32 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     localization, points = _build_localization(search, penalized, probability)
     localization = replace(localization, calibration_doubt=doubt, seen_camera=seen)
     return localization, [(localization, points)]
+
+
+def _undo_rotation(search: Search, best: Hypothesis) -> tuple[Hypothesis, float | None]:
+    """Return the hypothesis as if a rolling shutter had read all rows at once, and the angle
+    (degrees) that the camera turned during the frame. None if that is not evident."""
+    if not best.evidence.is_of_nodes:
+        return best, None
+    fit, seen = best.fit, best.fit.inlier_observations(1.0)
+    found = find_rotation(
+        seen.points_img.astype(np.float64),
+        seen.points_world,
+        seen.covariances,
+        search.config.pose.key_point_sigma_px,
+        fit.camera,
+        fit.cam_from_world,
+        map_variance(search.correlated_error_share),
+    )
+    if found is None:
+        return best, None
+    points_img = found.undo(fit.features.points_img.astype(np.float64), fit.camera)
+    features = replace(fit.features, points_img=points_img.astype(np.float32))
+    covariance = fit.pose.covariance + found.covariance
+    pose = replace(fit.pose, cam_from_world=found.cam_from_world, covariance=covariance)
+    fit = replace(fit, features=features, pose=pose)
+    undone = replace(best, fit=fit, covariance=best.covariance + found.covariance)
+    return undone, float(np.rad2deg(np.linalg.norm(found.rotation)))
 
 
 def _weigh_camera(
