@@ -137,9 +137,14 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
     found = None if joint is None else _find_distortion(joint, prior, 0.99)
     if joint is None or found is None:
         return None
-    cameras = (fit.cam_from_world, calibrated), (joint.cam_from_world, joint.camera)
-    residuals = [camera.fx * np.linalg.norm(observed.linearize(*one)[2], axis=1) for one in cameras]
-    if _gain_of(*residuals, max(camera.width, camera.height)) < _MIN_GAIN:
+    before_px, after_px = (
+        camera.fx * np.linalg.norm(observed.linearize(pose, parameters)[2], axis=1)
+        for pose, parameters in (
+            (fit.cam_from_world, calibrated),
+            (joint.cam_from_world, joint.camera),
+        )
+    )
+    if _gain_of(before_px, after_px, max(camera.width, camera.height)) < _MIN_GAIN:
         return None
     scale = search.query.scale
     focal, centre = camera.fx * scale, _principal_point(camera, scale)
@@ -184,11 +189,11 @@ def _refine_image_calibration(
 
 def _gain(before: PoseFit, after: PoseFit) -> float:
     """Return `_gain_of` for the inliers of two fits."""
-    errors_px = (
+    before_px, after_px = (
         fit.inlier_observations(1.0).errors_px(fit.camera, fit.cam_from_world)
         for fit in (before, after)
     )
-    return _gain_of(*errors_px, max(before.camera.width, before.camera.height))
+    return _gain_of(before_px, after_px, max(before.camera.width, before.camera.height))
 
 
 def _gain_of(
