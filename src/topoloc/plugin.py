@@ -85,6 +85,7 @@ if TYPE_CHECKING:
         parse_relative_path as parse_relative_path,
         read_text as read_text,
     )
+    from topoloc.recordings.trajectory import has_answers as has_answers
     from topoloc.removed_settings import parse_tables as parse_tables
 
 _NAMES = {
@@ -115,6 +116,7 @@ _NAMES = {
     "topoloc.recordings.ros_calibration": "RosCalibration",
     "topoloc.recordings.stored_images": "encode_jpeg",
     "topoloc.recordings.text_files": "parse_relative_path read_text",
+    "topoloc.recordings.trajectory": "has_answers",
     "topoloc.removed_settings": "parse_tables",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
