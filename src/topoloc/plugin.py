@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         cache_folder as cache_folder,
     )
     from topoloc.json_data import Finite as Finite, decode_json as decode_json
+    from topoloc.localization.query import Deadline as Deadline
     from topoloc.mapping.node_images import read_node_image as read_node_image
     from topoloc.recordings.atomic import (
         atomic_write as atomic_write,
@@ -98,6 +99,7 @@ _NAMES = {
     "topoloc.features.network_files": "NetworkInfo cache_folder",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.mapping.node_images": "read_node_image",
+    "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (
         "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"
     ),

@@ -192,6 +192,11 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
             return 2
     except TopolocError as error:
         _print_error(str(error))
+    except OSError as error:
+        if error.errno not in (errno.EMFILE, errno.ENFILE):
+            raise
+        where = f"cannot open {error.filename}: " if error.filename else ""
+        _print_error(f"{where}{error.strerror}; raise the limit (ulimit -n)")
     except MemoryError:
         _print_error("out of memory; no file is incomplete")
     except KeyboardInterrupt:
