@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         write_bytes as write_bytes,
         write_folder as write_folder,
         write_text as write_text,
+        written_paths as written_paths,
     )
     from topoloc.recordings.calibration import (
         parse_calibration as parse_calibration,
@@ -102,6 +103,7 @@ _NAMES = {
     "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (
         "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"
+        " written_paths"
     ),
     "topoloc.recordings.calibration": "parse_calibration replace_cameras",
     "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",
