@@ -76,7 +76,7 @@ def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
         and first.config.guided.num_nodes > 0
         and first.correlated_error_share <= weights.max_correlated_error_share
         and not isinstance(first.query.input_camera, UncalibratedCamera)
-        and not first.query.is_past_deadline
+        and not first.query.deadline.is_past
         and bool(first.query.grey.any())  # not so if only features are known
     )
 

@@ -132,7 +132,7 @@ class Command:
             raise UsageError("--fit-map-from-truth needs one recording and no --map-from-truth")
         if self.report:
             import_report_writer()
-        inputs = [self.map, self.map_from_truth, self.config]
+        inputs = [self.map, *self.sequences, *self.elsewhere, self.map_from_truth, self.config]
         check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
 
     def _report(
