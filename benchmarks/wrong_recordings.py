@@ -1,11 +1,11 @@
 """Wrong and right variants of recordings, mapped by `topoloc build`: which are reported?
 
     python benchmarks/wrong_recordings.py [--shared ../shared] [--only TEXT] [--right] [--wrong]
-        [--json FILE]
+        [--checks] [--json FILE]
 
 A variant is reported if the command refuses it or warns. For one that is mapped without a word, six
 of its images are localized in the map: the row has the number of answers, and their median distance
-from the truth.
+from the truth. With --checks the command ends before SLAM and mapping.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import tempfile
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
@@ -27,10 +28,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 from topoloc.apps.cli import main as run_topoloc
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization
+from topoloc.mapping import build
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.image_io import read_image
+from topoloc.slam import slam
 from variants.right import right_variants
-from variants.walks import BASES, Walk, read_walk
+from variants.walks import Walk, read_walk
 from variants.wrong import Variant, wrong_variants
 
 
@@ -43,7 +46,16 @@ class Outcome:
     answers: str = ""
 
 
-def run_variant(variant: Variant, data: Path, work: Path) -> Outcome:
+class EndOfChecksError(Exception):
+    """The recording passed the checks."""
+
+
+def end_checks(*_: object) -> None:
+    """Take the place of SLAM or mapping."""
+    raise EndOfChecksError
+
+
+def run_variant(variant: Variant, data: Path, work: Path, is_check: bool = False) -> Outcome:
     """Map a variant as a user does."""
     names = variant.base.split(" and ")[:1]
     pairs = [(names[0], variant.change), *([variant.second] if variant.second else [])]
@@ -53,15 +65,24 @@ def run_variant(variant: Variant, data: Path, work: Path) -> Outcome:
     target = folder / "map.topo"
     arguments = [*map(str, paths), str(target), "--features", "surf"]
     out, error, status = io.StringIO(), io.StringIO(), 0
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.redirect_stdout(out))
+        stack.enter_context(contextlib.redirect_stderr(error))
+        for place in (slam, build) if is_check else ():
+            name = "_track_recording" if place is slam else "build_map"
+            stack.enter_context(mock.patch.object(place, name, end_checks))
         try:
             status = run_topoloc(["build", *arguments])
+        except EndOfChecksError:
+            pass
         except Exception:  # a finding of its own
             return Outcome("traceback", traceback.format_exc().strip().splitlines()[-1])
     lines = [line for line in error.getvalue().splitlines() if _is_message(line)]
     message = (lines or [""])[-1].replace(str(folder), "")
     if status:
         return Outcome("refused", message)
+    if is_check:
+        return Outcome("warned" if lines else "silent", message)
     answers = ask(target, read_walk(names[0], data, work), walks[0])
     return Outcome("warned" if lines else "silent", message, answers)
 
@@ -99,6 +120,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="variants whose names contain one of A;B;...")
     parser.add_argument("--right", action="store_true", help="right variants alone")
     parser.add_argument("--wrong", action="store_true", help="wrong variants alone")
+    parser.add_argument("--checks", action="store_true", help="end before SLAM and mapping")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     data, found = arguments.shared.resolve() / "data", dict[str, dict[str, str]]()
@@ -107,9 +129,11 @@ def main() -> None:
         groups = {name: groups[name] for name in groups if getattr(arguments, name)}
     with tempfile.TemporaryDirectory() as work:
         for group, variants in groups.items():
-            rows = [one for one in variants if any(p in one.name for p in arguments.only.split(";"))]
+            rows = [
+                one for one in variants if any(p in one.name for p in arguments.only.split(";"))
+            ]
             for variant in rows:
-                outcome = run_variant(variant, data, Path(work))
+                outcome = run_variant(variant, data, Path(work), arguments.checks)
                 found[f"{group}, {variant.name}"] = vars(outcome)
                 line = " | ".join((outcome.status, outcome.answers, outcome.message))
                 print(f"| {group} | {variant.name} | {line} |", flush=True)

@@ -105,8 +105,8 @@ class Walk:
             text = json.dumps(data | {"right_from_left": matrix})
             (folder / "camera.json").write_text(text)
             return
-        data = dict(width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy)
-        data |= dict(cx=camera.cx, cy=camera.cy, model="PINHOLE")
+        names = ("model", "width", "height", "fx", "fy", "cx", "cy")
+        data = {name: getattr(camera, name) for name in names}
         given = {"baseline": self.baseline, "depth_factor": self.depth_factor}
         data |= {key: value for key, value in given.items() if value is not None}
         (folder / "camera.json").write_text(json.dumps(data))

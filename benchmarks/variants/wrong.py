@@ -78,9 +78,7 @@ def rotate_right(degrees: float, axis: tuple[float, float, float]) -> Change:
         c = walk.camera
         k = np.array([[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]])
         turned = k @ exp_so3(np.radians(degrees) * np.array(axis)) @ np.linalg.inv(k)
-        return replace(
-            walk, edit_other=lambda im: cv2.warpPerspective(im, turned, im.shape[1::-1])
-        )
+        return replace(walk, edit_other=lambda im: cv2.warpPerspective(im, turned, im.shape[1::-1]))
 
     return change
 
@@ -194,7 +192,9 @@ def _wrong_stereo() -> Iterator[Variant]:
         for name, factor in {"mm": 1e3, "cm": 1e2, "15 % more": 1.15, "15 % less": 0.85}.items():
             yield Variant(f"baseline, {name}", base, scale_baseline(factor))
         yield Variant("baseline, feet", base, scale_baseline(1 / 0.3048))
-        yield Variant("calibration of larger image, KITTI", base, enlarge_calibration(True, "kitti"))
+        yield Variant(
+            "calibration of larger image, KITTI", base, enlarge_calibration(True, "kitti")
+        )
     for base in ("zed1", "lab"):
         yield Variant("swapped, slam", base, by_slam(swap))
         turn = rotate_right(1.0, (1.0, 0.0, 0.0))
