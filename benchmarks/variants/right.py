@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from variants.walks import Walk
-from variants.wrong import DEPTH, STEREO, Change, Variant
+from variants.wrong import DEPTH, STEREO, Change, Variant, scale_times
 
 
 def take(rows: slice) -> Change:
@@ -51,6 +51,9 @@ def right_variants() -> Iterator[Variant]:
         yield Variant("still at the start", base, stand_still)
         yield Variant("slam", base, forget_poses)
         yield Variant("every third frame, backwards in time", base, _backwards)
+    for base in ("zed1", "kitchen"):
+        for name, factor in {"ms": 1e3, "us": 1e6, "ns": 1e9}.items():
+            yield Variant(f"pose times in {name}", base, scale_times(1.0, factor))
     for base in ("zed1", "lab"):
         yield Variant("12 bits in 16", base, to_12_bits)
     yield Variant("not rectified, with its calibration, slam", "euroc", forget_poses)

@@ -21,6 +21,7 @@ from topoloc.geometry.absolute_pose import estimate_absolute_pose
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
+from topoloc.slam.depth_checks import find_depth_shift
 from topoloc.slam.input_checks import add_calibration
 from topoloc.slam.measured_steps import MatchedPoints, MeasuredStep, measure_steps
 
@@ -29,16 +30,18 @@ MIN_STEPS = 5
 # up to 0.05 by the images, 0.10 by rotations, 0.05 by depth.
 _FOCAL_TOLERANCE, _ROTATION_TOLERANCE, _SCALE_TOLERANCE = 0.075, 0.12, 0.07
 _NUM_SIGMAS = 2.0
-_DISPARITY_BIAS_PX = 0.6  # of right calibrations (KITTI)
+_DISPARITY_BIAS_PX = 0.7  # of right calibrations (KITTI)
 
 
 @dataclass(frozen=True)
 class CalibrationErrors:
     """Hold factors by which a calibration is wrong: the stated value over the one that fits. None
-    if it is right, or the images do not decide. `scale`: of depth over that by the poses."""
+    if it is right, or the images do not decide. `scale`: of depth over that by the poses. Without
+    rotations a wrong `focal` looks like a wrong scale, and `is_focal_known` is False."""
 
     focal: float | None = None
     scale: float | None = None
+    is_focal_known: bool = True
 
 
 def check_calibration(
@@ -58,14 +61,33 @@ def check_calibration(
     if errors.scale is not None:
         percent, scale = 100.0 * (errors.scale - 1.0), f"scale={errors.scale:.4g}"
         looks = f"the poses are of another unit than the metre: --poses {scale}"
+        explained = add_calibration(looks, sequence, [scale])
+        if not errors.is_focal_known:
+            explained += ", or the focal length is wrong, which a straight walk does not show"
         raise TrajectoryError(
             f"{sequence.name}: depth is {abs(percent):.0f} % {'more' if percent > 0 else 'less'}"
-            f" than the motion of the poses shows; {add_calibration(looks, sequence, [scale])};"
-            f" {unchecked}"
+            f" than the motion of the poses shows; {explained}; {unchecked}"
         )
 
 
-def find_focal_error(sequence: StereoSequence) -> str | None:
+def find_image_faults(sequence: StereoSequence) -> list[str]:
+    """Return a note for each fault of a recording without poses that its images or times show.
+
+    Raises:
+        RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
+    """
+    max_interval_s = 10.0  # median; a longer one is of another unit than the second
+    interval = float(np.median(np.diff(sequence.t_ns))) / 1e9 if len(sequence) > 1 else 0.0
+    notes = [find_depth_shift(sequence), _find_focal_error(sequence)]
+    if interval > max_interval_s:
+        notes.append(
+            f"{sequence.name}: {interval:.4g} s from picture to picture (median); are the times in"
+            f" {'milliseconds' if interval < 1e4 else 'micro- or nanoseconds'}? Write seconds"
+        )
+    return [note for note in notes if note is not None]
+
+
+def _find_focal_error(sequence: StereoSequence) -> str | None:
     """Return a note if the images alone show a wrong focal length of a stereo or RGB-D recording.
 
     Raises:
@@ -114,8 +136,9 @@ def evaluate_calibration(
         return CalibrationErrors()
     (low, sigma), (scale, _), (high, _) = (_median(column) for column in zip(*ratios, strict=True))
     nearest = max(0.0, low, -high)
-    is_wrong = nearest - _NUM_SIGMAS * sigma > _SCALE_TOLERANCE
-    return CalibrationErrors(scale=math.exp(scale) if is_wrong else None)
+    is_wrong = nearest - 3.0 * sigma > _SCALE_TOLERANCE
+    is_focal_known = max(len(by_images), len(by_poses)) >= MIN_STEPS
+    return CalibrationErrors(None, math.exp(scale) if is_wrong else None, is_focal_known)
 
 
 def _combine(by_images: Sequence[float], by_poses: Sequence[float]) -> float | None:
@@ -193,7 +216,7 @@ def _focal_cost(points: MatchedPoints, factor: float) -> float:
 def _depth_ratios(points: MatchedPoints, given: Rigid3) -> Float[np.ndarray, " 3"] | None:
     """Return the median logarithm of depth over that by a step of poses, in ascending order: if
     disparities are too small, as they are, or too large by the bias of right calibrations."""
-    min_points, max_error_px, min_parallax_px = 15, 2.0, 8.0
+    min_points, max_error_px, min_parallax_px = 20, 2.0, 8.0
     last_from_first = points.view_from_cam @ given.inverse() @ points.view_from_cam.inverse()
     t, focal = last_from_first.translation, points.camera.fx
     z = points.points_cam[:, 2]
@@ -209,6 +232,7 @@ def _depth_ratios(points: MatchedPoints, given: Rigid3) -> Float[np.ndarray, " 3
         is_used = (depth > 0.0) & (errors < max_error_px) & (parallax > min_parallax_px)
     if np.count_nonzero(is_used) < min_points:
         return None
+    is_used &= z <= np.median(z[is_used])  # near points have larger disparities
     z, depth = z[is_used], depth[is_used]
     if points.focal_baseline is None:
         return np.full(3, np.median(np.log(z / depth)))

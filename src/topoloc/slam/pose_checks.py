@@ -113,8 +113,7 @@ def check_poses(sequence: StereoSequence) -> None:
         return
     steps = measure_steps(sequence, posed)
     verdict = evaluate_poses(steps, sequence.poses, sequence.t_ns)
-    if not verdict.conventions:  # the images alone show whether poses or focal length are wrong
-        check_calibration(sequence, steps, verdict.is_accepted)
+    check_calibration(sequence, steps, verdict.is_accepted)
     if verdict.is_accepted:
         return
     differ = (

@@ -27,7 +27,6 @@ from topoloc.node_ids import NodeId
 from topoloc.recordings.damaged_images import leave_out_damaged
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
-from topoloc.slam.calibration_checks import find_focal_error
 from topoloc.slam.depth_checks import find_depth_shift
 from topoloc.slam.input_checks import check_pose_coverage, check_stereo
 from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_step, extract_view
@@ -75,17 +74,14 @@ def build_map(
     opened = [open_sequence(one) if isinstance(one, str | Path) else one for one in several]
     sequences = [leave_out_damaged(one, warn) for one in opened]
     if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
-        sequences = run_slam(sequences, progress).apply(sequences)
+        sequences = run_slam(sequences, progress, warn).apply(sequences)
         poses_from = ["slam"] * len(sequences)
     sources = poses_from or [""] * len(sequences)
-    for sequence, source in zip(sequences, sources, strict=True):
-        of_depth = find_depth_shift(sequence)
-        of_lens = find_focal_error(sequence) if source == "slam" else None
-        for note in filter(None, (of_depth, of_lens)):
-            warn(note)
     given = [one for one, source in zip(sequences, sources, strict=True) if source != "slam"]
     for sequence in given:
         check_stereo(sequence)
+        if (note := find_depth_shift(sequence)) is not None:
+            warn(note)
         if is_coverage_checked:
             check_pose_coverage(sequence)
         if are_poses_checked:
