@@ -70,24 +70,16 @@ class SimilarFeatures:
 
 @dataclass(frozen=True, eq=False)
 class MatchedPoints:
-    """Hold the points of the first view (metres) that match in the last, in its camera after
-    rectification: `camera_rays` on the plane z = 1, `pixels` without distortion.
-
-    `focal_baseline` (px m) is depth times disparity, None for measured depth.
-    """
+    """Hold the points of the first view (metres) that match in the last, as `rays` on the plane z =
+    1 of its rectified camera. `focal_baseline` (px m) is depth times disparity, None for measured
+    depth."""
 
     points_cam: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
-    camera_rays: Float[np.ndarray, "n 2"]
+    rays: Float[np.ndarray, "n 2"]
     camera: Camera
     view_from_cam: Rigid3
     focal_baseline: float | None
-
-    @property
-    def pixels(self) -> Float[np.ndarray, "n 2"]:
-        """Return the pixels of a pinhole camera with the same focal length."""
-        c = self.camera
-        return self.camera_rays * [c.fx, c.fy] + [c.cx, c.cy]
 
 
 @dataclass(frozen=True, eq=False)

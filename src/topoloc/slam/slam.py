@@ -147,8 +147,9 @@ def run_slam(
     residuals: list[np.ndarray] = []
     for number, sequence in enumerate(sequences):
         check_stereo(sequence)
-        for note in find_image_faults(sequence) if warn is not None else ():
-            warn(note)
+        if warn is not None:
+            for note in find_image_faults(sequence):
+                warn(note)
         odometry = Odometry(number, keyframes, landmarks)
         tracked.append(_track_recording(sequence, odometry, progress))
         residuals += odometry.right_residuals_px
