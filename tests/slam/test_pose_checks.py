@@ -13,8 +13,9 @@ from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import SequenceView, with_poses
+from topoloc.slam.input_checks import check_pose_coverage
 from topoloc.slam.measured_steps import MeasuredStep, measure_steps
-from topoloc.slam.pose_checks import check_pose_coverage, check_poses, evaluate_poses
+from topoloc.slam.pose_checks import check_poses, evaluate_poses
 
 BODY_FROM_CAM = Rigid3(exp_so3(np.array([1.2, -1.1, 0.7])), np.array([0.3, -0.1, 0.5]))
 FLIP, FLU = (

@@ -15,7 +15,7 @@ from topoloc.recordings.recording import SequenceView, sequence_subset
 
 
 def leave_out_damaged(
-    sequence: StereoSequence, warn: Callable[[str], None] | None = None
+    sequence: StereoSequence, warn: Callable[[str], object] | None = None
 ) -> StereoSequence:
     """Return a recording of image files without the frames that have a missing, empty or truncated
     file. `warn` is called with their number.

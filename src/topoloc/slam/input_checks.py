@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import CalibrationError, RecordingError
+from topoloc.errors import CalibrationError, RecordingError, TrajectoryError
 from topoloc.features.config import MatchingConfig
 from topoloc.features.extraction import extract_features
 from topoloc.features.feature_types import FeatureConfig, find_feature_type
@@ -42,7 +42,8 @@ def check_stereo(sequence: StereoSequence, num_frames: int = 8) -> None:
         return
     if rig.baseline > max_baseline:
         raise CalibrationError(
-            f"{sequence.name}: a baseline of {rig.baseline:g} m; is it in millimetres?"
+            f"{sequence.name}: a baseline of {rig.baseline:g} m; is it in millimetres"
+            f" ({rig.baseline / 1000:.4g} m) or centimetres ({rig.baseline / 100:.4g} m)?"
         )
     chosen = np.unique(np.linspace(0, len(sequence) - 1, num_frames).astype(int)).tolist()
     is_left, vertical = _compare_pairs(sequence[k] for k in chosen)
@@ -64,6 +65,16 @@ def check_stereo(sequence: StereoSequence, num_frames: int = 8) -> None:
 
 def _exchange(frame: StereoFrame) -> StereoFrame:
     return frame if frame.right is None else replace(frame, image=frame.right, right=frame.image)
+
+
+def check_pose_coverage(sequence: StereoSequence) -> None:
+    """Raise TrajectoryError if some frames have a pose, but less than half of them."""
+    num_posed = sum(pose is not None for pose in sequence.poses)
+    if 0 < 2 * num_posed < len(sequence):
+        raise TrajectoryError(
+            f"{sequence.name}: only {num_posed} of {len(sequence)} frames have a pose; --allow-gaps"
+            " maps these, without the others"
+        )
 
 
 def add_calibration(looks: str, sequence: StereoSequence, conventions: Sequence[str]) -> str:

@@ -69,6 +69,20 @@ class SimilarFeatures:
 
 
 @dataclass(frozen=True, eq=False)
+class MatchedPoints:
+    """Hold the points of the first view (metres) that match in the last, as `rays` on the plane z =
+    1 of its rectified camera. `focal_baseline` (px m) is depth times disparity, None for measured
+    depth."""
+
+    points_cam: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    rays: Float[np.ndarray, "n 2"]
+    camera: Camera
+    view_from_cam: Rigid3
+    focal_baseline: float | None
+
+
+@dataclass(frozen=True, eq=False)
 class MeasuredStep:
     """Hold the measured motion between the cameras of two frames.
 
@@ -83,6 +97,7 @@ class MeasuredStep:
     has_scale: bool = True
     num_inliers: int = 0
     similar: SimilarFeatures | None = None
+    points: MatchedPoints | None = None
 
     @property
     def translation_tolerance(self) -> float:
@@ -180,6 +195,7 @@ class ViewFeatures:
     view_from_cam: Rigid3
     features: Features
     points: MetricPoints | None
+    focal_baseline: float | None = None
 
 
 def extract_view(frame: StereoFrame, is_first: bool = True) -> ViewFeatures:
@@ -193,7 +209,8 @@ def extract_view(frame: StereoFrame, is_first: bool = True) -> ViewFeatures:
         rows = np.flatnonzero(located.valid)
         features = features.select(rows)
         points = MetricPoints(*(column[rows] for column in vars(located).values()))
-    return ViewFeatures(view.camera, view.view_from_cam, features, points)
+    scale = view.rig.left.fx * view.rig.baseline if view.rig is not None else None
+    return ViewFeatures(view.camera, view.view_from_cam, features, points, scale)
 
 
 def estimate_step(
@@ -208,7 +225,7 @@ def estimate_step(
     if len(matches) < min_inliers:
         return None
     points_img = last.features.points_img[matches.query_idx].astype(np.float64)
-    points = None
+    points, matched = None, None
     if first.points is None:
         first_img = first.features.points_img[matches.train_idx].astype(np.float64)
         moved = estimate_relative_pose(first_img, first.camera, points_img, last.camera)
@@ -220,6 +237,9 @@ def estimate_step(
             points_img, points, last.camera, point_covariances=covariances
         )
         motion = None if pose is None else (pose.cam_from_world, pose.inliers)
+        rays = last.camera.normalized_from_img(points_img)
+        facts = last.camera, last.view_from_cam, first.focal_baseline
+        matched = MatchedPoints(points, covariances, rays, *facts)
     if motion is None or np.count_nonzero(motion[1]) < min_inliers:
         return None
     last_from_first, inliers = motion
@@ -228,7 +248,7 @@ def estimate_step(
     depth = 0.0 if points is None else float(np.median(points[inliers, 2]))
     num_inliers, has_scale = int(np.count_nonzero(inliers)), points is not None
     return MeasuredStep(
-        first_idx, last_idx, first_from_last, depth, has_scale, num_inliers, similar
+        first_idx, last_idx, first_from_last, depth, has_scale, num_inliers, similar, matched
     )
 
 

@@ -34,6 +34,7 @@ from topoloc.geometry.pose_conventions import (
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.trajectory import Trajectory
+from topoloc.slam.calibration_checks import check_calibration
 from topoloc.slam.input_checks import add_calibration
 from topoloc.slam.measured_steps import ROTATION_TOLERANCE, MeasuredStep, measure_steps
 
@@ -98,29 +99,21 @@ class _PoseInterpretation:
         return self.num_consistent - 0.5 * complexity, -self.median_error
 
 
-def check_pose_coverage(sequence: StereoSequence) -> None:
-    """Raise TrajectoryError if some frames have a pose, but less than half of them."""
-    num_posed = sum(pose is not None for pose in sequence.poses)
-    if 0 < 2 * num_posed < len(sequence):
-        raise TrajectoryError(
-            f"{sequence.name}: only {num_posed} of {len(sequence)} frames have a pose; --allow-gaps"
-            " maps these, without the others"
-        )
-
-
 def check_poses(sequence: StereoSequence) -> None:
-    """Check that the poses of a recording fit its images. For a single camera the scale is not
-    checked.
+    """Check that the poses and the calibration of a recording fit its images. For a single camera
+    the scale and the calibration are not checked.
 
     Raises:
         TrajectoryError: they do not fit. The message contains the convention that makes them fit,
-            in the format of `--poses`, if one does.
+            in the format of `--poses`, if one does, or the value of the calibration.
         RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
     """
     posed = [k for k, pose in enumerate(sequence.poses) if pose is not None]
     if len(posed) < _MIN_INFORMATIVE_STEPS or sequence[posed[0]].camera is None:
         return
-    verdict = evaluate_poses(measure_steps(sequence, posed), sequence.poses, sequence.t_ns)
+    steps = measure_steps(sequence, posed)
+    verdict = evaluate_poses(steps, sequence.poses, sequence.t_ns)
+    check_calibration(sequence, steps, verdict.is_accepted)
     if verdict.is_accepted:
         return
     differ = (

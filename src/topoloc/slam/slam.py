@@ -29,6 +29,7 @@ from topoloc.points.disparity import MeasuredView, measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.recording import with_poses
+from topoloc.slam.calibration_checks import find_image_faults
 from topoloc.slam.global_optimization import (
     adjust_global_bundle,
     close_loops,
@@ -122,12 +123,15 @@ class SlamResult:
 
 
 def run_slam(
-    sequences: StereoSequence | Sequence[StereoSequence], progress: Progress | None = None
+    sequences: StereoSequence | Sequence[StereoSequence],
+    progress: Progress | None = None,
+    warn: Callable[[str], object] | None = None,
 ) -> SlamResult:
     """Run SLAM on one or several recordings of one place.
 
     Recordings after the first are joined to it at common places. The same recordings give
-    byte-identical poses.
+    byte-identical poses. If `warn` is given, images are searched for faults of the calibration
+    first, and it is called with a note on each.
 
     Raises:
         RecordingError: no frame could be tracked, left and right are swapped or no pairs, or there
@@ -143,6 +147,9 @@ def run_slam(
     residuals: list[np.ndarray] = []
     for number, sequence in enumerate(sequences):
         check_stereo(sequence)
+        if warn is not None:
+            for note in find_image_faults(sequence):
+                warn(note)
         odometry = Odometry(number, keyframes, landmarks)
         tracked.append(_track_recording(sequence, odometry, progress))
         residuals += odometry.right_residuals_px

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,11 +24,13 @@ from topoloc.mapping import build
 from topoloc.mapping.config import Progress
 from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
 from topoloc.node_ids import NodeId
+from topoloc.recordings.damaged_images import leave_out_damaged
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
-from topoloc.slam.input_checks import check_stereo
+from topoloc.slam.depth_checks import find_depth_shift
+from topoloc.slam.input_checks import check_pose_coverage, check_stereo
 from topoloc.slam.measured_steps import MeasuredStep, ViewFeatures, estimate_step, extract_view
-from topoloc.slam.pose_checks import check_pose_coverage, check_poses
+from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam
 
 
@@ -43,7 +46,7 @@ def build_map(
     """Build a topo-metric map from recordings whose poses share one world frame.
 
     If a recording has no poses at all, SLAM estimates those of all recordings, as in `topoloc
-    build`.
+    build`. Frames with a missing or damaged image are left out.
 
     Args:
         sequences: the recordings, or their paths, which `open_sequence` opens.
@@ -52,7 +55,8 @@ def build_map(
         are_poses_checked: compare the poses with the images, unless SLAM estimated them.
         is_coverage_checked: require that at least half of the frames have a pose, unless SLAM
             estimated them.
-        warn: called with each note on what could not be checked.
+        warn: called with each note on frames that are left out, on what could not be checked, and
+            on faults that images alone show. Default: Python's warnings.
 
     Raises:
         ConfigError: a value of `config` is out of bounds.
@@ -66,21 +70,24 @@ def build_map(
     for kind in config.kinds:
         find_feature_type(kind)
     several = [sequences] if isinstance(sequences, StereoSequence | str | Path) else sequences
-    sequences = [open_sequence(one) if isinstance(one, str | Path) else one for one in several]
+    warn = warn or warnings.warn
+    opened = [open_sequence(one) if isinstance(one, str | Path) else one for one in several]
+    sequences = [leave_out_damaged(one, warn) for one in opened]
     if poses_from is None and not all(any(sequence.poses) for sequence in sequences):
-        sequences = run_slam(sequences, progress).apply(sequences)
+        sequences = run_slam(sequences, progress, warn).apply(sequences)
         poses_from = ["slam"] * len(sequences)
     sources = poses_from or [""] * len(sequences)
     given = [one for one, source in zip(sequences, sources, strict=True) if source != "slam"]
     for sequence in given:
         check_stereo(sequence)
+        if (note := find_depth_shift(sequence)) is not None:
+            warn(note)
         if is_coverage_checked:
             check_pose_coverage(sequence)
         if are_poses_checked:
             check_poses(sequence)
     for note in check_common_world(given) if are_poses_checked else []:
-        if warn is not None:
-            warn(note)
+        warn(note)
     return with_map_statistics(build.build_map(sequences, config, progress, poses_from), progress)
 
 

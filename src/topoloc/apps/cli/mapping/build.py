@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from topoloc import BuildConfig
+from topoloc import BuildConfig, check_map
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
 from topoloc.apps.cli.mapping.map_jobs import (
     MapJob,
@@ -148,6 +148,12 @@ class Command:
         info = topomap.describe(target)
         if info["num_nodes"] == 1:
             print_warning(f"{target}: one node, the camera moved less than --d-thresh")
+        if faults := check_map(target):
+            num = f"{len(faults)} of {info['num_nodes']} nodes contradict the rest"
+            print_warning(
+                f"{target}: {num} ({faults[0]}); check poses and calibration, topoloc info --check"
+                " lists them"
+            )
         if self.json != "-":
             size = f"{info['num_nodes']} nodes, {info['num_points']} points"
             source = " and ".join(sorted(set(poses_from)))

@@ -82,7 +82,7 @@ class MapJob:
         sequences, poses_from = self._open(tell)
         is_slam = poses_from[0] == "slam"
         if is_slam:
-            result = run_slam(sequences, progress)
+            result = run_slam(sequences, progress, _warn)
             sequences = result.apply(sequences)
             if apart := result.num_submaps - result.num_joined:
                 _warn(f"{apart} of {result.num_submaps} sub-maps share no view with the others")

@@ -20,6 +20,7 @@ from topoloc.apps.cli.output import (
     open_recording,
     print_fields,
     print_line,
+    print_warning,
     progress_bar,
     write_json,
 )
@@ -48,7 +49,7 @@ class Command:
             print_line(describe_recording(*words[:3], sequence))
         start = time.perf_counter()
         with progress_bar() as progress:
-            result = run_slam(sequence, progress)
+            result = run_slam(sequence, progress, print_warning)
         seconds = time.perf_counter() - start
         Trajectory.of_frames(result.poses[0], sequence.t_ns).write_tum(Path(self.out))
         rate = round(len(sequence) / seconds, 2)

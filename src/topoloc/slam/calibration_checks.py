@@ -1,0 +1,182 @@
+"""Check focal length, baseline and depth factor of a recording: errors of some percent that no
+single step between images shows, but all of them together.
+
+A wrong focal length bends the points of a frame, so that they fit another image less well after a
+rotation. A wrong baseline or depth factor changes depth, but not the depth by the motion between
+two poses; another unit of the poses changes the second alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.absolute_pose import estimate_absolute_pose
+from topoloc.geometry.absolute_pose_kernels import squared_errors
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.pose_matches import Matches
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.frame import StereoSequence
+from topoloc.slam.depth_checks import find_depth_shift
+from topoloc.slam.input_checks import add_calibration
+from topoloc.slam.measured_steps import MatchedPoints, MeasuredStep, measure_steps
+
+_MIN_STEPS = 5
+# Logarithms of the smallest factors by which a focal length or scale is wrong. Those of right
+# recordings are up to 0.06 and 0.05 (ZED, KITTI, 7-Scenes: benchmarks/wrong_recordings.py --right).
+_FOCAL_TOLERANCE, _SCALE_TOLERANCE = 0.075, 0.07
+
+
+def check_calibration(
+    sequence: StereoSequence, steps: Sequence[MeasuredStep], are_poses_right: bool
+) -> None:
+    """Check the calibration of a recording by steps between its images, and by its poses if these
+    are right but for some percent. Single cameras are not checked.
+
+    Raises:
+        TrajectoryError: it does not fit. Contains the value that does.
+    """
+    unchecked = "--poses unchecked maps it all the same"
+    if (problem := _find_focal_problem(sequence, steps)) is not None:
+        raise TrajectoryError(f"{problem}; {unchecked}")
+    scale = estimate_scale_error(steps, sequence.poses) if are_poses_right else None
+    if scale is None:
+        return
+    looks = f"the poses are of another unit than the metre: --poses scale={scale:.4g}"
+    explained = add_calibration(looks, sequence, [f"scale={scale:.4g}"])
+    if not math.isfinite(_estimate_focal_error(steps)[1]):
+        explained += ", or the focal length is wrong, which a straight trajectory does not show"
+    raise TrajectoryError(
+        f"{sequence.name}: depth is {abs(100.0 * (scale - 1.0)):.0f} %"
+        f" {'more' if scale > 1.0 else 'less'} than the motion of the poses shows; {explained};"
+        f" {unchecked}"
+    )
+
+
+def find_image_faults(sequence: StereoSequence) -> list[str]:
+    """Return a note for each fault of a recording without poses that its images or times show.
+
+    Raises:
+        RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
+    """
+    max_interval_s = 10.0  # median; a longer one is of another unit than the second
+    interval = float(np.median(np.diff(sequence.t_ns))) / 1e9 if len(sequence) > 1 else 0.0
+    is_single = sequence[0].right is None and sequence[0].depth is None
+    steps = [] if is_single else measure_steps(sequence, list(range(len(sequence))))
+    notes = [find_depth_shift(sequence), _find_focal_problem(sequence, steps)]
+    if interval > max_interval_s:
+        unit = "milliseconds" if interval < 1e4 else "micro- or nanoseconds"
+        between = f"{interval:.4g} s from picture to picture (median)"
+        notes.append(f"{sequence.name}: {between}; are the times in {unit}? Write seconds")
+    return [note for note in notes if note is not None]
+
+
+def _find_focal_problem(sequence: StereoSequence, steps: Sequence[MeasuredStep]) -> str | None:
+    focal, sigma = _estimate_focal_error(steps)
+    camera = sequence[0].camera
+    if camera is None or not abs(focal) - 2.0 * sigma > _FOCAL_TOLERANCE:
+        return None
+    return (
+        f"{sequence.name}: a focal length of about {camera.fx / math.exp(focal):.4g} px fits the"
+        f" pictures, not {camera.fx:.4g}; calibrate the camera again, or correct fx and fy"
+    )
+
+
+def _estimate_focal_error(steps: Sequence[MeasuredStep]) -> tuple[float, float]:
+    """Return the logarithm of the stated focal length over the right one, and its standard
+    deviation."""
+    found = [step.points and _fit_focal(step.points) for step in steps]
+    return _median([log for log in found if log is not None])
+
+
+def estimate_scale_error(
+    steps: Sequence[MeasuredStep], poses: Sequence[Rigid3 | None]
+) -> float | None:
+    """Return depth over that by the motion of poses (world_from_cam, one for each frame). None if
+    it is 1, or the images do not decide."""
+    ratios = list[Float[np.ndarray, " 3"]]()
+    for step in steps:
+        first, last = poses[step.first], poses[step.last]
+        if step.points is not None and first is not None and last is not None:
+            ratio = _depth_ratios(step.points, first.inverse() @ last)
+            ratios += [] if ratio is None else [ratio]
+    if len(ratios) < _MIN_STEPS:
+        return None
+    (low, sigma), (scale, _), (high, _) = (_median(column) for column in zip(*ratios, strict=True))
+    is_wrong = max(low, -high) - 3.0 * sigma > _SCALE_TOLERANCE
+    return math.exp(scale) if is_wrong else None
+
+
+def _median(logs: Sequence[float]) -> tuple[float, float]:
+    """Return the median and its standard deviation, by the scatter of the values. It is infinite
+    for few values."""
+    if len(logs) < _MIN_STEPS:
+        return 0.0, math.inf
+    median = float(np.median(logs))
+    scatter = 1.4826 * float(np.median(np.abs(np.array(logs) - median)))
+    return median, 1.25 * scatter / math.sqrt(len(logs))
+
+
+def _fit_focal(points: MatchedPoints) -> float | None:
+    """Return the logarithm of the stated focal length over the one with which the points fit best
+    in the last image. None if it hardly matters."""
+    step, min_rise = 0.08, 6.0
+    factors = step * np.arange(-9.0, 10.0)
+    costs = np.array([_focal_cost(points, math.exp(factor)) for factor in factors])
+    if not np.isfinite(costs).all():
+        return None
+    k = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
+    before, at, after = costs[k - 1 : k + 2]
+    curvature = before - 2.0 * at + after
+    if curvature < 2.0 * min_rise:
+        return None
+    shift = float(np.clip(0.5 * (before - after) / curvature, -1.0, 1.0))
+    return -(factors[k] + step * shift)
+
+
+def _focal_cost(points: MatchedPoints, factor: float) -> float:
+    """Return the robust sum of squared errors with the focal length times `factor`. Depth by stereo
+    is in proportion to it; with measured depth, x and y are in inverse proportion."""
+    cauchy_square = 9.0
+    stretch = [1.0, 1.0, factor] if points.focal_baseline else [1.0 / factor, 1.0 / factor, 1.0]
+    stretched = points.points_cam * stretch, points.covariances * np.outer(stretch, stretch)
+    c = points.camera
+    camera = Camera.pinhole(c.width, c.height, factor * c.fx, factor * c.fy, c.cx, c.cy)
+    pixels = points.rays * [c.fx, c.fy] + [c.cx, c.cy]
+    pose = estimate_absolute_pose(pixels, stretched[0], camera, point_covariances=stretched[1])
+    if pose is None:
+        return math.inf
+    matches = Matches.from_pixels(pixels, *stretched, camera, 1.0)
+    squares = squared_errors(*matches.kernel_args(pose.cam_from_world))
+    squares = squares[np.isfinite(squares)]  # points in front of the camera
+    return float(cauchy_square * np.log1p(squares / cauchy_square).sum())
+
+
+def _depth_ratios(points: MatchedPoints, given: Rigid3) -> Float[np.ndarray, " 3"] | None:
+    """Return the median logarithm of depth over that by a step of poses: with disparities that are
+    larger, equal or smaller by the error that right calibrations leave in them."""
+    min_points, max_error_px, min_parallax_px, disparity_error_px = 20, 2.0, 8.0, 0.7
+    last_from_first = points.view_from_cam @ given.inverse() @ points.view_from_cam.inverse()
+    t, focal, z = last_from_first.translation, points.camera.fx, points.points_cam[:, 2]
+    rays = points.points_cam / z[:, None] @ last_from_first.rotation.T
+    seen = np.insert(points.rays, 2, 1.0, axis=1)
+    across, along = (np.cross(seen, one)[:, :2] for one in (rays, t))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -np.sum(across * along, axis=1) / np.sum(across**2, axis=1)
+        far = np.maximum((depth[:, None] * rays + t)[:, 2], 1e-6)
+        errors = focal * np.linalg.norm(across * depth[:, None] + along, axis=1) / far
+        parallax = focal * np.linalg.norm(along, axis=1) / far
+        is_used = (depth > 0.0) & (errors < max_error_px) & (parallax > min_parallax_px)
+    if np.count_nonzero(is_used) < min_points:
+        return None
+    is_used &= z <= np.median(z[is_used])  # near points have larger disparities
+    z, depth = z[is_used], depth[is_used]
+    if points.focal_baseline is None:
+        return np.full(3, np.median(np.log(z / depth)))
+    changes = disparity_error_px * np.array([[1.0], [0.0], [-1.0]])
+    disparities = np.maximum(points.focal_baseline / z + changes, 0.1)
+    return np.median(np.log(points.focal_baseline / disparities / depth), axis=1)

@@ -1,0 +1,133 @@
+"""Errors of a calibration by some percent are refused with the value that is right, and obeying
+the message mends them. Right recordings pass."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tiny_world
+from room_frames import FrameList, depth_frame, stereo_frame
+from topoloc.errors import TrajectoryError
+from topoloc.geometry.camera import Camera
+from topoloc.geometry.rig import StereoRig
+from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.open import open_sequence
+from topoloc.recordings.recording import Recording, with_poses
+from topoloc.slam.calibration_checks import find_image_faults
+from topoloc.slam.depth_checks import find_depth_shift
+from topoloc.slam.pose_checks import check_poses
+
+PLACES = [0.4 * k for k in range(20)]
+
+
+def with_rig(frame: StereoFrame, camera: Camera, baseline: float) -> StereoFrame:
+    return replace(frame, camera=camera, rig=StereoRig.rectified(camera, baseline))
+
+
+def with_focal(recording: Recording, factor: float) -> Recording:
+    """The recording with this factor in its focal length."""
+    assert recording.right is not None
+    c = recording.right.rig.left
+    camera = Camera.pinhole(c.width, c.height, factor * c.fx, factor * c.fy, c.cx, c.cy)
+    rig = StereoRig.rectified(camera, recording.right.rig.baseline)
+    return replace(recording, camera=camera, right=replace(recording.right, rig=rig))
+
+
+def open_recording(path: Path) -> Recording:
+    sequence = open_sequence(path)
+    assert isinstance(sequence, Recording)
+    return sequence
+
+
+@pytest.mark.parametrize("factor", [0.85, 1.15])
+def test_obeying_a_message_on_the_baseline_mends_it(factor: float):
+    frames = [stereo_frame(place) for place in PLACES]
+    check_poses(FrameList(frames))
+    wrong = factor * tiny_world.BASELINE
+    with pytest.raises(TrajectoryError, match=r"depth is 1\d % (more|less) .*a baseline") as caught:
+        check_poses(FrameList([with_rig(one, tiny_world.CAMERA, wrong) for one in frames]))
+    message = str(caught.value)
+    found = float(message.partition("a baseline of ")[2].partition(" m")[0])
+    assert found == pytest.approx(tiny_world.BASELINE, rel=0.03)
+    assert message.index("baseline") < message.index("--poses scale=")
+    check_poses(FrameList([with_rig(one, tiny_world.CAMERA, found) for one in frames]))
+
+
+def test_obeying_a_message_on_the_unit_of_poses_mends_it():
+    sequence = FrameList([stereo_frame(place) for place in PLACES])
+    wrong = [Rigid3(one.rotation, 1.15 * one.translation) for one in sequence.poses if one]
+    with pytest.raises(TrajectoryError, match=r"depth is 1\d % less") as caught:
+        check_poses(with_poses(sequence, list(wrong)))
+    scale = float(re.findall(r"--poses scale=([\d.]+)", str(caught.value))[0])
+    mended = [Rigid3(one.rotation, scale * one.translation) for one in wrong]
+    assert scale == pytest.approx(1 / 1.15, rel=0.03)
+    check_poses(with_poses(sequence, list(mended)))
+
+
+@pytest.mark.parametrize("factor", [0.85, 1.15])
+def test_obeying_a_message_on_the_focal_length_mends_it(shared: Path, factor: float):
+    right = open_recording(shared / "data" / "zed_lab" / "session2")
+    assert right.camera is not None
+    with pytest.raises(TrajectoryError, match="a focal length of about") as caught:
+        check_poses(with_focal(right, factor))
+    found = float(str(caught.value).partition("of about ")[2].partition(" px")[0])
+    assert found == pytest.approx(right.camera.fx, rel=0.06)
+    check_poses(with_focal(right, found / right.camera.fx))
+    (note,) = find_image_faults(with_poses(with_focal(right, factor), [None] * len(right)))
+    assert "a focal length of about" in note
+
+
+def test_a_right_recording_without_poses_has_no_fault(shared: Path):
+    assert find_image_faults(open_sequence(shared / "data" / "euroc" / "v1_01_part")) == []
+
+
+def test_a_street_names_the_focal_length_as_well(shared: Path):
+    """Without rotations a wrong focal length looks like a wrong baseline."""
+    street = open_recording(shared / "data" / "kitti" / "sequences" / "street1")
+    check_poses(street)
+    with pytest.raises(TrajectoryError, match=r"a baseline of .* or the focal length is wrong"):
+        check_poses(with_focal(street, 1.15))
+
+
+def test_a_disparity_error_of_half_a_pixel_accuses_nobody(shared: Path):
+    """Depth of this street is 12 % more than its poses show, by half a pixel at 75 m."""
+    check_poses(open_sequence(shared / "data" / "kitti" / "sequences" / "street2@25:51"))
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e6])
+def test_times_of_another_unit_are_noted(factor: float):
+    frames = [
+        replace(stereo_frame(place), t_ns=round(factor * k * 1e8))
+        for k, place in enumerate(PLACES[:8])
+    ]
+    notes = find_image_faults(FrameList(frames))
+    assert any("are the times in m" in note for note in notes)
+    assert find_image_faults(FrameList([stereo_frame(place) for place in PLACES[:8]])) == []
+
+
+def shift_depth(frame: StereoFrame, columns: int) -> StereoFrame:
+    assert frame.depth is not None
+    return replace(
+        frame, depth=replace(frame.depth, depth=np.roll(frame.depth.depth, columns, axis=1))
+    )
+
+
+def test_depth_of_another_view_is_noted(shared: Path):
+    kitchen = open_sequence(shared / "data" / "seven_scenes" / "kitchen" / "seq-01@0:160:20")
+    frames = [kitchen[k] for k in range(len(kitchen))]
+    assert find_depth_shift(FrameList(frames)) is None
+    note = find_depth_shift(FrameList([shift_depth(one, -24) for one in frames]))
+    assert note is not None
+    right, down = re.findall(r"moved by (-?\d+), (-?\d+) px", note)[0]
+    assert 20 <= int(right) <= 36
+    assert abs(int(down)) <= 6
+
+
+def test_rendered_depth_is_not_accused():
+    assert find_depth_shift(FrameList([depth_frame(place) for place in PLACES[:8]])) is None
