@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     )
     from topoloc.json_data import Finite as Finite, decode_json as decode_json
     from topoloc.localization.query import Deadline as Deadline
-    from topoloc.mapping.node_images import read_node_image as read_node_image
     from topoloc.recordings.atomic import (
         atomic_write as atomic_write,
         remove_stale_files as remove_stale_files,
@@ -99,7 +98,6 @@ _NAMES = {
     "topoloc.features.feature_types": "find_available_types",
     "topoloc.features.network_files": "NetworkInfo cache_folder",
     "topoloc.json_data": "Finite decode_json",
-    "topoloc.mapping.node_images": "read_node_image",
     "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (
         "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"

@@ -22,9 +22,6 @@ RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 # A result with an error above either limit is a false accept: a wrong place, not an inaccurate
 # pose.
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
-# The probability of an answer is about these limits (metres, degrees).
-ACCURATE_TRANSLATION, ACCURATE_ROTATION_DEG = 0.25, 2.0
-_CHI_SQUARE_95 = 12.592  # six degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +127,8 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     rotation = np.array([a.rotation_deg for a in with_truth])
     localized = np.isfinite(translation)
     over_sigma = np.array([a.error_over_sigma for a in with_truth])[localized]
-    is_inaccurate = (translation > ACCURATE_TRANSLATION) | (rotation > ACCURATE_ROTATION_DEG)
+    is_inaccurate = (translation > 0.25) | (rotation > 2.0)  # what p is about
+    chi_square_6_at_95 = 12.592
     ranked = [a for a in with_truth if a.nearest_node_id is not None]
     first = [(a, a.result.candidates[0].node_id if a.result.candidates else None) for a in ranked]
     hits = [node == a.nearest_node_id for a, node in first]
@@ -145,7 +143,7 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
         "max_translation_m": float(translation[localized].max()) if localized.any() else None,
         "max_rotation_deg": float(rotation[localized].max()) if localized.any() else None,
         "num_inaccurate": int(is_inaccurate.sum()),
-        "num_outside_ellipsoid": int((6.0 * over_sigma**2 > _CHI_SQUARE_95).sum()),
+        "num_outside_ellipsoid": int((6.0 * over_sigma**2 > chi_square_6_at_95).sum()),
         "recall": {
             f"{metres:g}m_{degrees:g}deg": float(
                 np.mean((translation <= metres) & (rotation <= degrees))

@@ -22,10 +22,6 @@ from topoloc.geometry.pose_matches import CAUCHY_SCALE, estimate_noise_scale
 from topoloc.geometry.rigid import Rigid3
 
 _ROTATION_SIGMA = math.radians(1.5)  # of one axis, during a frame: a hand turns 50 deg/s and more
-_MIN_LOG_ODDS = math.log(99.0) - math.log(0.1)  # one image in ten is of a camera that turns
-# after one round; cameras at rest had -7 to -12, turns of one degree 1 to 15 (demo's lab)
-_MIN_FIRST_LOG_ODDS = -3.0
-_NUM_ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +66,10 @@ def find_rotation(
         sigmas_px: standard deviation of the pixels.
         variance: factor of the variance by errors that all points share.
     """
+    num_rounds, min_log_odds = 5, math.log(99.0) - math.log(0.1)  # one camera in ten turns
+    # The first round counts the effects of a rotation as noise. Then cameras at rest had -7 to -12,
+    # turns of one degree 1 to 15 (demo's lab).
+    min_first_log_odds = -3.0
     seen = Observations(
         camera.normalized_from_img(points_img),
         np.asarray(sigmas_px) / camera.fx,
@@ -80,13 +80,12 @@ def find_rotation(
     )
     shares = _row_shares(points_img, camera.height)
     estimate = _Estimate(cam_from_world, np.zeros(3))
-    for number in range(_NUM_ROUNDS):
+    for number in range(num_rounds):
         improved = estimate.improved(seen, shares, variance)
         if improved is None:
             return None
         estimate = improved
-        # The first round counts the effects of a rotation as noise.
-        if estimate.log_odds < (_MIN_LOG_ODDS if number else _MIN_FIRST_LOG_ODDS):
+        if estimate.log_odds < (min_log_odds if number else min_first_log_odds):
             return None
     by_turn = estimate.pose_by_rotation
     covariance = by_turn @ estimate.covariance @ by_turn.T

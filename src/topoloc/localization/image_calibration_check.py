@@ -45,8 +45,6 @@ from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
 
-_MIN_GAIN = 3.0  # total gain of the image's own camera, in standard deviations
-
 
 def check_camera_calibrations(
     results: Iterable[Localization | NotLocalized],
@@ -90,7 +88,7 @@ def check_image_calibration(
     fit, found = _refine_image_calibration(search, fit, found)
     seen = compute_intrinsics_deviation(calibrated, fit.camera, found, place)
     is_off = _is_calibration_off(fit, found, calibrated, *reported)
-    if not any(is_off) or _gain(by_calibration, fit) < _MIN_GAIN:
+    if not any(is_off) or not _is_better(_gain(by_calibration, fit)):
         return seen, None
     camera, scale = corrected_camera(fit.camera, found), search.query.scale
     sigma = math.sqrt(
@@ -144,7 +142,7 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
             (joint.cam_from_world, joint.camera),
         )
     )
-    if _gain_of(before_px, after_px, max(camera.width, camera.height)) < _MIN_GAIN:
+    if not _is_better(_gain_of(before_px, after_px, max(camera.width, camera.height))):
         return None
     scale = search.query.scale
     focal, centre = camera.fx * scale, _principal_point(camera, scale)
@@ -194,6 +192,11 @@ def _gain(before: PoseFit, after: PoseFit) -> float:
         for fit in (before, after)
     )
     return _gain_of(before_px, after_px, max(before.camera.width, before.camera.height))
+
+
+def _is_better(gain: float) -> bool:
+    """Return whether an image's own camera explains it better than the calibration."""
+    return gain >= 3.0  # standard deviations
 
 
 def _gain_of(

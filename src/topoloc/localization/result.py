@@ -56,8 +56,8 @@ class Localization:
         focal_length_px: focal length estimated with the pose, None if the camera was calibrated.
         noise_share: share of the covariance that is independent from image to image. The rest comes
             from the map and is common to images taken nearby.
-        frame_rotation_deg: angle that the camera turned while a rolling shutter read the image.
-            None if that is not evident. The pose is that of the middle row.
+        frame_rotation_deg: angle by which a camera with a rolling shutter evidently turned during
+            the image. The pose is that of the middle row.
         calibration_doubt: mismatch of the image and its calibration. The covariance and probability
             include it.
         seen_camera: calibration estimate of this image, None if there is none.
@@ -119,6 +119,7 @@ class Localization:
 
     def to_json(self, query: str) -> dict[str, Any]:
         """Return one line of the result file, see docs/cli.md."""
+        turned = self.frame_rotation_deg
         return {
             "query": query,
             "localized": True,
@@ -133,11 +134,7 @@ class Localization:
             **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),
             **({} if self.noise_share == 1.0 else {"noise_share": self.noise_share}),
             **({} if self.evidence is None else {"evidence": asdict(self.evidence)}),
-            **(
-                {}
-                if self.frame_rotation_deg is None
-                else {"frame_rotation_deg": self.frame_rotation_deg}
-            ),
+            **({} if turned is None else {"frame_rotation_deg": turned}),
             **(
                 {}
                 if self.calibration_doubt is None

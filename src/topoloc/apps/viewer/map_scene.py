@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 
 from topoloc import MapError, TopoMetricMap, TopoNode
 from topoloc.apps.viewer.scene import Points, Progress, Scene, View
-from topoloc.plugin import NodeMatcher, read_node_image
+from topoloc.plugin import NodeMatcher
 
 NUM_NEIGHBOURS = 8
 MAX_ERROR_PX = 3.0
@@ -268,7 +268,7 @@ def sample_colours(node: TopoNode, pixels: Float[np.ndarray, "m 2"]) -> Float[np
 
 def read_node_rgb(node: TopoNode) -> UInt8[np.ndarray, "h w 3"] | None:
     """Return the image of a node, RGB; None if there is none. Raises MapError: it is damaged."""
-    image = read_node_image(node)
+    image = node.read_image()
     if image is None or image.ndim == 3:
         return image
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)

@@ -19,7 +19,6 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
 from topoloc.localization.fitted_weights import LastStepWeights
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.mapping.node_images import read_node_image
 from topoloc.mapping.topomap import TopoNode
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import to_grey
@@ -66,7 +65,7 @@ class NodeTemplate:
     def of_node(node: TopoNode) -> NodeTemplate:
         """Return the stored image of a node in grey."""
         try:
-            image = read_node_image(node)
+            image = node.read_image()
         except MapError:
             image = None
         grey = np.zeros((2, 2), np.uint8) if image is None else to_grey(image)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Float32, Int8
+from jaxtyping import Float, Float32, Int8, UInt8
 
 from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
@@ -91,6 +91,19 @@ class TopoNode:
     template_image: bytes
     session_statistics: Iterable[LandmarkStatistics] = ()
     stored_descriptors: Int8[np.ndarray, "n d"] | None = None
+
+    def read_image(self) -> UInt8[np.ndarray, "h w *rgb"] | None:
+        """Return the node's stored image, grey (H, W) or RGB (H, W, 3). None if it has none.
+
+        Raises:
+            MapError: the image is damaged, or larger than the images of the node's camera.
+        """
+        from topoloc.recordings.stored_images import read_stored_image  # it needs OpenCV
+
+        if not self.template_image:
+            return None
+        size = self.camera.width, self.camera.height
+        return read_stored_image(f"node {self.summary.node_id}", self.template_image, size)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ import numpy as np
 from topoloc.errors import EmptyMapError, MapError
 from topoloc.json_data import decode_json
 from topoloc.mapping.coarse_models import open_map_coarse_localizer
-from topoloc.mapping.node_images import read_node_image
 from topoloc.mapping.sessions import Session
+from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.storage.map_file import MapFile
 from topoloc.mapping.storage.map_writing import compute_map_digest
 from topoloc.mapping.storage.schema import SORT_COLUMNS, TABLES
@@ -104,7 +104,7 @@ def _check_rows(file: MapFile) -> Iterator[str]:
 def _check_entries(topomap: TopoMetricMap) -> Iterator[str]:
     for layer in topomap.layers.values():
         yield from _check_each(layer.nodes, lambda node: list(node.session_statistics))
-    yield from _check_each(topomap.nodes, read_node_image)
+    yield from _check_each(topomap.nodes, TopoNode.read_image)
     yield from _check_each(topomap.place_images, lambda image: topomap.row_of(image.node_id))
     if topomap.repetitions is not None:
         moves = topomap.repetitions.moves
