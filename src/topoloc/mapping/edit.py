@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 
 from topoloc.errors import MapError
 from topoloc.mapping.sessions import Edit, today
-from topoloc.mapping.storage.map_lock import WaitCallback, lock_map_file
+from topoloc.mapping.storage.map_lock import WaitCallback, lock_map_file, no_edit_of
 from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
@@ -197,6 +197,34 @@ def edit_map(path: str | Path, on_wait: WaitCallback | None = None) -> Iterator[
             raise MapError(f"cannot write map {path}: it is read-only")
         with TopoMetricMap.load(path) as topomap:
             yield MapEdit(path, topomap, locked)
+
+
+def save_map(topomap: TopoMetricMap, path: Path, on_wait: WaitCallback | None = None) -> None:
+    """Write the map to `path` atomically. A reader sees the old map or the new one. A file that is
+    replaced is kept. Waits while another process edits the map at `path`, and calls `on_wait` once
+    before.
+
+    Raises:
+        MapError: the folder does not exist or cannot be written, the disk is full, or this thread
+            edits the map at `path`. Nothing is left behind.
+    """
+    if os.path.isdir(path):  # Path.is_dir raises an error for names that are too long
+        raise MapError(f"cannot write map {path}: it is a folder")
+    kept = None
+    try:
+        with no_edit_of(path, on_wait), atomic_write(path) as temporary:
+            write_map(topomap, temporary)
+            if os.path.isfile(path):
+                kept = keep_file(Path(os.path.realpath(path)), temporary)
+    except (OSError, ValueError) as error:
+        if kept is not None:
+            kept.unlink(missing_ok=True)
+        # a null character in the name; any other ValueError is a bug
+        if isinstance(error, ValueError) and "null" not in str(error):
+            raise
+        raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
+    if kept is not None:
+        drop_kept_files(Path(os.path.realpath(path)))
 
 
 def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:

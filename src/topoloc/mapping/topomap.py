@@ -234,9 +234,10 @@ class TopoMetricMap:
         return replace(self, layers={**self.layers, self.kind: first})
 
     def save(self, path: str | Path, on_wait: Callable[[], None] | None = None) -> None:
-        """Write the map file atomically. Waits while another process edits the map at `path`, and
-        calls `on_wait` once before. Raises MapError."""
-        from topoloc.mapping.storage.map_writing import save_map
+        """Write the map file atomically. A file that is replaced is kept, and `undo_edit` brings it
+        back. Waits while another process edits the map at `path`, and calls `on_wait` once before.
+        Raises MapError."""
+        from topoloc.mapping.edit import save_map
 
         save_map(self, Path(path), on_wait)
 

@@ -138,8 +138,27 @@ def find_format(
         return found
     if folder.is_dir() and not any(folder.iterdir()):
         raise UnknownFormatError(f"{folder}: no known recording: the folder is empty")
+    if inside := _recordings_below(folder):
+        names = ", ".join(f"{path.name} ({name})" for path, name in inside[:10])
+        example = folder / inside[0][0].name
+        raise UnknownFormatError(
+            f"{folder}: no recording, but a folder of {len(inside)}: {names}; name one, such as"
+            f" {example}"
+        )
     looked_for = "; ".join(f"{name}: {load_format(name).expected_files}" for name in FORMATS)
     raise UnknownFormatError(f"{folder}: no known recording. Looked for {looked_for}")
+
+
+def _recordings_below(folder: Path) -> list[tuple[Path, str]]:
+    """Return the recordings directly inside a folder, each with its format."""
+    max_entries = 200
+    if not folder.is_dir():
+        return []
+    found = []
+    for path in sorted(folder.iterdir())[:max_entries]:
+        name = next((name for name in FORMATS if load_format(name).can_open(path)), None)
+        found += [] if name is None else [(path, name)]
+    return found
 
 
 def split_selection(path: str) -> tuple[Path, str | None]:

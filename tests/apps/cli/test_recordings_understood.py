@@ -43,3 +43,29 @@ def test_build_prints_how_it_understood_a_recording_and_warns_of_a_still_camera(
     assert "one node, the camera moved less than --d-thresh" in printed.err
     assert main([*command, "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["num_nodes"] == 1
+
+
+def test_a_folder_of_recordings_lists_them(
+    tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    for name in ("walk1", "walk2"):
+        shutil.copytree(tiny_recording, tmp_path / "day" / name)
+    assert main(["build", str(tmp_path / "day"), str(tmp_path / "a.topo")]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no recording, but a folder of 2: walk1 (kitti), walk2 (kitti)" in line
+    assert line.endswith(f"such as {tmp_path / 'day' / 'walk1'}")
+
+
+def test_a_map_that_build_replaces_comes_back(
+    tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = tmp_path / "a.topo"
+    assert main(["build", str(tiny_recording), str(path), "--features", "surf"]) == 0
+    before = path.read_bytes()
+    assert "was there" not in capsys.readouterr().err
+    assert main(["build", f"{tiny_recording}@0:2", str(path), "--features", "surf"]) == 0
+    assert f"`topoloc undo {path}` brings it back" in capsys.readouterr().err
+    assert path.read_bytes() != before
+    assert main(["undo", str(path)]) == 0
+    assert path.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == [path]

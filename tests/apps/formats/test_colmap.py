@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -82,6 +83,20 @@ def model(tmp_path: Path) -> Make:
         return root
 
     return make
+
+
+def test_the_largest_of_several_models_is_used_and_the_others_are_named(model: Make):
+    root = model()
+    small = root / "sparse" / "1"
+    shutil.copytree(root / "sparse" / "0", small)
+    (root / "sparse" / "0").rename(root / "sparse" / "2")
+    pycolmap.Reconstruction().write_binary(small)
+    notes = list[str]()
+    assert len(open_sequence(root, warn=notes.append)) == 3
+    assert "model 2 is the largest; not used: 1" in notes[0]
+    notes.clear()
+    assert len(open_sequence(root / "sparse" / "2", warn=notes.append)) == 3
+    assert notes == []
 
 
 @pytest.mark.parametrize("binary", [True, False], ids=["binary", "text"])

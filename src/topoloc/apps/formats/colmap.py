@@ -14,6 +14,7 @@ import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import Any
@@ -33,7 +34,6 @@ from topoloc.plugin import Recording, RecordingFormat, natural_key, parse_relati
 
 EXPECTED_FILES = "cameras and images (.bin or .txt) of COLMAP"
 _FILES = ("cameras", "images", "points3D")
-_SUBFOLDERS = ("sparse/0", "sparse", "0")
 _MAX_SECONDS = 10**12
 _DISTANCE = re.compile(r"(?P<one>[^,=]+),(?P<other>[^,=]+)=\s*(?P<metres>[0-9.eE+-]+)\s*m?")
 _SCALE_TOLERANCE = 0.05  # of the scale; larger than errors of a measuring tape
@@ -74,14 +74,31 @@ def open_colmap(path: Path, images: Path | None = None) -> Recording:
     poses: list[Rigid3 | None] = [_world_from_cam(image, model) for image in posed]
     name, t_ns = path.resolve().name, times_from_names(names)
     frames = (names, t_ns, poses, of_images)
-    return Recording.with_cameras(name, root, *frames, has_scale=False, as_stored=True)
+    recording = Recording.with_cameras(name, root, *frames, has_scale=False, as_stored=True)
+    others = [one.name for one in _models(model.parent) if model not in (one, path)]
+    note = f"{path}: model {model.name} is the largest; not used: {', '.join(others)}"
+    return replace(recording, notes=(note,)) if others else recording
 
 
 def _find_model(path: Path) -> Path | None:
     if not path.is_dir():
         return None
-    candidates = (path, *(path / below for below in _SUBFOLDERS))
-    return next((folder for folder in candidates if _model_suffix(folder) is not None), None)
+    models = [*_models(path), *_models(path / "sparse")]
+    return max(models, key=_size, default=None)
+
+
+def _models(folder: Path) -> list[Path]:
+    """Return the folder if it is a model, else the numbered models in it, of which the mapper of
+    COLMAP writes one for each connected part of the images."""
+    if _model_suffix(folder) is not None:
+        return [folder]
+    inside = folder.iterdir() if folder.is_dir() else ()
+    return sorted(one for one in inside if one.name.isdigit() and _model_suffix(one) is not None)
+
+
+def _size(model: Path) -> int:
+    """Return the bytes of the images of a model."""
+    return (model / f"images{_model_suffix(model)}").stat().st_size
 
 
 def _model_suffix(folder: Path) -> str | None:

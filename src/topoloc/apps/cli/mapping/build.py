@@ -144,7 +144,10 @@ class Command:
         with progress_bar() as progress:
             tell = None if self.json == "-" else print_line
             topomap, poses_from = map_job.make(progress, tell)
+        is_replaced = target.is_file()
         topomap.save(target, print_waiting)
+        if is_replaced:
+            print_warning(f"{target} was there; `topoloc undo {target}` brings it back")
         info = topomap.describe(target)
         if info["num_nodes"] == 1:
             print_warning(f"{target}: one node, the camera moved less than --d-thresh")
