@@ -1,12 +1,12 @@
 """Attack `topoloc serve` while honest clients ask it, and count what they meet.
 
     python benchmarks/service_attack.py MAP QUERIES [--requests 100000] [--clients 4]
-        [--hostile 1250] [--width 336]
+        [--hostile 1250] [--width 336] [--images 0.9]
 
-A tenth of the honest requests is garbage. During the middle third, hostile connections from five
-other addresses are held, and replaced when the service closes them. They say nothing, do not read
-answers, or send a request byte by byte. Meanwhile another client asks for `/healthz` twice a
-second, each time over a new connection.
+A tenth of the honest requests is garbage, `--images` are images, the others ask for facts. During
+the middle third, hostile connections from five other addresses are held, and replaced when the
+service closes them. They say nothing, do not read answers, or send a request byte by byte.
+Meanwhile another client asks for `/healthz` twice a second, each time over a new connection.
 
 Prints for each third the counts by status, the slowest `/healthz` and the memory of the service,
 whose workers are threads. The exit status is 1 if an honest client got another answer than 200 or
@@ -37,7 +37,6 @@ from urllib.parse import quote
 import cv2
 
 from topoloc import open_sequence
-from topoloc.geometry.camera import Camera
 from topoloc.recordings.stored_images import encode_jpeg
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -70,11 +69,11 @@ class Third:
 
 
 def ask_honestly(
-    of: Service, name: str, camera: Camera, requests: Sequence[bytes], clients: int
+    of: Service, path: str, requests: Sequence[bytes | str], clients: int
 ) -> Counter[str]:
-    """Send the requests over so many connections. Return how often each status came."""
+    """Send images to this path, and requests for other paths, over so many connections. Return how
+    often each status came."""
     words = {"Content-Type": "image/jpeg"}
-    path = f"/v1/maps/{name}/localize?camera={quote(json.dumps(camera.to_json()))}"
     waiting, lock, statuses = iter(requests), threading.Lock(), Counter[str]()
 
     def ask() -> None:
@@ -89,7 +88,10 @@ def ask_honestly(
                     of.host, of.port, timeout=120, source_address=(HONEST, 0)
                 )
             try:
-                connection.request("POST", path, body, words)
+                if isinstance(body, str):
+                    connection.request("GET", body)
+                else:
+                    connection.request("POST", path, body, words)
                 response = connection.getresponse()
                 response.read()
                 status = str(response.status)
@@ -197,6 +199,18 @@ def _is_open(connection: socket.socket, is_slow: bool) -> bool:
     return is_open
 
 
+def make_requests(
+    number: int, share: float, images: Sequence[bytes], name: str
+) -> Iterator[bytes | str]:
+    """Yield images, garbage instead of images, and paths of facts."""
+    rng, facts = random.Random(0), ("/v1/maps", f"/v1/maps/{name}", "/capabilities", "/metrics")
+    for i in range(number):
+        if i % 10 == 3:
+            yield garbage(rng, images[0])
+        else:
+            yield images[i % len(images)] if rng.random() < share / 0.9 else rng.choice(facts)
+
+
 def find_faults(thirds: Sequence[Third]) -> list[str]:
     """Return what the requirements forbid."""
     faults = list[str]()
@@ -221,6 +235,7 @@ def main() -> int:
     parser.add_argument("--requests", type=int, default=100_000)
     parser.add_argument("--clients", type=int, default=4)
     parser.add_argument("--hostile", type=int, default=1250)
+    parser.add_argument("--images", type=float, default=0.9, help="share of the requests")
     parser.add_argument("--width", type=int, default=336, help="of the images, pixels")
     args = parser.parse_args()
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -231,18 +246,16 @@ def main() -> int:
     height = round(camera.height * args.width / camera.width)
     camera = camera.rescaled(args.width, height)
     clear = [encode_jpeg(cv2.resize(one, (args.width, height)), 90) for one in images]
-    rng, thirds = random.Random(0), [Third() for _ in range(3)]
-    requests = [
-        garbage(rng, clear[0]) if i % 10 == 3 else clear[i % len(clear)]
-        for i in range(args.requests)
-    ]
+    thirds, name = [Third() for _ in range(3)], args.map.stem
+    path = f"/v1/maps/{name}/localize?camera={quote(json.dumps(camera.to_json()))}"
+    requests = list(make_requests(args.requests, args.images, clear, name))
     size = -(-args.requests // 3)
     with service(args.map) as of:
         for number, third in enumerate(thirds):
             part = requests[number * size : (number + 1) * size]
             num_hostile = args.hostile if number == 1 else 0
             with watching(of, third), attacking(of, num_hostile, third):
-                third.statuses += ask_honestly(of, args.map.stem, camera, part, args.clients)
+                third.statuses += ask_honestly(of, path, part, args.clients)
             print(f"third {number + 1}: {third}", flush=True)
     faults = find_faults(thirds)
     print("; ".join(faults) or "no fault")

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +18,10 @@ from built_room import unseen_views
 from tiny_world import CAMERA
 from topoloc import Localizer, TopoMetricMap
 from topoloc.apps.cli import main
+from topoloc.errors import MapError
 from topoloc.geometry.alignment import translation_error
 from topoloc.lifelong.landmark_pruning import select_landmarks
+from topoloc.lifelong.prune import _FileSize
 from topoloc.localization.result import Localization
 from topoloc.mapping.edit import edit_map
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
@@ -156,6 +160,19 @@ def test_a_budget_that_is_too_small_changes_nothing(
     assert "with 100 landmarks each its" in complaint("prune", path, "--max-mb", 0.01)
     assert "--max-mb" in complaint("prune", path, "--max-mb", -1, status=2)
     assert "nan" in complaint("prune", path, "--max-mb", "nan", status=2)
+
+
+def test_the_size_of_a_map_is_measured_behind_the_checks_of_its_file(
+    room_map: Path, tmp_path: Path, complaint: Callable[..., str]
+):
+    path = Path(shutil.copy(room_map, tmp_path / "forged.topo"))
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE VIEW more AS SELECT * FROM node_points")
+        database.commit()
+    with pytest.raises(MapError, match=r"forged\.topo is damaged"):
+        _FileSize.of(path, ["surf"])
+    for words in (("prune", path), ("merge", room_map, path, tmp_path / "out.topo")):
+        assert "forged.topo is damaged" in complaint(*words)
 
 
 def test_points_of_a_node_go_with_what_sessions_know_of_them(room_map: Path):

@@ -200,7 +200,8 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
         if error.errno not in (errno.EMFILE, errno.ENFILE):
             raise
         where = f"cannot open {error.filename}: " if error.filename else ""
-        _print_error(f"{where}{error.strerror}; raise the limit (ulimit -n)")
+        text = f"{where}{error.strerror}; raise the limit (ulimit -n)"
+        _print_error(_with_written_files(text, args))
     except MemoryError:
         _print_error("out of memory; no file is incomplete")
     except KeyboardInterrupt:
