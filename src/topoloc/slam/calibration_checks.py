@@ -14,12 +14,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import TrajectoryError
+from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
 from topoloc.geometry.absolute_pose_kernels import squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.pose_matches import Matches
 from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.calibration import camera_from_intrinsics
 from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.depth_checks import find_depth_shift
 from topoloc.slam.input_checks import add_calibration
@@ -68,6 +69,12 @@ def find_image_faults(sequence: StereoSequence) -> list[str]:
     is_single = sequence[0].right is None and sequence[0].depth is None
     steps = [] if is_single else measure_steps(sequence, list(range(len(sequence))))
     notes = [find_depth_shift(sequence), _find_focal_problem(sequence, steps)]
+    if (camera := sequence[0].camera) is not None:
+        try:
+            camera_from_intrinsics(*camera.intrinsics, camera.width, camera.height)
+        except CalibrationError as error:
+            fault, factor = str(error).partition(" (")[0], camera.width / (2.0 * camera.cx + 1.0)
+            notes.append(f"{sequence.name}: {fault}; multiply them by {factor:.3g}")
     if interval > max_interval_s:
         unit = "milliseconds" if interval < 1e4 else "micro- or nanoseconds"
         between = f"{interval:.4g} s from picture to picture (median)"
@@ -101,9 +108,13 @@ def estimate_scale_error(
     ratios = list[Float[np.ndarray, " 3"]]()
     for step in steps:
         first, last = poses[step.first], poses[step.last]
-        if step.points is not None and first is not None and last is not None:
-            ratio = _depth_ratios(step.points, first.inverse() @ last)
-            ratios += [] if ratio is None else [ratio]
+        if step.points is None or first is None or last is None:
+            continue
+        given = first.inverse() @ last
+        if step.normalized_error(given) >= 1.0 and not step.decides_on(given):
+            continue  # equal panels
+        if (ratio := _depth_ratios(step.points, given)) is not None:
+            ratios.append(ratio)
     if len(ratios) < _MIN_STEPS:
         return None
     (low, sigma), (scale, _), (high, _) = (_median(column) for column in zip(*ratios, strict=True))
