@@ -36,11 +36,8 @@ def check_calibration(
     sequence: StereoSequence, steps: Sequence[MeasuredStep], are_poses_right: bool
 ) -> None:
     """Check the calibration of a recording by steps between its images, and by its poses if these
-    are right but for some percent. Single cameras are not checked.
-
-    Raises:
-        TrajectoryError: it does not fit. Contains the value that does.
-    """
+    are right but for some percent. Raises TrajectoryError with the value that fits. Single cameras
+    pass."""
     unchecked = "--poses unchecked maps it all the same"
     if (problem := _find_focal_problem(sequence, steps)) is not None:
         raise TrajectoryError(f"{problem}; {unchecked}")
@@ -60,10 +57,7 @@ def check_calibration(
 
 def find_image_faults(sequence: StereoSequence) -> list[str]:
     """Return a note for each fault of a recording without poses that its images or times show.
-
-    Raises:
-        RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
-    """
+    Raises as the recording."""
     max_interval_s = 10.0  # median; a longer one is of another unit than the second
     interval = float(np.median(np.diff(sequence.t_ns))) / 1e9 if len(sequence) > 1 else 0.0
     is_single = sequence[0].right is None and sequence[0].depth is None
@@ -141,12 +135,10 @@ def _fit_focal(points: MatchedPoints) -> float | None:
     if not np.isfinite(costs).all():
         return None
     k = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
-    before, at, after = costs[k - 1 : k + 2]
-    curvature = before - 2.0 * at + after
-    if curvature < 2.0 * min_rise:
+    square, linear, _ = np.polyfit(factors[k - 1 : k + 2], costs[k - 1 : k + 2], 2)
+    if square * step**2 < min_rise:
         return None
-    shift = float(np.clip(0.5 * (before - after) / curvature, -1.0, 1.0))
-    return -(factors[k] + step * shift)
+    return float(np.clip(0.5 * linear / square, -factors[k + 1], -factors[k - 1]))
 
 
 def _focal_cost(points: MatchedPoints, factor: float) -> float:
