@@ -158,6 +158,18 @@ def panorama(image: np.ndarray, camera: Camera) -> np.ndarray:
     return warped(image, camera, (math.atan(x), y / math.hypot(1.0, x)), undistort)[0]
 
 
+def rolled(image: np.ndarray, camera: Camera, degrees: float) -> np.ndarray:
+    """Return the image of a rolling shutter, during which the camera turns by an angle: to the
+    right and down alike. The pose is that of the middle row."""
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = camera.normalized_from_img(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+    angle = math.radians(degrees) * (y.ravel() / camera.height - 0.5) / math.sqrt(2.0)
+    u, v = np.tan(np.arctan(rays[:, 0]) + angle), np.tan(np.arctan(rays[:, 1]) + angle)
+    map_x = (u * camera.fx + camera.cx).astype(np.float32).reshape(x.shape)
+    map_y = (v * camera.fy + camera.cy).astype(np.float32).reshape(x.shape)
+    return cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR)
+
+
 def zoomed(image: np.ndarray, factor: float) -> np.ndarray:
     """Return the middle of the image, enlarged to the size of the whole."""
     side = (1.0 - 1.0 / factor) / 2.0
@@ -188,6 +200,8 @@ def made_of(image: np.ndarray, camera: Camera) -> Iterator[tuple[str, Given]]:
     yield "fisheye, no calibration", of(through_fisheye(image, camera)[0])
     yield "panorama, no calibration", of(panorama(image, camera))
     yield "calibrated", (image, camera)
+    yield "calibrated, rolling shutter, 1 degree", (rolled(image, camera, 1.0), camera)
+    yield "calibrated, rolling shutter, 2 degrees", (rolled(image, camera, 2.0), camera)
 
 
 def compare(result: Localization | NotLocalized, truth: Rigid3) -> dict[str, Any]:

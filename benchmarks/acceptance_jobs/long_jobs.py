@@ -66,7 +66,7 @@ def test_slow(work: Workplace) -> Iterator[Figure]:
     need_module("pytest")
     words = [sys.executable, "-m", "pytest", "-m", "slow", "-x", "-p", "no:cacheprovider"]
     words += ["--ignore", "tests/paper/test_benchmark_command.py"]
-    code, out, err = run(words, ROOT, timeout=900)
+    code, out, err = run(words, ROOT, timeout=1800)
     if code != 0:
         raise JobError(last_line(out) or last_line(err))
     yield Figure("make test-slow passes", int(code == 0), "at least")

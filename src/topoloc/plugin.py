@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         cache_folder as cache_folder,
     )
     from topoloc.json_data import Finite as Finite, decode_json as decode_json
+    from topoloc.localization.query import Deadline as Deadline
     from topoloc.mapping.node_images import read_node_image as read_node_image
     from topoloc.recordings.atomic import (
         atomic_write as atomic_write,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
         write_bytes as write_bytes,
         write_folder as write_folder,
         write_text as write_text,
+        written_paths as written_paths,
     )
     from topoloc.recordings.calibration import (
         parse_calibration as parse_calibration,
@@ -85,6 +87,7 @@ if TYPE_CHECKING:
         parse_relative_path as parse_relative_path,
         read_text as read_text,
     )
+    from topoloc.recordings.trajectory import has_answers as has_answers
     from topoloc.removed_settings import parse_tables as parse_tables
 
 _NAMES = {
@@ -97,8 +100,10 @@ _NAMES = {
     "topoloc.features.network_files": "NetworkInfo cache_folder",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.mapping.node_images": "read_node_image",
+    "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (
         "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"
+        " written_paths"
     ),
     "topoloc.recordings.calibration": "parse_calibration replace_cameras",
     "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",
@@ -115,6 +120,7 @@ _NAMES = {
     "topoloc.recordings.ros_calibration": "RosCalibration",
     "topoloc.recordings.stored_images": "encode_jpeg",
     "topoloc.recordings.text_files": "parse_relative_path read_text",
+    "topoloc.recordings.trajectory": "has_answers",
     "topoloc.removed_settings": "parse_tables",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -55,6 +55,17 @@ def test_counts_medians_and_recall():
     assert evaluation["false_accepts"] == 2
     assert evaluation["not_localized"] == {"not_in_map": 1, "too_few_inliers": 2}
     assert evaluation["num_elsewhere"] == 0
+    assert evaluation["max_translation_m"] == pytest.approx(0.6)
+    assert evaluation["max_rotation_deg"] == pytest.approx(11.0)
+    assert evaluation["num_inaccurate"] == 3  # 3 degrees, 11 degrees, 0.6 m
+
+
+def test_errors_are_compared_with_their_standard_deviations():
+    exact = answer("a", 0.0, error_m=0.03, error_deg=0.0)  # a standard deviation of 1 cm each
+    assert exact.error_over_sigma == pytest.approx(3.0 / np.sqrt(6.0))
+    assert np.isnan(lost("b", 0.0).error_over_sigma)
+    inside, outside = (answer("c", 0.0, error_m=m, error_deg=0.0) for m in (0.0354, 0.0356))
+    assert summarize([inside, exact, outside])["num_outside_ellipsoid"] == 1  # 3.548 sigmas
 
 
 def test_poses_for_images_from_elsewhere_are_false_and_nothing_else_changes():

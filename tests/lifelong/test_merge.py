@@ -4,8 +4,11 @@ where they do not."""
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +26,7 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.query import QueryImage
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
+from topoloc.mapping.edit import edit_map
 from topoloc.mapping.storage.integrity_check import find_map_damage
 from topoloc.mapping.topomap import Layer
 from topoloc.recordings.recording import with_poses
@@ -47,6 +51,25 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return _map_of(left, folder / "left.topo", Rigid3.identity()), _map_of(
         right, folder / "right.topo", OTHER_WORLD
     )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no locks")
+def test_a_merge_over_a_map_that_is_edited_waits_and_says_so(
+    maps: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = Path(shutil.copy(maps[0], tmp_path / "out.topo"))
+    with ThreadPoolExecutor() as pool:
+        with edit_map(out) as edit:
+            merging = pool.submit(main, ["merge", *map(str, maps), str(out)])
+            said = ""
+            while "another process edits this map; waiting for it ..." not in said:
+                assert not merging.done()
+                time.sleep(0.05)
+                said += capsys.readouterr().err
+            edit.commit(edit.topomap, "the first")
+        assert merging.result() == 0
+    with TopoMetricMap.load(out) as topomap:
+        assert [one.name for one in topomap.edits] == ["build", "merge right.topo"]
 
 
 def test_two_maps_become_one_in_the_world_of_the_first(

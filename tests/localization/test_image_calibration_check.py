@@ -31,6 +31,26 @@ def test_right_calibrations_are_not_doubted(localizer: Localizer, queries: Path)
         assert not isinstance(result, Localization) or result.calibration_doubt is None
 
 
+def test_a_camera_that_turned_while_its_rows_were_read_is_no_doubt(
+    localizer: Localizer, queries: Path
+):
+    for frame in open_sequence(queries):
+        assert frame.camera is not None
+        assert frame.world_from_cam is not None
+        image, camera = frame.image, frame.camera
+        x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        turn = np.deg2rad(1.5) * ((y + 0.5) / camera.height - 0.5)
+        u = np.tan(np.arctan((x - camera.cx) / camera.fx) + turn) * camera.fx + camera.cx
+        read = cv2.remap(image, u.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+        result = localizer.localize(read, camera)
+        assert isinstance(result, Localization)
+        assert result.calibration_doubt is None
+        assert result.frame_rotation_deg == pytest.approx(1.5, abs=0.4)
+        assert Localization.from_json(result.to_json("a")).frame_rotation_deg is not None
+        error = frame.world_from_cam.inverse() @ result.world_from_cam
+        assert np.rad2deg(error.angle()) < 0.5
+
+
 @pytest.mark.parametrize("scale", [0.93, 1.08])
 def test_a_wrong_focal_length_is_named(localizer: Localizer, queries: Path, scale: float):
     num_named = 0

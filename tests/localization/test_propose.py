@@ -22,7 +22,7 @@ from topoloc.localization.config import LocalizerConfig, NodeViewpointsConfig, S
 from topoloc.localization.fitted_weights import load_fitted_weights
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointMatches, PoseFit
-from topoloc.localization.query import QueryImage, StageClock
+from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import NodeProposal, is_already_found
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Proposal, Trace, verify
@@ -295,9 +295,7 @@ def test_a_clear_pose_is_refined_with_its_own_nodes_if_the_nearest_ones_see_some
 ):
     """As around a bend. The farthest node stands for the nearest ones."""
     localizer, (picture, truth) = Localizer(room), unseen_views()[0]
-    (search, *_) = localizer.context.searches(
-        QueryImage(picture, CAMERA), StageClock(), float("inf")
-    )
+    (search, *_) = localizer.context.searches(QueryImage(picture, CAMERA), StageClock(), Deadline())
     first = propose.propose_first(search, None)
     assert isinstance(first, NodeProposal)
     assert first.fit.num_inliers >= search.config.num_clear_inliers

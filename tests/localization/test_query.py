@@ -3,8 +3,6 @@ when."""
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from topoloc.errors import QueryError
 from topoloc.features.feature_types import FeatureConfig
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.localization.query import Query, check_image_size, reduce_image
+from topoloc.localization.query import Deadline, Query, check_image_size, reduce_image
 
 MAP_FOCAL = 300.0
 IMAGE = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)
@@ -84,12 +82,13 @@ def test_features_are_extracted_when_first_wanted_and_once():
 
 
 def test_a_query_is_late_from_its_deadline_on():
-    assert not Query(IMAGE, _camera(300.0), 1.0, FeatureConfig()).is_past_deadline
-    now = time.perf_counter()
-    assert not Query(
-        IMAGE, _camera(300.0), 1.0, FeatureConfig(), deadline=now + 1e3
-    ).is_past_deadline
-    assert Query(IMAGE, _camera(300.0), 1.0, FeatureConfig(), deadline=now - 1e-3).is_past_deadline
+    assert not Query(IMAGE, _camera(300.0), 1.0, FeatureConfig()).deadline.is_past
+    assert Deadline.of(-1.0).is_past
+    later = Deadline.of(1e6)
+    assert Deadline.of(later) is later
+    assert not later.is_past
+    later.stop.set()
+    assert later.is_past
 
 
 def test_of_a_camera_that_is_roughly_known_the_likeliest_stands_in():

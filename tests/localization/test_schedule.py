@@ -17,15 +17,15 @@ from topoloc.localization import propose, schedule
 from topoloc.localization.fitted_weights import NodeStop
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.propose import min_rival_inliers, propose_quick
-from topoloc.localization.query import QueryImage, StageClock
+from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import find_best_case_evidence
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.schedule import TileProposals, TileQuery
-from topoloc.localization.search import Search, verify
+from topoloc.localization.search import Search, Trace, verify
 from topoloc.mapping.topomap import TopoMetricMap
 
-FOREVER = float("inf")
+FOREVER = Deadline()
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,9 @@ def localizer(room_map: Path) -> Iterator[Localizer]:
         yield Localizer(topomap)
 
 
-def _searches(localizer: Localizer, image: np.ndarray, deadline: float = FOREVER) -> list[Search]:
+def _searches(
+    localizer: Localizer, image: np.ndarray, deadline: Deadline = FOREVER
+) -> list[Search]:
     return localizer.context.searches(QueryImage(image, CAMERA), StageClock(), deadline)
 
 
@@ -69,10 +71,20 @@ def test_an_exhaustive_search_continues_from_the_coarse_one(
 
 
 def test_after_the_deadline_one_proposal_is_finished(localizer: Localizer):
-    (search,) = searches = _searches(localizer, unseen_views(seed=1)[1][0], deadline=0.0)
+    (search,) = searches = _searches(localizer, unseen_views(seed=1)[1][0], deadline=Deadline(0.0))
     proposals = list(TileQuery(localizer.context, searches).exhaustive())
     assert [one.source for one in proposals] == ["retrieval"]
     assert search.is_stopped
+
+
+def test_a_search_that_another_thread_stops_tries_no_further_proposal(localizer: Localizer):
+    image, deadline = np.roll(unseen_views()[0][0], 150, axis=1), Deadline()
+    whole, stopped = Trace(), Trace()
+    localizer.localize(image, CAMERA, max_ms=deadline, trace=whole)
+    assert len(whole.tried) > 1
+    deadline.stop.set()
+    localizer.localize(image, CAMERA, max_ms=deadline, trace=stopped)
+    assert len(stopped.tried) == 1
 
 
 def test_a_map_that_cannot_be_read_ends_the_search(localizer: Localizer):

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +32,8 @@ GRACE_S = 3600.0
 """Seconds for which files without a reference are kept, because readers may still use the previous
 manifest."""
 _MAX_TRIES = 1000
+PutFile = Callable[[str, Path], None]
+"""`Store.put`: stores a copy of a file under a name."""
 ManifestEdit = Callable[[Manifest, float], Manifest]
 """A function from a manifest and the time (Unix seconds) to the next manifest. It may be called
 several times."""
@@ -77,10 +80,12 @@ def create_atlas(where: str, new: Sequence[NewTile]) -> Manifest:
     exists = AtlasError(f"{where} is an atlas already; `topoloc atlas add` adds to it")
     if store.manifest() is not None:
         raise exists
-    tiles = {tile.tile_id: store_tile(tile, store) for tile in new}
-    after = Manifest().with_tiles(tiles, time.time())
-    if not store.commit(None, after.to_bytes()):
-        raise exists
+    with removing_new_files_on_failure(store) as put:
+        tiles = {tile.tile_id: store_tile(tile, put) for tile in new}
+        after = Manifest().with_tiles(tiles, time.time())
+        if not store.commit(None, after.to_bytes()):
+            raise exists
+    _restore_files(store, new, list(tiles.values()))
     return after
 
 
@@ -101,13 +106,15 @@ def add_tiles(
     store = store_at(where)
     # before the work, and again with each try
     _check_ids_free(read_manifest(store, creates)[1], new, replaces)
-    added = {tile.tile_id: store_tile(tile, store) for tile in new}
+    added = dict[str, Tile]()
 
     def with_added(manifest: Manifest, now: float) -> Manifest:
         _check_ids_free(manifest, new, replaces)
         return manifest.with_tiles(manifest.by_id | added, now)
 
-    after = _commit_change(store, with_added, grace_s, creates)
+    with removing_new_files_on_failure(store) as put:
+        added |= {tile.tile_id: store_tile(tile, put) for tile in new}
+        after = _commit_change(store, with_added, grace_s, creates)
     _restore_files(store, new, list(added.values()))
     return after
 
@@ -119,21 +126,22 @@ def replace_tile(where: str, new: NewTile, before: Tile) -> Manifest | None:
     If the tile was removed or changed since `before`, nothing is changed and None is returned.
     Raises AtlasError and MapError as `add_tiles`.
     """
-    store = store_at(where)
-    tile = store_tile(new, store)
+    store, stored = store_at(where), dict[str, Tile]()
 
     def with_replaced(manifest: Manifest, now: float) -> Manifest:
         is_same = _is_same_map(manifest, before)
         if not is_same or manifest.by_id[before.tile_id].world != before.world:
             raise _TileChangedError
         joins = [join for join in manifest.joins if before.tile_id in join.pair]
-        return manifest.with_tiles(manifest.by_id | {tile.tile_id: tile}, now, joins)
+        return manifest.with_tiles(manifest.by_id | stored, now, joins)
 
     try:
-        after = _commit_change(store, with_replaced)
+        with removing_new_files_on_failure(store) as put:
+            stored[new.tile_id] = store_tile(new, put)
+            after = _commit_change(store, with_replaced)
     except _TileChangedError:
         return None
-    _restore_files(store, [new], [tile])
+    _restore_files(store, [new], list(stored.values()))
     return after
 
 
@@ -173,8 +181,28 @@ def _is_same_map(manifest: Manifest, tile: Tile) -> bool:
     return there is not None and there.map.sha256 == tile.map.sha256
 
 
-def store_tile(new: NewTile, store: Store) -> Tile:
-    """Store the files of a map and return its manifest entry.
+@contextmanager
+def removing_new_files_on_failure(store: Store) -> Iterator[PutFile]:
+    """Yield `store.put`. If the body fails, the files that it has added are removed, unless another
+    writer's manifest has them."""
+    before, new = store.ages(TILES), list[str]()
+
+    def put(name: str, path: Path) -> None:
+        new.extend([] if name in before else [name])
+        store.put(name, path)
+
+    try:
+        yield put
+    except BaseException:
+        with suppress(AtlasError, OSError):
+            known = read_manifest(store, creates=True)[1].files
+            for name in set(new).difference(known):
+                store.remove(name)
+        raise
+
+
+def store_tile(new: NewTile, put: PutFile) -> Tile:
+    """Store the files of a map with `put` and return its manifest entry.
 
     Raises:
         MapError, AtlasError: the map cannot be read or is empty, or the store cannot be written.
@@ -187,10 +215,10 @@ def store_tile(new: NewTile, store: Store) -> Tile:
         found = {kind: shared_vocabulary(kind) for kind in vectors}
         versions = {kind: one.version for kind, one in found.items() if one is not None}
         save_global_descriptors(path, vectors)
-        places = structs.asdict(_store_file(store, f"{new.tile_id}.places", path))
+        places = structs.asdict(_store_file(put, f"{new.tile_id}.places", path))
         newest, *older = [new.path, *find_kept_files(new.path)]
-        stored = _store_file(store, f"{new.tile_id}.topo", newest)
-        kept = [_store_file(store, f"{new.tile_id}.topo", one) for one in older]
+        stored = _store_file(put, f"{new.tile_id}.topo", newest)
+        kept = [_store_file(put, f"{new.tile_id}.topo", one) for one in older]
         previous = [*kept, *new.older]
         previous = select_kept(previous, [one.num_bytes for one in previous])
         placed = PlacesFile(**places, vocabularies=versions)
@@ -206,12 +234,12 @@ def store_tile(new: NewTile, store: Store) -> Tile:
         )
 
 
-def _store_file(store: Store, name: str, path: Path) -> StoredFile:
+def _store_file(put: PutFile, name: str, path: Path) -> StoredFile:
     """Store a file under this name and a digest of its contents."""
     sha256 = sha256_of(path)
     stem, _, suffix = name.rpartition(".")
     stored = StoredFile(f"{TILES}/{stem}-{sha256[:12]}.{suffix}", sha256, path.stat().st_size)
-    store.put(stored.name, path)
+    put(stored.name, path)
     return stored
 
 
@@ -220,7 +248,7 @@ def _restore_files(store: Store, new: Sequence[NewTile], tiles: Sequence[Tile]) 
     names = set(store.ages(TILES))
     for one, tile in zip(new, tiles, strict=True):
         if not {stored.name for stored in tile.files} <= names:
-            store_tile(one, store)
+            store_tile(one, store.put)
 
 
 class _TileChangedError(Exception):

@@ -14,10 +14,17 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from topoloc.atlas.atlas import Atlas, store_at
-from topoloc.atlas.editing import NewTile, new_tiles, replace_tile, store_tile
+from topoloc.atlas.editing import (
+    NewTile,
+    PutFile,
+    new_tiles,
+    removing_new_files_on_failure,
+    replace_tile,
+    store_tile,
+)
 from topoloc.atlas.joins import Join
 from topoloc.atlas.manifest import Manifest, StoredFile, Tile
-from topoloc.atlas.store import MANIFEST, Store, sha256_of
+from topoloc.atlas.store import MANIFEST, sha256_of
 from topoloc.errors import AtlasError, MapError, ObjectStoreError, TopolocError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
@@ -230,32 +237,33 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
 
     def store_map(path: str) -> dict[str, Tile]:
         (new,) = new_tiles([path])
-        added = {new.tile_id: store_tile(new, store)}
+        added = {new.tile_id: store_tile(new, put)}
         _check_same(path, tiles, added)
         return added
 
     def store_atlas(atlas: Atlas) -> dict[str, Tile]:
         _check_same(atlas.store.where, tiles, atlas.manifest.by_id)
         for tile in atlas.manifest.tiles:
-            _copy_files(atlas, tile, store)
+            _copy_files(atlas, tile, put)
         joins.extend(atlas.manifest.joins)
         return atlas.manifest.by_id
 
-    for source in sources:
-        added = open_place(source).visit(store_map, store_atlas)
-        tiles = _with_unique_worlds(tiles, added) | tiles
-    after = Manifest().with_tiles(tiles, time.time(), joins)
-    if not store.commit(None, after.to_bytes()):
-        raise AtlasError(f"{where} became an atlas meanwhile; it stays as it is")
+    with removing_new_files_on_failure(store) as put:
+        for source in sources:
+            added = open_place(source).visit(store_map, store_atlas)
+            tiles = _with_unique_worlds(tiles, added) | tiles
+        after = Manifest().with_tiles(tiles, time.time(), joins)
+        if not store.commit(None, after.to_bytes()):
+            raise AtlasError(f"{where} became an atlas meanwhile; it stays as it is")
     return after
 
 
-def _copy_files(atlas: Atlas, tile: Tile, store: Store) -> None:
+def _copy_files(atlas: Atlas, tile: Tile, put: PutFile) -> None:
     problem = atlas.find_problem(tile.tile_id)
     if problem is not None:
         raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
     for stored in tile.files:
-        store.put(stored.name, atlas.store.local_path(stored.name, stored.sha256))
+        put(stored.name, atlas.store.local_path(stored.name, stored.sha256))
 
 
 def _check_same(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile]) -> None:

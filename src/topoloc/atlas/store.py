@@ -97,6 +97,7 @@ class FolderStore:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.where = folder, str(folder)
+        self._is_new = not folder.exists()
 
     def manifest(self) -> bytes | None:
         """See `Store.manifest`."""
@@ -124,6 +125,7 @@ class FolderStore:
             try:
                 write_bytes(self.folder / MANIFEST, after)
             except TopolocError as error:
+                self._remove_if_empty()
                 raise AtlasError(str(error)) from None
             remove_all_stale_files(self.folder / TILES)
         return True
@@ -164,6 +166,16 @@ class FolderStore:
         """See `Store.remove`."""
         with suppress(FileNotFoundError):
             (self.folder / name).unlink()
+        self._remove_if_empty()
+
+    def _remove_if_empty(self) -> None:
+        """Remove a folder that this store has created, if nobody has stored anything in it."""
+        if self._is_new and self.version() is None:
+            with suppress(OSError):
+                if os.path.isdir(self.folder / TILES):
+                    (self.folder / TILES).rmdir()
+                (self.folder / _LOCK).unlink(missing_ok=True)
+                self.folder.rmdir()
 
     @contextmanager
     def _lock(self) -> Iterator[None]:

@@ -63,10 +63,14 @@ def describe_night(evaluation: dict[str, Any]) -> str:
         text += f" {lost} {'is' if lost == 1 else 'are'} not localized ({reasons})."
     false = night["false_accepts"]
     count = {0: "No pose is", 1: "1 pose is"}.get(false, f"{false} poses are")
-    return (
-        f"{text} {count} wrong by more than {EvaluatedQuery.MAX_TRANSLATION:g} m or"
+    text += (
+        f" {count} wrong by more than {EvaluatedQuery.MAX_TRANSLATION:g} m or"
         f" {EvaluatedQuery.MAX_ROTATION_DEG:g} degrees."
     )
+    if night["num_localized"]:
+        largest = f"{100 * night['max_translation_m']:.1f} cm"
+        text += f" The largest error by night is {largest}."
+    return text
 
 
 def describe_out_of_map(evaluation: dict[str, Any]) -> str:

@@ -22,6 +22,9 @@ RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 # A result with an error above either limit is a false accept: a wrong place, not an inaccurate
 # pose.
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
+# The probability of an answer is about these limits (metres, degrees).
+ACCURATE_TRANSLATION, ACCURATE_ROTATION_DEG = 0.25, 2.0
+_CHI_SQUARE_95 = 12.592  # six degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,17 @@ class EvaluatedQuery:
         if isinstance(self.result, NotLocalized) or truth is None:
             return math.nan
         return error(self.result.world_from_cam, truth)
+
+    @property
+    def error_over_sigma(self) -> float:
+        """Return the error of the pose over its reported standard deviations: the Mahalanobis
+        length over the root of its six degrees of freedom. NaN as `translation_m`."""
+        truth = self.world_from_cam
+        if isinstance(self.result, NotLocalized) or truth is None or self.is_in_other_world:
+            return math.nan
+        xi = (truth @ self.result.world_from_cam.inverse()).log()
+        # the covariance of a pose that is exact in one direction is singular
+        return math.sqrt(max(float(xi @ np.linalg.pinv(self.result.covariance) @ xi), 0.0) / 6.0)
 
     @property
     def is_false_accept(self) -> bool:
@@ -115,6 +129,8 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     translation = np.array([a.translation_m for a in with_truth])
     rotation = np.array([a.rotation_deg for a in with_truth])
     localized = np.isfinite(translation)
+    over_sigma = np.array([a.error_over_sigma for a in with_truth])[localized]
+    is_inaccurate = (translation > ACCURATE_TRANSLATION) | (rotation > ACCURATE_ROTATION_DEG)
     ranked = [a for a in with_truth if a.nearest_node_id is not None]
     first = [(a, a.result.candidates[0].node_id if a.result.candidates else None) for a in ranked]
     hits = [node == a.nearest_node_id for a, node in first]
@@ -126,6 +142,10 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
         "num_localized": int(localized.sum()),
         "median_translation_m": _median(translation[localized]),
         "median_rotation_deg": _median(rotation[localized]),
+        "max_translation_m": float(translation[localized].max()) if localized.any() else None,
+        "max_rotation_deg": float(rotation[localized].max()) if localized.any() else None,
+        "num_inaccurate": int(is_inaccurate.sum()),
+        "num_outside_ellipsoid": int((6.0 * over_sigma**2 > _CHI_SQUARE_95).sum()),
         "recall": {
             f"{metres:g}m_{degrees:g}deg": float(
                 np.mean((translation <= metres) & (rotation <= degrees))

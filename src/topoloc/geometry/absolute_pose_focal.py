@@ -152,17 +152,15 @@ def _choose_camera(
     chosen = max(allowed, key=lambda one: weighed[one][0])
     if max(weighed, key=lambda one: weighed[one][0]).lens == "other":
         chosen = CameraHypothesis()
-    parameters = np.zeros(7)
-    if chosen == CameraHypothesis() and camera == first:
-        return cam_from_world, camera, weigh_poses(fit, weighed, (chosen, parameters))
     mean = chosen.basis @ np.linalg.lstsq(chosen.basis, weighed[chosen][1], rcond=None)[0]
     pose = Rigid3.exp(fit.pose_by_camera @ (mean - fit.camera)) @ fit.cam_from_world
-    refit = fit_jointly(seen, pose, mean, prior.of(chosen), chosen.basis)
+    expected, covariance = prior.of(chosen)
+    # errors of the points that the image does not show leave more to the prior
+    refit = fit_jointly(seen, pose, mean, (expected, covariance / fit.variance), chosen.basis)
     if refit is None:
         return None
-    parameters = refit.camera
-    belief = weigh_poses(fit, weighed, (chosen, parameters))
-    return refit.cam_from_world, with_parameters(first, parameters), belief
+    belief = weigh_poses(fit, weighed, (chosen, refit.camera))
+    return refit.cam_from_world, with_parameters(first, refit.camera), belief
 
 
 def camera_prior(uncalibrated: UncalibratedCamera, focal: float) -> CameraPrior:

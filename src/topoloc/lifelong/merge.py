@@ -22,6 +22,7 @@ from topoloc.lifelong.session_poses import SessionPoses, align_motion_to_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.config import Progress
+from topoloc.mapping.edit import WaitCallback
 from topoloc.mapping.nodes import node_distances
 from topoloc.mapping.sessions import Edit, today
 from topoloc.mapping.storage.entries import overlay
@@ -37,8 +38,10 @@ def merge(
     out: str | Path,
     localizer_config: LocalizerConfig | None = None,
     progress: Progress | None = None,
+    on_wait: WaitCallback | None = None,
 ) -> dict[str, Any]:
-    """Merge two map files of overlapping places into a new one, in the world of the first.
+    """Merge two map files of overlapping places into a new one, in the world of the first. If
+    another process edits a map at `out`, `on_wait` is called once, and the merge waits.
 
     Returns:
         The changes: numbers and texts by their names, with the bytes of the new file.
@@ -54,7 +57,7 @@ def merge(
         merged, changes = merge_maps(one, other, localizer_config, progress)
         name = f"merge {Path(second).name}"
         edit = Edit(one.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
-        replace(merged, edits=[*one.edits, edit]).save(out)
+        replace(merged, edits=[*one.edits, edit]).save(out, on_wait)
     return changes | {"bytes": Path(out).stat().st_size}
 
 

@@ -17,7 +17,6 @@ These settings give the paper's own behaviour: `num_candidates=1`, `guided.num_n
 from __future__ import annotations
 
 import copy
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
@@ -33,7 +32,7 @@ from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.map_context import MapContext
-from topoloc.localization.query import QueryImage, StageClock, unknown_camera
+from topoloc.localization.query import Deadline, QueryImage, StageClock, unknown_camera
 from topoloc.localization.result import Localization, NotLocalized, R, with_time
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.schedule import Schedule
@@ -206,7 +205,7 @@ class Localizer:
         image: Image,
         camera: Camera | UncalibratedCamera | None,
         prior: Rigid3 | None = None,
-        max_ms: float | None = None,
+        max_ms: float | Deadline | None = None,
         trace: Trace | None = None,
         t_ns: int | None = None,
         tile_id: str | None = None,
@@ -222,8 +221,8 @@ class Localizer:
             prior: approximate pose (world_from_cam). The nodes nearest to it replace coarse
                 retrieval. The pose needs the same evidence as any other, from matches that the
                 prior did not guide. In an atlas it is in the world of the tile `tile_id`.
-            max_ms: time limit in milliseconds, instead of `config.max_ms`. No further tile or
-                hypothesis is tested after it.
+            max_ms: time limit in milliseconds, or a `Deadline`, instead of `config.max_ms`. No
+                further tile or hypothesis is tested after it.
             trace: collects all tried proposals.
             t_ns: capture time in nanoseconds, stored in the result.
             tile_id: search only this tile.
@@ -241,7 +240,7 @@ class Localizer:
         self,
         query_image: QueryImage,
         prior: Rigid3 | None = None,
-        max_ms: float | None = None,
+        max_ms: float | Deadline | None = None,
         trace: Trace | None = None,
         tile_id: str | None = None,
     ) -> ResultWithInliers:
@@ -250,8 +249,7 @@ class Localizer:
         The reported poses are the result's own pose, or its alternatives. The query image caches
         its features, which several maps can share.
         """
-        limit = max_ms if max_ms is not None else self.config.max_ms
-        deadline = float("inf") if limit is None else time.perf_counter() + limit / 1e3
+        deadline = Deadline.of(self.config.max_ms if max_ms is None else max_ms)
         schedule = Schedule(
             self._tiles, self.tile_config, query_image, deadline, self._reach, trace
         )

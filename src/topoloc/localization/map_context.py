@@ -17,7 +17,7 @@ from topoloc.localization.fitted_weights import FittedWeights, load_fitted_weigh
 from topoloc.localization.map_facts.correlated_errors import ErrorShareMeasurement
 from topoloc.localization.open_map import OpenMap
 from topoloc.localization.provenance import Provenance
-from topoloc.localization.query import Query, QueryImage, StageClock, reduce_image
+from topoloc.localization.query import Deadline, Query, QueryImage, StageClock, reduce_image
 from topoloc.localization.result import Localization, NotLocalized, R
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.search import Search, Trace
@@ -121,12 +121,12 @@ class MapContext:
         self,
         query_image: QueryImage,
         clock: StageClock,
-        deadline: float,
+        deadline: Deadline,
         trace: Trace | None = None,
     ) -> list[Search]:
         """Return one search for each feature type. Each one links to the previous one.
 
-        No further hypothesis is tested after the deadline (`time.perf_counter`, seconds).
+        No further hypothesis is tested after the deadline.
         """
         config, opened, searches = self.config, self.first.map, list[Search]()
         reduced, camera = reduce_image(

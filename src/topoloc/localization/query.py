@@ -8,6 +8,7 @@ the map's pixels per radian. A coarser image keeps its size.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
@@ -49,6 +50,27 @@ class StageClock:
     def times_ms(self) -> dict[str, float]:
         """Return the milliseconds of each stage, and `total`."""
         return self._times_ms | {"total": (time.perf_counter() - self._start) * 1e3}
+
+
+@dataclass(frozen=True, eq=False)
+class Deadline:
+    """The time (`time.perf_counter`, seconds) after which no further hypothesis is tested. Another
+    thread may set `stop` before."""
+
+    at: float = float("inf")
+    stop: threading.Event = field(default_factory=threading.Event)
+
+    @staticmethod
+    def of(limit: float | Deadline | None) -> Deadline:
+        """Return the deadline in so many milliseconds, or the given one."""
+        if isinstance(limit, Deadline):
+            return limit
+        return Deadline() if limit is None else Deadline(time.perf_counter() + limit / 1e3)
+
+    @property
+    def is_past(self) -> bool:
+        """Return whether the time is over or another thread has ended it."""
+        return self.stop.is_set() or time.perf_counter() > self.at
 
 
 class SharedFeatures:
@@ -136,8 +158,8 @@ class QueryImage:
 class Query:
     """Hold a reduced image and its camera model (`input_camera`).
 
-    The original image is `scale` times as wide. `deadline` is the `time.perf_counter` value
-    (seconds) after which no further hypothesis is tested. It is infinite by default.
+    The original image is `scale` times as wide. No further hypothesis is tested after the
+    `deadline`. There is none by default.
     """
 
     image: Image
@@ -145,7 +167,7 @@ class Query:
     scale: float
     feature_config: FeatureConfig
     clock: StageClock = field(default_factory=StageClock)
-    deadline: float = float("inf")
+    deadline: Deadline = field(default_factory=Deadline)
     shared: SharedFeatures = field(default_factory=SharedFeatures)
 
     @cached_property
@@ -169,11 +191,6 @@ class Query:
             normalized = normalize_image(self.grey, self.feature_config)
         with self.clock.stage("features"):
             return extract_from_normalized(normalized, self.feature_config)
-
-    @property
-    def is_past_deadline(self) -> bool:
-        """Return whether the deadline has passed."""
-        return time.perf_counter() > self.deadline
 
 
 def check_image_size(image: Image, camera: Camera | UncalibratedCamera) -> None:

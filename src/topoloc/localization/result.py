@@ -56,6 +56,8 @@ class Localization:
         focal_length_px: focal length estimated with the pose, None if the camera was calibrated.
         noise_share: share of the covariance that is independent from image to image. The rest comes
             from the map and is common to images taken nearby.
+        frame_rotation_deg: angle that the camera turned while a rolling shutter read the image.
+            None if that is not evident. The pose is that of the middle row.
         calibration_doubt: mismatch of the image and its calibration. The covariance and probability
             include it.
         seen_camera: calibration estimate of this image, None if there is none.
@@ -77,6 +79,7 @@ class Localization:
     calibrated: bool = True
     provenance: Provenance = EMPTY_PROVENANCE
     geopose: GeoPose | None = None
+    frame_rotation_deg: float | None = None
     calibration_doubt: CalibrationMismatch | None = None
     seen_camera: IntrinsicsDeviation | None = None
 
@@ -130,6 +133,11 @@ class Localization:
             **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),
             **({} if self.noise_share == 1.0 else {"noise_share": self.noise_share}),
             **({} if self.evidence is None else {"evidence": asdict(self.evidence)}),
+            **(
+                {}
+                if self.frame_rotation_deg is None
+                else {"frame_rotation_deg": self.frame_rotation_deg}
+            ),
             **(
                 {}
                 if self.calibration_doubt is None
@@ -280,6 +288,7 @@ class _LocalizedLine(_Line, frozen=True, kw_only=True):
     noise_share: Share = 1.0
     calibrated: bool = True
     geopose: GeoPose | None = None
+    frame_rotation_deg: NonNegative | None = None
     calibration_doubt: CalibrationMismatch | None = None
 
     def __post_init__(self) -> None:

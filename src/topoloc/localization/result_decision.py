@@ -9,8 +9,14 @@ import numpy as np
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import compute_variance_inflation
-from topoloc.geometry.joint_camera.camera_hypotheses import CameraBelief
+from topoloc.geometry.joint_camera.camera_hypotheses import (
+    CameraBelief,
+    CameraHypothesis,
+    WeighedCamera,
+    map_variance,
+)
 from topoloc.geometry.rigid import inverse_covariance
+from topoloc.geometry.rolling_shutter import find_rotation
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis, log_odds_margin
 from topoloc.localization.evidence import (
@@ -21,7 +27,7 @@ from topoloc.localization.evidence import (
 )
 from topoloc.localization.image_calibration_check import check_image_calibration
 from topoloc.localization.pose_fit import PointMatches, PointObservations
-from topoloc.localization.provenance import Provenance, probability_within_tolerance
+from topoloc.localization.provenance import Provenance
 from topoloc.localization.result import Alternative, Localization, NotLocalized, Reason
 from topoloc.localization.search import Search
 
@@ -69,8 +75,13 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     if best.fit.pose.camera is not None:
         return _weigh_camera(search, best, result, best.fit.pose.camera)
     with search.query.clock.stage("calibration"):
+        best, frame_rotation_deg = _undo_rotation(search, best)
         seen, doubt = check_image_calibration(search, best.fit)
     if doubt is None:
+        if frame_rotation_deg is not None:
+            result, points = _build_localization(search, best, result.probability)
+            result = replace(result, frame_rotation_deg=frame_rotation_deg)
+            named = [(result, points)]
         result = replace(result, seen_camera=seen, times_ms=search.query.clock.times_ms())
         return result, [(result, points) for _, points in named]
     covariance = best.covariance + np.outer(doubt.shift, doubt.shift)
@@ -79,7 +90,9 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     )
     evidence = replace(best.evidence, doubt=max(best.evidence.doubt, uncertainty))
     penalized = replace(best, covariance=covariance, evidence=evidence)
-    probability = result.probability * probability_within_tolerance(evidence.doubt)
+    shifted = WeighedCamera(CameraHypothesis(), 1.0, doubt.shift, best.covariance)
+    camera = CameraBelief(shifted.hypothesis, [shifted])
+    probability = result.probability * _probability_within(search, best, camera)
     if probability < search.config.evidence.min_probability:
         refusal = _build_not_localized(
             search, "too_few_inliers", best.fit, f"the calibration is doubtful: {doubt}"
@@ -90,22 +103,52 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     return localization, [(localization, points)]
 
 
+def _undo_rotation(search: Search, best: Hypothesis) -> tuple[Hypothesis, float | None]:
+    """Return the hypothesis as if a rolling shutter had read all rows at once, and the angle
+    (degrees) that the camera turned during the frame. None if that is not evident."""
+    if not best.evidence.is_of_nodes:
+        return best, None
+    fit, seen = best.fit, best.fit.inlier_observations(1.0)
+    found = find_rotation(
+        seen.points_img.astype(np.float64),
+        seen.points_world,
+        seen.covariances,
+        search.config.pose.key_point_sigma_px,
+        fit.camera,
+        fit.cam_from_world,
+        map_variance(search.correlated_error_share),
+    )
+    if found is None:
+        return best, None
+    points_img = found.undo(fit.features.points_img.astype(np.float64), fit.camera)
+    features = replace(fit.features, points_img=points_img.astype(np.float32))
+    covariance = fit.pose.covariance + found.covariance
+    pose = replace(fit.pose, cam_from_world=found.cam_from_world, covariance=covariance)
+    fit = replace(fit, features=features, pose=pose)
+    undone = replace(best, fit=fit, covariance=best.covariance + found.covariance)
+    return undone, float(np.rad2deg(np.linalg.norm(found.rotation)))
+
+
 def _weigh_camera(
     search: Search, best: Hypothesis, result: Localization, camera: CameraBelief
 ) -> ResultWithInliers:
     """Return the result of a camera without calibration, with the probability that the pose is
     within the tolerance whatever its camera may be."""
-    config = search.config.evidence
-    max_translation = compute_translation_tolerance(best.fit.median_depth, config)
-    tolerances = max_translation, math.radians(config.max_rotation_deg)
-    probability = result.probability * camera.probability_within(*tolerances)
-    if probability >= config.min_probability:
+    probability = result.probability * _probability_within(search, best, camera)
+    if probability >= search.config.evidence.min_probability:
         named = _build_localization(search, best, probability)
         return named[0], [named]
     detail = "a cropped image or another lens would put the camera elsewhere: state --camera"
     if camera.is_contradicted:
         detail = "the image contradicts all camera models, as a panorama does: state --camera"
     return _build_not_localized(search, "too_few_inliers", best.fit, detail), []
+
+
+def _probability_within(search: Search, best: Hypothesis, camera: CameraBelief) -> float:
+    """Return the probability that a camera moves the pose by less than the tolerances."""
+    config = search.config.evidence
+    max_translation = compute_translation_tolerance(best.fit.median_depth, config)
+    return camera.probability_within(max_translation, math.radians(config.max_rotation_deg))
 
 
 def _log_odds_margin(search: Search, best: Hypothesis, other: Hypothesis) -> float:

@@ -20,7 +20,6 @@ searched exhaustively until one localizes the image. Similar tiles may then hold
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -41,7 +40,7 @@ from topoloc.localization.propose import (
     propose_repetitions,
     propose_similar_places,
 )
-from topoloc.localization.query import QueryImage, StageClock
+from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.refine import confirm_hypotheses, find_best_case_evidence
 from topoloc.localization.result import Localization
 from topoloc.localization.result_decision import (
@@ -90,7 +89,7 @@ def _until_late(search: Search, proposals: Iterable[Proposal]) -> Iterator[Propo
         yield proposal
         if search.failure is not None:
             raise search.failure
-        if search.query.is_past_deadline:
+        if search.query.deadline.is_past:
             search.is_stopped = True
             return
 
@@ -142,7 +141,7 @@ class TileQuery:
 
 @dataclass(eq=False)
 class Schedule:
-    """Generate the proposals for one image until the deadline (`time.perf_counter`).
+    """Generate the proposals for one image until the deadline.
 
     `reach` holds the tiles that may be searched, None for all. `queries` holds the searches in each
     tile. If its map was closed since, new ones start.
@@ -151,7 +150,7 @@ class Schedule:
     tiles: Tiles
     config: AtlasConfig
     query_image: QueryImage
-    deadline: float
+    deadline: Deadline
     reach: Reach | None = None
     trace: Trace | None = None
     clock: StageClock = field(default_factory=StageClock)
@@ -164,7 +163,7 @@ class Schedule:
         for ranking in self.tiles.rankings(self.query_image, self.clock, self.reach):
             self.ranking = ranking
             yield from self._propose_coarse_only(self.config.num_coarse_first)
-            if self._has_clear_pose or self._is_late:
+            if self._has_clear_pose or self.deadline.is_past:
                 break
         else:
             yield from self._propose_coarse_only(self.config.num_glanced)
@@ -175,7 +174,7 @@ class Schedule:
             searched = {one.tile_id for one in self.results.values() if one.is_exhaustive}
             left = [one for one in self._readable(hopeful) if one[0] not in searched]
             left = [one for one in left if self._priority(one) >= least or self._is_unranked(one)]
-            if not left or self._localized or (self.results and self._is_late):
+            if not left or self._localized or (self.results and self.deadline.is_past):
                 break
             yield from self.propose_in_tile(*max(left, key=self._priority))
         while not self.results and (left := self._readable(self.ranking)):
@@ -188,7 +187,7 @@ class Schedule:
         if ranking_margin(self._readable(self.ranking)) >= self.config.min_ranking_margin:
             return
         for tile_id, similarity in self._candidates()[:num_tiles]:
-            if self._has_clear_pose or self._is_late:
+            if self._has_clear_pose or self.deadline.is_past:
                 return
             if tile_id not in self.results:
                 yield from self.propose_in_tile(tile_id, similarity, "coarse")
@@ -198,7 +197,7 @@ class Schedule:
         least = min(one.similarity for one in self._localized) - self.config.max_rival_gap
         alike = [one for one in self.ranking if one[1] >= least and one[0] not in self.results]
         for tile_id, similarity in alike[: self.config.num_rivals]:
-            if not self._is_late:
+            if not self.deadline.is_past:
                 yield from self.propose_in_tile(tile_id, similarity, "rival")
         for one in list(self.results.values()):
             if one.is_clear and not one.is_exhaustive:  # one of them may hold the true pose
@@ -294,7 +293,3 @@ class Schedule:
     @property
     def _has_clear_pose(self) -> bool:
         return any(one.is_clear for one in self.results.values())
-
-    @property
-    def _is_late(self) -> bool:
-        return time.perf_counter() > self.deadline

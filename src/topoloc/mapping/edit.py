@@ -90,6 +90,15 @@ def _find_fault(kept: Path) -> str | None:
     return None if is_same else f"{kept} {text}"
 
 
+def _warn_of_damage(kept: Sequence[Path]) -> int:
+    """Warn of the first damaged one of the kept files. Return the number of files before it."""
+    for row, one in enumerate(kept):
+        if fault := _find_fault(one):
+            warnings.warn(f"no earlier edit can be undone: {fault}", stacklevel=3)
+            return row
+    return len(kept)
+
+
 def drop_kept_files(path: Path) -> None:
     """Remove kept files that do not lead back from the map file at `path`, and the oldest ones
     beyond `_MAX_BYTES`. A file that cannot be removed stays."""
@@ -137,7 +146,8 @@ class MapEdit:
         history. `changes` holds numbers and texts for the history, by name.
 
         Raises MapError if the map cannot be written, the file before cannot be kept, or another
-        process replaced the map. The file at the path stays unchanged.
+        process replaced the map. The file at the path stays unchanged. Warns of a damaged kept file
+        of an earlier edit.
         """
         edits = self.topomap.edits
         edit = Edit(self.topomap.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
@@ -155,6 +165,8 @@ class MapEdit:
                 raise
             raise MapError(f"cannot write map {self.path}: {describe_failure(error)}") from error
         drop_kept_files(self.path)
+        with suppress(MapError):  # the edit is done
+            _warn_of_damage(find_kept_files(self.path)[1:])
         return edit
 
     def check_still_locked(self) -> None:
@@ -221,11 +233,7 @@ def read_history(path: str | Path, num_undoable: int | None = None) -> list[dict
     with TopoMetricMap.load(path) as topomap:
         edits = [asdict(edit) for edit in topomap.edits]
     if num_undoable is None:
-        kept = find_kept_files(Path(os.path.realpath(path)))
-        faults = [_find_fault(one) for one in kept]
-        num_undoable = next((row for row, fault in enumerate(faults) if fault), len(kept))
-        if num_undoable < len(kept):
-            warnings.warn(f"no earlier edit can be undone: {faults[num_undoable]}", stacklevel=2)
+        num_undoable = _warn_of_damage(find_kept_files(Path(os.path.realpath(path))))
     return [
         edit | {"undoable": number > len(edits) - num_undoable}
         for number, edit in enumerate(edits, start=1)

@@ -15,6 +15,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from hashlib import blake2b
 from pathlib import Path
 
@@ -24,6 +25,10 @@ try:
     import fcntl
 except ImportError:  # Windows: stale files are not removed
     fcntl = None
+
+
+written_paths: ContextVar[list[Path] | None] = ContextVar("written_paths", default=None)
+"""Collects the paths of all files and folders that are complete, if it is set to a list."""
 
 
 def write_text(path: Path, text: str) -> None:
@@ -51,6 +56,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
         yield temporary
         fsync(temporary)
         os.replace(temporary, path)
+        _note_written(path)
         with suppress(OSError):  # no handle is left: the file is in place
             fsync(path.parent)
 
@@ -116,6 +122,7 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
         if path.is_dir():
             os.rename(path, before)
         os.rename(temporary, path)
+        _note_written(path)
         fsync(path.parent)
     except OSError as error:
         if before.is_dir() and not path.exists():
@@ -138,6 +145,11 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
             raise TopolocError(
                 f"cannot write {path}: this folder holds other things, such as {name}"
             )
+
+
+def _note_written(path: Path) -> None:
+    if (paths := written_paths.get()) is not None:
+        paths.append(path)
 
 
 def _resolve_link(path: Path) -> Path:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from topoloc.apps.cli import main
 from topoloc.apps.cli.output import check_outputs, print_fields, progress_bar, write_text
 from topoloc.errors import TopolocError
 
@@ -57,6 +60,26 @@ def test_one_path_is_not_two_outputs(tmp_path: Path):
                 str(tmp_path / "sub" / ".." / "a") if (tmp_path / "sub").mkdir() is None else None,
             ]
         )
+
+
+def test_a_file_of_a_recording_is_not_overwritten(
+    room_map: Path, tiny_recording: Path, tmp_path: Path, complaint: Callable[..., str]
+):
+    recording = Path(shutil.copytree(tiny_recording, tmp_path / "walk"))
+    truth = (recording / "truth.tum").read_bytes()
+    frames = f"{recording}@0:2"
+    for words in (
+        ("localize", room_map, frames, "--tum", recording / "truth.tum"),
+        ("slam", frames, recording / "truth.tum"),
+        ("evaluate", room_map, frames, "--json", recording / "truth.tum"),
+        ("certify", room_map, "--walk", frames, "--json", recording / "truth.tum"),
+    ):
+        text = complaint(*words)
+        assert "truth.tum: it is a file of the input; choose another path, or remove it" in text
+    assert (recording / "truth.tum").read_bytes() == truth
+    own = str(recording / "answers.tum")
+    for _ in range(2):  # answers of before are replaced
+        assert main(["localize", str(room_map), frames, "--tum", own]) == 0
 
 
 def test_facts_stand_in_columns(capsys: pytest.CaptureFixture[str]):

@@ -84,6 +84,9 @@ def test_numbers_on_the_page_are_those_of_the_evaluation(page: str):
     assert "0.55 cm" in page  # the median of 1, 2 ... 9 mm and 40 m
     assert "<b>2</b><span>false accepts, of 13 images</span>" in page
     assert "1 not in map, 1 too few inliers" in page
+    assert "<th>Largest error</th><td>40.00 m, 2.00°</td>" in page
+    assert "largest 40 m" in page or "largest 4e+03 cm" in page
+    assert "1 false position is outside of the figure, marked at its edge" in page
     assert "1.23 MB" in page
 
 
@@ -95,13 +98,13 @@ def test_the_worst_come_first():
 
 def test_the_worst_are_shown_beside_the_node_they_were_matched_with(page: str):
     articles = re.findall(
-        r"<article>.*?</article>", page[page.index("The worst queries") :], re.DOTALL
+        r"<article>.*?</article>", page[page.index("The worst answers") :], re.DOTALL
     )
     assert len(articles) == 6
     (far,) = [article for article in articles if "walk/far" in article]
     assert "node 1" in far
     assert "nearest to the truth is node 0" in far
-    assert "off by 40.00 m, 2.00°" in far
+    assert re.search(r"off by 40.00 m, 2.00°, 16\d\d\.\d standard deviations", far)
     assert far.count("data:image/jpeg;base64,") == 1
 
 

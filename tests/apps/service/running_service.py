@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[3]
 TOKEN = "a-token-of-some-length"
 LIMITS = (
     "[serve]\nmax_upload_mb = 3.0\nmax_megapixels = 4.0\nupload_s = 4.0\nmax_sessions ="
-    " 3\nsession_idle_s = 4.0\n"
+    " 4\nmax_sessions_per_address = 3\nsession_idle_s = 4.0\n"
 )
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import io
+import json
 import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,12 +25,15 @@ from starlette.requests import Request
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from topoloc import Localizer, MapCache
 from topoloc.apps.service import query_handler
+from topoloc.apps.service.application import create_application
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.connections import Connections, protocols
+from topoloc.apps.service.map_routes import build_scene
 from topoloc.apps.service.query_handler import ImageDecoder
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.apps.service.state import Workers, _while_connected
+from topoloc.apps.service.state import Service, Workers, _while_connected
 from topoloc.recordings.image_io import EncodedImage
 
 
@@ -93,7 +97,10 @@ def test_an_answer_that_is_not_taken_in_time_ends_its_connection():
         reader, writer = await asyncio.open_connection(*listener.getsockname())
         writer.write(b"GET / HTTP/1.1\r\nHost: a\r\n\r\n")
         assert await reader.read(12) == b"HTTP/1.1 200"
-        assert len(server.server_state.connections) == 1
+        (connection,) = server.server_state.connections
+        accepted: socket.socket = connection.transport.get_extra_info("socket")  # pyright: ignore
+        is_sent_at_once = accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        assert is_sent_at_once, "the body would wait for the acknowledgement of the head"
         begun = time.monotonic()
         while server.server_state.connections:
             assert time.monotonic() - begun < 10.0, "the connection is held"
@@ -181,6 +188,48 @@ def test_a_job_that_nobody_waits_for_gives_its_place_to_the_next(is_gone: bool):
         await asyncio.to_thread(workers.close)
 
     asyncio.run(ask())
+
+
+def _service_of(paths: list[str], config: ServiceConfig) -> Service:
+    maps = MapCache(paths, Localizer, 100_000_000)
+    return create_application(maps, config)._app.state.service  # pyright: ignore
+
+
+@pytest.mark.parametrize("is_gone", [False, True])
+def test_a_search_that_nobody_waits_for_is_stopped(is_gone: bool):
+    async def receive() -> dict[str, str]:
+        await asyncio.sleep(0.05 if is_gone else 60.0)
+        return {"type": "http.disconnect"}
+
+    async def ask() -> None:
+        config = ServiceConfig(workers=1, answer_s=5.0 if is_gone else 0.1)
+        service = _service_of([], config)
+        stop, ended = threading.Event(), threading.Event()
+
+        def search() -> None:
+            assert stop.wait(20.0)
+            ended.set()
+
+        with pytest.raises(RequestError) as raised:
+            await service.run_job(Request({"type": "http"}, receive), search, stop)
+        assert raised.value.status == (499 if is_gone else 503)
+        assert await asyncio.to_thread(ended.wait, 20.0)
+        await service.close()
+
+    asyncio.run(ask())
+
+
+def test_a_scene_that_nobody_waits_for_is_not_made(room_map: Path):
+    stop = threading.Event()
+    service = _service_of([str(room_map)], ServiceConfig())
+    with closing(service.maps):
+        scene = build_scene(service, room_map.stem, stop)
+        assert json.loads(scene)["format"] == "topoloc-scene"
+        service.scenes.clear()
+        stop.set()
+        with pytest.raises(RequestError, match="the client has gone"):
+            build_scene(service, room_map.stem, stop)
+        assert service.scenes == {}
 
 
 def test_all_workers_share_one_budget_of_pixels(monkeypatch: pytest.MonkeyPatch):

@@ -97,7 +97,15 @@ def test_streams_end_when_nobody_uses_them_and_there_are_not_too_many(
 ):
     sockets = [connect(_socket_address(service)) for _ in range(3)]
     try:
-        assert client.post(SESSIONS).status_code == 429
+        refused = client.post(SESSIONS)
+        assert (refused.status_code, refused.headers["retry-after"]) == (429, "10")
+        assert "3 streams of this address are open" in refused.json()["error"]
+        other = httpx.HTTPTransport(local_address="127.0.0.2")
+        with service.client(transport=other) as neighbour:
+            assert neighbour.post(SESSIONS).status_code == 201
+            refused = neighbour.post(SESSIONS)
+            assert refused.status_code == 429
+            assert "4 streams are open" in refused.json()["error"]
         for socket in sockets:
             with pytest.raises(ConnectionClosed) as closed:
                 socket.recv(10)

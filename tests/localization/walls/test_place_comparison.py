@@ -7,7 +7,7 @@ import numpy as np
 from built_corridor import WIDE, corridor_of_two_kinds, seen_on_the_way_back
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import QueryImage, StageClock
+from topoloc.localization.query import Deadline, QueryImage, StageClock
 from topoloc.localization.walls.place_comparison import Comparison
 from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 
@@ -15,7 +15,7 @@ from topoloc.localization.walls.virtual_view_matching import VirtualViewSearch
 def _walls(seed: int, number: int) -> VirtualViewSearch:
     localizer = Localizer(corridor_of_two_kinds())
     query_image = QueryImage(seen_on_the_way_back(seed)[number][0], WIDE)
-    search = localizer.context.searches(query_image, StageClock(), np.inf)[-1]
+    search = localizer.context.searches(query_image, StageClock(), Deadline())[-1]
     assert search.map.walls is not None
     return VirtualViewSearch.of(search, search.map.walls)
 

@@ -173,6 +173,10 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
         _check_address_space()
         import tyro
 
+        from topoloc.plugin import written_paths
+
+        written_paths.set([])
+
         from topoloc.apps.cli.output import UsageError, interruptible
 
         with interruptible():  # too little memory to load the libraries is reported too
@@ -191,12 +195,29 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
             _print_error(f"{error}; see `topoloc {name} --help`")
             return 2
     except TopolocError as error:
-        _print_error(str(error))
+        _print_error(_with_written_files(str(error), args))
+    except OSError as error:
+        if error.errno not in (errno.EMFILE, errno.ENFILE):
+            raise
+        where = f"cannot open {error.filename}: " if error.filename else ""
+        _print_error(f"{where}{error.strerror}; raise the limit (ulimit -n)")
     except MemoryError:
         _print_error("out of memory; no file is incomplete")
     except KeyboardInterrupt:
         _print_error("interrupted; no file is incomplete")
     return 1
+
+
+def _with_written_files(text: str, args: list[str]) -> str:
+    """Return the text of a failure with the files, of those that the arguments name, that were
+    written before it. An atlas is written with its manifest."""
+    from topoloc.plugin import written_paths
+
+    paths = [os.path.realpath(path) for path in written_paths.get() or () if os.path.exists(path)]
+    found = {path.removesuffix(f"{os.sep}atlas.json") for path in paths}
+    named = [arg.rpartition("=")[2] for arg in args]
+    names = [arg for arg in named if os.path.realpath(arg) in found and arg not in text]
+    return f"{text} (already written: {', '.join(names)})" if names else text
 
 
 def _check_address_space() -> None:

@@ -18,7 +18,13 @@ import tyro
 
 from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequence
 from topoloc.apps.cli import printable
-from topoloc.plugin import find_format, remove_stale_files, write_text
+from topoloc.plugin import (
+    find_format,
+    has_answers,
+    remove_stale_files,
+    split_selection,
+    write_text,
+)
 
 
 def option(metavar: str, default: str = "", **more: Any) -> Any:
@@ -109,16 +115,22 @@ class UsageError(TopolocError):
 
 def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str | None] = ()) -> None:
     """Check before the work that the output files can be written. None and ``-`` are ignored.
-    `inputs`: files that must not be overwritten. Raises TopolocError: the folder is missing or
-    read-only, the path is no regular file, or a file is used twice."""
+    `inputs`: files, and recordings with their files, that must not be overwritten. Trajectories of
+    answers in a recording may be. Raises TopolocError: the folder is missing or read-only, the path
+    is no regular file, or a file is used twice."""
     taken = {os.path.realpath(path) for path in inputs if path}
+    folders = {os.path.realpath(split_selection(path)[0]) for path in inputs if path}
     for path in (Path(output) for output in outputs if output not in (None, "-")):
+        parents = {str(one) for one in Path(os.path.realpath(path)).parents}
         faults = {
             f"folder {path.parent} does not exist": not path.parent.is_dir(),
             "it is a folder": path.is_dir(),
             "it is no regular file": path.exists() and not path.is_file(),  # such as a device
             f"folder {path.parent} is read-only": not os.access(path.parent, os.W_OK),
             "this file is used twice": os.path.realpath(path) in taken,
+            "it is a file of the input; choose another path, or remove it first": path.exists()
+            and bool(parents & folders)
+            and not has_answers(path),
         }
         if fault := next((text for text, is_found in faults.items() if is_found), None):
             raise TopolocError(f"cannot write {path}: {fault}")

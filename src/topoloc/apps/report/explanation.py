@@ -21,6 +21,7 @@ from topoloc import (
     TriedProposal,
     UncalibratedCamera,
 )
+from topoloc.plugin import Deadline
 
 _MIN_FEATURES, _MIN_PROBABILITY = 150, 0.5
 _DARKER, _BRIGHTER = 0.6, 1.7  # times the light of the nearest session
@@ -72,11 +73,15 @@ class Explanation:
 
 
 def explain(
-    localizer: Localizer, image: Image, camera: Camera | UncalibratedCamera | None
+    localizer: Localizer,
+    image: Image,
+    camera: Camera | UncalibratedCamera | None,
+    deadline: Deadline | None = None,
 ) -> Explanation:
-    """Localize an image and explain the result. Raises the errors of `Localizer.localize`."""
+    """Localize an image until a deadline and explain the result. Raises the errors of
+    `Localizer.localize`."""
     trace = Trace()
-    result = localizer.localize(image, camera, trace=trace)
+    result = localizer.localize(image, camera, max_ms=deadline, trace=trace)
     poses = [_evaluate_pose(tried, result) for tried in trace.tried]
     near = {pose.tried.fit.node_id for pose in poses if pose.num_inliers and pose.node_id >= 0}
     without = trace.nodes_without_image | {

@@ -135,38 +135,34 @@ def _draw_curves(errors: dict[str, Float[np.ndarray, " _"]], label: str, unit: s
         figure = Figure(figsize=(4.6, 2.9 + 0.2 * len(errors)), layout="constrained")
         axes = figure.add_subplot()
         found = {name: np.sort(values[np.isfinite(values)]) for name, values in errors.items()}
-        # the median of the recordings' tails: one bad recording must not squeeze the others
-        tails = [1.5 * float(np.percentile(values, 95)) for values in found.values() if len(values)]
-        limit = max(float(np.median(tails)), 1e-3) if tails else 1.0
+        low, high = _powers_of_ten(np.concatenate([[], *found.values()]))
         for name, values in found.items():
             prefix = f"{name}: " if len(errors) > 1 else ""
-            text = _curve_label(values, len(errors[name]), limit, unit)
-            drawn = values[values <= limit]
-            shares = np.arange(1, len(drawn) + 1) / len(errors[name])
-            last = shares[-1] if len(shares) else 0.0
-            x, y = np.r_[0.0, drawn, limit], np.r_[0.0, shares, last]
+            text = _curve_label(values, len(errors[name]), unit)
+            shares = np.arange(1, len(values) + 1) / len(errors[name])
+            x, y = np.r_[low, values, high], np.r_[0.0, shares, shares[-1:]]
             points = (x, y) if len(values) else ([], [])
             style = {"where": "post", "color": colours[name], "linewidth": 1.8}
             axes.step(*points, label=prefix + text, **style)
-        limits = {"xlim": (0.0, limit), "ylim": (0.0, 1.03)}
+        limits = {"xlim": (low, high), "ylim": (0.0, 1.03), "xscale": "log"}
         axes.set(xlabel=label, ylabel="queries within this error", **limits)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
         figure.legend(loc="outside lower left", ncols=1, handlelength=1.4)
         return svg_text(figure, f"cumulative {label.partition(' (')[0]}")
 
 
-def _curve_label(found: Float[np.ndarray, " n"], num_queries: int, limit: float, unit: str) -> str:
-    """Return the median, and the number of errors beyond the right edge."""
+def _curve_label(found: Float[np.ndarray, " n"], num_queries: int, unit: str) -> str:
+    """Return the median and the largest error."""
     if len(found) == 0:
         return f"none of {num_queries} localized"
-    num_beyond = int((found > limit).sum())
-    beyond = f", {num_beyond} of {num_queries} beyond" if num_beyond else ""
-    return f"median {float(np.median(found)):.3g}{unit}{beyond}"
+    return f"median {float(np.median(found)):.3g}{unit}, largest {found[-1]:.3g}{unit}"
 
 
 def _powers_of_ten(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """Return the powers of ten around the finite values."""
-    finite = values[np.isfinite(values)]
+    finite = values[np.isfinite(values) & (values > 0.0)]
     if len(finite) == 0:
         return 1e-3, 1.0
     low, high = np.floor(np.log10(finite.min())), np.ceil(np.log10(finite.max()))

@@ -76,10 +76,11 @@ class MapFigure:
         return bool(np.all(place >= self.low) and np.all(place <= self.high))
 
     def plot(self, poses: Sequence[Rigid3], **style: Any) -> None:
-        """Draw the positions. Many marks become one image inside the SVG."""
+        """Draw the positions, at the edge if they are outside. Many marks become one image inside
+        the SVG."""
         if poses:
             style = {"rasterized": len(poses) > MAX_MARKS} | style
-            self.axes.plot(*self.flatten(poses).T, **style)
+            self.axes.plot(*np.clip(self.flatten(poses), self.low, self.high).T, **style)
 
     def draw_lines(self, lines: Sequence[Any], **style: Any) -> None:
         """Draw pairs of points as lines."""
@@ -131,11 +132,11 @@ def draw_map(answers: Sequence[EvaluatedQuery], topomap: TopoMetricMap) -> str:
         ]
         figure.draw_lines(pairs, colors=ERROR, linewidths=1.2, zorder=3)
         false = _estimates([a for a in answers if a.is_false_accept])
-        shown = [pose for pose in false if figure.contains(pose)]
-        figure.plot(shown, zorder=5, **_FALSE)
-        if num_outside := len(false) - len(shown):
-            what = "positions" if num_outside > 1 else "position"
-            figure.axes.set_title(f"{num_outside} false {what} outside of the figure", color=BAD)
+        figure.plot(false, zorder=5, clip_on=False, **_FALSE)
+        if num_outside := sum(not figure.contains(pose) for pose in false):
+            what = "positions are" if num_outside > 1 else "position is"
+            text = f"{num_outside} false {what} outside of the figure, marked at its edge"
+            figure.axes.set_title(text, color=BAD)
         return figure.to_svg("map from above", _create_legend(answers, colours), 5)
 
 

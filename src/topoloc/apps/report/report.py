@@ -52,7 +52,8 @@ NUM_WORST = 6
 def select_worst_queries(
     answers: Sequence[EvaluatedQuery], count: int = NUM_WORST
 ) -> list[EvaluatedQuery]:
-    """Return false accepts first, then queries without a pose, then the largest errors.
+    """Return false accepts first, then queries without a pose, then the largest errors over their
+    standard deviations.
 
     Each recording has an equal share of the places.
     """
@@ -88,11 +89,7 @@ def _error_rank(answer: EvaluatedQuery) -> tuple[int, float]:
         return 2 * answer.is_false_accept, 0.0
     if isinstance(answer.result, NotLocalized):
         return 1, 0.0
-    errors = (
-        answer.translation_m / answer.MAX_TRANSLATION,
-        answer.rotation_deg / answer.MAX_ROTATION_DEG,
-    )
-    return 2 * answer.is_false_accept, max(errors)
+    return 2 * answer.is_false_accept, answer.error_over_sigma
 
 
 def _render_query(answer: EvaluatedQuery, topomap: TopoMetricMap) -> tuple[str, str]:
@@ -132,6 +129,7 @@ def _describe_result(answer: EvaluatedQuery) -> str:
     if answer.world_from_cam is None:
         return "false accept: this image is out of the map"
     error = f"{format_length(answer.translation_m)}, {answer.rotation_deg:.2f}°"
+    error += f", {answer.error_over_sigma:.1f} standard deviations"
     return f"false accept: off by {error}" if answer.is_false_accept else f"off by {error}"
 
 
@@ -173,17 +171,17 @@ _MAP = (
     " estimated positions."
 )
 _CURVES = (
-    "A curve shows the share of all queries with at most this error. It ends at the share of"
-    " queries with a pose."
+    "A curve shows the share of all queries with at most this error, up to the largest one. It ends"
+    " at the share of queries with a pose. The axis of the errors is logarithmic."
 )
 _TYPICAL = (
     "The query with the median error of each recording, and the node of its pose. Matches that"
     " agree with the pose are green, others are red."
 )
 _WORST = (
-    "False accepts first, then queries without a pose, then the largest errors. Each recording has"
-    " an equal share of the places. Without a pose, the lines are matches by appearance: green if"
-    " they agree with the truth, red if not."
+    "False accepts first, then queries without a pose, then the largest errors over their reported"
+    " standard deviations. Each recording has an equal share of the places. Without a pose, the"
+    " lines are matches by appearance: green if they agree with the truth, red if not."
 )
 _NO_WORST = "There are none: no out-of-map image has a pose."
 _ALONG = "Every query in the order of its recording. The axis of the errors is logarithmic."
@@ -237,7 +235,7 @@ def _render_sections(
         yield render_section("Typical queries", _TYPICAL, gallery)
     worst = select_worst_queries(answers)
     gallery = render_gallery(worst, topomap) if worst else ""
-    yield render_section("The worst queries", _WORST if worst else _NO_WORST, gallery)
+    yield render_section("The worst answers", _WORST if worst else _NO_WORST, gallery)
     if evaluation["num_queries"]:
         figure = _scrollable(draw_errors_along(answers))
         yield render_section("Errors along the recordings", _ALONG, figure)

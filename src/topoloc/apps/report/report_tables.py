@@ -104,6 +104,11 @@ def render_number_tables(evaluation: dict[str, Any]) -> str:
         rows.append(("Nearest node ranked first", f"{100 * e['topological_accuracy']:.1f} %"))
     if e["num_elsewhere"]:
         rows.append(("Out-of-map images", str(e["num_elsewhere"])))
+    if e["num_localized"]:
+        largest = f"{format_length(e['max_translation_m'])}, {e['max_rotation_deg']:.2f}°"
+        rows.append(("Largest error", largest))
+        rows.append(("Poses off by more than 25 cm or 2°", str(e["num_inaccurate"])))
+        rows.append(("Poses outside their 95 % ellipsoid", str(e["num_outside_ellipsoid"])))
     rows.append(("False accepts", str(e["false_accepts"])))
     reasons = e["not_localized"].items()
     refused = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in reasons)

@@ -49,9 +49,7 @@ def create_application(
     query_handler = QueryHandler(
         maps, ImageDecoder(config.max_pixels), 1e3 * config.answer_s, atlases
     )
-    streams = Streams(
-        maps, query_handler, tracking or TrackerConfig(), config.max_sessions, config.session_idle_s
-    )
+    streams = Streams(maps, query_handler, tracking or TrackerConfig(), config)
     workers = Workers(config.num_workers, config.max_queue)
     service = Service(maps, query_handler, workers, config, metrics, streams)
     metrics.gauge("topoloc_jobs", "Requests in progress or waiting.", lambda: workers.num_jobs)

@@ -35,6 +35,8 @@ class ServiceConfig:
     Tiles of atlases further away are skipped."""
     max_sessions: Annotated[int, Between(0, 100_000)] = 64
     """Streams at a time."""
+    max_sessions_per_address: Annotated[int, AtLeast(1)] = 16
+    """Streams of one address at a time."""
     session_idle_s: Annotated[float, Above(0)] = 60.0
     """Seconds without an image after which a stream ends."""
     drain_s: Annotated[float, AtLeast(0)] = 20.0

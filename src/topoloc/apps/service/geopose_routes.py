@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from typing import Annotated, Any
 
@@ -84,9 +85,9 @@ async def localize_geopose(request: Request, only: MapOnly = None) -> Response:
     service, accept = get_service(request), request.headers.get("accept", "")
     try:
         check_version(accept)
-        body = await read_body(request)
+        body, stop = await read_body(request), threading.Event()
         reply, results = await service.run_job(
-            request, lambda: _localize_and_reply(service, body, only)
+            request, lambda: _localize_and_reply(service, body, only, stop), stop
         )
     except RequestError as refusal:  # the protocol has 400 for all faults of a request
         status = 400 if refusal.status in (415, 422) else refusal.status
@@ -100,7 +101,7 @@ async def localize_geopose(request: Request, only: MapOnly = None) -> Response:
 
 
 def _localize_and_reply(
-    service: Service, body: bytes, only: str | None
+    service: Service, body: bytes, only: str | None, stop: threading.Event
 ) -> tuple[GeoPoseReply | None, Results]:
     """Return the results of all maps and atlases, and the reply if their poses agree."""
     query = read_request(body)
@@ -113,12 +114,13 @@ def _localize_and_reply(
     maps = [name for name in service.maps.names() if name not in tiles] if only is None else [only]
     results: Results = {}
     georeferences = dict[str, Georeference]()
+    deadline = handler.deadline_of(stop)
     for name in maps:
         with service.maps.use_map(name) as opened:
             topomap = opened.content.topomap
             if topomap.georeference is not None:
                 camera = fit_camera(_select_camera(reading, picture, size, topomap), size, image)
-                results[name] = opened.content.localize(image, camera, max_ms=handler.max_ms)
+                results[name] = opened.content.localize(image, camera, max_ms=deadline)
                 georeferences[name] = topomap.georeference
     near = query.near(service.config.geolocation_m)
     for atlas, localizer in atlases:
@@ -128,7 +130,7 @@ def _localize_and_reply(
         if known:
             camera = fit_camera(_select_camera(reading, picture, size, None), size, image)
             nearby = localizer.near(near, georeferenced_only=True)
-            result = nearby.localize(image, camera, max_ms=handler.max_ms)
+            result = nearby.localize(image, camera, max_ms=deadline)
             results[result.provenance.tile or ""] = result
             georeferences |= known
     if not results:

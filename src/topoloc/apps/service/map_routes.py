@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import threading
 from functools import cache, partial
 from hashlib import sha256
 from importlib import resources
@@ -122,7 +123,9 @@ async def one_map(request: Request, map: MapName) -> JSONResponse:
 async def localize(request: Request, map: MapName, parameters: UrlParameters) -> Response:
     """Localize an image in one map."""
     service, query = get_service(request), await read_query_request(request, parameters)
-    result = await service.run_job(request, partial(service.query_handler.localize, map, query))
+    result = await service.run_job(
+        request, partial(service.query_handler.localize, map, query), query.stop
+    )
     service.count(request, map, result)
     return Response(result_to_line(result, query.picture.name), media_type="application/json")
 
@@ -133,7 +136,7 @@ async def localize_everywhere(request: Request, parameters: UrlParameters) -> JS
     no poses or several."""
     service, query = get_service(request), await read_query_request(request, parameters)
     results = await service.run_job(
-        request, partial(service.query_handler.localize_everywhere, query)
+        request, partial(service.query_handler.localize_everywhere, query), query.stop
     )
     for map_name, result in results.items():
         service.count(request, map_name, result)
@@ -159,7 +162,7 @@ async def explain(request: Request, map: MapName, parameters: UrlParameters) -> 
     service, query = get_service(request), await read_query_request(request, parameters)
     as_page = "text/html" in request.headers.get("accept", "")
     text = await service.run_job(
-        request, partial(service.query_handler.explain, map, query, as_page)
+        request, partial(service.query_handler.explain, map, query, as_page), query.stop
     )
     return HTMLResponse(text) if as_page else Response(text, media_type="application/json")
 
@@ -167,18 +170,24 @@ async def explain(request: Request, map: MapName, parameters: UrlParameters) -> 
 @router.get("/v1/maps/{map}/scene", responses=error_responses(401, 404, 422, 429, 503))
 async def scene(request: Request, map: MapName) -> Response:
     """Return a map for display: points, nodes with their images, and paths. See docs/viewer.md."""
-    service = get_service(request)
-    body = await service.run_job(request, lambda: _build_scene(service, map))
+    service, stop = get_service(request), threading.Event()
+    body = await service.run_job(request, lambda: build_scene(service, map, stop), stop)
     return Response(body, media_type="application/json")
 
 
-def _build_scene(service: Service, name: str) -> bytes:
-    """Return the document of a map, cached while its file is unchanged."""
+def build_scene(service: Service, name: str, stop: threading.Event) -> bytes:
+    """Return the document of a map, cached while its file is unchanged. Raises RequestError when
+    `stop` is set."""
     cached = service.scenes
+
+    def check() -> None:
+        if stop.is_set():
+            raise RequestError(499, "the client has gone")
+
     with service.maps.use_map(name) as opened:
         if name in cached and cached[name][0] == opened.stamp:
             return cached[name][1]
-        document = create_document(opened.content.topomap, name, budget=SceneBudget())
+        document = create_document(opened.content.topomap, name, (), SceneBudget(), check)
         body = json.dumps(document, separators=(",", ":")).encode()
         cached.pop(name, None)
         while len(cached) >= _NUM_CACHED_SCENES:

@@ -36,7 +36,7 @@ from topoloc.apps.report.explanation_page import compared_to_json, explanation_p
 from topoloc.apps.service.logs import log
 from topoloc.apps.service.query_request import QueryRequest, parse_camera_field
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.plugin import EncodedImage, image_size
+from topoloc.plugin import Deadline, EncodedImage, image_size
 
 POLL_INTERVAL_S = 5.0
 """Seconds between two checks of an object store: one listing each, and a reading if it changed."""
@@ -112,11 +112,13 @@ class QueryHandler:
         """Localize in every map and every atlas of the service. Those that are left share the time
         that is left."""
         localizers = [localizer for _, localizer in self.atlases.opened()]
-        end = time.perf_counter() + self._limit_ms(query_request) / 1e3
+        end = time.perf_counter() + self._limit_ms(query_request.max_ms) / 1e3
         tiles = {tile_id for localizer in localizers for tile_id in localizer.tile_ids}
         names = [name for name in self.maps.names() if name not in tiles]
         answers, num_left = dict[str, Localization | NotLocalized](), len(names) + len(localizers)
         for one in [*names, *localizers]:
+            if query_request.stop.is_set():
+                break
             remaining_ms = max(1.0, 1e3 * (end - time.perf_counter()) / num_left)
             limited, num_left = replace(query_request, max_ms=remaining_ms), num_left - 1
             if isinstance(one, str):
@@ -133,7 +135,8 @@ class QueryHandler:
             raise QueryError("a prior is a pose in one map's world: ask that map")
         image, camera = self.decode_query(query_request, None)
         localizer = localizer if query_request.near is None else localizer.near(query_request.near)
-        return localizer.localize(image, camera, max_ms=query_request.max_ms)
+        deadline = self.deadline_of(query_request.stop, query_request.max_ms)
+        return localizer.localize(image, camera, max_ms=deadline)
 
     def explain(self, name: str, query_request: QueryRequest, as_page: bool) -> str:
         """Explain the result of an image as a page or as JSON."""
@@ -144,7 +147,8 @@ class QueryHandler:
             camera: Camera | UncalibratedCamera,
             query_request: QueryRequest,
         ) -> str:
-            explanation, query = (explain(localizer, image, camera), query_request.picture.name)
+            deadline, query = Deadline(stop=query_request.stop), query_request.picture.name
+            explanation = explain(localizer, image, camera, deadline)
             if as_page:
                 return explanation_page(query, image, explanation, localizer.topomap)
             compared = compared_to_json(image, explanation, localizer.topomap)
@@ -181,10 +185,15 @@ class QueryHandler:
         camera: Camera | UncalibratedCamera,
         query_request: QueryRequest,
     ) -> Localization | NotLocalized:
-        return localizer.localize(image, camera, query_request.prior, self._limit_ms(query_request))
+        deadline = self.deadline_of(query_request.stop, query_request.max_ms)
+        return localizer.localize(image, camera, query_request.prior, deadline)
 
-    def _limit_ms(self, query_request: QueryRequest) -> float:
-        return min(query_request.max_ms or self.max_ms, self.max_ms)
+    def deadline_of(self, stop: threading.Event, max_ms: float | None = None) -> Deadline:
+        """Return the end of a search that begins now. `stop` ends it before."""
+        return Deadline(time.perf_counter() + self._limit_ms(max_ms) / 1e3, stop)
+
+    def _limit_ms(self, max_ms: float | None) -> float:
+        return min(max_ms or self.max_ms, self.max_ms)
 
 
 class ImageDecoder:

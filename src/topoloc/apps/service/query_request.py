@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Annotated, Any
 
@@ -40,6 +41,7 @@ class QueryRequest:
         prior: world_from_cam.
         max_ms: time limit of `Localizer.localize`.
         near: tiles of atlases that lie further away are skipped.
+        stop: is set when nobody waits for the result any more. The search then ends.
     """
 
     picture: EncodedImage
@@ -47,6 +49,7 @@ class QueryRequest:
     prior: Rigid3 | None = None
     max_ms: float | None = None
     near: GeoPositionPrior | None = None
+    stop: threading.Event = field(default_factory=threading.Event)
 
 
 async def read_query_request(request: Request, parameters: QueryParameters) -> QueryRequest:

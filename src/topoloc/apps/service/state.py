@@ -43,6 +43,7 @@ class Stream:
     """One stream. Its lock is held during a query. `resources` keep its map open."""
 
     map_name: str
+    address: str
     resources: ExitStack
     tracker: Tracker
     camera: str | None
@@ -53,40 +54,48 @@ class Stream:
 
 
 class Streams:
-    """All streams of a service, at most `max_streams`. `idle_s`: seconds without an image after
-    which a stream ends."""
+    """All streams of a service, at most `config.max_sessions`, and `max_sessions_per_address` of
+    one address."""
 
     def __init__(
         self,
         maps: MapCache[Localizer],
         query_handler: QueryHandler,
-        config: TrackerConfig,
-        max_streams: int,
-        idle_s: float,
+        tracking: TrackerConfig,
+        config: ServiceConfig,
     ) -> None:
-        self._maps, self._query_handler, self._config = maps, query_handler, config
-        self._max_streams, self._idle_s = max_streams, idle_s
+        self._maps, self._query_handler = maps, query_handler
+        self._tracking, self._config = tracking, config
         self._lock = threading.Lock()
         self._streams: dict[str, Stream] = {}
 
     def __len__(self) -> int:
         return len(self._streams)
 
-    def begin(self, map_name: str, camera: str | None) -> Stream:
-        """Begin a stream in a map. `camera` is the default for its images. Raises RequestError:
-        there are too many streams, or no such map; MapError: the map is damaged."""
+    def begin(self, map_name: str, camera: str | None, address: str) -> Stream:
+        """Begin a stream in a map for a client at this address. `camera` is the default for its
+        images. Raises RequestError: there are too many streams, or no such map; MapError: the map
+        is damaged."""
         self.forget_idle()
         resources = ExitStack()
         localizer = resources.enter_context(self._maps.use_map(map_name)).content
-        stream = Stream(map_name, resources, Tracker(localizer, self._config), camera)
+        stream = Stream(map_name, address, resources, Tracker(localizer, self._tracking), camera)
         with self._lock:
-            is_full = len(self._streams) >= self._max_streams
-            if not is_full:
+            fault = self._find_excess(address)
+            if fault is None:
                 self._streams[stream.id] = stream
-        if is_full:
+        if fault is not None:
             resources.close()
-            raise RequestError(429, f"{self._max_streams} streams are open already", 10)
+            raise RequestError(429, fault, 10)
         return stream
+
+    def _find_excess(self, address: str) -> str | None:
+        """Return why this address may not begin a stream, None if it may."""
+        number = sum(one.address == address for one in self._streams.values())
+        if number >= self._config.max_sessions_per_address:
+            return f"{number} streams of this address are open already"
+        number = len(self._streams)
+        return f"{number} streams are open already" if number >= self._config.max_sessions else None
 
     def find(self, map_name: str, stream_id: str) -> Stream:
         """Return a stream by its id. Raises RequestError."""
@@ -125,7 +134,7 @@ class Streams:
 
     def forget_idle(self) -> None:
         """End the streams without a recent image."""
-        oldest = time.monotonic() - self._idle_s
+        oldest = time.monotonic() - self._config.session_idle_s
         for stream in list(self._streams.values()):
             if stream.last_used < oldest and not stream.lock.locked():
                 self.end(stream)
@@ -210,8 +219,11 @@ class Service:
     scenes: dict[str, tuple[tuple[int, ...], bytes]] = field(default_factory=dict)
     num_awaiting: int = 0
 
-    async def run_job(self, request: HTTPConnection, job: Callable[[], R]) -> R:
-        """Return the result of a job from a worker.
+    async def run_job(
+        self, request: HTTPConnection, job: Callable[[], R], stop: threading.Event | None = None
+    ) -> R:
+        """Return the result of a job from a worker. `stop` is set when the result is there, or when
+        nobody waits for it any more: the client has gone, or the time is over.
 
         If the job needs a tile that is still being fetched, it is run again after the fetch. The
         worker is free meanwhile. Every error of the job becomes a RequestError.
@@ -232,6 +244,9 @@ class Service:
             if not isinstance(error, TopolocError | RequestError):
                 log("failure", logging.ERROR, error, request_id=request.scope["request_id"])
             raise to_request_error(error) from error
+        finally:
+            if stop is not None:
+                stop.set()
 
     async def _wait_for_fetch(self, awaited: TilePending) -> None:
         """Wait for a tile until its deadline. Raises RequestError if too many requests wait."""

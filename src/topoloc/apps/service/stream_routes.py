@@ -14,6 +14,7 @@ from fastapi.responses import JSONResponse, Response
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 from pydantic import BaseModel
 
+from topoloc.apps.service.connections import client_address
 from topoloc.apps.service.map_routes import MapName, UrlParameters
 from topoloc.apps.service.openapi_schemas import (
     IMAGE_BODY,
@@ -53,8 +54,8 @@ class StreamFacts(BaseModel):
 )
 async def begin(request: Request, map: MapName, camera: StreamCamera = None) -> StreamFacts:
     """Begin a stream of successive images. Each result supports the next one."""
-    service = get_service(request)
-    stream = await service.run_job(request, lambda: service.streams.begin(map, camera))
+    service, address = get_service(request), client_address(request.client)
+    stream = await service.run_job(request, lambda: service.streams.begin(map, camera, address))
     return StreamFacts(session=stream.id, map=map, idle_s=service.config.session_idle_s)
 
 
@@ -99,8 +100,9 @@ async def stream_over_websocket(socket: WebSocket, map: str) -> None:
     next images: `{"camera": ..., "t_ns": ...}`. The time is that of the next image only.
     """
     service, camera = get_service(socket), socket.query_params.get("camera")
+    address = client_address(socket.client)
     try:
-        stream = await service.run_job(socket, lambda: service.streams.begin(map, camera))
+        stream = await service.run_job(socket, lambda: service.streams.begin(map, camera, address))
     except RequestError as refusal:
         body = refusal.to_json(socket.scope["request_id"])
         await socket.send_denial_response(JSONResponse(body, refusal.status, refusal.headers))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,15 +51,16 @@ def create_document(
     name: str,
     results: Sequence[ResultSet] = (),
     budget: SceneBudget | None = None,
+    on_node: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
-    """Return the document of a map and of results in it. Raises MapError: the map cannot be
-    read."""
+    """Return the document of a map and of results in it. `on_node` is called for each node, and its
+    errors end the work. Raises MapError: the map cannot be read."""
     budget = budget or SceneBudget()
-    shown = _read_nodes(topomap, budget.max_points)
+    shown = _read_nodes(topomap, budget.max_points, on_node)
     poses = [summary.world_from_cam for summary in topomap.summaries]
     centres = np.array([pose.translation for pose in poses])
     focus = _find_focus_box(centres, shown.points_world)
-    images = _encode_images(shown.images, budget.max_image_bytes)
+    images = _encode_images(shown.images, budget.max_image_bytes, on_node)
     return {
         "format": "topoloc-scene",
         "version": 1,
@@ -109,12 +110,15 @@ class _NodeContent:
     rgb: UInt8[np.ndarray, "n 3"]
 
 
-def _read_nodes(topomap: TopoMetricMap, max_points: int) -> _NodeContent:
+def _read_nodes(
+    topomap: TopoMetricMap, max_points: int, on_node: Callable[[], None]
+) -> _NodeContent:
     """Return at most `max_points` precise points, evenly from all nodes, with image colours."""
     share = min(1.0, max_points / max(1, sum(summary.num_points for summary in topomap.summaries)))
     cameras, images = list[Camera](), list[bytes]()
     points, colours = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for node in topomap.nodes:
+        on_node()
         sigmas = np.linalg.norm(node.point_sqrt_covs.astype(np.float64), axis=1)
         known = sigmas <= _MAX_POINT_SIGMA * np.linalg.norm(node.points_cam, axis=1)
         rows = np.flatnonzero(known & np.isfinite(node.points_cam).all(axis=1))
@@ -174,7 +178,9 @@ def _nodes_to_json(
     ]
 
 
-def _encode_images(images: Sequence[bytes], max_bytes: int) -> list[str | None]:
+def _encode_images(
+    images: Sequence[bytes], max_bytes: int, on_node: Callable[[], None]
+) -> list[str | None]:
     """Return the images as base64, at the largest common width that fits into the budget.
 
     If the smallest width is too large, only every k-th image is kept.
@@ -189,8 +195,11 @@ def _encode_images(images: Sequence[bytes], max_bytes: int) -> list[str | None]:
     }
     width = next((width for width, size in sizes.items() if size <= room), _IMAGE_WIDTHS[-1])
     step = max(1, int(np.ceil(sizes[width] / room)))
-    shrunk = (_resize(one, width) if row % step == 0 else b"" for row, one in enumerate(images))
-    return [to_base64(one) if one else None for one in shrunk]
+    found = list[str | None]()
+    for row, one in enumerate(images):
+        on_node()
+        found.append(to_base64(_resize(one, width)) if one and row % step == 0 else None)
+    return found
 
 
 def _resize(encoded: bytes, width: int) -> bytes:

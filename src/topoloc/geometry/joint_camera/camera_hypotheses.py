@@ -72,12 +72,12 @@ class CameraHypothesis:
 
     @property
     def basis(self) -> Float[np.ndarray, "7 k"]:
-        """Return the directions in which the parameters are estimated. A principal point off in one
-        axis is estimated in both, because that of a camera is off by a per cent in the other."""
+        """Return the directions in which the parameters are estimated: always the principal point,
+        because that of a whole image is off its centre by up to a per cent, too."""
         eye = np.eye(7)
         radial = np.array([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]]).T
         lens = {"none": eye[:, :0], "radial": radial, "other": eye[:, 3:]}[self.lens]
-        return np.hstack([eye[:, : 3 if self.off_centre else 1], lens])
+        return np.hstack([eye[:, :3], lens])
 
 
 @dataclass(frozen=True, eq=False)

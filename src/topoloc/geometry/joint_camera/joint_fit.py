@@ -44,7 +44,7 @@ class Observations:
     within which errors may be shared."""
 
     points: Float[np.ndarray, "n 2"]
-    sigma: float
+    sigma: float | Float[np.ndarray, " n"]
     points_world: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
     cells: np.ndarray
@@ -78,7 +78,7 @@ class Observations:
         jacobian[:, 0, 7] = jacobian[:, 1, 8] = 1.0
         by_world = jacobian[:, :, :3] @ cam_from_world.rotation
         spread = by_world @ self.covariances @ by_world.transpose(0, 2, 1)
-        spread += self.sigma**2 * np.eye(2)
+        spread += np.square(self.sigma)[..., None, None] * np.eye(2)
         return jacobian, np.linalg.inv(spread) * is_seen[:, None, None], projected - self.points
 
 
@@ -173,7 +173,7 @@ def linearized_fit(seen: Observations, cam_from_world: Rigid3, camera: Vector) -
     known = information[6:, 6:] - information[6:, :6] @ by_pose[:, 6:]
     pull = known @ camera - (gradient[6:] - by_pose[:, 6:].T @ gradient[:6])
     variance = estimate_noise_scale(squares[active], 13) ** 2
-    variance *= _shared_noise(information, gradients[active], seen.cells[active])
+    variance *= clustered_noise(information, gradients[active], seen.cells[active], slice(6, 9))
     return JointFit(cam_from_world, camera, information, pull, variance)
 
 
@@ -200,18 +200,21 @@ def _linear_system(
     return information, (weighted * errors[:, :, None]).sum(axis=1), squares, is_active
 
 
-def _shared_noise(
-    information: Float[np.ndarray, "13 13"], gradients: Float[np.ndarray, "n 13"], cells: np.ndarray
+def clustered_noise(
+    information: Float[np.ndarray, "k k"],
+    gradients: Float[np.ndarray, "n k"],
+    cells: np.ndarray,
+    of: slice,
 ) -> float:
-    """Return the factor of the variance of focal length and principal point by errors that are
-    common to parts of the image, at least 1 (see `clustered_errors.py`)."""
+    """Return the factor of the variance of some parameters (focal length and principal point, say)
+    by errors that are common to parts of the image, at least 1 (see `clustered_errors.py`)."""
     used, number = np.unique(cells, return_inverse=True)
     if len(used) < 8:
         return 1.0
     gradients = gradients - gradients.mean(axis=0)
-    of_cells = np.zeros((len(used), 13))
+    of_cells = np.zeros((len(used), len(information)))
     np.add.at(of_cells, number, gradients)
-    inverse = np.linalg.inv(information + 1e-6 * np.diag(np.diag(information)))[6:9]
+    inverse = np.linalg.inv(information + 1e-6 * np.diag(np.diag(information)))[of]
     alone = np.square(inverse @ gradients.T).sum(axis=1)
     together = np.square(inverse @ of_cells.T).sum(axis=1)
     return max(1.0, float(np.mean(together / alone)) * len(used) / (len(used) - 4.0))

@@ -76,7 +76,7 @@ def _can_refine(searches: Sequence[Search], weights: LastStepWeights) -> bool:
         and first.config.guided.num_nodes > 0
         and first.correlated_error_share <= weights.max_correlated_error_share
         and not isinstance(first.query.input_camera, UncalibratedCamera)
-        and not first.query.is_past_deadline
+        and not first.query.deadline.is_past
         and bool(first.query.grey.any())  # not so if only features are known
     )
 
@@ -124,8 +124,8 @@ def _reconsider_refusal(
 def _refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> ResultWithInliers:
     """Return the outcome with its pose refined, or unchanged if too few points agree.
 
-    Nodes near a pose from virtual views show something else, and a calibration in doubt would have
-    to be estimated with the pose.
+    Nodes near a pose from virtual views show something else. A calibration in doubt and a rotation
+    during a rolling shutter would have to be estimated with the pose.
     """
     result, first = outcome[0], searches[0]
     weights = load_last_step_weights()
@@ -133,6 +133,7 @@ def _refine_result(searches: Sequence[Search], outcome: ResultWithInliers) -> Re
         not isinstance(result, Localization)
         or not _is_from_nodes(first, result.evidence)
         or result.calibration_doubt is not None
+        or result.frame_rotation_deg is not None
         or not _can_refine(searches, weights)
     ):
         return outcome

@@ -114,7 +114,7 @@ class Command:
         split = SplitOptions.of(self.split)
         recordings, target = self._split_paths()
         read = [path for path in (*self.trajectory, self.config) if path not in ("truth", "slam")]
-        check_outputs([target if self.ray is None else None, self.json], read)
+        check_outputs([target if self.ray is None else None, self.json], [*recordings, *read])
         if any("=" not in text and not _is_positive(text) for text in self.scale):
             raise UsageError(
                 "--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not"

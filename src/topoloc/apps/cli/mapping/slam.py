@@ -42,7 +42,7 @@ class Command:
     """Write the printed facts as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
-        check_outputs([self.out, self.json])
+        check_outputs([self.out, self.json], [self.sequence])
         words = self.sequence, self.format, self.camera, self.topics
         sequence = open_recording(*words, whole_only=True)
         if self.json != "-":

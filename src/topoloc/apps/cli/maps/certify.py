@@ -76,7 +76,8 @@ class Command:
     def run(self) -> int:
         if not 0.0 < self.max_wrong < 100.0:
             raise UsageError(f"--max-wrong must be a percentage, not {self.max_wrong:g}")
-        check_outputs([self.json, self.report], [self.map, self.map_from_truth, self.config])
+        read = [self.map, *self.walk, *self.out_of_map, self.map_from_truth, self.config]
+        check_outputs([self.json, self.report], read)
         write_page = _import_page_writer() if self.report else None
         map_from_truth = read_rigid(Path(self.map_from_truth)) if self.map_from_truth else None
         config = read_settings(self.config).of(LocalizerConfig)

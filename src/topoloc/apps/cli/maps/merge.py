@@ -16,6 +16,7 @@ from topoloc.apps.cli.output import (
     UsageError,
     check_outputs,
     print_line,
+    print_waiting,
     progress_bar,
     write_json,
 )
@@ -55,7 +56,7 @@ class Command:
         settings = self._read_settings(self.out, self.json)
         config = settings.of(LocalizerConfig)
         with progress_bar() as progress:
-            c = merge(self.first, self.second, self.out, config, progress)
+            c = merge(self.first, self.second, self.out, config, progress, print_waiting)
         if self.json != "-":
             nodes = f"{c['agreeing']} of {c['nodes_of_second']} nodes of {self.second}"
             size = f"{c['bytes'] / 1e6:.2f} MB{describe_outdated_models(c)}"

@@ -74,7 +74,7 @@ class Command:
         if self.light is not None and not self.light.strip():
             raise UsageError("--light is a name, such as evening")
         place = open_place(self.paths[0])
-        check_outputs([self.json, self.joined], [self.paths[0], self.config])
+        check_outputs([self.json, self.joined], [*self.paths, self.config])
         settings = read_settings(self.config)
         return place.visit(
             lambda path: self._update_map(path, settings),

@@ -132,7 +132,7 @@ class Command:
             raise UsageError("--fit-map-from-truth needs one recording and no --map-from-truth")
         if self.report:
             import_report_writer()
-        inputs = [self.map, self.map_from_truth, self.config]
+        inputs = [self.map, *self.sequences, *self.elsewhere, self.map_from_truth, self.config]
         check_outputs([self.json, self.report, self.fit_map_from_truth], inputs)
 
     def _report(
@@ -270,7 +270,10 @@ def _facts_with_truth(e: dict[str, Any]) -> list[tuple[str, str]]:
     facts = [("localized", f"{e['num_localized']} of {e['num_queries']} ({share:.1f} %)")]
     if e["num_localized"]:
         error = f"{100 * e['median_translation_m']:.2f} cm, {e['median_rotation_deg']:.3f} deg"
-        facts.append(("median error", error))
+        largest = f"{100 * e['max_translation_m']:.2f} cm, {e['max_rotation_deg']:.3f} deg"
+        facts += [("median error", error), ("largest error", largest)]
+        outside = f"{e['num_outside_ellipsoid']} outside their 95 % ellipsoid"
+        facts.append(("inaccurate", f"{e['num_inaccurate']} beyond 25 cm or 2 deg, {outside}"))
     recalls = [f"{name.replace('_', ' ')} {100 * one:.1f} %" for name, one in e["recall"].items()]
     facts.append(("recall", ", ".join(recalls)))
     if e["topological_accuracy"] is not None:

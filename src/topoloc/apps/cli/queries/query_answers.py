@@ -29,6 +29,7 @@ from topoloc import (
 from topoloc.apps.cli.output import print_line, print_warning, write_text
 from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.query_camera import CameraOfSize, select_frame_camera
+from topoloc.plugin import format_length
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,10 +184,11 @@ def format_answer(answer: QueryAnswer) -> str:
     tile = "" if result.provenance.tile is None else f"  tile {result.provenance.tile}"
     x, y, z = result.world_from_cam.translation
     w, i, j, k = result.world_from_cam.quat_wxyz()
+    sigmas = f"{format_length(result.position_sigma_m)} {result.rotation_sigma_deg:.2f} deg"
     return (
         f"{answer.query}  {state}at {x:.3f} {y:.3f} {z:.3f} m, quat wxyz {w:.4f} {i:.4f} {j:.4f}"
-        f" {k:.4f}  p {result.probability:.2f}{tile}  node {result.node_id}  ({result.num_inliers}"
-        f" of {result.num_matches} matches){focal}{ms}"
+        f" {k:.4f}  p {result.probability:.2f}  sigma {sigmas}{tile}  node {result.node_id} "
+        f" ({result.num_inliers} of {result.num_matches} matches){focal}{ms}"
     )
 
 
