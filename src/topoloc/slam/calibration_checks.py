@@ -27,9 +27,6 @@ from topoloc.slam.input_checks import add_calibration
 from topoloc.slam.measured_steps import MatchedPoints, MeasuredStep, measure_steps
 
 _MIN_STEPS = 5
-# Logarithms of the smallest factors by which a focal length or scale is wrong. Those of right
-# recordings are up to 0.06 and 0.05 (ZED, KITTI, 7-Scenes: benchmarks/wrong_recordings.py --right).
-_FOCAL_TOLERANCE, _SCALE_TOLERANCE = 0.075, 0.07
 
 
 def check_calibration(
@@ -77,9 +74,10 @@ def find_image_faults(sequence: StereoSequence) -> list[str]:
 
 
 def _find_focal_problem(sequence: StereoSequence, steps: Sequence[MeasuredStep]) -> str | None:
+    min_log = 0.075  # right recordings of ZED, KITTI and 7-Scenes: up to 0.058
     focal, sigma = _estimate_focal_error(steps)
     camera = sequence[0].camera
-    if camera is None or not abs(focal) - 2.0 * sigma > _FOCAL_TOLERANCE:
+    if camera is None or not abs(focal) - 2.0 * sigma > min_log:
         return None
     return (
         f"{sequence.name}: a focal length of about {camera.fx / math.exp(focal):.4g} px fits the"
@@ -99,6 +97,7 @@ def estimate_scale_error(
 ) -> float | None:
     """Return depth over that by the motion of poses (world_from_cam, one for each frame). None if
     it is 1, or the images do not decide."""
+    min_log = 0.07  # right recordings of ZED, KITTI and 7-Scenes: up to 0.06
     ratios = list[Float[np.ndarray, " 3"]]()
     for step in steps:
         first, last = poses[step.first], poses[step.last]
@@ -112,7 +111,7 @@ def estimate_scale_error(
     if len(ratios) < _MIN_STEPS:
         return None
     (low, sigma), (scale, _), (high, _) = (_median(column) for column in zip(*ratios, strict=True))
-    is_wrong = max(low, -high) - 3.0 * sigma > _SCALE_TOLERANCE
+    is_wrong = max(low, -high) - 3.0 * sigma > min_log
     return math.exp(scale) if is_wrong else None
 
 
