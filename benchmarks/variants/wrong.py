@@ -84,7 +84,8 @@ def rotate_right(degrees: float, axis: tuple[float, float, float]) -> Change:
 
 
 def forget_rig(walk: Walk) -> Walk:
-    return replace(walk, rig=None)
+    camera = Camera.pinhole(walk.camera.width, walk.camera.height, *walk.camera.intrinsics)
+    return replace(walk, rig=None, camera=camera)
 
 
 def shift_clock(seconds: float) -> Change:

@@ -15,6 +15,7 @@ import pytest
 from tiny_recordings import picture, write
 from topoloc.apps.cli import main
 from topoloc.errors import RecordingError
+from topoloc.localization.map_facts.map_building import build_map
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.open import open_sequence
 
@@ -43,6 +44,18 @@ def test_frames_with_damaged_images_are_left_out_and_counted(
     assert main(["build", str(recording), str(tmp_path / "room.topo"), "--features", "surf"]) == 0
     assert f"3 of {num} frames" in capsys.readouterr().err
     assert len(TopoMetricMap.load(tmp_path / "room.topo").nodes) >= 2
+
+
+def test_build_map_leaves_damaged_frames_out_and_warns(recording: Path):
+    (recording / "image_0" / "000005.png").write_bytes(b"")
+    warned: list[object] = []
+    sources = recording, open_sequence(recording)  # a path and a recording
+    for source in sources:
+        assert len(build_map(source, warn=warned.append).nodes) >= 2
+    assert len(warned) == len(sources)
+    assert all("1 of 14 frames left out" in str(one) for one in warned)
+    with pytest.warns(UserWarning, match="1 of 14 frames left out"):
+        build_map(recording)
 
 
 def test_a_selection_counts_its_own_frames(recording: Path):

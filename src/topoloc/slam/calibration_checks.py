@@ -14,32 +14,27 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from topoloc.errors import TrajectoryError
+from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.geometry.absolute_pose import estimate_absolute_pose
 from topoloc.geometry.absolute_pose_kernels import squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.pose_matches import Matches
 from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.calibration import camera_from_intrinsics
 from topoloc.recordings.frame import StereoSequence
 from topoloc.slam.depth_checks import find_depth_shift
 from topoloc.slam.input_checks import add_calibration
 from topoloc.slam.measured_steps import MatchedPoints, MeasuredStep, measure_steps
 
 _MIN_STEPS = 5
-# Logarithms of the smallest factors by which a focal length or scale is wrong. Those of right
-# recordings are up to 0.06 and 0.05 (ZED, KITTI, 7-Scenes: benchmarks/wrong_recordings.py --right).
-_FOCAL_TOLERANCE, _SCALE_TOLERANCE = 0.075, 0.07
 
 
 def check_calibration(
     sequence: StereoSequence, steps: Sequence[MeasuredStep], are_poses_right: bool
 ) -> None:
     """Check the calibration of a recording by steps between its images, and by its poses if these
-    are right but for some percent. Single cameras are not checked.
-
-    Raises:
-        TrajectoryError: it does not fit. Contains the value that does.
-    """
+    are right but for some percent. Raises TrajectoryError with the value that fits. Single cameras
+    pass."""
     unchecked = "--poses unchecked maps it all the same"
     if (problem := _find_focal_problem(sequence, steps)) is not None:
         raise TrajectoryError(f"{problem}; {unchecked}")
@@ -59,15 +54,18 @@ def check_calibration(
 
 def find_image_faults(sequence: StereoSequence) -> list[str]:
     """Return a note for each fault of a recording without poses that its images or times show.
-
-    Raises:
-        RecordingError, CalibrationError, UnreadableImageError: the recording cannot be read.
-    """
+    Raises as the recording."""
     max_interval_s = 10.0  # median; a longer one is of another unit than the second
     interval = float(np.median(np.diff(sequence.t_ns))) / 1e9 if len(sequence) > 1 else 0.0
     is_single = sequence[0].right is None and sequence[0].depth is None
     steps = [] if is_single else measure_steps(sequence, list(range(len(sequence))))
     notes = [find_depth_shift(sequence), _find_focal_problem(sequence, steps)]
+    if (camera := sequence[0].camera) is not None:
+        try:
+            camera_from_intrinsics(*camera.intrinsics, camera.width, camera.height)
+        except CalibrationError as error:
+            fault, factor = str(error).partition(" (")[0], camera.width / (2.0 * camera.cx + 1.0)
+            notes.append(f"{sequence.name}: {fault}; multiply them by {factor:.3g}")
     if interval > max_interval_s:
         unit = "milliseconds" if interval < 1e4 else "micro- or nanoseconds"
         between = f"{interval:.4g} s from picture to picture (median)"
@@ -76,9 +74,10 @@ def find_image_faults(sequence: StereoSequence) -> list[str]:
 
 
 def _find_focal_problem(sequence: StereoSequence, steps: Sequence[MeasuredStep]) -> str | None:
+    min_log = 0.075  # right recordings of ZED, KITTI and 7-Scenes: up to 0.058
     focal, sigma = _estimate_focal_error(steps)
     camera = sequence[0].camera
-    if camera is None or not abs(focal) - 2.0 * sigma > _FOCAL_TOLERANCE:
+    if camera is None or not abs(focal) - 2.0 * sigma > min_log:
         return None
     return (
         f"{sequence.name}: a focal length of about {camera.fx / math.exp(focal):.4g} px fits the"
@@ -98,16 +97,21 @@ def estimate_scale_error(
 ) -> float | None:
     """Return depth over that by the motion of poses (world_from_cam, one for each frame). None if
     it is 1, or the images do not decide."""
+    min_log = 0.07  # right recordings of ZED, KITTI and 7-Scenes: up to 0.06
     ratios = list[Float[np.ndarray, " 3"]]()
     for step in steps:
         first, last = poses[step.first], poses[step.last]
-        if step.points is not None and first is not None and last is not None:
-            ratio = _depth_ratios(step.points, first.inverse() @ last)
-            ratios += [] if ratio is None else [ratio]
+        if step.points is None or first is None or last is None:
+            continue
+        given = first.inverse() @ last
+        if step.normalized_error(given) >= 1.0 and not step.decides_on(given):
+            continue  # equal panels
+        if (ratio := _depth_ratios(step.points, given)) is not None:
+            ratios.append(ratio)
     if len(ratios) < _MIN_STEPS:
         return None
     (low, sigma), (scale, _), (high, _) = (_median(column) for column in zip(*ratios, strict=True))
-    is_wrong = max(low, -high) - 3.0 * sigma > _SCALE_TOLERANCE
+    is_wrong = max(low, -high) - 3.0 * sigma > min_log
     return math.exp(scale) if is_wrong else None
 
 
@@ -130,12 +134,10 @@ def _fit_focal(points: MatchedPoints) -> float | None:
     if not np.isfinite(costs).all():
         return None
     k = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
-    before, at, after = costs[k - 1 : k + 2]
-    curvature = before - 2.0 * at + after
-    if curvature < 2.0 * min_rise:
+    square, linear, _ = np.polyfit(factors[k - 1 : k + 2], costs[k - 1 : k + 2], 2)
+    if square * step**2 < min_rise:
         return None
-    shift = float(np.clip(0.5 * (before - after) / curvature, -1.0, 1.0))
-    return -(factors[k] + step * shift)
+    return float(np.clip(0.5 * linear / square, -factors[k + 1], -factors[k - 1]))
 
 
 def _focal_cost(points: MatchedPoints, factor: float) -> float:

@@ -227,7 +227,8 @@ def _find_time_shift(
     largest = min(_MAX_SHIFT_S, 0.4e-9 * (posed[-1][1] - posed[0][1]))
     rows = [k for step in measured for k in (step.first, step.last)]
     min_steps, readings = max(_MIN_INFORMATIVE_STEPS, len(measured) // 2), []
-    for seconds in np.linspace(-largest, largest, 2 * _NUM_SHIFTS + 1).tolist():
+    fractions = np.linspace(-1.0, 1.0, 2 * _NUM_SHIFTS + 1)
+    for seconds in (largest * fractions * np.abs(fractions)).tolist():  # finer near 0
         times = [t_ns[k] + round(1e9 * seconds) for k in rows]
         shifted = trajectory.interpolate(times, _MAX_GAP_S)
         errors = [

@@ -31,6 +31,24 @@ def test_answers_beside_a_recording_are_no_ground_truth(
     assert " cm" in capsys.readouterr().out
 
 
+def test_build_warns_of_nodes_that_contradict_the_rest(
+    tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    walk, target = Path(shutil.copytree(tiny_recording, tmp_path / "walk")), tmp_path / "a.topo"
+    rows = [line.split() for line in (walk / "truth.tum").read_text().splitlines()]
+    for row in rows[4:7]:  # the tracker was a metre off for a while
+        row[1] = str(float(row[1]) + 1.0)
+    (walk / "truth.tum").write_text("".join(" ".join(row) + "\n" for row in rows))
+    command = ["build", str(walk), str(target), "--features", "surf", "--poses", "unchecked"]
+    assert main(command) == 0
+    (warning,) = capsys.readouterr().err.splitlines()
+    assert "nodes contradict the rest (node " in warning
+    assert "topoloc info --check" in warning
+    assert main(["info", str(target), "--check"]) == 1
+    assert main(["build", str(tiny_recording), str(target), "--features", "surf"]) == 0
+    assert "contradict" not in capsys.readouterr().err
+
+
 def test_build_prints_how_it_understood_a_recording_and_warns_of_a_still_camera(
     tiny_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
