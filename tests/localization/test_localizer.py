@@ -173,6 +173,11 @@ class _FromBelow:
 def test_without_all_nodes_there_is_no_map(localizer: Localizer):
     with pytest.raises(EmptyMapError, match="no node of the map remains"):
         localizer.without(one.node_id for one in localizer.topomap.summaries)
+    first, *others = (one.node_id for one in localizer.topomap.summaries)
+    last = localizer.without(others)
+    assert last.localize(PICTURE, CAMERA).candidates[0].node_id == first
+    with pytest.raises(EmptyMapError, match="no node of the map remains"):
+        last.without([first])
 
 
 def test_a_coarse_localizer_of_one_s_own_answers_instead_of_the_map_s(localizer: Localizer):

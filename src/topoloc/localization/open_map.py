@@ -90,7 +90,7 @@ class OpenMap:
         Loaded nodes are shared. Virtual views are not used. Raises EmptyMapError if none remains.
         """
         other = copy.copy(self)
-        other._masked_rows = sorted(set(rows))
+        other._masked_rows = sorted({*self._masked_rows, *rows})
         if len(other._masked_rows) == len(self.node_ids):
             raise EmptyMapError("no node of the map remains")
         other.coarse = _MaskedCoarseLocalizer(self.coarse, frozenset(other._masked_rows))
