@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from topoloc.localization.query import Deadline as Deadline
     from topoloc.recordings.atomic import (
         atomic_write as atomic_write,
+        recording_writes as recording_writes,
         remove_stale_files as remove_stale_files,
         temporary_folder as temporary_folder,
         write_bytes as write_bytes,
         write_folder as write_folder,
         write_text as write_text,
-        written_paths as written_paths,
     )
     from topoloc.recordings.calibration import (
         parse_calibration as parse_calibration,
@@ -100,8 +100,8 @@ _NAMES = {
     "topoloc.json_data": "Finite decode_json",
     "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (
-        "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"
-        " written_paths"
+        "atomic_write recording_writes remove_stale_files temporary_folder write_bytes write_folder"
+        " write_text"
     ),
     "topoloc.recordings.calibration": "parse_calibration replace_cameras",
     "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",

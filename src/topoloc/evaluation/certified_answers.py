@@ -39,7 +39,6 @@ from topoloc.recordings.frame import to_grey
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.25, 2.0
 """A pose further off than either (metres, degrees) is wrong: the probability is about these."""
 CONFIDENCE = 0.95
-_CHI_SQUARE_6_AT_95 = 12.592
 _PIECE_D_THRESH = 5.0
 """Images further apart than this many D_thresh (Eq. 1) are independent: no node serves both."""
 _THUMBNAIL_PX = 32
@@ -167,7 +166,7 @@ class CertifiedAnswers:
             sum(one >= min_probability for one in wrong) if self.has_truth else 0,
             num_wrong_pieces if self.has_truth else 0,
             max_share(num_wrong_pieces, num_pieces, confidence) if self.has_truth else None,
-            sum(_is_inside(one) for one in given if self.has_truth and not is_wrong(one)),
+            sum(one.is_inside_ellipsoid for one in given if self.has_truth and not is_wrong(one)),
             _median_ms(given),
             _median_ms(refused),
         )
@@ -245,15 +244,6 @@ def find_pieces(config: MapConfig, answers: Sequence[EvaluatedQuery], by_pose: b
 def _probability(answer: EvaluatedQuery) -> float:
     """Return the probability of a pose, -1 for a refusal."""
     return answer.result.probability if isinstance(answer.result, Localization) else -1.0
-
-
-def _is_inside(answer: EvaluatedQuery) -> bool:
-    """Return whether the true pose is inside the 95 % ellipsoid of the answer."""
-    if not isinstance(answer.result, Localization) or answer.world_from_cam is None:
-        return False
-    error = (answer.world_from_cam @ answer.result.world_from_cam.inverse()).log()
-    square = float(error @ np.linalg.solve(answer.result.covariance, error))
-    return square < _CHI_SQUARE_6_AT_95
 
 
 def _median_ms(answers: Sequence[EvaluatedQuery]) -> float | None:

@@ -80,6 +80,12 @@ class EvaluatedQuery:
         return math.sqrt(max(float(xi @ np.linalg.pinv(self.result.covariance) @ xi), 0.0) / 6.0)
 
     @property
+    def is_inside_ellipsoid(self) -> bool:
+        """Return whether the true pose is inside the 95 % ellipsoid of the result."""
+        chi_square_6_at_95 = 12.592
+        return 6.0 * self.error_over_sigma**2 < chi_square_6_at_95
+
+    @property
     def is_false_accept(self) -> bool:
         """Return whether the result has a pose that is wrong: out of map, in another world, or
         beyond the error limits."""
@@ -126,9 +132,8 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     translation = np.array([a.translation_m for a in with_truth])
     rotation = np.array([a.rotation_deg for a in with_truth])
     localized = np.isfinite(translation)
-    over_sigma = np.array([a.error_over_sigma for a in with_truth])[localized]
+    is_inside = np.array([a.is_inside_ellipsoid for a in with_truth], bool)
     is_inaccurate = (translation > 0.25) | (rotation > 2.0)  # what p is about
-    chi_square_6_at_95 = 12.592
     ranked = [a for a in with_truth if a.nearest_node_id is not None]
     first = [(a, a.result.candidates[0].node_id if a.result.candidates else None) for a in ranked]
     hits = [node == a.nearest_node_id for a, node in first]
@@ -143,7 +148,7 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
         "max_translation_m": float(translation[localized].max()) if localized.any() else None,
         "max_rotation_deg": float(rotation[localized].max()) if localized.any() else None,
         "num_inaccurate": int(is_inaccurate.sum()),
-        "num_outside_ellipsoid": int((6.0 * over_sigma**2 > chi_square_6_at_95).sum()),
+        "num_outside_ellipsoid": int((localized & ~is_inside).sum()),
         "recall": {
             f"{metres:g}m_{degrees:g}deg": float(
                 np.mean((translation <= metres) & (rotation <= degrees))

@@ -24,11 +24,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import find_least_median
 from topoloc.localization.result import Localization
 
-_MIN_ANSWERS = 5
-_MIN_ERROR = 1.0  # in normalized errors; smaller errors need no explanation
 _POSITION_SCALE_M, _ROTATION_SCALE = 0.25, np.deg2rad(2.0)
-_MAX_SHARE = 0.2
-_GATE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,25 +58,27 @@ def fit_worlds(answers: Sequence[EvaluatedQuery]) -> WorldFit | None:
     Each result proposes a transform. The one with the smallest median error is refined on the
     results that agree with it.
     """
+    min_answers, max_share, gate = 5, 0.2, 3.0
+    min_error = 1.0  # in normalized errors; smaller errors need no explanation
     pairs = [
         (a.result.world_from_cam, a.world_from_cam)
         for a in answers
         if isinstance(a.result, Localization) and a.world_from_cam
     ]
-    if len(pairs) < _MIN_ANSWERS:
+    if len(pairs) < min_answers:
         return None
     before = float(np.median(_normalized_errors(Rigid3.identity(), pairs)))
-    if before < _MIN_ERROR:
+    if before < min_error:
         return None
     proposals = [found @ true.inverse() for found, true in pairs]
     best, median = find_least_median(proposals, lambda one: _normalized_errors(one, pairs))
     agreeing = [
         pair
         for pair, error in zip(pairs, _normalized_errors(best, pairs), strict=True)
-        if error < max(_GATE * median, 1e-3)
+        if error < max(gate * median, 1e-3)
     ]
     map_from_truth = align_poses([found for found, _ in agreeing], [true for _, true in agreeing])
-    if float(np.median(_normalized_errors(map_from_truth, pairs))) > _MAX_SHARE * before or 2 * len(
+    if float(np.median(_normalized_errors(map_from_truth, pairs))) > max_share * before or 2 * len(
         agreeing
     ) < len(pairs):
         return None

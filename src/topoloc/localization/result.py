@@ -1,5 +1,4 @@
-"""Results of a query: a pose with its uncertainty, or a reason for none. No fallback pose
-exists."""
+"""Results of a query: a pose with its uncertainty, or a reason. No fallback pose exists."""
 
 from __future__ import annotations
 

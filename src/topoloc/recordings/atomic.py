@@ -27,8 +27,18 @@ except ImportError:  # Windows: stale files are not removed
     fcntl = None
 
 
-written_paths: ContextVar[list[Path] | None] = ContextVar("written_paths", default=None)
-"""Collects the paths of all files and folders that are complete, if it is set to a list."""
+_written: ContextVar[list[Path] | None] = ContextVar("_written", default=None)
+
+
+@contextmanager
+def recording_writes() -> Iterator[list[Path]]:
+    """Yield a list to which each file and folder is added that is complete."""
+    paths = list[Path]()
+    token = _written.set(paths)
+    try:
+        yield paths
+    finally:
+        _written.reset(token)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -148,7 +158,7 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _note_written(path: Path) -> None:
-    if (paths := written_paths.get()) is not None:
+    if (paths := _written.get()) is not None:
         paths.append(path)
 
 
