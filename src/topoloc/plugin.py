@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from topoloc.mapping.node_images import read_node_image as read_node_image
     from topoloc.recordings.atomic import (
         atomic_write as atomic_write,
+        collect_written_paths as collect_written_paths,
         remove_stale_files as remove_stale_files,
         temporary_folder as temporary_folder,
         write_bytes as write_bytes,
         write_folder as write_folder,
         write_text as write_text,
-        written_paths as written_paths,
     )
     from topoloc.recordings.calibration import (
         parse_calibration as parse_calibration,
@@ -102,8 +102,8 @@ _NAMES = {
     "topoloc.mapping.node_images": "read_node_image",
     "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (
-        "atomic_write remove_stale_files temporary_folder write_bytes write_folder write_text"
-        " written_paths"
+        "atomic_write collect_written_paths remove_stale_files temporary_folder write_bytes"
+        " write_folder write_text"
     ),
     "topoloc.recordings.calibration": "parse_calibration replace_cameras",
     "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",

@@ -27,8 +27,14 @@ except ImportError:  # Windows: stale files are not removed
     fcntl = None
 
 
-written_paths: ContextVar[list[Path] | None] = ContextVar("written_paths", default=None)
-"""Collects the paths of all files and folders that are complete, if it is set to a list."""
+_written_paths: ContextVar[list[Path] | None] = ContextVar("written_paths", default=None)
+
+
+def collect_written_paths() -> list[Path]:
+    """Return a list that receives the path of each file and folder that is complete from now on, in
+    this context (`contextvars`)."""
+    _written_paths.set(paths := [])
+    return paths
 
 
 def write_text(path: Path, text: str) -> None:
@@ -148,7 +154,7 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _note_written(path: Path) -> None:
-    if (paths := written_paths.get()) is not None:
+    if (paths := _written_paths.get()) is not None:
         paths.append(path)
 
 

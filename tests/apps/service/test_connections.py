@@ -29,11 +29,11 @@ from topoloc import Localizer, MapCache
 from topoloc.apps.service import query_handler
 from topoloc.apps.service.application import create_application
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.apps.service.connections import Connections, protocols
+from topoloc.apps.service.connections import Connections, protocols, while_connected
 from topoloc.apps.service.map_routes import build_scene
 from topoloc.apps.service.query_handler import ImageDecoder
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.apps.service.state import Service, Workers, _while_connected
+from topoloc.apps.service.state import Service, Workers
 from topoloc.recordings.image_io import EncodedImage
 
 
@@ -181,7 +181,7 @@ def test_a_job_that_nobody_waits_for_gives_its_place_to_the_next(is_gone: bool):
         request = Request({"type": "http"}, receive)
         expected = RequestError if is_gone else TimeoutError
         with pytest.raises(expected):
-            await _while_connected(request, workers.run(release.wait, 5.0 if is_gone else 0.1))
+            await while_connected(request, workers.run(release.wait, 5.0 if is_gone else 0.1))
         assert workers.num_jobs == 0
         assert await workers.run(lambda: "answer", 5.0) == "answer"
         release.set()

@@ -12,6 +12,8 @@ import importlib
 import os
 import sys
 import warnings
+from collections.abc import Iterable
+from os import PathLike
 from typing import Any, TextIO
 
 # NumPy reads this when it is imported. Threads of BLAS wait in busy loops, which costs more than
@@ -168,14 +170,12 @@ def _warn_broken_plugin(module: str, error: Exception) -> None:
 
 def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
     from topoloc import TopolocError
+    from topoloc.plugin import collect_written_paths
 
+    written = collect_written_paths()
     try:
         _check_address_space()
         import tyro
-
-        from topoloc.plugin import written_paths
-
-        written_paths.set([])
 
         from topoloc.apps.cli.output import UsageError, interruptible
 
@@ -195,13 +195,13 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
             _print_error(f"{error}; see `topoloc {name} --help`")
             return 2
     except TopolocError as error:
-        _print_error(_with_written_files(str(error), args))
+        _print_error(_with_written_files(str(error), args, written))
     except OSError as error:
         if error.errno not in (errno.EMFILE, errno.ENFILE):
             raise
         where = f"cannot open {error.filename}: " if error.filename else ""
         text = f"{where}{error.strerror}; raise the limit (ulimit -n)"
-        _print_error(_with_written_files(text, args))
+        _print_error(_with_written_files(text, args, written))
     except MemoryError:
         _print_error("out of memory; no file is incomplete")
     except KeyboardInterrupt:
@@ -209,12 +209,10 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
     return 1
 
 
-def _with_written_files(text: str, args: list[str]) -> str:
+def _with_written_files(text: str, args: list[str], written: Iterable[PathLike[str]]) -> str:
     """Return the text of a failure with the files, of those that the arguments name, that were
     written before it. An atlas is written with its manifest."""
-    from topoloc.plugin import written_paths
-
-    paths = [os.path.realpath(path) for path in written_paths.get() or () if os.path.exists(path)]
+    paths = [os.path.realpath(path) for path in written if os.path.exists(path)]
     found = {path.removesuffix(f"{os.sep}atlas.json") for path in paths}
     named = [arg.rpartition("=")[2] for arg in args]
     names = [arg for arg in named if os.path.realpath(arg) in found and arg not in text]

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Coroutine, MutableMapping, Sequence
 from ipaddress import ip_network
-from typing import Any
+from typing import Any, TypeVar
 
 from h11 import DONE, Request as RequestHead
+from starlette.requests import HTTPConnection, Request
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from topoloc.apps.service.config import ServiceConfig
 from topoloc.apps.service.logs import log
+from topoloc.apps.service.request_errors import RequestError
+
+R = TypeVar("R")
 
 KEEP_ALIVE_S = 75
 """Longer than clients and load balancers keep a connection (5 to 60 s). Otherwise a request may
@@ -193,3 +197,27 @@ def protocols(config: ServiceConfig, max_connections: int, behind_proxy: bool) -
         "http": type("HttpProtocol", (_HttpProtocol,), shared),
         "ws": type("WebSocketProtocol", (_WebSocketProtocol,), shared),
     }
+
+
+async def while_connected(request: HTTPConnection, running: Coroutine[Any, Any, R]) -> R:
+    """Return the result, and cancel it if the client of an HTTP request goes away. Raises
+    RequestError then."""
+    if not isinstance(request, Request):
+        return await running
+    job = asyncio.create_task(running)
+    gone = asyncio.create_task(_wait_for_disconnect(request))
+    try:
+        await asyncio.wait((job, gone), return_when=asyncio.FIRST_COMPLETED)
+        if job.done():
+            return job.result()
+        gone.result()  # its error, if the rest of the request is too large or slow
+        raise RequestError(499, "the client has gone")
+    finally:
+        job.cancel()
+        gone.cancel()
+        await asyncio.gather(job, gone, return_exceptions=True)
+
+
+async def _wait_for_disconnect(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass

@@ -9,14 +9,14 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar
 
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import HTTPConnection
 
 from topoloc import (
     Localization,
@@ -28,6 +28,7 @@ from topoloc import (
     TrackerConfig,
 )
 from topoloc.apps.service.config import ServiceConfig
+from topoloc.apps.service.connections import while_connected
 from topoloc.apps.service.logs import Metrics, log
 from topoloc.apps.service.query_handler import QueryHandler
 from topoloc.apps.service.query_request import QueryRequest
@@ -233,7 +234,7 @@ class Service:
             while True:
                 left_s = self.config.answer_s - (time.monotonic() - start)
                 try:
-                    return await _while_connected(request, self.workers.run(job, left_s))
+                    return await while_connected(request, self.workers.run(job, left_s))
                 except TimeoutError:
                     raise RequestError(
                         503, f"no answer within {self.config.answer_s:g} s", 5
@@ -278,30 +279,6 @@ class Service:
         await asyncio.to_thread(self.workers.close)
         self.streams.close()
         self.maps.close()
-
-
-async def _while_connected(request: HTTPConnection, running: Coroutine[Any, Any, R]) -> R:
-    """Return the result, and cancel it if the client of an HTTP request goes away. Raises
-    RequestError then."""
-    if not isinstance(request, Request):
-        return await running
-    job = asyncio.create_task(running)
-    gone = asyncio.create_task(_wait_for_disconnect(request))
-    try:
-        await asyncio.wait((job, gone), return_when=asyncio.FIRST_COMPLETED)
-        if job.done():
-            return job.result()
-        gone.result()  # its error, if the rest of the request is too large or slow
-        raise RequestError(499, "the client has gone")
-    finally:
-        job.cancel()
-        gone.cancel()
-        await asyncio.gather(job, gone, return_exceptions=True)
-
-
-async def _wait_for_disconnect(request: Request) -> None:
-    while (await request.receive())["type"] != "http.disconnect":
-        pass
 
 
 def get_service(request: HTTPConnection) -> Service:
