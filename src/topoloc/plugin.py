@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from topoloc.localization.query import Deadline as Deadline
     from topoloc.recordings.atomic import (
         atomic_write as atomic_write,
-        recording_writes as recording_writes,
+        collect_written_paths as collect_written_paths,
         remove_stale_files as remove_stale_files,
         temporary_folder as temporary_folder,
         write_bytes as write_bytes,
@@ -100,8 +100,8 @@ _NAMES = {
     "topoloc.json_data": "Finite decode_json",
     "topoloc.localization.query": "Deadline",
     "topoloc.recordings.atomic": (
-        "atomic_write recording_writes remove_stale_files temporary_folder write_bytes write_folder"
-        " write_text"
+        "atomic_write collect_written_paths remove_stale_files temporary_folder write_bytes"
+        " write_folder write_text"
     ),
     "topoloc.recordings.calibration": "parse_calibration replace_cameras",
     "topoloc.recordings.camera_json": "CameraCalibration read_camera_json",

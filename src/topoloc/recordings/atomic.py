@@ -27,18 +27,14 @@ except ImportError:  # Windows: stale files are not removed
     fcntl = None
 
 
-_written: ContextVar[list[Path] | None] = ContextVar("_written", default=None)
+_written_paths: ContextVar[list[Path] | None] = ContextVar("written_paths", default=None)
 
 
-@contextmanager
-def recording_writes() -> Iterator[list[Path]]:
-    """Yield a list to which each file and folder is added that is complete."""
-    paths = list[Path]()
-    token = _written.set(paths)
-    try:
-        yield paths
-    finally:
-        _written.reset(token)
+def collect_written_paths() -> list[Path]:
+    """Return a list that receives the path of each file and folder that is complete from now on, in
+    this context (`contextvars`)."""
+    _written_paths.set(paths := [])
+    return paths
 
 
 def write_text(path: Path, text: str) -> None:
@@ -158,7 +154,7 @@ def _check_replaceable(path: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _note_written(path: Path) -> None:
-    if (paths := _written.get()) is not None:
+    if (paths := _written_paths.get()) is not None:
         paths.append(path)
 
 

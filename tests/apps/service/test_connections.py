@@ -29,11 +29,11 @@ from topoloc import Localizer, MapCache
 from topoloc.apps.service import query_handler
 from topoloc.apps.service.application import create_application
 from topoloc.apps.service.config import ServiceConfig
-from topoloc.apps.service.connections import Connections, protocols
+from topoloc.apps.service.connections import Connections, protocols, while_connected
 from topoloc.apps.service.map_routes import build_scene
 from topoloc.apps.service.query_handler import ImageDecoder
 from topoloc.apps.service.request_errors import RequestError
-from topoloc.apps.service.state import Service, Workers, while_connected
+from topoloc.apps.service.state import Service, Workers
 from topoloc.recordings.image_io import EncodedImage
 
 

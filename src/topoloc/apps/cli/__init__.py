@@ -12,7 +12,8 @@ import importlib
 import os
 import sys
 import warnings
-from pathlib import Path
+from collections.abc import Iterable
+from os import PathLike
 from typing import Any, TextIO
 
 # NumPy reads this when it is imported. Threads of BLAS wait in busy loops, which costs more than
@@ -168,17 +169,10 @@ def _warn_broken_plugin(module: str, error: Exception) -> None:
 
 
 def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
-    from topoloc.plugin import recording_writes
-
-    with recording_writes() as written:
-        return _run_recorded(name, module_name, summary, args, written)
-
-
-def _run_recorded(
-    name: str, module_name: str, summary: str, args: list[str], written: list[Path]
-) -> int:
     from topoloc import TopolocError
+    from topoloc.plugin import collect_written_paths
 
+    written = collect_written_paths()
     try:
         _check_address_space()
         import tyro
@@ -215,7 +209,7 @@ def _run_recorded(
     return 1
 
 
-def _with_written_files(text: str, args: list[str], written: list[Path]) -> str:
+def _with_written_files(text: str, args: list[str], written: Iterable[PathLike[str]]) -> str:
     """Return the text of a failure with the files, of those that the arguments name, that were
     written before it. An atlas is written with its manifest."""
     paths = [os.path.realpath(path) for path in written if os.path.exists(path)]

@@ -18,6 +18,7 @@ from topoloc.apps.service.logs import log
 from topoloc.apps.service.request_errors import RequestError
 
 R = TypeVar("R")
+
 KEEP_ALIVE_S = 75
 """Longer than clients and load balancers keep a connection (5 to 60 s). Otherwise a request may
 meet a connection that is being closed."""
