@@ -52,3 +52,17 @@ def test_a_stream_in_milliseconds_is_read_as_such(shared: Path):
     t_ns = read_times(path, 7)
     assert t_ns[0] == NOW_S * 10**9
     assert t_ns[1] - t_ns[0] == 520_000_000
+
+
+@pytest.mark.parametrize("factor", [10**3, 10**6, 10**9])
+def test_dates_of_another_unit_with_many_decimals_fit_into_64_bits(tmp_path: Path, factor: int):
+    path = tmp_path / "times.txt"
+    path.write_text("".join(f"{factor * (1687709319 + k)}.000000000\n" for k in range(5)))
+    assert read_times(path, 5) == [(1687709319 + k) * 10**9 for k in range(5)]
+
+
+def test_times_beyond_64_bits_are_refused_in_one_line(tmp_path: Path):
+    path = tmp_path / "times.txt"
+    path.write_text("".join(f"{10**11 + k}\n" for k in range(5)))
+    with pytest.raises(RecordingError, match="beyond 292 years; write seconds"):
+        read_times(path, 5)

@@ -132,9 +132,13 @@ def parse_times(
         times.append(time)
     steps = [float(after - before) for before, after in pairwise(times)]
     step = float(np.median(steps)) if steps else 0.0
+    max_seconds = 9_223_372_036  # nanoseconds of 64 bits
     is_fine = -int(times[-1].as_tuple().exponent) >= _NUM_FINE_DECIMALS
+    is_fine &= abs(times[-1]) < max_seconds
     digits = 9 if is_fine else _find_digits(float(times[-1]), step, max_step_s)
     t_ns = [int(time.scaleb(digits).to_integral_value()) for time in times]
+    if abs(t_ns[-1]) > 1_000_000_000 * max_seconds:
+        raise error(f"{path}: time {rows[-1][1][0][:40]} is beyond 292 years; write seconds")
     for (line, columns), before, after in zip(rows[1:], t_ns[:-1], t_ns[1:], strict=True):
         if after <= before:
             raise error(f"{path}, line {line}: time {columns[0][:40]} is not after the one before")

@@ -45,6 +45,7 @@ def test_build_warns_of_nodes_that_contradict_the_rest(
     assert "nodes contradict the rest (node " in warning
     assert "topoloc info --check" in warning
     assert main(["info", str(target), "--check"]) == 1
+    capsys.readouterr()
     assert main(["build", str(tiny_recording), str(target), "--features", "surf"]) == 0
     assert "contradict" not in capsys.readouterr().err
 

@@ -8,6 +8,7 @@ groups is in place, so the larger one is assumed to be.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,6 +74,8 @@ def find_contradictions(topomap: TopoMetricMap) -> list[Contradiction]:
     # Minimum pose difference of a contradiction, in D_thresh (Eq. 1). It must also exceed the
     # covariance.
     min_distance = 0.5
+    # Smaller differences are inaccuracy: poses of 7-Scenes have 0.05 m and 2 degrees.
+    min_metres, min_radians = 0.1, math.radians(4.0)
     poses, lambda_rot = topomap.node_poses, topomap.config.lambda_rot
     errors = topomap.first_layer.shared_errors
     unknown = load_fitted_weights(topomap.kind).shared_errors.unknown
@@ -90,7 +93,8 @@ def find_contradictions(topomap: TopoMetricMap) -> list[Contradiction]:
                 continue
             is_same, metres, radians = difference
             is_far = metres + lambda_rot * radians > min_distance * topomap.config.d_thresh
-            if is_far and not is_same:
+            is_large = metres > min_metres or radians > min_radians
+            if is_far and is_large and not is_same:
                 found.append((row, other_row, metres, radians))
             else:
                 _merge_groups(group, row, other_row)
