@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from typing import Annotated
 
-from topoloc.plugin import Above, AtLeast, Between
+from topoloc.plugin import AtLeast, Between
 
 
 @dataclass(frozen=True)
@@ -19,25 +19,25 @@ class ServiceConfig:
     """Requests that may wait for a worker. Further ones get the status 429."""
     memory_mb: Annotated[int, Between(32, 1_000_000)] = 512
     """Megabytes of all maps in memory. The least recently used map is closed first."""
-    max_upload_mb: Annotated[float, Above(0)] = 20.0
+    max_upload_mb: Annotated[float, Between(0.01, 1e6)] = 20.0
     """Megabytes of one request."""
     max_megapixels: Annotated[float, Between(0.01, 100)] = 50.0
     """Megapixels of one image, read from its header before decoding."""
-    upload_s: Annotated[float, Above(0)] = 20.0
+    upload_s: Annotated[float, Between(0.01, 1e6)] = 20.0
     """Seconds until a request must be complete, and until a client must read its response."""
-    answer_s: Annotated[float, Above(0)] = 30.0
+    answer_s: Annotated[float, Between(0.01, 1e6)] = 30.0
     """Seconds until a request is answered, with waiting. After them it gets the status 503."""
-    fetch_s: Annotated[float, Above(0)] = 10.0
+    fetch_s: Annotated[float, Between(0.01, 1e6)] = 10.0
     """Seconds that a request waits for a tile from an object store. The fetch then continues for
     later requests."""
-    geolocation_m: Annotated[float, Above(0)] = 100.0
+    geolocation_m: Annotated[float, Between(0.01, 1e6)] = 100.0
     """Metres that are added to three times the accuracy of a device's position (GeoPose Protocol).
     Tiles of atlases further away are skipped."""
     max_sessions: Annotated[int, Between(0, 100_000)] = 64
     """Streams at a time."""
     max_sessions_per_address: Annotated[int, AtLeast(1)] = 16
     """Streams of one address at a time."""
-    session_idle_s: Annotated[float, Above(0)] = 60.0
+    session_idle_s: Annotated[float, Between(0.01, 1e6)] = 60.0
     """Seconds without an image after which a stream ends."""
     drain_s: Annotated[float, AtLeast(0)] = 20.0
     """Seconds that requests in progress may take after the service is told to end."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from topoloc import GeoPoint, GeoreferenceError, GeoreferenceResult, georeference, open_place
+from topoloc import GeoPoint, GeoreferenceError, georeference, open_place
 from topoloc.apps.cli.output import (
     File,
     UsageError,
@@ -57,22 +57,20 @@ class Command:
             select_tile(place, self.tile),
             lambda path: georeference(path, origin, self.gnss, self.points, self.up, print_waiting),
         )
-        facts = _describe_result(result)
+        facts = result.georeference.to_json() | {"heading_deg": result.heading_deg, "up": result.up}
+        if result.names:
+            left_out = np.flatnonzero(~result.is_inlier).tolist()
+            facts |= {
+                "num_points": len(result.is_inlier),
+                "num_used": int(result.is_inlier.sum()),
+                "residuals_m": result.residuals_m.round(4).tolist(),
+                "names": list(result.names),
+                "left_out": [result.names[k] for k in left_out],
+            }
         if self.json != "-":
-            _print(result, facts)
+            _print(str(result.georeference), facts)
         write_json(self.json, facts)
         return 0
-
-
-def _describe_result(result: GeoreferenceResult) -> dict[str, Any]:
-    facts = result.georeference.to_json() | {"heading_deg": result.heading_deg, "up": result.up}
-    if result.names:
-        facts |= {
-            "num_points": len(result.is_inlier),
-            "num_used": int(result.is_inlier.sum()),
-            "residuals_m": result.residuals_m.round(4).tolist(),
-        }
-    return facts
 
 
 def _parse_origin(text: str) -> tuple[GeoPoint, float]:
@@ -89,17 +87,18 @@ def _parse_origin(text: str) -> tuple[GeoPoint, float]:
     return GeoPoint(lat, lon, h), heading_deg
 
 
-def _print(result: GeoreferenceResult, facts: dict[str, Any]) -> None:
+def _print(origin: str, facts: dict[str, Any]) -> None:
     heading = f"{facts['heading_deg']:.1f} degrees from true north, clockwise"
-    lines = [("origin", str(result.georeference)), ("first picture looks to", heading)]
+    lines = [("origin", origin), ("first picture looks to", heading)]
     if facts["up"] is not None:
         lines.append(("up", f"the world's {facts['up']}"))
-    if result.names:
-        worst = int(np.argmax(np.where(result.is_inlier, result.residuals_m, -1.0)))
-        largest = f"{result.residuals_m[worst]:.3f} m ({result.names[worst]})"
+    if "names" in facts:
+        residuals = zip(facts["residuals_m"], facts["names"], strict=True)
+        worst, name = max(one for one in residuals if one[1] not in facts["left_out"])
         lines.append(("points", f"{facts['num_used']} of {facts['num_points']} agree"))
-        lines.append(("residuals", f"rms {result.georeference.rms_m:.3f} m, largest {largest}"))
-        if len(outliers := np.flatnonzero(~result.is_inlier).tolist()):
-            names = [result.names[k] for k in outliers[:5]] + ["..."] * (len(outliers) > 5)
+        largest = f"largest {worst:.3f} m ({name})"
+        lines.append(("residuals", f"rms {facts['rms_m']:.3f} m, {largest}"))
+        if left_out := facts["left_out"]:
+            names = left_out[:5] + ["..."] * (len(left_out) > 5)
             lines.append(("left out", ", ".join(names)))
     print_fields(lines)
