@@ -63,7 +63,7 @@ def run_variant(variant: Variant, data: Path, work: Path, is_check: bool = False
     folder = Path(tempfile.mkdtemp(dir=work))
     paths = [walk.write(folder / f"walk{k}") for k, walk in enumerate(walks)]
     target = folder / "map.topo"
-    arguments = [*map(str, paths), str(target), "--features", "surf", *walks[0].options]
+    arguments = [*map(str, paths), str(target), "--features", "surf"]
     out, error, status = io.StringIO(), io.StringIO(), 0
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.redirect_stdout(out))

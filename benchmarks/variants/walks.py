@@ -27,9 +27,9 @@ Edit = Callable[[np.ndarray], np.ndarray]
 class Walk:
     """A stereo or RGB-D recording. `others` are right or depth images, or empty.
 
-    `size` is that of the calibration. `times` are seconds. `pose_times` are those of the truth. An
+    `times` are seconds. `pose_times` are those of the truth. An
     edit changes the pixels of an image while it is written. `damaged` are rows of left images that
-    are cut. `options` are those of `topoloc build`.
+    are cut.
     """
 
     lefts: list[Path]
@@ -44,7 +44,6 @@ class Walk:
     edit_left: Edit | None = None
     edit_other: Edit | None = None
     damaged: tuple[int, ...] = ()
-    options: tuple[str, ...] = ()
     rig: StereoRig | None = None
 
     def select(self, rows: slice | list[int]) -> Walk:
@@ -133,31 +132,23 @@ def _write_images(
             cv2.imwrite(str(target), edit(image))
 
 
-@dataclass(frozen=True)
-class Base:
-    """The address of a recording below the data, `demo:` or `sgm:` (depth by matching)."""
-
-    address: str
-    is_straight: bool = False
-    has_truth: bool = True
-
-
+# Recordings below the data, `demo:`, or `sgm:` (depth by semi-global matching).
 BASES = {
-    "zed1": Base("zed_lab/session1@0:80"),
-    "zed2": Base("zed_lab/session2@0:80"),
-    "street1": Base("kitti/sequences/street1", is_straight=True),
-    "street2": Base("kitti/sequences/street2", is_straight=True),
-    "lab": Base("demo:map_lap1"),
-    "kitchen": Base("seven_scenes/kitchen/seq-01@0:100"),
-    "zed depth": Base("sgm:zed_lab/session2@0:80"),
-    "euroc": Base("euroc/v1_01_part", has_truth=False),
+    "zed1": "zed_lab/session1@0:80",
+    "zed2": "zed_lab/session2@0:80",
+    "street1": "kitti/sequences/street1",
+    "street2": "kitti/sequences/street2",
+    "lab": "demo:map_lap1",
+    "kitchen": "seven_scenes/kitchen/seq-01@0:100",
+    "zed depth": "sgm:zed_lab/session2@0:80",
+    "euroc": "euroc/v1_01_part",
 }
 
 
 @cache
 def read_walk(name: str, data: Path, work: Path) -> Walk:
     """Read a recording of `BASES`. Depth is registered to the image, and written below `work`."""
-    address = BASES[name].address
+    address = BASES[name]
     place = address.removeprefix("sgm:")
     is_demo = place.startswith("demo:")
     path = SHIPPED / place.removeprefix("demo:") if is_demo else data / place

@@ -19,7 +19,7 @@ Change = Callable[[Walk], Walk]
 @dataclass(frozen=True)
 class Variant:
     """A kind of change, the recording, and the change. `second`: a second recording, and its
-    change. `is_decidable` is False if no image can show the fault."""
+    change."""
 
     kind: str
     base: str
