@@ -312,6 +312,17 @@ def test_the_command_line(
     assert "world" not in printed.out
 
 
+def test_a_pair_with_a_tile_that_cannot_be_read_is_an_error(
+    own: Path, parts: dict[str, Path], capsys: pytest.CaptureFixture[str]
+):
+    remove_tiles(str(own), ["middle"])
+    add_tiles(str(own), new_tiles([str(parts["middle"])]))
+    tile = Atlas.open(str(own)).tile("left")
+    (own / tile.map.name).write_bytes(b"damaged")
+    assert main(["atlas", "join", str(own), "middle"]) == 1
+    assert "is not a topoloc map" in capsys.readouterr().err
+
+
 def test_what_cannot_be_meant_is_said(own: Path, complaint: Callable[..., str]):
     assert "has no tile 'attic'" in complaint("atlas", "join", own, "attic")
     assert "--join belongs to create and add" in complaint("atlas", "info", own, "--join", status=2)

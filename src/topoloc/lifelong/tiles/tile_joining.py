@@ -226,7 +226,7 @@ def _join_pair(atlas: Atlas, maps: MapCache[Localizer], first: Tile, second: Til
             tiles = OpenTile(one.content, vectors[0]), OpenTile(other.content, vectors[1])
             found = compare_tiles(*tiles)
     except (MapError, AtlasError) as error:
-        found = NotJoined(str(error))
+        found = NotCompared(str(error))
     if isinstance(found, TileTransform):
         join = Join(*ids, found.first_from_second, found.covariance, found.num_agreeing)
         add_joins(atlas.store.where, [join], dict(zip(ids, (first, second), strict=True)))
