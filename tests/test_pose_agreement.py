@@ -12,11 +12,7 @@ import pytest
 SRC = Path(__file__).parents[1] / "src" / "topoloc"
 PREDICATE, ENGINE = "geometry/rigid.py", "geometry/transform_consensus.py"
 # Hypotheses of a stream consist of a pose and a velocity.
-# A true pose is inside the ellipsoid of an answer, or not.
-OTHER_TESTS = {
-    "tracking/motion.py:_is_same_motion",
-    "evaluation/certified_answers.py:_is_inside",
-}
+OTHER_TESTS = {"tracking/motion.py:_is_same_motion"}
 # It draws triples of points. `find_least_median` compares their transforms.
 OTHER_ENGINES = {"mapping/georeferencing.py:_robust_weights"}
 _ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)

@@ -116,10 +116,10 @@ def test_comments_and_docstrings_are_no_change(code: Path):
     path = code / "topoloc/localization/localizer.py"
     text = path.read_text()
     reworded = text.replace("section III-B of the paper", "a part of the paper", 1).replace(
-        "import time", "import time  # clocks", 1
+        "import warnings", "import warnings  # of users", 1
     )
-    assert reworded.count("# clocks") == 1
-    assert reworded != text.replace("import time", "import time  # clocks", 1)
+    assert reworded.count("# of users") == 1
+    assert reworded != text.replace("import warnings", "import warnings  # of users", 1)
     assert _done_again(lambda: path.write_text(reworded)) == set()
 
 
