@@ -3,7 +3,7 @@
     python benchmarks/network_pairs.py FOLDER [FOLDER ...] [--views VIEWS] [--shared ../shared]
 
 Each FOLDER holds a `topoloc-net.onnx`. Mutual nearest neighbours of 1,000 key points are matched.
-VIEWS are rendered by `python -m topoloc_training.net.wide_views`: depth and poses say whether a
+VIEWS are rendered by `python -m topoloc_worlds.wide_views`: depth and poses say whether a
 match is right (within 3 px). Real recordings: within 2 px of the epipolar line of the true poses,
 as they are and darkened. `gardenspoint`: a day's walk and a night's.
 """
@@ -26,7 +26,7 @@ from topoloc.recordings.frame import to_grey
 from topoloc.recordings.image_io import read_image
 from topoloc.recordings.open import open_sequence
 from topoloc_training.net.stored_depth import read_depth
-from topoloc_training.net.wide_views import LIGHTS
+from topoloc_worlds.wide_views import LIGHTS
 
 FOCAL, CENTRE, SIZE = 380.0, np.array([319.5, 199.5]), np.array([640, 400])
 RIGHT_PX, LINE_PX = 3.0, 2.0

@@ -17,11 +17,12 @@ from topoloc_training.net import wide_pairs
 from topoloc_training.net.batch_light import change_light
 from topoloc_training.net.losses import sampled
 from topoloc_training.net.network import TopolocNet
-from topoloc_training.net.stored_depth import read_depth, store_depth
+from topoloc_training.net.stored_depth import read_depth
 from topoloc_training.net.train_wide import losses, train, unfold_norms
 from topoloc_training.net.wide_pairs import Library, draw_batch, find_pairs, grid_pixels, project
 from topoloc_training.networks.edgepoint2 import EdgePoint2
 from topoloc_training.networks.export import export
+from topoloc_worlds.wide_views import store_depth
 
 WALL_M = 4.0
 

@@ -1,5 +1,6 @@
-"""Render pictures of one place ahead and to the sides, by several lights, for `train_wide.py`:
-`python -m topoloc_training.net.wide_views OUT --places corridor:1:0.1 --conditions day night
+"""Render pictures of one place ahead and to the sides, by several lights, for
+`topoloc_training.net.train_wide`:
+`python -m topoloc_worlds.wide_views OUT --places corridor:1:0.1 --conditions day night
 --photos FOLDER...`.
 
 OUT gets grey WebP pictures of 640x400, depth of every fourth pixel as 16-bit PNG, and `views.json`.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +20,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 from numpy.random import Generator
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc_training.net.stored_depth import store_depth
 from topoloc_worlds.conditions import find_condition
 from topoloc_worlds.noise import rng_of
 from topoloc_worlds.rendering import first_hits
@@ -38,6 +40,8 @@ LIGHTS = ("day", "cloudy", "evening", "rain", "night")
 """The day comes first: its descriptors are those that other pictures of the place learn."""
 _STRETCH = {"corridor": 10.0, "street": 45.0, "lab": 9.0, "hospital": 9.0}
 _LATERAL = {"corridor": 0.5, "street": 3.5, "lab": 0.2, "hospital": 0.4}
+_STEP, _FIRST = 4, 1  # depth is stored of columns and rows 1, 5, 9 ...
+_UNIT, _NEAREST, _LAST = math.log(4000) / 65000, 0.1, 65000
 _PHOTO_WIDTH, _QUALITY = 640, 82
 _RENDERED_SHARE = 0.6  # of the samples that are copies of one picture, beside one photo each
 
@@ -146,6 +150,16 @@ def draw_poses(
             )
             route = plan_route(world.loop, world.camera_height, moved)
             yield route, world_from_cam_at(route, 0.0)
+
+
+def store_depth(path: Path, depth: Float[np.ndarray, "h w"]) -> None:
+    """Store depth as PNG: metres from 0.1 to 400, anything else (NaN in the sky) is none."""
+    known = np.nan_to_num(depth[_FIRST::_STEP, _FIRST::_STEP])
+    coded = np.rint(np.log(np.maximum(known, _NEAREST) / _NEAREST) / _UNIT).astype(np.int64)
+    is_known = (known > _NEAREST) & (coded < _LAST)
+    coded = np.where(is_known, coded // 4 * 4 + 2, 0).astype(np.uint16)
+    coded[:, 1:] -= coded[:, :-1].copy()
+    cv2.imwrite(str(path), coded, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 if __name__ == "__main__":
