@@ -21,7 +21,7 @@ def sampled(
     maps: Float[Tensor, "b c hs ws"], pixels: Float[Tensor, "b n 2"], stride: int
 ) -> Float[Tensor, "b n c"]:
     """Unit descriptors at pixels (x, y) of the picture, bilinearly."""
-    size = torch.tensor([maps.shape[3], maps.shape[2]], dtype=pixels.dtype) * stride
+    size = pixels.new_tensor([maps.shape[3], maps.shape[2]]) * stride
     grid = (2 * pixels + 1) / size - 1
     values = functional.grid_sample(
         maps, grid[:, :, None], mode="bilinear", padding_mode="border", align_corners=False
