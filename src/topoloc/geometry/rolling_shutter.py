@@ -66,7 +66,9 @@ def find_rotation(
         sigmas_px: standard deviation of the pixels.
         variance: factor of the variance by errors that all points share.
     """
-    num_rounds, min_log_odds = 5, math.log(99.0) - math.log(0.1)  # one camera in ten turns
+    # Images of a ZED in calm motion had up to 16, but for one of 33, with errors of the map alone.
+    # Turns of one degree had 2 to 360 (benchmarks/inputs.py, five places).
+    num_rounds, min_log_odds = 5, 15.0
     # The first round counts the effects of a rotation as noise. Then cameras at rest had -7 to -12,
     # turns of one degree 1 to 15 (demo's lab).
     min_first_log_odds = -3.0
