@@ -66,12 +66,9 @@ def find_rotation(
         sigmas_px: standard deviation of the pixels.
         variance: factor of the variance by errors that all points share.
     """
-    # Images of a ZED in calm motion had up to 16, but for one of 33, with errors of the map alone.
-    # Turns of one degree had 2 to 360 (benchmarks/inputs.py, five places).
-    num_rounds, min_log_odds = 5, 15.0
-    # The first round counts the effects of a rotation as noise. Then cameras at rest had -7 to -12,
-    # turns of one degree 1 to 15 (demo's lab).
-    min_first_log_odds = -3.0
+    # `benchmarks/inputs.py`: calm images had up to 16, by errors of the map, turns of a degree 2 to
+    # 360; after one round, which counts the rotation as noise, -7 to -12 and 1 to 15.
+    num_rounds, min_first_log_odds, min_log_odds = 5, -3.0, 15.0
     seen = Observations(
         camera.normalized_from_img(points_img),
         np.asarray(sigmas_px) / camera.fx,
