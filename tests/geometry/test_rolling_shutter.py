@@ -49,3 +49,12 @@ def test_pixels_are_moved_to_where_they_would_be_at_rest():
     first, middle = found.undo(np.array([[319.5, 0.0], [319.5, 239.5]]), CAMERA)
     np.testing.assert_allclose(middle, [319.5, 239.5])
     assert first[0] - 319.5 == pytest.approx(500.0 * np.deg2rad(1.0), rel=0.01)
+
+
+def test_pixels_without_a_ray_stay():
+    found = TurningCamera(CAM_FROM_WORLD, np.deg2rad([0.0, 2.0, 0.0]), np.eye(6), 480)
+    lens = Camera("SIMPLE_RADIAL", 640, 480, (300.0, 319.5, 239.5, -0.6))
+    corner, inner = np.array([[0.0, 0.0], [300.0, 200.0]])
+    moved = found.undo(np.array([corner, inner]), lens)
+    np.testing.assert_array_equal(moved[0], corner)
+    assert 0.0 < np.linalg.norm(moved[1] - inner) < 5.0

@@ -35,13 +35,13 @@ class TurningCamera:
     height: int
 
     def undo(self, points_img: Float[np.ndarray, "n 2"], camera: Camera) -> np.ndarray:
-        """Return where the pixels would be if all rows were read with the middle one."""
-        x, y = camera.normalized_from_img(points_img).T
-        rays = np.column_stack([x, y, np.ones(len(x))])
-        turned = rays - _row_shares(points_img, self.height)[:, None] * np.cross(
-            self.rotation, rays
-        )
-        return camera.img_from_cam(turned)
+        """Return where pixels would be if all rows were read with the middle one. Pixels without a
+        ray stay."""
+        rays = np.insert(camera.normalized_from_img(points_img), 2, 1.0, axis=1)
+        shares = _row_shares(points_img, self.height)
+        turned = rays - shares[:, None] * np.cross(self.rotation, rays)
+        moved = camera.img_from_cam(turned)
+        return np.where(np.isfinite(moved), moved, points_img)
 
 
 def _row_shares(points_img: Float[np.ndarray, "n 2"], height: int) -> Float[np.ndarray, " n"]:

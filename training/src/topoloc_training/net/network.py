@@ -92,3 +92,15 @@ class TopolocNet(nn.Module):
         keeps best through the night."""
         logits, descriptors, places = self._maps(image)
         return torch.sigmoid(logits), descriptors, places
+
+
+def follow(average: nn.Module, network: nn.Module, kept: float) -> None:
+    """Move the average toward the network."""
+    with torch.no_grad():
+        for old, new in zip(
+            average.state_dict().values(), network.state_dict().values(), strict=True
+        ):
+            if old.dtype.is_floating_point:
+                old.lerp_(new, 1 - kept)
+            else:
+                old.copy_(new)

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from topoloc.recordings.open import open_sequence
 from topoloc_training.net.losses import likeness, peaks, placed, sampled, told_apart
-from topoloc_training.net.network import KIND, STRIDE, TopolocNet
+from topoloc_training.net.network import KIND, STRIDE, TopolocNet, follow
 from topoloc_training.net.pairs import Pair, find_pairs
 from topoloc_training.net.side_pairs import find_side_pairs
 from topoloc_training.net.teacher import HEIGHT, learn
@@ -137,7 +137,7 @@ def train(config: TrainNet) -> None:
         optimizer.step()
         schedule.step()
         step += 1
-        _follow(average, network, min(_KEPT_AVERAGE, step / (step + 20)))
+        follow(average, network, min(_KEPT_AVERAGE, step / (step + 20)))
         sums += [float(part.detach()) for part in parts]
         if step % _LOG_EVERY == 0:
             names = ("cosine", "to_teacher", "across_light", "score", "place")
@@ -218,17 +218,6 @@ def _rate(step: int, steps: int) -> float:
     return (
         min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, step / steps))) + 1e-3
     )
-
-
-def _follow(average: nn.Module, network: nn.Module, kept: float) -> None:
-    with torch.no_grad():
-        for old, new in zip(
-            average.state_dict().values(), network.state_dict().values(), strict=True
-        ):
-            if old.dtype.is_floating_point:
-                old.lerp_(new, 1 - kept)
-            else:
-                old.copy_(new)
 
 
 def _save(

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from topoloc_training.net.losses import likeness, peaks, placed, sampled, told_apart
-from topoloc_training.net.network import KIND, STRIDE, TopolocNet
+from topoloc_training.net.network import KIND, STRIDE, TopolocNet, follow
 from topoloc_training.net.stored_depth import STEP as DEPTH_STEP, read_depth
 from topoloc_training.net.wide_pairs import (
     HEIGHT,
@@ -162,18 +162,6 @@ def unfold_norms(network: TopolocNet, batch: Batch) -> None:
         network.maps(batch.views)
     for hook in hooks:
         hook.remove()
-
-
-def follow(average: nn.Module, network: nn.Module, kept: float) -> None:
-    """Move the average toward the network."""
-    with torch.no_grad():
-        for old, new in zip(
-            average.state_dict().values(), network.state_dict().values(), strict=True
-        ):
-            if old.dtype.is_floating_point:
-                old.lerp_(new, 1 - kept)
-            else:
-                old.copy_(new)
 
 
 def read_library(folder: Path, teacher: Path, device: torch.device) -> tuple[Library, KnownPairs]:
