@@ -138,3 +138,11 @@ def test_unknown_coarse_models_are_named(saved: Path):
     model = replace(topomap.first_layer.coarse_models["surf-vlad"], name="cnn-xy")
     with pytest.raises(MapError, match="'cnn-xy' is not known"):
         open_coarse_localizer(model)
+
+
+def test_damaged_text_that_an_error_of_sqlite_quotes_is_damage(saved: Path):
+    whole = saved.read_bytes()
+    at = whole.index(b"CREATE TABLE")
+    saved.write_bytes(whole[: at + 8] + b"\xc6" + whole[at + 9 :])
+    with pytest.raises(MapError, match="is damaged"):
+        TopoMetricMap.load(saved)

@@ -152,6 +152,7 @@ class MapFile:
             raise
         except (
             sqlite3.Error,
+            UnicodeDecodeError,  # SQLite's message quotes damaged text
             zlib.error,
             CorruptDataError,
             ConfigError,
