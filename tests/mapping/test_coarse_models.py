@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 
 from topoloc import TopoMetricMap
+from topoloc.errors import TopolocError
 from topoloc.features.features import Features
 from topoloc.mapping.coarse_models import (
     compute_illumination_distance,
     find_node_illumination_groups,
     group_by_illumination,
+    node_ids_to_rows,
     open_map_coarse_localizer,
 )
 from topoloc.mapping.sessions import Illumination, Session
-from topoloc.retrieval.coarse import VladConfig
+from topoloc.node_ids import NodeId
+from topoloc.retrieval.coarse import VladConfig, open_coarse_localizer
 from topoloc.retrieval.vlad import SurfVlad
 
 DAY = Illumination(0.5, 0.2, 0.02, 0.05, 1.0, 1.0)
@@ -130,3 +133,13 @@ def test_the_name_of_a_light_is_kept(room_map: Path, tmp_path: Path, name: str |
         )
     with TopoMetricMap.load(tmp_path / "named.topo") as topomap:
         assert topomap.sessions[0].light_name == name
+
+
+def test_vectors_without_rows_are_damage(room_map: Path):
+    topomap = TopoMetricMap.load(room_map)
+    name, model = next(iter(topomap.first_layer.coarse_models.items()))
+    assert "vectors" in model.arrays, name
+    damaged = replace(model, arrays={**model.arrays, "vectors": np.array(1.0, np.float32)})
+    ids = [NodeId(int(one) + 1) for one in model.arrays["node_ids"]]
+    with pytest.raises(TopolocError):
+        open_coarse_localizer(node_ids_to_rows(damaged, ids))

@@ -66,7 +66,7 @@ def node_ids_to_rows(model: CoarseModel, ids: Sequence[NodeId]) -> CoarseModel:
     per_vector = {
         name: model.arrays[name][kept]
         for name in ("vectors", "centres", "cell_vectors")
-        if len(model.arrays.get(name, ())) == len(kept)
+        if np.shape(model.arrays.get(name, ()))[:1] == kept.shape
     }
     return replace(model, arrays={**model.arrays, **per_vector, "node_ids": of_known[kept]})
 
