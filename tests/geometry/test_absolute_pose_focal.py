@@ -10,6 +10,11 @@ from topoloc.errors import CalibrationError
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
 from topoloc.geometry.absolute_pose_focal import estimate_pose_and_focal
 from topoloc.geometry.alignment import rotation_error, translation_error
+from topoloc.geometry.joint_camera.camera_hypotheses import (
+    CameraBelief,
+    CameraHypothesis,
+    WeighedCamera,
+)
 from topoloc.geometry.rigid import Rigid3, exp_so3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 
@@ -225,6 +230,51 @@ def test_radial_distortion_is_estimated_with_the_pose(k1: float):
     assert found is not None
     assert found[1].distortion()[0] == pytest.approx(k1, abs=0.03)
     assert rotation_error(found[0].cam_from_world, CAM_FROM_WORLD) < np.deg2rad(0.8)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_fisheye_lens_does_not_look_off_centre(side: float):
+    """A cubic term does not follow the lens to its edge, and most points lie to one side."""
+    rng, focal = np.random.default_rng(7), 250.0
+    pixels, points, covariances = _scene(focal / 2.0, rng, num=900, noise_px=0.5)
+    rays = UNKNOWN.with_focal(focal / 2.0).normalized_from_img(pixels)
+    radii = np.linalg.norm(rays, axis=1, keepdims=True)
+    bent = rays / radii * np.arctan(radii) * focal + [319.5, 239.5]
+    kept = (radii[:, 0] < 1.3) & (side * rays[:, 0] > -0.15)
+    found = estimate_pose_and_focal(
+        bent[kept], points[kept], UNKNOWN, CONFIG, point_covariances=covariances[kept]
+    )
+    assert found is not None
+    pose, camera = found
+    assert camera.model == "RADIAL"
+    assert rotation_error(pose.cam_from_world, CAM_FROM_WORLD) < np.deg2rad(1.0)
+
+
+@pytest.mark.parametrize("start_px", [590.0, 610.0])
+def test_a_start_outside_the_stated_range_moves_both_ways(start_px: float):
+    """A crop keeps the focal length that EXIF data state for the whole image. Of seven points no
+    other camera parameters are estimated."""
+    pixels, points, covariances = _scene(600.0, np.random.default_rng(8), num=7)
+    stated = UncalibratedCamera.from_focal_guess(640, 480, 300.0)
+    start = (CAM_FROM_WORLD, stated.with_focal(start_px))
+    found = estimate_pose_and_focal(
+        pixels, points, stated, CONFIG, point_covariances=covariances, start=start
+    )
+    assert found is not None
+    assert found[1].fx == pytest.approx(600.0, rel=0.01)
+
+
+def test_the_probability_within_a_tolerance_counts_all_directions():
+    rng = np.random.default_rng(9)
+    for _ in range(20):
+        root, mean = rng.normal(size=(3, 3)), rng.normal(size=3)
+        errors = mean + rng.normal(size=(40_000, 3)) @ root.T
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = root @ root.T
+        camera = WeighedCamera(CameraHypothesis(), 1.0, np.r_[mean, 0, 0, 0], covariance)
+        share = float(np.mean(np.linalg.norm(errors, axis=1) < 2.0))
+        belief = CameraBelief(camera.hypothesis, [camera])
+        assert belief.probability_within(2.0, 1.0) == pytest.approx(share, abs=0.1)
 
 
 def test_a_panorama_contradicts_all_camera_models():

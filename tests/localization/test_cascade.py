@@ -147,8 +147,11 @@ def test_a_pose_that_both_hold_is_that_of_the_kind_for_which_more_speaks(
     assert result.provenance.features == answers
 
 
-def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_features(
-    topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("kind", "part"), [("sift", "focal_length"), ("sift", "distortion"), ("surf", "distortion")]
+)
+def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_other_features(
+    topomap: TopoMetricMap, monkeypatch: pytest.MonkeyPatch, kind: str, part: str
 ):
     """They see too little to contradict it, and the pose is as wrong."""
 
@@ -157,13 +160,12 @@ def test_a_pose_that_contradicts_its_calibration_is_not_saved_by_coarser_feature
     ) -> tuple[IntrinsicsDeviation | None, CalibrationMismatch | None]:
         seen, _ = check_image_calibration(search, fit)
         shift = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        doubt = CalibrationMismatch(
-            200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), ["focal_length"], shift
-        )
-        return seen, doubt if search.query.feature_config.kind == "sift" else None
+        doubt = CalibrationMismatch(200.0, 1.0, 300.0, np.zeros(2), np.zeros(2), [part], shift)
+        is_doubted = search.query.feature_config.kind == kind
+        return None if part == "distortion" else seen, doubt if is_doubted else None
 
     monkeypatch.setattr("topoloc.localization.result_decision.check_image_calibration", doubted)
-    monkeypatch.setattr(Search, "is_settled", property(lambda search: False))
+    monkeypatch.setattr(Search, "is_settled", property(lambda search: kind == "surf"))
     result = Localizer(topomap).localize(PICTURE, CAMERA)
     assert isinstance(result, NotLocalized)
     assert "the calibration is doubtful" in result.detail

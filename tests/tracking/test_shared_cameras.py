@@ -11,8 +11,8 @@ from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.tracking.shared_cameras import combine_likelihoods
 
 PRIOR = camera_prior(UncalibratedCamera.unknown(640, 480), 640.0)
-SIGMAS = np.array([0.02, 0.01, 0.01, 0.02, 0.02, 0.02, 0.02])
-TRUE = np.array([-0.2, 0.08, 0.0, 0.0, 0.0, 0.0, 0.0])  # cropped at one side
+SIGMAS = np.array([0.02, 0.01, 0.01, 0.02, 0.02, 0.02, 0.02, 0.02])
+TRUE = np.array([-0.2, 0.08, *[0.0] * 6])  # cropped at one side
 
 
 def _seen(parameters: np.ndarray) -> CameraLikelihood:
@@ -21,7 +21,7 @@ def _seen(parameters: np.ndarray) -> CameraLikelihood:
 
 
 def _images(num: int, seed: int) -> list[CameraLikelihood]:
-    noise = np.random.default_rng(seed).normal(size=(num, 7)) * SIGMAS
+    noise = np.random.default_rng(seed).normal(size=(num, 8)) * SIGMAS
     return [_seen(TRUE + one) for one in noise]
 
 
@@ -43,7 +43,7 @@ def test_images_together_are_more_exact_and_know_it():
 
 
 def test_images_of_another_camera_hardly_count():
-    zoomed = _seen(TRUE + 0.4 * np.eye(7)[0])
+    zoomed = _seen(TRUE + 0.4 * np.eye(8)[0])
     estimate, sigmas = _estimate([*_images(10, 1), zoomed, zoomed], 12)
     assert abs(estimate[0] - TRUE[0]) < 3.0 * sigmas[0]
 

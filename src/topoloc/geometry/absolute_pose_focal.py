@@ -23,13 +23,15 @@ from topoloc.geometry.absolute_pose import (
     estimate_pose_ransac,
     select_inliers,
 )
-from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_cholesky
+from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_cholesky, squared_errors
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import cells_of
 from topoloc.geometry.joint_camera.camera_hypotheses import (
+    NUM_PARAMETERS,
     CameraBelief,
     CameraHypothesis,
     CameraPrior,
+    Vector,
     map_variance,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
@@ -92,11 +94,13 @@ def estimate_pose_and_focal(
     )
     finite = points_img[usable], points_world[usable], point_covariances[usable]
     stated, usual = uncalibrated, uncalibrated.unknown(uncalibrated.width, uncalibrated.height)
+    if start and not stated.min_focal < start[1].fx < stated.max_focal:
+        stated = usual  # the residuals contradicted the stated range
     best = None
     for focals in (stated, usual):
         starts = [start] if start else _search_focal_lengths(finite, focals, config)
         refined = [_refine_pose_and_focal(each, finite, focals, config) for each in starts]
-        best = max(filter(None, [best, *refined]), key=lambda one: one[0], default=None)
+        best = min(filter(None, [best, *refined]), key=lambda one: one[0], default=None)
         # The stated focal length is that of the whole image. At a bound it is contradicted.
         is_inside = best is not None and stated.min_focal < best[2].fx < stated.max_focal
         if start or is_inside or stated == usual:
@@ -140,10 +144,7 @@ def _choose_camera(
         MAX_THRESHOLD_SCALE * config.max_reprojection_error_px / camera.fx,
     )
     prior = camera_prior(uncalibrated, camera.fx)
-    start = np.zeros(7)
-    start[1:3] = (camera.cx - first.cx) / camera.fx, (camera.cy - first.cy) / camera.fx
-    start[3:] = camera.distortion()[0]
-    fit = fit_camera(seen, cam_from_world, start, prior)
+    fit = fit_camera(seen, cam_from_world, parameters_of(camera, first), prior)
     if fit is None:
         return None
     fit = replace(fit, variance=fit.variance * map_variance(correlated_error_share))
@@ -174,14 +175,24 @@ def camera_prior(uncalibrated: UncalibratedCamera, focal: float) -> CameraPrior:
     return CameraPrior(sides, stated, widest)
 
 
-def with_parameters(camera: Camera, parameters: Float[np.ndarray, " 7"]) -> Camera:
+def parameters_of(camera: Camera, reference: Camera) -> Vector:
+    """Return the parameters of a camera relative to a pinhole."""
+    parameters = np.zeros(NUM_PARAMETERS)
+    parameters[0] = math.log(camera.fx / reference.fx)
+    parameters[1] = (camera.cx - reference.cx) / reference.fx
+    parameters[2] = (camera.cy - reference.cy) / reference.fx
+    parameters[3:7], parameters[7] = camera.distortion()[:2]
+    return parameters
+
+
+def with_parameters(camera: Camera, parameters: Vector) -> Camera:
     """Return the camera that the parameters describe relative to a pinhole."""
     focal = camera.fx * math.exp(parameters[0])
     cx, cy = camera.cx + camera.fx * parameters[1], camera.cy + camera.fx * parameters[2]
     if parameters[3] == 0.0:
         return Camera.pinhole(camera.width, camera.height, focal, focal, cx, cy)
-    values = tuple(float(one) for one in (focal, cx, cy, parameters[3]))
-    return Camera("SIMPLE_RADIAL", camera.width, camera.height, values)
+    values = tuple(float(one) for one in (focal, cx, cy, parameters[3], parameters[7]))
+    return Camera("RADIAL", camera.width, camera.height, values)
 
 
 def _search_focal_lengths(
@@ -219,18 +230,16 @@ def _refine_pose_and_focal(
     finite: _FiniteMatches,
     uncalibrated: UncalibratedCamera,
     config: AbsolutePoseConfig,
-) -> tuple[int, Rigid3, Camera] | None:
-    """Return the number of inliers, and the pose and camera that fit them best. Each round selects
-    the inliers again."""
+) -> tuple[float, Rigid3, Camera] | None:
+    """Return the robust loss of all matches, and the pose and camera that fit the inliers best.
+    Each round selects the inliers again."""
     cam_from_world, camera = start
-    # a start outside the stated range was found by the residuals
-    lowest = min(uncalibrated.min_focal, camera.fx)
-    highest = max(uncalibrated.max_focal, camera.fx)
-    num_inliers = 0
+    loss, worst = math.inf, (config.max_reprojection_error_px / config.key_point_sigma_px) ** 2
     for _ in range(_MAX_ROUNDS):
         matches = Matches.from_pixels(*finite, camera, config.key_point_sigma_px)
         inliers = select_inliers(cam_from_world, matches, camera, config)
-        num_inliers = int(np.count_nonzero(inliers))
+        squares = np.where(inliers, squared_errors(*matches.kernel_args(cam_from_world)), worst)
+        loss = float(np.log1p(squares / CAUCHY_SCALE**2).sum())
         if not is_non_collinear(matches.points_world[inliers]):
             return None
         cam_from_world = refine_pose(cam_from_world, matches, inliers)
@@ -241,12 +250,12 @@ def _refine_pose_and_focal(
         if not is_definite:
             return None
         focal = camera.fx * math.exp(np.clip(step[6], -0.2, 0.2))
-        focal = float(np.clip(focal, lowest, highest))
+        focal = float(np.clip(focal, uncalibrated.min_focal, uncalibrated.max_focal))
         if abs(math.log(focal / camera.fx)) < 1e-4:
             break
         camera = camera.with_focal(focal)
         cam_from_world = Rigid3.exp(step[:6]) @ cam_from_world
-    return num_inliers, cam_from_world, camera
+    return loss, cam_from_world, camera
 
 
 def _normal_equations(

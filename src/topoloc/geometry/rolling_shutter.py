@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import cells_of
+from topoloc.geometry.joint_camera.camera_hypotheses import NUM_PARAMETERS
 from topoloc.geometry.joint_camera.joint_fit import Observations, clustered_noise
 from topoloc.geometry.pose_matches import CAUCHY_SCALE, estimate_noise_scale
 from topoloc.geometry.rigid import Rigid3
@@ -27,12 +28,16 @@ _ROTATION_SIGMA = math.radians(1.5)  # of one axis, during a frame: a hand turns
 @dataclass(frozen=True, eq=False)
 class TurningCamera:
     """Hold the pose of the middle row and the rotation (radians, camera axes) from the first to the
-    last row. `covariance` is what the rotation adds to that of the pose (left perturbation)."""
+    last row. `covariance` is what the rotation adds to that of the pose (left perturbation).
+
+    A rotation `is_evident`, or is only as good an explanation of what contradicts a calibration.
+    """
 
     cam_from_world: Rigid3
     rotation: Float[np.ndarray, " 3"]
     covariance: Float[np.ndarray, "6 6"]
     height: int
+    is_evident: bool = True
 
     def undo(self, points_img: Float[np.ndarray, "n 2"], camera: Camera) -> np.ndarray:
         """Return where pixels would be if all rows were read with the middle one. Pixels without a
@@ -67,8 +72,9 @@ def find_rotation(
         variance: factor of the variance by errors that all points share.
     """
     # `benchmarks/inputs.py`: calm images had up to 16, by errors of the map, turns of a degree 2 to
-    # 360; after one round, which counts the rotation as noise, -7 to -12 and 1 to 15.
-    num_rounds, min_first_log_odds, min_log_odds = 5, -3.0, 15.0
+    # 360; after one round, which counts the rotation as noise, -7 to -12 and 1 to 15. Images
+    # through a lens that the calibration leaves out had up to 4.
+    num_rounds, min_first_log_odds, min_log_odds, evident_log_odds = 5, -3.0, 4.0, 15.0
     seen = Observations(
         camera.normalized_from_img(points_img),
         np.asarray(sigmas_px) / camera.fx,
@@ -78,7 +84,7 @@ def find_rotation(
         math.inf,
     )
     shares = _row_shares(points_img, camera.height)
-    estimate = _Estimate(cam_from_world, np.zeros(3))
+    estimate, is_evident = _Estimate(cam_from_world, np.zeros(3)), True
     for number in range(num_rounds):
         improved = estimate.improved(seen, shares, variance)
         if improved is None:
@@ -86,9 +92,12 @@ def find_rotation(
         estimate = improved
         if estimate.log_odds < (min_log_odds if number else min_first_log_odds):
             return None
+        is_evident &= number == 0 or estimate.log_odds >= evident_log_odds
     by_turn = estimate.pose_by_rotation
     covariance = by_turn @ estimate.covariance @ by_turn.T
-    return TurningCamera(estimate.cam_from_world, estimate.rotation, covariance, camera.height)
+    return TurningCamera(
+        estimate.cam_from_world, estimate.rotation, covariance, camera.height, is_evident
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +115,7 @@ class _Estimate:
         self, seen: Observations, shares: Float[np.ndarray, " n"], variance: float
     ) -> _Estimate | None:
         """Return the estimate after a round of Gauss-Newton, None if the points do not fix it."""
-        jacobian, weights, errors = seen.linearize(self.cam_from_world, np.zeros(7))
+        jacobian, weights, errors = seen.linearize(self.cam_from_world, np.zeros(NUM_PARAMETERS))
         by_rotation = shares[:, None, None] * jacobian[:, :, 3:6]
         errors = errors + by_rotation @ self.rotation
         squares = np.einsum("ni,nij,nj->n", errors, weights, errors)

@@ -29,7 +29,11 @@ from topoloc.geometry.calibration_check import (
 from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import cells_of
-from topoloc.geometry.joint_camera.camera_hypotheses import CameraPrior
+from topoloc.geometry.joint_camera.camera_hypotheses import (
+    NUM_PARAMETERS,
+    CameraPrior,
+    Vector,
+)
 from topoloc.geometry.joint_camera.joint_fit import (
     JointFit,
     Observations,
@@ -125,7 +129,7 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
         math.inf,
     )
     sides = camera.width / camera.fx, camera.height / camera.fy
-    calibrated = np.zeros(7)
+    calibrated = np.zeros(NUM_PARAMETERS)
     # standard deviations of the logarithm of the focal length: calibrated or not
     prior = CameraPrior(sides, stated=(0.0, 0.01), usual=(0.0, 0.3))
     joint = linearized_fit(observed, fit.cam_from_world, calibrated)
@@ -154,9 +158,7 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
     return CalibrationMismatch(focal, 0.0, focal, centre, centre, ["distortion"], shift)
 
 
-def _find_distortion(
-    joint: JointFit, prior: CameraPrior, min_probability: float
-) -> Float[np.ndarray, " 7"] | None:
+def _find_distortion(joint: JointFit, prior: CameraPrior, min_probability: float) -> Vector | None:
     """Return the likeliest camera parameters, None unless distortion is probable."""
     weighed = weigh_cameras(joint.likelihood, prior)
     if sum(weighed[one][0] for one in weighed if one.lens != "none") < min_probability:

@@ -16,7 +16,7 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     map_variance,
 )
 from topoloc.geometry.rigid import inverse_covariance
-from topoloc.geometry.rolling_shutter import find_rotation
+from topoloc.geometry.rolling_shutter import TurningCamera, find_rotation
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Hypothesis, log_odds_margin
 from topoloc.localization.evidence import (
@@ -75,8 +75,16 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     if best.fit.pose.camera is not None:
         return _weigh_camera(search, best, result, best.fit.pose.camera)
     with search.query.clock.stage("calibration"):
-        best, frame_rotation_deg = _undo_rotation(search, best)
-        seen, doubt = check_image_calibration(search, best.fit)
+        turning, frame_rotation_deg = _find_rotation(search, best), None
+        seen, doubt = None, None
+        is_undone = turning is not None and turning.is_evident
+        if not is_undone:
+            seen, doubt = check_image_calibration(search, best.fit)
+            is_undone = turning is not None and doubt is not None
+        if turning is not None and is_undone:
+            best = _undo_rotation(best, turning)
+            frame_rotation_deg = float(np.rad2deg(np.linalg.norm(turning.rotation)))
+            seen, doubt = check_image_calibration(search, best.fit)
     if doubt is None:
         if frame_rotation_deg is not None:
             result, points = _build_localization(search, best, result.probability)
@@ -90,10 +98,13 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     )
     evidence = replace(best.evidence, doubt=max(best.evidence.doubt, uncertainty))
     penalized = replace(best, covariance=covariance, evidence=evidence)
-    shifted = WeighedCamera(CameraHypothesis(), 1.0, doubt.shift, best.covariance)
+    # inliers by the wrong camera hide a part of the shift: half of it in `benchmarks/inputs.py`
+    half = best.covariance + 0.25 * np.outer(doubt.shift, doubt.shift)
+    shifted = WeighedCamera(CameraHypothesis(), 1.0, doubt.shift, half)
     camera = CameraBelief(shifted.hypothesis, [shifted])
     probability = result.probability * _probability_within(search, best, camera)
     if probability < search.config.evidence.min_probability:
+        search.is_refuted = True
         refusal = _build_not_localized(
             search, "too_few_inliers", best.fit, f"the calibration is doubtful: {doubt}"
         )
@@ -103,13 +114,13 @@ def decide_final_result(search: Search) -> ResultWithInliers:
     return localization, [(localization, points)]
 
 
-def _undo_rotation(search: Search, best: Hypothesis) -> tuple[Hypothesis, float | None]:
-    """Return the hypothesis as if a rolling shutter had read all rows at once, and the angle
-    (degrees) that the camera turned during the frame. None if that is not evident."""
+def _find_rotation(search: Search, best: Hypothesis) -> TurningCamera | None:
+    """Return the camera that turned while a rolling shutter read its rows, None if it may be at
+    rest."""
     if not best.evidence.is_of_nodes:
-        return best, None
+        return None
     fit, seen = best.fit, best.fit.inlier_observations(1.0)
-    found = find_rotation(
+    return find_rotation(
         seen.points_img.astype(np.float64),
         seen.points_world,
         seen.covariances,
@@ -118,15 +129,17 @@ def _undo_rotation(search: Search, best: Hypothesis) -> tuple[Hypothesis, float 
         fit.cam_from_world,
         map_variance(search.correlated_error_share),
     )
-    if found is None:
-        return best, None
-    points_img = found.undo(fit.features.points_img.astype(np.float64), fit.camera)
+
+
+def _undo_rotation(best: Hypothesis, turning: TurningCamera) -> Hypothesis:
+    """Return the hypothesis as if all rows had been read at once."""
+    fit = best.fit
+    points_img = turning.undo(fit.features.points_img.astype(np.float64), fit.camera)
     features = replace(fit.features, points_img=points_img.astype(np.float32))
-    covariance = fit.pose.covariance + found.covariance
-    pose = replace(fit.pose, cam_from_world=found.cam_from_world, covariance=covariance)
+    covariance = fit.pose.covariance + turning.covariance
+    pose = replace(fit.pose, cam_from_world=turning.cam_from_world, covariance=covariance)
     fit = replace(fit, features=features, pose=pose)
-    undone = replace(best, fit=fit, covariance=best.covariance + found.covariance)
-    return undone, float(np.rad2deg(np.linalg.norm(found.rotation)))
+    return replace(best, fit=fit, covariance=best.covariance + turning.covariance)
 
 
 def _weigh_camera(

@@ -123,8 +123,7 @@ class TileQuery:
             outcomes.append((result, named))
             is_localized = is_final and isinstance(result, Localization)
             # other types have the same calibration, so they are not used if it is refuted
-            is_refuted = not isinstance(result, Localization) and result.seen_camera is not None
-            if search.is_stopped or is_localized or is_refuted:
+            if search.is_stopped or is_localized or search.is_refuted:
                 return result, named
             if is_first and self.prior is not None and named and not is_final:
                 confirmed = confirm_hypotheses(first, last)

@@ -117,6 +117,8 @@ class Search:
     """True if the best pose is one of many from which a repetitive place looks the same."""
     is_stopped: bool = False
     """True if the time limit was reached before all proposals were tried."""
+    is_refuted: bool = False
+    """True if the image contradicts its calibration, and the pose was refused for that."""
 
     @property
     def candidates(self) -> list[NodeScore]:

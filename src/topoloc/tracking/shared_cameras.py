@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topoloc.geometry.absolute_pose_focal import camera_prior, with_parameters
+from topoloc.geometry.absolute_pose_focal import camera_prior, parameters_of, with_parameters
 from topoloc.geometry.calibration_check import MIN_IMAGES, MIN_PLACES
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import cells_of
@@ -23,7 +23,6 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     CameraLikelihood,
     CameraPrior,
     Matrix,
-    Vector,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
     JointFit,
@@ -55,7 +54,7 @@ class SharedCamera:
         focal, x, y = self.camera.fx * np.sqrt(np.diag(self.covariance)[:3])
         lens = ""
         if self.camera.is_distorted:
-            lens = f", k1 = {self.camera.params[-1]:.3f} +- {math.sqrt(self.covariance[3, 3]):.3f}"
+            lens = f", k1 = {self.camera.params[3]:.3f} +- {math.sqrt(self.covariance[3, 3]):.3f}"
         return (
             f"f = {self.camera.fx:.1f} +- {focal:.1f} px, principal point ({self.camera.cx:.1f} +-"
             f" {x:.1f}, {self.camera.cy:.1f} +- {y:.1f}){lens}, from {self.num_images} images"
@@ -124,7 +123,7 @@ class _CameraEstimate:
         self._learn(result, named)
         cam_from_world, of_pose = result.world_from_cam.inverse(), np.zeros((6, 6))
         seen = self._observations(named[0][1])
-        fit = linearized_fit(seen, cam_from_world, self._parameters(shared.camera))
+        fit = linearized_fit(seen, cam_from_world, parameters_of(shared.camera, self._reference))
         if fit is not None:
             of_pose = fit.pose_by_camera @ shared.covariance @ fit.pose_by_camera.T
         covariance = result.covariance + inverse_covariance(cam_from_world, of_pose)
@@ -161,7 +160,7 @@ class _CameraEstimate:
         found = result.provenance.camera
         if found is None:
             return None
-        start = self._parameters(found)
+        start = parameters_of(found, self._reference)
         return fit_camera(
             self._observations(inliers), result.world_from_cam.inverse(), start, self._prior
         )
@@ -179,15 +178,6 @@ class _CameraEstimate:
             math.inf,
         )
 
-    def _parameters(self, camera: Camera) -> Vector:
-        """Return the parameters of a camera relative to the reference."""
-        reference, parameters = self._reference, np.zeros(7)
-        parameters[0] = math.log(camera.fx / reference.fx)
-        parameters[1] = (camera.cx - reference.cx) / reference.fx
-        parameters[2] = (camera.cy - reference.cy) / reference.fx
-        parameters[3:] = camera.distortion()[0]
-        return parameters
-
     def _estimate(self) -> SharedCamera | None:
         """Return the likeliest camera, None if none of the hypotheses explains the images or the
         focal length remains uncertain."""
@@ -198,7 +188,8 @@ class _CameraEstimate:
         _, mean, covariance = weighed[chosen]
         if chosen.lens == "other" or math.sqrt(covariance[0, 0]) > max_focal_sigma:
             return None
-        mean[3:] = mean[3:].mean() if chosen.lens == "radial" else 0.0  # as cameras are modelled
+        # as cameras are modelled
+        mean[3:7] = mean[3:7].mean() if chosen.lens == "radial" else 0.0
         return SharedCamera(with_parameters(self._reference, mean), covariance, len(self._seen))
 
 
@@ -208,7 +199,7 @@ def combine_likelihoods(
     """Return what images show together. Images that disagree have smaller weights (Cauchy). Images
     of one viewpoint share the errors of its points, so the information is scaled to the number of
     viewpoints, and to the scatter of the images beyond their noise."""
-    median_chi_square = 6.346  # of seven
+    median_chi_square = 7.344  # of eight
     mean, covariance = prior.of(CameraHypothesis(False, "xy", "other"))
     each = [one.posteriors(mean[None], covariance[None]) for one in seen]
     estimates, inverse = (
@@ -221,7 +212,7 @@ def combine_likelihoods(
         residuals = estimates - centre
         squares = np.einsum("ni,nij,nj->n", residuals, inverse, residuals)
         scatter = max(1.0, float(np.median(squares)) / median_chi_square)
-        weights = 1.0 / (1.0 + squares / scatter / (CAUCHY_SCALE**2 * 3.5))
+        weights = 1.0 / (1.0 + squares / scatter / (CAUCHY_SCALE**2 * 4.0))
         weighted = weights[:, None, None] * inverse
         pulls = np.einsum("nij,nj->i", weighted, estimates)
         centre = np.linalg.solve(weighted.sum(axis=0), pulls)

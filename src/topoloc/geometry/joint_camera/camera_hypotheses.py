@@ -1,4 +1,4 @@
-"""Hold hypotheses about an uncalibrated camera: priors of seven parameters, and their
+"""Hold hypotheses about an uncalibrated camera: priors of eight parameters, and their
 probabilities. The parameters are those of `joint_camera/joint_fit.py`."""
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from topoloc.json_data import Positive, decode_json
 
 Lens = Literal["none", "radial", "other"]
 Axes = Literal["", "x", "y", "xy"]
-Vector = Float[np.ndarray, " 7"]
-Matrix = Float[np.ndarray, "7 7"]
+NUM_PARAMETERS = 8
+Vector = Float[np.ndarray, " 8"]
+Matrix = Float[np.ndarray, "8 8"]
 
 
 class _Priors(Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,6 +40,7 @@ class _Priors(Struct, frozen=True, forbid_unknown_fields=True):
     off_centre_sigma: Positive
     no_lens_sigma: Positive
     lens_sigma: Positive
+    lens_quintic_sigma: Positive
     map_variance: Positive
 
 
@@ -71,11 +73,11 @@ class CameraHypothesis:
         return math.log(odds if self.is_focal_stated else odds * _priors().unstated_focal)
 
     @property
-    def basis(self) -> Float[np.ndarray, "7 k"]:
+    def basis(self) -> Float[np.ndarray, "8 k"]:
         """Return the directions in which the parameters are estimated: always the principal point,
         because that of a whole image is off its centre by up to a per cent, too."""
-        eye = np.eye(7)
-        radial = np.array([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]]).T
+        eye = np.eye(NUM_PARAMETERS)
+        radial = np.column_stack([eye[:, 3:7].sum(axis=1), eye[:, 7]])
         lens = {"none": eye[:, :0], "radial": radial, "other": eye[:, 3:]}[self.lens]
         return np.hstack([eye[:, :3], lens])
 
@@ -94,7 +96,10 @@ class CameraPrior:
 
     def of(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
         """Return mean and covariance of the parameters under a hypothesis."""
-        mean, focal = np.zeros(7), self.stated if hypothesis.is_focal_stated else self.usual
+        mean, focal = (
+            np.zeros(NUM_PARAMETERS),
+            self.stated if hypothesis.is_focal_stated else self.usual,
+        )
         priors = _priors()
         offsets = [
             side * priors.off_centre_sigma
@@ -103,11 +108,14 @@ class CameraPrior:
             for axis, side in zip("xy", self.sides, strict=True)
         ]
         mean[0] = focal[0]
-        covariance = np.diag(np.square([focal[1], *offsets, *[priors.no_lens_sigma] * 4]))
-        if hypothesis.lens != "none":
-            covariance[3:, 3:] += priors.lens_sigma**2
+        is_lens = hypothesis.lens != "none"
+        quintic = priors.lens_quintic_sigma if is_lens else priors.no_lens_sigma
+        sigmas = [focal[1], *offsets, *[priors.no_lens_sigma] * 4, quintic]
+        covariance = np.diag(np.square(sigmas))
+        if is_lens:
+            covariance[3:7, 3:7] += priors.lens_sigma**2
         if hypothesis.lens == "other":
-            covariance[3:, 3:] += priors.lens_sigma**2 * np.eye(4)
+            covariance[3:7, 3:7] += priors.lens_sigma**2 * np.eye(4)
         return mean, covariance
 
     @property
@@ -126,8 +134,8 @@ class CameraLikelihood:
     pull: Vector
 
     def posteriors(
-        self, means: Float[np.ndarray, "k 7"], covariances: Float[np.ndarray, "k 7 7"]
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 7"], Float[np.ndarray, "k 7 7"]]:
+        self, means: Float[np.ndarray, "k 8"], covariances: Float[np.ndarray, "k 8 8"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 8"], Float[np.ndarray, "k 8 8"]]:
         """Return the logarithm of the evidence of each of k priors, and the parameters' mean and
         covariance under it."""
         by_priors = np.linalg.inv(covariances)
@@ -136,7 +144,7 @@ class CameraLikelihood:
         pull = self.pull + weighed
         estimates = (posteriors @ pull[:, :, None])[:, :, 0]
         evidence = np.sum(pull * estimates, axis=1) - np.sum(means * weighed, axis=1)
-        evidence -= np.linalg.slogdet(np.eye(7) + covariances @ self.information)[1]
+        evidence -= np.linalg.slogdet(np.eye(NUM_PARAMETERS) + covariances @ self.information)[1]
         return 0.5 * evidence, estimates, posteriors
 
 
@@ -191,8 +199,19 @@ class CameraBelief:
 def _probability_below(
     limit: float, mean: Float[np.ndarray, " 3"], covariance: Float[np.ndarray, "3 3"]
 ) -> float:
-    """Return the probability that a normal vector is shorter than a limit, as if it varied along
-    its mean only."""
-    scale = math.sqrt(2.0 * max(float(np.linalg.eigvalsh(covariance)[-1]), 1e-18))
-    length = float(np.linalg.norm(mean))
-    return (math.erf((limit - length) / scale) + math.erf((limit + length) / scale)) / 2.0
+    """Return the probability that a normal vector is shorter than a limit.
+
+    Its squared length is about a shifted chi-square variable with the same three cumulants (Imhof,
+    Biometrika 1961), whose cube root is about normal (Wilson and Hilferty, PNAS 1931).
+    """
+    squared = covariance @ covariance
+    expected = np.trace(covariance) + mean @ mean
+    variance = 2.0 * np.vdot(covariance, covariance) + 4.0 * mean @ covariance @ mean
+    if variance < 1e-18:
+        return float(expected < limit**2)
+    third = 8.0 * np.vdot(squared, covariance) + 24.0 * mean @ squared @ mean
+    spread = float(third**2 / (36.0 * variance**3))  # 2 / 9 of a degree of freedom
+    ratio = 1.0 + 3.0 * float(limit**2 - expected) * math.sqrt(spread / variance)
+    if ratio <= 0.0:
+        return 0.0
+    return 0.5 * (1.0 + math.erf((ratio ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(2.0 * spread)))

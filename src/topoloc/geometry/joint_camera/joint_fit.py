@@ -2,15 +2,16 @@
 
 The principal point of a cropped image is not in its centre, and lenses distort. Such errors move
 the pose by metres, but the residuals of many points show them. Gauss-Newton estimates the pose and
-seven camera parameters together. These are the logarithm of the focal length, the principal point,
-and four cubic terms of distortion:
+eight camera parameters together. These are the logarithm of the focal length, the principal point,
+four cubic terms of distortion and one of the fifth power of the radius r:
 
-    x' = f x (1 + a x^2 + b y^2) + cx,    y' = f y (1 + c x^2 + d y^2) + cy
+    x' = f x (1 + a x^2 + b y^2 + e r^4) + cx,    y' = f y (1 + c x^2 + d y^2 + e r^4) + cy
 
-A radial lens has a = b = c = d. A panorama has not. Each hypothesis about the camera is a normal
-prior of the seven parameters: narrow where it assumes a value, wide where the image decides. The
-evidence of a hypothesis is the density of the estimate under it. So a parameter is only estimated
-if the residuals ask for it. Residuals that neighbouring points share count as noise.
+A radial lens has a = b = c = d, a panorama has not. Without e, fisheye lenses look off-centre. Each
+hypothesis about the camera is a normal prior of the eight parameters: narrow where it assumes a
+value, wide where the image decides. The evidence of a hypothesis is the density of the estimate
+under it. So a parameter is only estimated if the residuals ask for it. Residuals that neighbouring
+points share count as noise.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Observations:
 
     def linearize(
         self, cam_from_world: Rigid3, camera: Vector
-    ) -> tuple[Float[np.ndarray, "n 2 13"], Float[np.ndarray, "n 2 2"], Float[np.ndarray, "n 2"]]:
+    ) -> tuple[Float[np.ndarray, "n 2 14"], Float[np.ndarray, "n 2 2"], Float[np.ndarray, "n 2"]]:
         """Return the derivatives of the projections by the pose's left perturbation and the camera,
         the information of each pixel, and the residuals. The information of points behind the
         camera is zero."""
@@ -60,20 +61,24 @@ class Observations:
         is_seen = z > 1e-6
         z = np.where(is_seen, z, 1.0)
         u, v, w, scale = x / z, y / z, 1.0 / z, math.exp(camera[0])
-        a, b, c, d = camera[3:]
+        a, b, c, d, e = camera[3:]
         uu, vv, zero = u * u, v * v, np.zeros_like(u)
-        bent_u, bent_v = u * (1.0 + a * uu + b * vv), v * (1.0 + c * uu + d * vv)
+        rr, r4 = uu + vv, (uu + vv) ** 2
+        bent_u = u * (1.0 + a * uu + b * vv + e * r4)
+        bent_v = v * (1.0 + c * uu + d * vv + e * r4)
         projected = scale * np.stack([bent_u, bent_v], axis=1) + camera[1:3]
         by_u = np.stack([w, zero, -u * w, -u * v, 1.0 + uu, -v], axis=1)
         by_v = np.stack([zero, w, -v * w, -(1.0 + vv), u * v, u], axis=1)
-        jacobian = np.zeros((len(u), 2, 13))
-        jacobian[:, 0, :6] = (1.0 + 3.0 * a * uu + b * vv)[:, None] * by_u
-        jacobian[:, 0, :6] += (2.0 * b * u * v)[:, None] * by_v
-        jacobian[:, 1, :6] = (1.0 + c * uu + 3.0 * d * vv)[:, None] * by_v
-        jacobian[:, 1, :6] += (2.0 * c * u * v)[:, None] * by_u
+        jacobian = np.zeros((len(u), 2, 14))
+        along_u, along_v = e * rr * (rr + 4.0 * uu), e * rr * (rr + 4.0 * vv)
+        jacobian[:, 0, :6] = (1.0 + 3.0 * a * uu + b * vv + along_u)[:, None] * by_u
+        jacobian[:, 0, :6] += (2.0 * u * v * (b + 2.0 * e * rr))[:, None] * by_v
+        jacobian[:, 1, :6] = (1.0 + c * uu + 3.0 * d * vv + along_v)[:, None] * by_v
+        jacobian[:, 1, :6] += (2.0 * u * v * (c + 2.0 * e * rr))[:, None] * by_u
         jacobian[:, 0, 6], jacobian[:, 1, 6] = bent_u, bent_v
         jacobian[:, 0, 9], jacobian[:, 0, 10] = u * uu, u * vv
         jacobian[:, 1, 11], jacobian[:, 1, 12] = v * uu, v * vv
+        jacobian[:, 0, 13], jacobian[:, 1, 13] = u * r4, v * r4
         jacobian *= scale
         jacobian[:, 0, 7] = jacobian[:, 1, 8] = 1.0
         by_world = jacobian[:, :, :3] @ cam_from_world.rotation
@@ -87,7 +92,7 @@ class JointFit:
     """Hold a pose and a camera that fit observations together.
 
     Args:
-        information: of the pose and the seven camera parameters, without the prior.
+        information: of the pose and the eight camera parameters, without the prior.
         pull: information times the estimate of the camera parameters by the observations alone.
         variance: factor by which the noise exceeds the assumed one, errors shared within parts of
             the image included.
@@ -95,12 +100,12 @@ class JointFit:
 
     cam_from_world: Rigid3
     camera: Vector
-    information: Float[np.ndarray, "13 13"]
+    information: Float[np.ndarray, "14 14"]
     pull: Vector
     variance: float
 
     @cached_property
-    def pose_by_camera(self) -> Float[np.ndarray, "6 7"]:
+    def pose_by_camera(self) -> Float[np.ndarray, "6 8"]:
         """Return the shift of the pose for a change of the camera parameters."""
         return -np.linalg.solve(self.information[:6, :6], self.information[:6, 6:])
 
@@ -116,11 +121,11 @@ def fit_jointly(
     cam_from_world: Rigid3,
     camera: Vector,
     prior: tuple[Vector, Matrix],
-    basis: Float[np.ndarray, "7 k"],
+    basis: Float[np.ndarray, "8 k"],
 ) -> JointFit | None:
     """Fit pose and camera together, from a nearby pose and camera. Only the directions of `basis`
     are estimated. None if the observations do not fix the pose."""
-    to_all = np.zeros((13, 6 + basis.shape[1]))
+    to_all = np.zeros((14, 6 + basis.shape[1]))
     to_all[:6, :6], to_all[6:, 6:] = np.eye(6), basis
     mean, by_prior = prior[0], np.linalg.inv(prior[1])
     active = None
@@ -172,7 +177,7 @@ def linearized_fit(seen: Observations, cam_from_world: Rigid3, camera: Vector) -
     gradient = gradients.sum(axis=0)
     known = information[6:, 6:] - information[6:, :6] @ by_pose[:, 6:]
     pull = known @ camera - (gradient[6:] - by_pose[:, 6:].T @ gradient[:6])
-    variance = estimate_noise_scale(squares[active], 13) ** 2
+    variance = estimate_noise_scale(squares[active], 14) ** 2
     variance *= clustered_noise(information, gradients[active], seen.cells[active], slice(6, 9))
     return JointFit(cam_from_world, camera, information, pull, variance)
 
@@ -183,7 +188,7 @@ def _linear_system(
     camera: Vector,
     active: Bool[np.ndarray, " n"] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bool[np.ndarray, " n"]] | None:
-    """Return Gauss-Newton's information (13, 13), the gradient of each observation (n, 13), the
+    """Return Gauss-Newton's information (14, 14), the gradient of each observation (n, 14), the
     squared lengths of the residuals, and the active observations: those given, or those that agree.
     None if they are fewer than eight."""
     jacobian, weights, errors = seen.linearize(cam_from_world, camera)

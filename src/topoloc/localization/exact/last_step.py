@@ -93,7 +93,7 @@ def _reconsider_refusal(
     if (
         isinstance(result, Localization)
         or result.reason == "ambiguous"
-        or result.seen_camera is not None
+        or any(search.is_refuted for search in searches)
         or not _can_refine(searches, weights)
     ):
         return outcome
