@@ -18,18 +18,14 @@ PEERS = ("the paper's step", "pycolmap, SIFT")
 
 def block_of(results: Mapping[str, Any]) -> str:
     """The block with its markers: a line for each recording, its methods and the peers side by
-    side, and the command that makes it."""
-    accuracy, peers, command = (
-        results.get("accuracy", []),
-        results.get("peers", []),
-        results["settings"]["command"],
-    )
+    side, and the commands that make it."""
+    accuracy, peers = results.get("accuracy", []), results.get("peers", [])
     places = dict.fromkeys((row["dataset"], row["queries"]) for row in accuracy)
     lines = []
     for place in places:
         mine = [row for row in accuracy if (row["dataset"], row["queries"]) == place]
         others = [row for row in peers if (row["dataset"], row["queries"]) == place]
-        lines.append([", ".join(place), *_cells(mine, others), _of_part(command, mine[0])])
+        lines.append([", ".join(place), *_cells(mine, others)])
     own = "surf-vlad (no weights)"
     columns = [
         "place, queries",
@@ -39,11 +35,11 @@ def block_of(results: Mapping[str, Any]) -> str:
         own,
         f"{own}, own nodes, ms",
         *PEERS,
-        "command",
     ]
     how = (
         "All but the last of ours have the paper's D_thresh; in brackets how many queries were"
-        " localized, where not all."
+        " localized, where not all. With `conditions` in place of `paper` the command makes the"
+        " rows of rendered places, with `recordings` the others, with `peers` the last two columns."
     )
     return f"{BEGIN}\n{about(results)} {how}\n\n{Table(columns, lines).markdown()}\n{END}"
 
@@ -89,10 +85,3 @@ def _cells(mine: Sequence[Row], others: Sequence[Row]) -> list[str]:
 
 def _cell(rows: Sequence[Row]) -> str:
     return error_words(rows[0]) if rows else MISSING
-
-
-def _of_part(command: str, row: Row) -> str:
-    """The parts that make the line."""
-    if row.get("real"):
-        return f"`{command.replace(' paper', ' recordings', 1)}`"
-    return f"`{command.replace(' paper', ' conditions', 1)}`; others: `peers` in its place"
