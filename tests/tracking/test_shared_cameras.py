@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from topoloc.geometry.absolute_pose_focal import camera_prior
+from topoloc.geometry.camera import Camera
 from topoloc.geometry.joint_camera.camera_hypotheses import CameraLikelihood
 from topoloc.geometry.joint_camera.joint_fit import weigh_cameras
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
-from topoloc.tracking.shared_cameras import combine_likelihoods
+from topoloc.tracking.shared_cameras import SharedCamera, combine_likelihoods
 
 PRIOR = camera_prior(UncalibratedCamera.unknown(640, 480), 640.0)
 SIGMAS = np.array([0.02, 0.01, 0.01, 0.02, 0.02, 0.02, 0.02, 0.02])
@@ -52,3 +53,9 @@ def test_images_of_one_place_count_once():
     _, at_many = _estimate(_images(16, 2), 16)
     _, at_one = _estimate(_images(16, 2), 4)
     assert at_one[0] > 1.5 * at_many[0]
+
+
+def test_a_shared_camera_prints_its_distortion():
+    camera = Camera("RADIAL", 640, 480, (500.0, 319.5, 239.5, -0.3, 0.08))
+    shared = SharedCamera(camera, np.diag(np.arange(1.0, 9.0) ** 2 * 1e-4), 12)
+    assert "k1 = -0.300 +- 0.040, k2 = 0.080 +- 0.080, from 12 images" in str(shared)

@@ -54,7 +54,9 @@ class SharedCamera:
         focal, x, y = self.camera.fx * np.sqrt(np.diag(self.covariance)[:3])
         lens = ""
         if self.camera.is_distorted:
-            lens = f", k1 = {self.camera.params[3]:.3f} +- {math.sqrt(self.covariance[3, 3]):.3f}"
+            k1, k2 = self.camera.distortion()[:2]
+            sigma_1, sigma_2 = np.sqrt(np.diag(self.covariance)[[3, 7]])
+            lens = f", k1 = {k1:.3f} +- {sigma_1:.3f}, k2 = {k2:.3f} +- {sigma_2:.3f}"
         return (
             f"f = {self.camera.fx:.1f} +- {focal:.1f} px, principal point ({self.camera.cx:.1f} +-"
             f" {x:.1f}, {self.camera.cy:.1f} +- {y:.1f}){lens}, from {self.num_images} images"
