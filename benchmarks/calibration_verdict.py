@@ -1,5 +1,5 @@
-"""Of wrong calibrations (5 % of focal length or width), how many do N pictures in a row name; how
-often is a right one accused?
+"""Of wrong calibrations (5 % of focal length or width, k1 of 0.1), how many do N pictures in a row
+name; how often is a right one accused?
 
 python benchmarks/calibration_verdict.py kitchen.topo kitchen@60-99/100 --every 3
 """
@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from typing import NamedTuple
 
-from topoloc.geometry.calibration_check import check_calibration_consistency
+from topoloc.geometry.calibration_check import CalibrationConsistency, check_calibration_consistency
 from topoloc.geometry.calibration_mismatch import IntrinsicsDeviation
 from topoloc.geometry.camera import MODELS, Camera
 from topoloc.localization.localizer import Localizer
@@ -17,33 +18,51 @@ from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 
-RIGHT = (1.0, 0.0, 0.0)
+
+class Change(NamedTuple):
+    """How a calibration is wrong: focal length times `scale`, principal point moved by shares of
+    the width, and a lens that the camera has not."""
+
+    scale: float = 1.0
+    across: float = 0.0
+    down: float = 0.0
+    k1: float = 0.0
+
+    def of(self, camera: Camera) -> Camera:
+        values = dict(zip(MODELS[camera.model], camera.params, strict=True))
+        values |= {name: self.scale * values[name] for name in ("f", "fx", "fy") if name in values}
+        values["cx"] += self.across * camera.width
+        values["cy"] += self.down * camera.width
+        if not self.k1:
+            return replace(camera, params=tuple(values.values()))
+        assert not camera.is_distorted, "a pinhole camera is needed"
+        parameters = camera.fx, camera.fy, camera.cx, camera.cy, self.k1, 0.0, 0.0, 0.0
+        return Camera("OPENCV", camera.width, camera.height, parameters)
+
+    def is_named(self, verdict: CalibrationConsistency) -> bool:
+        if self.k1:
+            return verdict.has_distortion_mismatch
+        is_focal = self.scale != 1.0
+        return verdict.has_focal_mismatch if is_focal else verdict.has_principal_point_mismatch
+
+
+RIGHT = Change()
 WRONG = (
-    (0.95, 0.0, 0.0),
-    (1.05, 0.0, 0.0),
-    (1.0, 0.05, 0.0),
-    (1.0, -0.05, 0.0),
-    (1.0, 0.0, 0.05),
-    (1.0, 0.0, -0.05),
+    *(Change(scale=one) for one in (0.95, 1.05)),
+    *(Change(across=one) for one in (0.05, -0.05)),
+    *(Change(down=one) for one in (0.05, -0.05)),
+    *(Change(k1=one) for one in (0.1, -0.1)),
 )
 NUM_PICTURES = (5, 10, 15, 20)
 
 
-def changed(camera: Camera, scale: float, across: float, down: float) -> Camera:
-    """Focal length times `scale`, principal point moved by shares of the width."""
-    values = dict(zip(MODELS[camera.model], camera.params, strict=True))
-    values |= {name: scale * values[name] for name in ("f", "fx", "fy") if name in values}
-    values |= {"cx": values["cx"] + across * camera.width, "cy": values["cy"] + down * camera.width}
-    return replace(camera, params=tuple(values.values()))
-
-
 def seen_with(
-    localizer: Localizer, sequence: StereoSequence, every: int, case: tuple[float, float, float]
+    localizer: Localizer, sequence: StereoSequence, every: int, case: Change
 ) -> tuple[list[IntrinsicsDeviation], Camera]:
     """What each picture says, and the calibration that it was asked with."""
     first = sequence[0].camera
     assert first is not None, "a recording with a calibration is needed"
-    camera = changed(first, *case)
+    camera = case.of(first)
     results = [
         localizer.localize(sequence[index].image, camera)
         for index in range(0, len(sequence), every)
@@ -68,11 +87,7 @@ def main() -> None:
                 check_calibration_consistency(seen[first : first + num], camera)
                 for first in range(len(seen) - num + 1)
             ]
-            said = [
-                one.has_focal_mismatch if case[0] != 1.0 else one.has_principal_point_mismatch
-                for one in verdicts
-                if one is not None
-            ]
+            said = [case.is_named(one) for one in verdicts if one is not None]
             accused = [one.is_contradicted for one in verdicts if one is not None]
             counts[num, case == RIGHT][0] += sum(accused if case == RIGHT else said)
             counts[num, case == RIGHT][1] += len(said)

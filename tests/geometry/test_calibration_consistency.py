@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -147,3 +149,15 @@ def test_pictures_that_all_say_the_same():
     assert verdict is not None
     assert not verdict.is_contradicted
     assert verdict.to_json()["principal_point_px"] == pytest.approx([319.5, 239.5])
+
+
+@pytest.mark.parametrize(("num_distorted", "is_named"), [(0, False), (9, False), (12, True)])
+def test_most_images_must_show_a_lens(num_distorted: int, is_named: bool):
+    seen = pictures((0.08, 0.0, 0.0), 20, np.random.default_rng(5))
+    seen = [replace(one, is_distorted=k < num_distorted) for k, one in enumerate(seen)]
+    verdict = check_calibration_consistency(seen, CAMERA)
+    assert verdict is not None
+    assert verdict.is_contradicted
+    assert verdict.has_distortion_mismatch == is_named
+    assert verdict.has_focal_mismatch != is_named, "estimated without the lens"
+    assert ("their lens distorts more" in str(verdict)) == is_named

@@ -9,6 +9,7 @@ import pytest
 
 from topoloc.geometry.camera import Camera
 from topoloc.localization import image_calibration_check
+from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PoseFit
 from topoloc.localization.result import Localization, NotLocalized
@@ -103,7 +104,7 @@ def test_another_camera_is_named_only_where_it_explains_the_picture_better(
 
 
 def test_distortion_that_the_calibration_leaves_out_is_named(localizer: Localizer, queries: Path):
-    num_named = 0
+    num_named, results = 0, list[Localization | NotLocalized]()
     for frame in open_sequence(queries):
         assert frame.camera is not None
         assert frame.world_from_cam is not None
@@ -117,6 +118,7 @@ def test_distortion_that_the_calibration_leaves_out_is_named(localizer: Localize
         )
         distorted = cv2.remap(frame.image, map_x, map_y, cv2.INTER_LINEAR)
         result = localizer.localize(distorted, frame.camera)
+        results.append(result)
         if not isinstance(result, Localization):
             num_named += "its lens distorts" in result.detail
             continue
@@ -125,3 +127,5 @@ def test_distortion_that_the_calibration_leaves_out_is_named(localizer: Localize
         if result.calibration_doubt is not None:
             num_named += "distortion" in result.calibration_doubt.of
     assert num_named >= 0.8 * len(open_sequence(queries))
+    (together,) = check_camera_calibrations(results)
+    assert "their lens distorts more than the calibration states" in str(together)

@@ -193,11 +193,13 @@ class CalibrationConsistency:
     calibrated_principal_point_px: Float[np.ndarray, " 2"]
     has_focal_mismatch: bool
     has_principal_point_mismatch: bool
+    has_distortion_mismatch: bool = False
 
     @property
     def is_contradicted(self) -> bool:
         """Return whether the images contradict the calibration."""
-        return self.has_focal_mismatch or self.has_principal_point_mismatch
+        is_moved = self.has_focal_mismatch or self.has_principal_point_mismatch
+        return is_moved or self.has_distortion_mismatch
 
     def __str__(self) -> str:
         (x, y), (x_sigma, y_sigma) = self.principal_point_px, self.principal_point_sigma_px
@@ -210,7 +212,9 @@ class CalibrationConsistency:
             f"the principal point at ({x:.1f} +- {x_sigma:.1f}, {y:.1f} +- {y_sigma:.1f}), the"
             f" calibration ({cx:.1f}, {cy:.1f})"
         )
+        lens = "that their lens distorts more than the calibration states"
         parts = [focal] * self.has_focal_mismatch + [centre] * self.has_principal_point_mismatch
+        parts += [lens] * self.has_distortion_mismatch
         found = f"say {'; '.join(parts)}" if parts else f"agree with it: {focal}"
         return f"the pictures {found} ({self.num_images} pictures)"
 
@@ -236,6 +240,8 @@ def check_calibration_consistency(
     sigmas = np.sqrt(np.diag(covariance))
     shares = np.abs(deviation) * np.array([1.0, *np.repeat(calibrated.fx / calibrated.width, 2)])
     is_off = (np.abs(deviation) > _NUM_SIGMAS * sigmas) & (shares > _MIN_RELATIVE_DEVIATION)
+    if is_distorted := np.mean([one.is_distorted for one in observations]) > 0.5:
+        is_off[:] = False  # an estimate without the lens
     focal = calibrated.fx * float(np.exp(deviation[0]))
     centre = np.array([calibrated.cx, calibrated.cy])
     return CalibrationConsistency(
@@ -248,6 +254,7 @@ def check_calibration_consistency(
         centre,
         bool(is_off[0]),
         bool(is_off[1:].any()),
+        bool(is_distorted),
     )
 
 

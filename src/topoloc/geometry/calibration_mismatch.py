@@ -21,11 +21,13 @@ class IntrinsicsDeviation:
             principal point in calibrated focal lengths (x, y).
         covariance: its noise under independent errors of the points.
         place: node that the image shows. Images of one node share the errors of its points.
+        is_distorted: whether the image shows distortion that the calibration leaves out.
     """
 
     deviation: Float[np.ndarray, " 3"]
     covariance: Float[np.ndarray, "3 3"]
     place: int = -1
+    is_distorted: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import compress
 
 import numpy as np
@@ -76,16 +77,17 @@ def check_image_calibration(
 
     Returns:
         The deviation from the calibration, None if it cannot be estimated or there is no
-        calibration. And the mismatch, None if the two agree.
+        calibration. The mismatch, None if the two agree.
     """
     suspect, reported = (3.0, 0.01), (5.0, 0.035)  # sigmas, share of focal length or image width
     if isinstance(fit.input_camera, UncalibratedCamera):
         return None, None
-    if (mismatch := _check_distortion(search, fit)) is not None:
-        return None, mismatch
-    found = _estimate_image_calibration(search, fit)
+    mismatch, found = _check_distortion(search, fit), _estimate_image_calibration(search, fit)
     if found is None:
-        return None, None
+        return None, mismatch
+    if mismatch is not None:
+        seen = compute_intrinsics_deviation(fit.camera, fit.camera, found, fit.node_id)
+        return replace(seen, is_distorted=True), mismatch
     if not any(_is_calibration_off(fit, found, fit.camera, *suspect)):
         return compute_intrinsics_deviation(fit.camera, fit.camera, found, fit.node_id), None
     by_calibration, calibrated, first, place = fit, fit.camera, fit.cam_from_world, fit.node_id
