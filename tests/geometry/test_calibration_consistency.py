@@ -151,8 +151,8 @@ def test_pictures_that_all_say_the_same():
     assert verdict.to_json()["principal_point_px"] == pytest.approx([319.5, 239.5])
 
 
-@pytest.mark.parametrize(("num_distorted", "is_named"), [(0, False), (9, False), (12, True)])
-def test_most_images_must_show_a_lens(num_distorted: int, is_named: bool):
+@pytest.mark.parametrize(("num_distorted", "is_named"), [(0, False), (5, False), (9, True)])
+def test_a_third_of_the_images_must_show_a_lens(num_distorted: int, is_named: bool):
     seen = pictures((0.08, 0.0, 0.0), 20, np.random.default_rng(5))
     seen = [replace(one, is_distorted=k < num_distorted) for k, one in enumerate(seen)]
     verdict = check_calibration_consistency(seen, CAMERA)

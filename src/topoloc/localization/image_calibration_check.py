@@ -34,6 +34,7 @@ from topoloc.geometry.joint_camera.camera_hypotheses import (
     NUM_PARAMETERS,
     CameraPrior,
     Vector,
+    map_variance,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
     JointFit,
@@ -45,7 +46,6 @@ from topoloc.geometry.joint_camera.joint_fit import (
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.guided import match_guided
-from topoloc.localization.map_facts.correlated_errors import covariance_inflation
 from topoloc.localization.pose_fit import PointMatches, PoseFit, fit_pose
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.localization.search import Search
@@ -97,10 +97,7 @@ def check_image_calibration(
     if not any(is_off) or not _is_better(_gain(by_calibration, fit)):
         return seen, None
     camera, scale = corrected_camera(fit.camera, found), search.query.scale
-    sigma = math.sqrt(
-        covariance_inflation(fit.num_inliers, search.correlated_error_share)
-        * found.covariance[0, 0]
-    )
+    sigma = math.sqrt(found.covariance[0, 0])
     return seen, CalibrationMismatch(
         camera.fx * scale,
         sigma * camera.fx * scale,
@@ -138,6 +135,9 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
     if joint is None or _find_distortion(joint, prior, 0.012) is None:
         return None
     joint = fit_camera(observed, fit.cam_from_world, calibrated, prior)
+    if joint is not None:
+        shared = map_variance(search.correlated_error_share)
+        joint = replace(joint, variance=shared * joint.variance)
     found = None if joint is None else _find_distortion(joint, prior, 0.99)
     if joint is None or found is None:
         return None
@@ -221,7 +221,7 @@ def _gain_of(
 def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibration | None:
     seen = fit.inlier_observations(1.0)
     points_img, sigma_px = seen.points_img.astype(np.float64), search.config.pose.key_point_sigma_px
-    return estimate_image_calibration(
+    found = estimate_image_calibration(
         points_img,
         seen.points_world,
         seen.covariances,
@@ -229,6 +229,10 @@ def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibratio
         fit.cam_from_world,
         sigma_px,
     )
+    if found is None:
+        return None
+    shared = map_variance(search.correlated_error_share)
+    return replace(found, covariance=shared * found.covariance)
 
 
 def _rematch(search: Search, fit: PoseFit, found: ImageCalibration) -> PointMatches:
