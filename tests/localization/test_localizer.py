@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import pickle
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -271,3 +276,45 @@ def test_who_is_traced_gets_the_same_answer(localizer: Localizer):
     assert _facts(localizer.localize(PICTURE, CAMERA, trace=Trace())) == _facts(
         localizer.localize(PICTURE, CAMERA)
     )
+
+
+@pytest.mark.parametrize("kind", ["matrix", "tuple", "list", "text", "path"])
+def test_a_camera_may_be_given_as_people_have_it(localizer: Localizer, kind: str, tmp_path: Path):
+    four = CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(CAMERA.to_json()))
+    matrix = np.array([[four[0], 0.0, four[2]], [0.0, four[1], four[3]], [0.0, 0.0, 1.0]])
+    given = {
+        "matrix": matrix,
+        "tuple": four,
+        "list": list(four),
+        "text": ",".join(map(str, four)),
+        "path": path,
+    }
+    by_camera = localizer.localize(PICTURE, CAMERA)
+    assert isinstance(by_camera, Localization)
+    found = localizer.localize(PICTURE, given[kind])
+    assert isinstance(found, Localization)
+    assert translation_error(found.world_from_cam, by_camera.world_from_cam) < 1e-9
+
+
+@pytest.mark.parametrize("given", [(1.0, 2.0), np.eye(4)])
+def test_what_is_no_camera_is_named(localizer: Localizer, given: Any):
+    with pytest.raises(QueryError, match=r"a 3x3 matrix K, \(fx, fy, cx, cy\) in pixels"):
+        localizer.localize(PICTURE, given)
+
+
+def test_a_localizer_of_a_file_answers_in_another_process(localizer: Localizer, tmp_path: Path):
+    localizer.topomap.save(tmp_path / "room.topo")
+    of_file = Localizer(tmp_path / "room.topo", LocalizerConfig(num_candidates=2))
+    data = pickle.dumps(of_file)
+    assert len(data) < 10_000, "the path and the settings, not the map"
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        there = pool.submit(pickle.loads(data).localize, PICTURE, CAMERA).result()
+    here = of_file.localize(PICTURE, CAMERA)
+    assert isinstance(there, Localization)
+    assert isinstance(here, Localization)
+    assert there.world_from_cam.to_json() == here.world_from_cam.to_json()
+    part = of_file.without([of_file.topomap.summaries[0].node_id])
+    with pytest.raises(TypeError, match="cannot be pickled: use one of its file"):
+        pickle.dumps(part)

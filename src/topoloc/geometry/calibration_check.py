@@ -99,7 +99,9 @@ _PRIOR_SIGMA = 0.3
 _MIN_POINTS = 20
 MIN_IMAGES, MIN_PLACES = 5, 4  # images of one place share their errors, however many there are
 _NUM_SIGMAS, _MIN_RELATIVE_DEVIATION = 3.0, 0.02  # of the focal length, or of the image's width
-_MIN_DISTORTED_SHARE = 0.3  # of the images; of 202 images through their own lens none showed another
+_MIN_DISTORTED_SHARE = (
+    0.3  # of the images; of 202 images through their own lens none showed another
+)
 _NUM_MEAN_ITERATIONS = 10
 _MAD_TO_SIGMA = 1.4826
 

@@ -21,7 +21,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from topoloc.atlas.config import AtlasConfig
 from topoloc.bounds import check_bounds
@@ -32,7 +32,7 @@ from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.fitted_weights import FittedWeights
 from topoloc.localization.map_context import MapContext
-from topoloc.localization.query import Deadline, QueryImage, StageClock, unknown_camera
+from topoloc.localization.query import CameraLike, Deadline, QueryImage, StageClock, camera_of
 from topoloc.localization.result import Localization, NotLocalized, R, with_time
 from topoloc.localization.result_decision import ResultWithInliers
 from topoloc.localization.schedule import Schedule
@@ -95,8 +95,9 @@ class Localizer:
         check_bounds(self.tile_config)
         self._reach: Reach | None = None
         self._nothing_in_reach = ""
+        self._options = coarse, weights, features, tiles
         if isinstance(source, MapContext):
-            self.config, self.source = source.config, source.topomap
+            self.config, self.source, self._options = source.config, source.topomap, None
             self._tiles = Tiles(source)
             return
         self.config = config or LocalizerConfig()
@@ -123,6 +124,13 @@ class Localizer:
             maps = maps or MapCache.with_memory([], lambda one: Localizer(open_map(one)), 512)
             self._tiles = AtlasTiles(source, maps, self.tile_config, warn)
 
+    def __reduce__(self) -> tuple[type[Localizer], tuple[Any, ...], dict[str, Any]]:
+        """Return what opens the same map in another process. Raises TypeError: it may be a part."""
+        if self._options is None:
+            raise TypeError("a localizer of an open map cannot be pickled: use one of its file")
+        state = {"_reach": self._reach, "_nothing_in_reach": self._nothing_in_reach}
+        return Localizer, (self.source, self.config, *self._options), state
+
     @property
     def context(self) -> MapContext:
         """Return the open map. Raises AtlasError: this is an atlas."""
@@ -135,9 +143,7 @@ class Localizer:
 
     @property
     def unavailable_types(self) -> dict[str, str]:
-        """Return the reason for each feature type of the map that cannot be used, for example
-        because its network is not installed. Raises AtlasError: this is an
-        atlas."""
+        """Return why feature types of the map are not used. Raises AtlasError: this is an atlas."""
         return self.context.unavailable_types
 
     @property
@@ -152,10 +158,7 @@ class Localizer:
 
     @contextmanager
     def in_tile(self, tile_id: str | None = None) -> Iterator[Localizer]:
-        """Yield a localizer for one tile alone. Its map stays open for the context.
-
-        Args:
-            tile_id: the tile. It may be None if there is only one.
+        """Yield a localizer for one tile alone, None: the only one. Its map stays open meanwhile.
 
         Raises:
             AtlasError: there is no such tile, or several and none is named.
@@ -177,8 +180,7 @@ class Localizer:
         Args:
             georeferenced_only: use only tiles with a known position on earth.
 
-        Raises:
-            AtlasError: no tile belongs to the prior's world, or this is one map.
+        Raises AtlasError: no tile belongs to the prior's world, or this is one map.
         """
         other = copy.copy(self)
         other._reach = self._tiles.in_reach(near, georeferenced_only)
@@ -203,21 +205,20 @@ class Localizer:
     def localize(
         self,
         image: Image,
-        camera: Camera | UncalibratedCamera | None,
+        camera: CameraLike | None,
         prior: Rigid3 | None = None,
         max_ms: float | Deadline | None = None,
         trace: Trace | None = None,
         t_ns: int | None = None,
         tile_id: str | None = None,
     ) -> Localization | NotLocalized:
-        """Estimate the pose of an image (grey or RGB, uint8).
-
-        If the camera is not exactly known, or unknown (None), the focal length is estimated with
-        the pose, and principal point and distortion if the residuals ask for it. This takes a few
-        times as long. In an atlas the provenance holds the tile, in whose world the pose is.
+        """Estimate the pose of an image (grey or RGB, uint8). In an atlas it is in the world of the
+        tile that the provenance names. A camera that is not exactly known is estimated too, which
+        takes a few times as long.
 
         Args:
-            camera: camera model of the image, exact or approximate. None: unknown.
+            camera: camera model of the image, exact or approximate; K, (fx, fy, cx, cy) in pixels,
+                or the path of a calibration. None: unknown.
             prior: approximate pose (world_from_cam). The nodes nearest to it replace coarse
                 retrieval. The pose needs the same evidence as any other, from matches that the
                 prior did not guide. In an atlas it is in the world of the tile `tile_id`.
@@ -232,7 +233,7 @@ class Localizer:
             AtlasError: there is no such tile, a prior comes without one, or no tile can be read.
             ObjectStoreError: the object store of a required tile does not respond.
         """
-        query_image = QueryImage(image, camera or unknown_camera(image))
+        query_image = QueryImage(image, camera_of(image, camera))
         result = self.localize_query(query_image, prior, max_ms, trace, tile_id)[0]
         return result if t_ns is None else with_time(result, t_ns)
 

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -208,15 +209,43 @@ def check_image_size(image: Image, camera: Camera | UncalibratedCamera) -> None:
         )
 
 
-def unknown_camera(image: Image) -> UncalibratedCamera:
-    """Return the approximate camera for an image without any calibration.
+CameraLike = Camera | UncalibratedCamera | str | Path | Sequence[float] | np.ndarray
+"""A camera, K, (fx, fy, cx, cy) in pixels, or the path of a calibration."""
 
-    Raises:
-        QueryError: the image is not an 8-bit image.
-    """
+
+def unknown_camera(image: Image) -> UncalibratedCamera:
+    """Return the approximate camera for an image without any calibration. Raises QueryError: the
+    image is not an 8-bit image."""
     if problem := find_image_problem(image):
         raise QueryError(problem)
     return UncalibratedCamera.unknown(image.shape[1], image.shape[0])
+
+
+def camera_of(image: Image, camera: CameraLike | None) -> Camera | UncalibratedCamera:
+    """Return the camera of an image. None: unknown.
+
+    Raises:
+        QueryError: the image is not an 8-bit image, or the camera is none of `CameraLike`.
+        CalibrationError: the calibration cannot be read, or is of another image size.
+    """
+    if isinstance(camera, Camera | UncalibratedCamera):
+        return camera
+    unknown = unknown_camera(image)
+    if camera is None:
+        return unknown
+    if not isinstance(camera, str | Path):
+        values = np.array(camera, dtype=object)
+        if values.shape == (3, 3):
+            values = values[[0, 1, 0, 1], [0, 1, 2, 2]]
+        if values.shape != (4,):
+            raise QueryError(
+                "a camera is a topoloc.Camera, a 3x3 matrix K, (fx, fy, cx, cy) in pixels, or the"
+                f" path of a calibration, not {type(camera).__name__} of shape {values.shape}"
+            )
+        camera = ",".join(map(str, values))
+    from topoloc.recordings.calibration import parse_calibration  # reads many formats
+
+    return parse_calibration(camera)(unknown.width, unknown.height).camera
 
 
 def reduce_image(

@@ -18,7 +18,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import check_image_size, unknown_camera
+from topoloc.localization.query import CameraLike, camera_of, check_image_size
 from topoloc.localization.result import Localization, NotLocalized, with_time
 from topoloc.recordings.frame_checks import find_time_problem
 from topoloc.retrieval.coarse import Image
@@ -74,7 +74,7 @@ class Tracker:
     def process(
         self,
         image: Image,
-        camera: Camera | UncalibratedCamera | None,
+        camera: CameraLike | None,
         t_ns: int,
         odom_from_cam: Rigid3 | None = None,
     ) -> StreamedPose:
@@ -95,7 +95,7 @@ class Tracker:
             AtlasError: no tile can be read.
             ObjectStoreError: the object store does not respond.
         """
-        camera = camera or unknown_camera(image)
+        camera = camera_of(image, camera)
         check_image_size(image, camera)
         is_same = self._image is not None and np.array_equal(self._image, image)
         self._check_time(t_ns, is_repeat_allowed=is_same)
