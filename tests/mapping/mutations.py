@@ -279,7 +279,7 @@ def _arrays(database: sqlite3.Connection, rng: Rng) -> str:
     if number == len(changes):
         del arrays[name]
     else:
-        arrays[name] = changes[number](arrays[name])
+        arrays[name] = changes[number](np.atleast_1d(arrays[name]))  # it may be changed already
     buffer = io.BytesIO()
     (np.savez_compressed if rng.random() < 0.1 else np.savez)(buffer, **arrays)
     _try(database, f"UPDATE {table} SET arrays = ? WHERE rowid = ?", buffer.getvalue(), row[0])
