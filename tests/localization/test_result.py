@@ -106,6 +106,8 @@ def test_the_cameras_own_covariance_is_that_of_a_perturbation_on_its_side():
     result = Localization(POSE, np.cov(left.T), 0.98, 17, CANDIDATES, 212, 158)
     deviations = np.sqrt(np.diag(result.camera_covariance))
     np.testing.assert_allclose(deviations, np.diag(roots), rtol=0.03)
+    positions = np.array([(POSE @ Rigid3.exp(xi)).translation for xi in samples])
+    np.testing.assert_allclose(result.position_covariance, np.cov(positions.T), atol=2e-5)
 
 
 def test_a_probability_that_is_not_calibrated_says_so():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -16,6 +19,9 @@ from topoloc.mapping.nodes import (
     node_distances,
     select_node_frames,
 )
+from topoloc.mapping.topomap import TopoMetricMap
+
+SHAPES = ("circle", "text")
 
 
 def moved(x: float, yaw: float = 0.0) -> Rigid3:
@@ -107,3 +113,23 @@ def test_unset_parameters_follow_from_the_scene():
         1.5 / RADIANS_PER_NODE
     )
     assert NodeConfig(0.7, 0.2).resolved(100.0) == NodeConfig(0.7, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("num", "spacing", "bar"), [(1, 1.0, "0.01 m"), (40, 0.2, "1 m"), (9000, 0.1, "100 m")]
+)
+def test_a_plan_shows_the_nodes_and_a_length(num: int, spacing: float, bar: str):
+    steps = np.arange(num) * spacing
+    poses = NodePoses(np.column_stack([steps, np.sin(steps), 0.1 * steps]), np.zeros((num, 3, 3)))
+    root = ElementTree.fromstring(poses.plan_svg())
+    circles, texts = (list(root.iter(f"{{http://www.w3.org/2000/svg}}{one}")) for one in SHAPES)
+    assert [one.text for one in texts] == [bar]
+    assert min(num, 250) <= len(circles) <= 500
+    assert all(0 <= float(one.attrib["cx"]) <= 320 for one in circles)
+
+
+def test_a_map_in_a_notebook_is_a_line_and_a_plan(room_map: Path):
+    text = TopoMetricMap.load(room_map)._repr_html_()
+    assert "nodes along" in text
+    assert "<svg" in text
+    assert len(text) < 30_000

@@ -40,14 +40,12 @@ class Localization:
     Attributes:
         covariance: covariance (6, 6) of the left perturbation xi of world_from_cam,
             ``true_world_from_cam = exp(xi) @ world_from_cam``. Order (translation, rotation),
-            metres and radians, world axes. It includes the image noise, the uncertainty of each map
-            point and the correlated errors of the map (`correlated_errors.py`). It also includes
-            errors shared within parts of the image, such as moved objects
-            (`geometry/clustered_errors.py`). The translation part refers to the world's origin.
-            `camera_covariance` refers to the camera.
+            metres and radians, world axes. It includes image noise, the uncertainty of each map
+            point, and errors that points share in the map or in parts of the image. Its translation
+            part refers to the world's origin, `camera_covariance` and `position_covariance` to the
+            camera.
         probability: probability that the pose is within 0.25 m and 2 degrees. 5 % of the distance
-            of the seen points replaces 0.25 m if that is less. It is computed from `evidence` with
-            fitted weights.
+            of the seen points replaces 0.25 m if that is less.
         calibrated: False if no weights were fitted to this feature type and those of another are
             used.
         node_id: node with the most inliers.
@@ -59,8 +57,7 @@ class Localization:
             the image. The pose is that of the middle row.
         calibration_doubt: mismatch of the image and its calibration. The covariance and probability
             include it.
-        seen_camera: calibration estimate of this image, None if there is none.
-            `calibration_check.py` combines those of many images.
+        seen_camera: calibration estimate of this image (`geometry/calibration_check.py`), or None.
         geopose: the camera's pose on earth, if the map is georeferenced (`topoloc georeference`).
     """
 
@@ -94,8 +91,7 @@ class Localization:
 
     @property
     def is_of_nodes(self) -> bool:
-        """Return whether the place was recognised by the map's nodes, not by virtual views, which
-        serve where nearby nodes show another side."""
+        """Return whether the place was recognised by the map's nodes, not by virtual views."""
         return self.evidence is None or self.evidence.is_of_nodes
 
     @property
@@ -110,11 +106,15 @@ class Localization:
 
     @property
     def camera_covariance(self) -> Float[np.ndarray, "6 6"]:
-        """Return `covariance` in the camera frame.
-
-        It is that of xi in ``true_world_from_cam = world_from_cam @ exp(xi)``.
-        """
+        """Return `covariance` in the camera frame: that of xi in ``true_world_from_cam =
+        world_from_cam @ exp(xi)``."""
         return self.world_from_cam.inverse().transform_covariance(self.covariance)
+
+    @property
+    def position_covariance(self) -> Float[np.ndarray, "3 3"]:
+        """Return the covariance of the camera's position (m^2), in the axes of the world."""
+        rotation = self.world_from_cam.rotation
+        return rotation @ self.camera_covariance[:3, :3] @ rotation.T
 
     def to_json(self, query: str) -> dict[str, Any]:
         """Return one line of the result file, see docs/cli.md."""

@@ -67,6 +67,26 @@ class NodePoses:
         """Return the poses of some nodes."""
         return NodePoses(self.centres[rows], self.rotations[rows])
 
+    def plan_svg(self, size_px: int = 320) -> str:
+        """Return a plan of the nodes in the plane of their main directions, with a bar whose length
+        is written beside it, as SVG of some kilobytes."""
+        max_nodes, margin = 500, 24.0
+        centred = (self.centres - self.centres.mean(axis=0))[:: len(self.centres) // max_nodes + 1]
+        points = centred @ np.linalg.svd(centred.T @ centred)[0][:, :2]
+        extents = np.ptp(points, axis=0)
+        scale = (size_px - 2.0 * margin) / max(extents.max(), 0.1)
+        xy = (points - points.min(axis=0)) * scale + margin
+        metres = 10.0 ** np.floor(np.log10(0.7 * max(extents.max(), 0.1)))
+        height = extents[1] * scale + 2.0 * margin + 16.0
+        bar, end = metres * scale, margin + metres * scale + 6.0
+        dots = "".join(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="2"/>' for x, y in xy)
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{size_px}" height="{height:.0f}"'
+            f' fill="#3f6ea5" font-family="sans-serif" font-size="12">{dots}<path stroke="#6b7786"'
+            f' stroke-width="2" d="M{margin} {height - 12:.0f}h{bar:.0f}"/><text fill="#6b7786"'
+            f' x="{end:.0f}" y="{height - 8:.0f}">{metres:g} m</text></svg>'
+        )
+
 
 def node_distances(
     world_from_cam: Rigid3, nodes: NodePoses, lambda_rot: float

@@ -10,6 +10,7 @@ Every entry has an id that never changes and is never reused. Computations use r
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -117,6 +118,11 @@ class TopoMetricMap:
     def __repr__(self) -> str:
         nodes = f"{len(self.summaries)} nodes along {self.length_m:.1f} m"
         return f"TopoMetricMap({nodes}, features {', '.join(self.layers)}, version {self.version})"
+
+    def _repr_html_(self) -> str:
+        """Return the line of `repr` and a plan, for notebooks."""
+        plan = self.node_poses.plan_svg() if self.summaries else ""
+        return f"<p>{html.escape(repr(self))}</p>{plan}"
 
     @property
     def kind(self) -> str:
