@@ -27,12 +27,12 @@ from topoloc.geometry.absolute_pose_kernels import normal_equations, solve_chole
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import cells_of
 from topoloc.geometry.joint_camera.camera_hypotheses import (
-    NUM_PARAMETERS,
     CameraBelief,
     CameraHypothesis,
     CameraPrior,
     Vector,
     map_variance,
+    unchanged_camera,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
     Observations,
@@ -177,7 +177,7 @@ def camera_prior(uncalibrated: UncalibratedCamera, focal: float) -> CameraPrior:
 
 def parameters_of(camera: Camera, reference: Camera) -> Vector:
     """Return the parameters of a camera relative to a pinhole."""
-    parameters = np.zeros(NUM_PARAMETERS)
+    parameters = unchanged_camera()
     parameters[0] = math.log(camera.fx / reference.fx)
     parameters[1] = (camera.cx - reference.cx) / reference.fx
     parameters[2] = (camera.cy - reference.cy) / reference.fx

@@ -99,9 +99,6 @@ _PRIOR_SIGMA = 0.3
 _MIN_POINTS = 20
 MIN_IMAGES, MIN_PLACES = 5, 4  # images of one place share their errors, however many there are
 _NUM_SIGMAS, _MIN_RELATIVE_DEVIATION = 3.0, 0.02  # of the focal length, or of the image's width
-_MIN_DISTORTED_SHARE = (
-    0.3  # of the images; of 202 images through their own lens none showed another
-)
 _NUM_MEAN_ITERATIONS = 10
 _MAD_TO_SIGMA = 1.4826
 
@@ -243,7 +240,8 @@ def check_calibration_consistency(
     sigmas = np.sqrt(np.diag(covariance))
     shares = np.abs(deviation) * np.array([1.0, *np.repeat(calibrated.fx / calibrated.width, 2)])
     is_off = (np.abs(deviation) > _NUM_SIGMAS * sigmas) & (shares > _MIN_RELATIVE_DEVIATION)
-    if is_distorted := np.mean([one.is_distorted for one in observations]) > _MIN_DISTORTED_SHARE:
+    min_distorted_share = 0.3  # of 202 images through their own lens none showed another
+    if is_distorted := np.mean([one.is_distorted for one in observations]) > min_distorted_share:
         is_off[:] = False  # an estimate without the lens
     focal = calibrated.fx * float(np.exp(deviation[0]))
     centre = np.array([calibrated.cx, calibrated.cy])

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import cells_of
-from topoloc.geometry.joint_camera.camera_hypotheses import NUM_PARAMETERS
+from topoloc.geometry.joint_camera.camera_hypotheses import unchanged_camera
 from topoloc.geometry.joint_camera.joint_fit import Observations, clustered_noise
 from topoloc.geometry.pose_matches import CAUCHY_SCALE, estimate_noise_scale
 from topoloc.geometry.rigid import Rigid3
@@ -115,7 +115,7 @@ class _Estimate:
         self, seen: Observations, shares: Float[np.ndarray, " n"], variance: float
     ) -> _Estimate | None:
         """Return the estimate after a round of Gauss-Newton, None if the points do not fix it."""
-        jacobian, weights, errors = seen.linearize(self.cam_from_world, np.zeros(NUM_PARAMETERS))
+        jacobian, weights, errors = seen.linearize(self.cam_from_world, unchanged_camera())
         by_rotation = shares[:, None, None] * jacobian[:, :, 3:6]
         errors = errors + by_rotation @ self.rotation
         squares = np.einsum("ni,nij,nj->n", errors, weights, errors)

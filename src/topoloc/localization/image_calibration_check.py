@@ -31,10 +31,10 @@ from topoloc.geometry.calibration_mismatch import CalibrationMismatch, Intrinsic
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.clustered_errors import cells_of
 from topoloc.geometry.joint_camera.camera_hypotheses import (
-    NUM_PARAMETERS,
     CameraPrior,
     Vector,
     map_variance,
+    unchanged_camera,
 )
 from topoloc.geometry.joint_camera.joint_fit import (
     JointFit,
@@ -128,7 +128,7 @@ def _check_distortion(search: Search, fit: PoseFit) -> CalibrationMismatch | Non
         math.inf,
     )
     sides = camera.width / camera.fx, camera.height / camera.fy
-    calibrated = np.zeros(NUM_PARAMETERS)
+    calibrated = unchanged_camera()
     # standard deviations of the logarithm of the focal length: calibrated or not
     prior = CameraPrior(sides, stated=(0.0, 0.01), usual=(0.0, 0.3))
     joint = linearized_fit(observed, fit.cam_from_world, calibrated)

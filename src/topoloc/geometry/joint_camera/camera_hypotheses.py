@@ -20,9 +20,13 @@ from topoloc.json_data import Positive, decode_json
 
 Lens = Literal["none", "radial", "other"]
 Axes = Literal["", "x", "y", "xy"]
-NUM_PARAMETERS = 8
 Vector = Float[np.ndarray, " 8"]
 Matrix = Float[np.ndarray, "8 8"]
+
+
+def unchanged_camera() -> Vector:
+    """Return the parameters of the camera that others are compared with."""
+    return np.zeros(8)
 
 
 class _Priors(Struct, frozen=True, forbid_unknown_fields=True):
@@ -76,7 +80,7 @@ class CameraHypothesis:
     def basis(self) -> Float[np.ndarray, "8 k"]:
         """Return the directions in which the parameters are estimated: always the principal point,
         because that of a whole image is off its centre by up to a per cent, too."""
-        eye = np.eye(NUM_PARAMETERS)
+        eye = np.eye(8)
         radial = np.column_stack([eye[:, 3:7].sum(axis=1), eye[:, 7]])
         lens = {"none": eye[:, :0], "radial": radial, "other": eye[:, 3:]}[self.lens]
         return np.hstack([eye[:, :3], lens])
@@ -97,7 +101,7 @@ class CameraPrior:
     def of(self, hypothesis: CameraHypothesis) -> tuple[Vector, Matrix]:
         """Return mean and covariance of the parameters under a hypothesis."""
         mean, focal = (
-            np.zeros(NUM_PARAMETERS),
+            unchanged_camera(),
             self.stated if hypothesis.is_focal_stated else self.usual,
         )
         priors = _priors()
@@ -144,7 +148,7 @@ class CameraLikelihood:
         pull = self.pull + weighed
         estimates = (posteriors @ pull[:, :, None])[:, :, 0]
         evidence = np.sum(pull * estimates, axis=1) - np.sum(means * weighed, axis=1)
-        evidence -= np.linalg.slogdet(np.eye(NUM_PARAMETERS) + covariances @ self.information)[1]
+        evidence -= np.linalg.slogdet(np.eye(8) + covariances @ self.information)[1]
         return 0.5 * evidence, estimates, posteriors
 
 
