@@ -152,6 +152,7 @@ class MapFile:
             raise
         except (
             sqlite3.Error,
+            UnicodeDecodeError,  # the text of an error quotes damaged data
             zlib.error,
             CorruptDataError,
             ConfigError,
