@@ -18,6 +18,7 @@ from schema_1 import write_schema_1
 from topoloc import TopoMetricMap
 from topoloc.errors import MapError
 from topoloc.mapping.edit import (
+    _digest_of as of,
     edit_map,
     find_kept_files,
     keep_file,
@@ -163,6 +164,28 @@ def test_a_damaged_kept_file_is_refused(map_file: Path, seed: int):
         _without_a_node(map_file)
     undo_edit(map_file)
     assert map_file.read_bytes() == edited
+
+
+def test_an_edit_reads_one_of_the_older_kept_files(
+    map_file: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """All together may have 1 GB. `history` reads all; `undo` reads the one that it restores."""
+    for _ in range(4):
+        _without_a_node(map_file)
+    kept, read = find_kept_files(map_file), list[Path]()
+    kept[2].write_bytes(kept[2].read_bytes()[:-1])
+    with monkeypatch.context() as patched:
+        patched.setattr("topoloc.mapping.edit._digest_of", lambda one: read.append(one) or of(one))
+        _without_a_node(map_file)
+    assert [one for one in read if one in kept] == [kept[0]]
+    with pytest.warns(UserWarning, match=f"{kept[2].name} is damaged"):
+        assert sum(edit["undoable"] for edit in read_history(map_file)) == 3
+    for _ in range(3):
+        undo_edit(map_file)
+    before = map_file.read_bytes()
+    with pytest.raises(MapError, match=f"{kept[2].name} is damaged"):
+        undo_edit(map_file)
+    assert map_file.read_bytes() == before
 
 
 def test_a_kept_file_of_another_map_is_not_used(map_file: Path):

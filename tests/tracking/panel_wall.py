@@ -10,7 +10,7 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_context import MapContext
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.localization.query import QueryImage
+from topoloc.localization.query import Deadline, QueryImage
 from topoloc.localization.result import Alternative, Localization, NotLocalized
 from topoloc.localization.result_decision import LocalizationWithInliers
 from topoloc.localization.search import Trace
@@ -37,14 +37,15 @@ class PanelWall(Localizer):
     def __init__(self) -> None:
         self.xs: list[float] = []
         self.num_asked, self.probability = 0, 0.99
-        opened = MapContext(TopoMetricMap([], {}, [], []), LocalizerConfig(), (), {})
+        self.config = LocalizerConfig()
+        opened = MapContext(TopoMetricMap([], {}, [], []), self.config, (), {})
         self._tiles = Tiles(opened)
 
     def localize_query(
         self,
         query_image: QueryImage,
         prior: Rigid3 | None = None,
-        max_ms: float | None = None,
+        max_ms: float | Deadline | None = None,
         trace: Trace | None = None,
         tile_id: str | None = None,
     ) -> tuple[Localization | NotLocalized, list[LocalizationWithInliers]]:

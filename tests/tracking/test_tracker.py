@@ -18,6 +18,7 @@ from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
+from topoloc.localization.query import Deadline
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.recordings.frame_preparation import downscale_image
 from topoloc.tracking.config import TrackerConfig
@@ -45,6 +46,31 @@ def _stream(tracker: Tracker, first: int, last: int, delay_ns: int = 0) -> list[
         tracker.process(grey, CAMERA, t_ns + delay_ns)
         for t_ns, grey, _ in room_stream()[first:last]
     ]
+
+
+def test_no_further_search_follows_when_the_time_of_an_image_is_over(
+    localizer: Localizer, monkeypatch: pytest.MonkeyPatch
+):
+    """Of a single image and of a stream one deadline holds for all searches."""
+    limits, search = list[Deadline | None](), localizer.localize_query
+
+    def localize_query(query, near=None, max_ms=None):
+        limits.append(max_ms)
+        return search(query, near, max_ms)
+
+    monkeypatch.setattr(localizer, "localize_query", localize_query)
+    over = Deadline()
+    over.stop.set()
+    (t_ns, grey, _), *_ = room_stream()
+    for limit in (over, Deadline(), 1e6, None):
+        answer = Tracker(localizer).process(grey, CAMERA, t_ns, max_ms=limit)
+        assert answer.state == "localized"
+        assert all(one is limits[0] for one in limits)
+        assert (limits[0] is limit) == isinstance(limit, Deadline)
+        limits.clear()
+    unknown = Tracker(localizer).process(NOTHING, CAMERA, t_ns, max_ms=over)
+    assert unknown.state == "lost"
+    assert set(limits) == {over}
 
 
 def _raw(answer: StreamedPose) -> Rigid3:

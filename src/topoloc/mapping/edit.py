@@ -48,10 +48,15 @@ def find_kept_files(path: Path) -> list[Path]:
     MapError if the map file or its folder cannot be read."""
     try:
         found = _find_by_digest(path)
-        digest = _digest_of(path)[:16] if found else ""
+        return _find_chain(found, _digest_of(path)[:16] if found else "")
     except OSError as error:
         raise MapError(f"cannot read map {path}: {describe_failure(error)}") from error
-    kept = list[Path]()
+
+
+def _find_chain(found: Mapping[str, Path], digest: str) -> list[Path]:
+    """Return those of the kept files that lead back from the map of this digest, the newest first.
+    `found` has them by the digest of the map after the edit."""
+    kept, found = list[Path](), dict(found)
     while digest in found:
         kept.append(found.pop(digest))
         digest = kept[-1].name[-16:]
@@ -99,14 +104,18 @@ def _warn_of_damage(kept: Sequence[Path]) -> int:
     return len(kept)
 
 
-def drop_kept_files(path: Path) -> None:
-    """Remove kept files that do not lead back from the map file at `path`, and the oldest ones
-    beyond `_MAX_BYTES`. A file that cannot be removed stays."""
-    with suppress(OSError, MapError):
-        kept = find_kept_files(path)
+def drop_kept_files(path: Path, newest: Path) -> Sequence[Path]:
+    """Remove the files kept of the map at `path` that do not lead back from its `newest` one, and
+    the oldest ones beyond `_MAX_BYTES`. A file that cannot be removed stays. Return the others, the
+    newest first."""
+    used: Sequence[Path] = []
+    with suppress(OSError):
+        found = _find_by_digest(path)
+        kept = _find_chain(found, newest.name[-33:-17])
         used = select_kept(kept, [one.stat().st_size for one in kept])
-        for one in set(_find_by_digest(path).values()).difference(used):
+        for one in set(found.values()).difference(used):
             one.unlink()
+    return used
 
 
 def select_kept(files: Sequence[T], sizes: Sequence[int]) -> Sequence[T]:
@@ -146,8 +155,8 @@ class MapEdit:
         history. `changes` holds numbers and texts for the history, by name.
 
         Raises MapError if the map cannot be written, the file before cannot be kept, or another
-        process replaced the map. The file at the path stays unchanged. Warns of a damaged kept file
-        of an earlier edit.
+        process replaced the map. The file at the path stays unchanged. Warns if the kept file of
+        the edit before is damaged.
         """
         edits = self.topomap.edits
         edit = Edit(self.topomap.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
@@ -164,9 +173,9 @@ class MapEdit:
             if isinstance(error, MapError):
                 raise
             raise MapError(f"cannot write map {self.path}: {describe_failure(error)}") from error
-        drop_kept_files(self.path)
-        with suppress(MapError):  # the edit is done
-            _warn_of_damage(find_kept_files(self.path)[1:])
+        # The newest was read just now. Of the older ones the next alone is read: all together have
+        # up to `_MAX_BYTES`. `read_history` reads all, and `undo_edit` the one that it restores.
+        _warn_of_damage(drop_kept_files(self.path, kept)[1:2])
         return edit
 
     def check_still_locked(self) -> None:
@@ -224,7 +233,7 @@ def save_map(topomap: TopoMetricMap, path: Path, on_wait: WaitCallback | None = 
             raise
         raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
     if kept is not None:
-        drop_kept_files(Path(os.path.realpath(path)))
+        drop_kept_files(Path(os.path.realpath(path)), kept)
 
 
 def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:

@@ -25,7 +25,7 @@ import numpy as np
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import StageClock
+from topoloc.localization.query import Deadline, StageClock
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.recordings.frame import to_grey
 from topoloc.recordings.frame_preparation import downscale_image
@@ -67,15 +67,16 @@ class MapStream:
         self._last_attempt_ns = 0
 
     def process(
-        self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None
+        self, image: Image, camera: Camera, t_ns: int, odom_from_cam: Rigid3 | None, limit: Deadline
     ) -> StreamedPose:
         """Localize the next image of the stream, see `Tracker.process`."""
         max_side_px = 800  # images are reduced to this width or height for point tracking
         if self.config.mode == "paper":
-            answer = self._process_paper_mode(image, camera, t_ns)
+            alone = self.localizer.localize(image, camera, max_ms=limit)
+            answer = self._process_paper_mode(alone, t_ns)
         else:
             grey = downscale_image(to_grey(image), camera, max_side_px)
-            frame = StreamFrame(image, camera, t_ns, odom_from_cam, *grey)
+            frame = StreamFrame(image, camera, t_ns, odom_from_cam, *grey, limit)
             answer = self._process_motion_mode(frame)
         self._last_smoothed = answer.smoothed
         return self._complete_result(answer, camera)
@@ -94,10 +95,9 @@ class MapStream:
         result = self.localizer.with_provenance(answer.result, camera, answer.t_ns)
         return replace(answer, result=result)
 
-    def _process_paper_mode(self, image: Image, camera: Camera, t_ns: int) -> StreamedPose:
-        """Localize one image by section III-B: "when such a jump is found, we copy the previous
-        pose from the trajectory"."""
-        result = self.localizer.localize(image, camera)
+    def _process_paper_mode(self, result: Localization | NotLocalized, t_ns: int) -> StreamedPose:
+        """Apply section III-B to one result: "when such a jump is found, we copy the previous pose
+        from the trajectory"."""
         if not isinstance(result, Localization):
             return self._copy_previous_pose(result, t_ns)
         pose, previous = result.world_from_cam, self._last_smoothed

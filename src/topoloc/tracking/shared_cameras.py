@@ -36,7 +36,7 @@ from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
 from topoloc.localization.pose_fit import PointObservations
-from topoloc.localization.query import QueryImage, unknown_camera
+from topoloc.localization.query import Deadline, QueryImage, unknown_camera
 from topoloc.localization.result import Localization, NotLocalized, with_time
 from topoloc.retrieval.coarse import Image
 
@@ -84,14 +84,18 @@ class SharedCameras:
         }
 
     def localize(
-        self, image: Image, camera: UncalibratedCamera | None = None, t_ns: int | None = None
+        self,
+        image: Image,
+        camera: UncalibratedCamera | None = None,
+        t_ns: int | None = None,
+        max_ms: float | Deadline | None = None,
     ) -> Localization | NotLocalized:
         """Localize an image by the camera that it shares with others, or alone. See
         `Localizer.localize`."""
         camera = camera or unknown_camera(image)
         if camera not in self._estimates:
             self._estimates[camera] = _CameraEstimate(self.localizer, camera)
-        result = self._estimates[camera].localize(image)
+        result = self._estimates[camera].localize(image, max_ms)
         return result if t_ns is None else with_time(result, t_ns)
 
 
@@ -108,18 +112,24 @@ class _CameraEstimate:
         self._viewpoints: list[Rigid3] = []
         self.shared: SharedCamera | None = None
 
-    def localize(self, image: Image) -> Localization | NotLocalized:
+    def localize(
+        self, image: Image, max_ms: float | Deadline | None
+    ) -> Localization | NotLocalized:
         """Localize an image by the shared camera, or alone."""
-        result = None if self.shared is None else self._localize_by(self.shared, image)
+        result = None if self.shared is None else self._localize_by(self.shared, image, max_ms)
         if result is None:
-            result, named = self.localizer.localize_query(QueryImage(image, self.uncalibrated))
+            query = QueryImage(image, self.uncalibrated)
+            result, named = self.localizer.localize_query(query, max_ms=max_ms)
             self._learn(result, named)
         return result
 
-    def _localize_by(self, shared: SharedCamera, image: Image) -> Localization | None:
+    def _localize_by(
+        self, shared: SharedCamera, image: Image, max_ms: float | Deadline | None
+    ) -> Localization | None:
         """Return the pose by the shared camera, None if there is none or the image contradicts
         it. The camera's uncertainty is added to the covariance."""
-        result, named = self.localizer.localize_query(QueryImage(image, shared.camera))
+        query = QueryImage(image, shared.camera)
+        result, named = self.localizer.localize_query(query, max_ms=max_ms)
         if not isinstance(result, Localization) or result.calibration_doubt is not None:
             return None
         self._learn(result, named)

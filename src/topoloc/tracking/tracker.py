@@ -18,7 +18,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.localizer import Localizer
-from topoloc.localization.query import CameraLike, camera_of, check_image_size
+from topoloc.localization.query import CameraLike, Deadline, camera_of, check_image_size
 from topoloc.localization.result import Localization, NotLocalized, with_time
 from topoloc.recordings.frame_checks import find_time_problem
 from topoloc.retrieval.coarse import Image
@@ -77,6 +77,7 @@ class Tracker:
         camera: CameraLike | None,
         t_ns: int,
         odom_from_cam: Rigid3 | None = None,
+        max_ms: float | Deadline | None = None,
     ) -> StreamedPose:
         """Localize the next image of the stream. In an atlas each result names its tile, in whose
         world the pose is.
@@ -88,6 +89,7 @@ class Tracker:
                 same image.
             odom_from_cam: pose from external odometry, in any fixed frame. Only its change from
                 image to image is used.
+            max_ms: limit of all searches for this image, see `Localizer.localize`.
 
         Raises:
             QueryError: the clock goes backwards, stands still or is not in integer nanoseconds. Or
@@ -107,7 +109,8 @@ class Tracker:
                 is_repeated=True,
             )
         self._image = image.copy()  # the caller may reuse the buffer
-        self._answer = self._process_in_tile(image, camera, t_ns, odom_from_cam)
+        limit = Deadline.of(self.localizer.config.max_ms if max_ms is None else max_ms)
+        self._answer = self._process_in_tile(image, camera, t_ns, odom_from_cam, limit)
         return self._answer
 
     def process_missing(
@@ -130,27 +133,29 @@ class Tracker:
         camera: Camera | UncalibratedCamera,
         t_ns: int,
         odom_from_cam: Rigid3 | None,
+        limit: Deadline,
     ) -> StreamedPose:
         """Process the image in the tracked tile. If it has given no pose for long, search the other
         tiles."""
         if isinstance(camera, UncalibratedCamera):
             if (shared := self.cameras.known.get(camera)) is None:
-                return _without_stream(self.cameras.localize(image, camera, t_ns), t_ns)
+                return _without_stream(self.cameras.localize(image, camera, t_ns, limit), t_ns)
             camera = shared.camera
         answer = None
         if self._stream is not None:
-            answer = self._stream.process(image, camera, t_ns, odom_from_cam)
+            answer = self._stream.process(image, camera, t_ns, odom_from_cam, limit)
             if answer.state in _LOCALIZED_STATES:
                 self._last_localized_ns = t_ns
             last = max(self._last_localized_ns, self._last_search_ns)
             if len(self.localizer.tile_ids) == 1 or t_ns - last < _SEARCH_INTERVAL_NS:
                 return answer
         self._last_search_ns = t_ns
-        result = self.localizer.localize(image, camera, t_ns=t_ns)
+        result = self.localizer.localize(image, camera, max_ms=limit, t_ns=t_ns)
         if not isinstance(result, Localization):
             return answer or _without_stream(result, t_ns)
         self._last_localized_ns = t_ns
-        return self._enter_tile(result.provenance.tile).process(image, camera, t_ns, odom_from_cam)
+        stream = self._enter_tile(result.provenance.tile)
+        return stream.process(image, camera, t_ns, odom_from_cam, limit)
 
     def _enter_tile(self, tile_id: str | None) -> MapStream:
         """Start the stream in this tile. Its map stays open."""

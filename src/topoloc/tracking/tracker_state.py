@@ -19,6 +19,7 @@ from jaxtyping import Float, UInt8
 
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.localization.query import Deadline
 from topoloc.localization.result import Localization
 from topoloc.retrieval.coarse import Image
 from topoloc.slam.pose_graph import Edge, optimize_pose_graph
@@ -30,7 +31,7 @@ from topoloc.tracking.point_tracker import PointTracker, TrackedMotion
 class StreamFrame:
     """Hold the current image, its time and external odometry.
 
-    `grey` is the image in grey, reduced, and `grey_camera` its camera.
+    `grey` is the image in grey, reduced, and `grey_camera` its camera. Searches end at `limit`.
     """
 
     image: Image
@@ -39,6 +40,7 @@ class StreamFrame:
     odom_from_cam: Rigid3 | None
     grey: UInt8[np.ndarray, "a b"]
     grey_camera: Camera
+    limit: Deadline
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import threading
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
+import uvicorn
 from running_service import Running
+from websockets.asyncio.client import connect as connect_async
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from tiny_world import CAMERA
+from topoloc import Localizer, MapCache, Tracker
+from topoloc.apps.service.application import create_application
+from topoloc.apps.service.config import ServiceConfig
+from topoloc.apps.service.connections import protocols
+from topoloc.localization.query import Deadline
 
 SESSIONS = "/v1/maps/room/sessions"
 
@@ -128,3 +137,57 @@ def test_a_camera_may_be_unknown(client: httpx.Client, tiny_recording: Path):
     assert answer.json()["state"] == "localized"
     assert answer.json()["focal_length_px"] == pytest.approx(CAMERA.fx, rel=0.1)
     client.delete(f"{SESSIONS}/{session}")
+
+
+async def _close_during_a_job(port: int, is_socket: bool, picture: bytes, begun: threading.Event):
+    """Send an image of a stream, and close the connection when its job runs."""
+    address = f"127.0.0.1:{port}{SESSIONS}"
+    if is_socket:
+        async with connect_async(f"ws://{address}?camera=map") as stream:
+            await stream.send(picture)
+            assert await asyncio.to_thread(begun.wait, 20.0)
+        return
+    async with httpx.AsyncClient() as client:
+        session = (await client.post(f"http://{address}?camera=map")).json()["session"]
+        url = f"http://{address}/{session}/pictures"
+        headers = {"content-type": "image/png"}
+        post = asyncio.create_task(client.post(url, content=picture, headers=headers))
+        assert await asyncio.to_thread(begun.wait, 20.0)
+        post.cancel()
+
+
+@pytest.mark.parametrize("is_socket", [False, True])
+def test_a_search_whose_client_has_gone_is_stopped(
+    room_map: Path, view: Path, monkeypatch: pytest.MonkeyPatch, is_socket: bool
+):
+    begun, ended, process = threading.Event(), threading.Event(), Tracker.process
+
+    def process_when_stopped(*args: object, **options: object) -> object:
+        deadline = args[-1]
+        assert isinstance(deadline, Deadline)
+        assert not deadline.is_past
+        begun.set()
+        assert deadline.stop.wait(20.0)
+        answer = process(*args, **options)  # pyright: ignore[reportArgumentType]
+        ended.set()
+        return answer
+
+    monkeypatch.setattr(Tracker, "process", process_when_stopped)
+
+    async def serve() -> None:
+        limits = ServiceConfig(workers=1)
+        maps = MapCache([str(room_map)], Localizer, 100_000_000)
+        app = create_application(maps, limits)
+        options = protocols(limits, 100, behind_proxy=False)
+        config = uvicorn.Config(app, log_config=None, lifespan="on", port=0, **options)
+        server = uvicorn.Server(config)
+        serving = asyncio.create_task(server.serve())
+        while not server.started:
+            await asyncio.sleep(0.05)
+        port = server.servers[0].sockets[0].getsockname()[1]
+        await _close_during_a_job(port, is_socket, view.read_bytes(), begun)
+        assert await asyncio.to_thread(ended.wait, 10.0)
+        server.should_exit = True
+        await serving
+
+    asyncio.run(serve())

@@ -12,7 +12,7 @@ import uuid
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, TypeVar
 
@@ -112,14 +112,14 @@ class Streams:
         if not stream.lock.acquire(blocking=False):
             raise RequestError(409, "the previous image is in progress; send the next one after it")
         try:
-            if stream.is_ended:
+            if stream.is_ended or query_request.stop.is_set():
                 raise RequestError(404, "the stream has ended")
             stream.last_used = time.monotonic()
-            named = QueryRequest(query_request.picture, query_request.camera or stream.camera)
-            image, camera = self._query_handler.decode_query(
-                named, stream.tracker.localizer.topomap
-            )
-            return stream.tracker.process(image, camera, t_ns).to_json(query_request.picture.name)
+            named = replace(query_request, camera=query_request.camera or stream.camera)
+            tracker, handler = stream.tracker, self._query_handler
+            image, camera = handler.decode_query(named, tracker.localizer.topomap)
+            deadline = handler.deadline_of(named.stop, named.max_ms)
+            return tracker.process(image, camera, t_ns, None, deadline).to_json(named.picture.name)
         finally:
             stream.last_used = time.monotonic()
             stream.lock.release()

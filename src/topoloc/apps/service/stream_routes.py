@@ -13,6 +13,7 @@ from fastapi import APIRouter, Query, Request, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse, Response
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 from pydantic import BaseModel
+from starlette.types import Message
 
 from topoloc.apps.service.connections import client_address
 from topoloc.apps.service.map_routes import MapName, UrlParameters
@@ -74,7 +75,9 @@ async def next_picture(
     stream = service.streams.find(map, session)
     query = await read_query_request(request, parameters)
     t_ns = time.time_ns() if t_ns is None else t_ns
-    answer = await service.run_job(request, lambda: service.streams.next(stream, query, t_ns))
+    answer = await service.run_job(
+        request, lambda: service.streams.next(stream, query, t_ns), query.stop
+    )
     request.scope["facts"].update({"map": map, "outcome": answer["state"]})
     return Response(json.dumps(answer), media_type="application/json")
 
@@ -123,20 +126,22 @@ async def stream_over_websocket(socket: WebSocket, map: str) -> None:
 async def _serve_websocket(socket: WebSocket, service: Service, stream: Stream) -> None:
     """Serve until the client disconnects. Raises RequestError if it does not read or send."""
     parameters: dict[str, Any] = {}
-    number = 0
+    number, ahead = 0, asyncio.ensure_future(socket.receive())
     while True:
         try:
-            message = await asyncio.wait_for(socket.receive(), service.config.session_idle_s)
+            message = await asyncio.wait_for(ahead, service.config.session_idle_s)
         except TimeoutError:
             raise RequestError(408, f"no image for {service.config.session_idle_s:g} s") from None
         if message["type"] == "websocket.disconnect":
             return
+        ahead = asyncio.ensure_future(socket.receive())
         if message.get("text") is not None:
             parameters |= _parse_message(message["text"])
             continue
         t_ns = parameters.pop("t_ns", None) or time.time_ns()
         query = QueryRequest(EncodedImage(str(number), message["bytes"]), parameters.get("camera"))
         number += 1
+        ahead.add_done_callback(partial(_stop_if_closed, query))
         text = await _localize_image(socket, service, stream, query, t_ns)
         try:
             await asyncio.wait_for(socket.send_text(text), service.config.upload_s)
@@ -144,12 +149,22 @@ async def _serve_websocket(socket: WebSocket, service: Service, stream: Stream) 
             raise RequestError(408, "the client does not read the results") from None
 
 
+def _stop_if_closed(query: QueryRequest, ahead: asyncio.Future[Message]) -> None:
+    """Stop a job if the next message is the end of the connection. A client that sends an image
+    ahead is not watched: no further message is read, because it takes memory."""
+    is_read = not ahead.cancelled() and ahead.exception() is None
+    if is_read and ahead.result()["type"] == "websocket.disconnect":
+        query.stop.set()
+
+
 async def _localize_image(
     socket: WebSocket, service: Service, stream: Stream, query: QueryRequest, t_ns: int
 ) -> str:
     """Return the result, or the error of this image as JSON. The stream continues."""
     try:
-        answer = await service.run_job(socket, lambda: service.streams.next(stream, query, t_ns))
+        answer = await service.run_job(
+            socket, lambda: service.streams.next(stream, query, t_ns), query.stop
+        )
     except RequestError as refusal:
         answer = {"query": query.picture.name, "error": refusal.text}
     return json.dumps(answer)
