@@ -34,22 +34,22 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 # The figures of `python tools/house.py .` (`--help` has the rule of each). A ceiling only goes
 # down, unless an issue grants an allowance. The goals stand behind the ceilings.
 CEILINGS = {
-    "lines.core": 41014,  # goal 30000; with searches that end at once, and atlases left clean
-    "lines.apps": 16429,  # goal 15500; with the share of streams
-    "statements.core": 20447,  # goal 13500
-    "statements.apps": 8870,  # goal 7500
+    "lines.core": 41167,  # goal 30000; with a fifth power of lenses, verdicts on lenses, cameras as people have them
+    "lines.apps": 16444,  # goal 15500; with streams whose client has gone
+    "statements.core": 20543,  # goal 13500
+    "statements.apps": 8879,  # goal 7500
     "files_over_300": 1,  # goal 20
     "functions_over_45": 4,  # goal 15
     "folders_over_20": 0,  # goal 0
     "one_importer": 68,  # goal 50
     "apps.deep_names": 0,  # goal 0
-    "apps.public_names": 141,  # goal: at most 120
+    "apps.public_names": 138,  # goal: at most 120
     "asserts.sum": 3,  # goal 40
     "branches.map_or_atlas": 0,
     "branches.walls": 0,  # goal 0
     "constants.all": 430,  # goal 474, localization 25
     "constants.core/localization": 24,
-    "user_docs_bytes": 149202,  # goal 150000
+    "user_docs_bytes": 149154,  # goal 150000
     "readme_lines": 149,  # goal 150
     "architecture_lines": 110,  # goal 110
 }
