@@ -34,7 +34,7 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 # The figures of `python tools/house.py .` (`--help` has the rule of each). A ceiling only goes
 # down, unless an issue grants an allowance. The goals stand behind the ceilings.
 CEILINGS = {
-    "lines.core": 41167,  # goal 30000; with a fifth power of lenses, verdicts on lenses, cameras as people have them
+    "lines.core": 41167,  # goal 30000; with verdicts on lenses, K as a camera
     "lines.apps": 16444,  # goal 15500; with streams whose client has gone
     "statements.core": 20543,  # goal 13500
     "statements.apps": 8879,  # goal 7500
