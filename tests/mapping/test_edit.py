@@ -166,9 +166,7 @@ def test_a_damaged_kept_file_is_refused(map_file: Path, seed: int):
     assert map_file.read_bytes() == edited
 
 
-def test_an_edit_reads_one_of_the_older_kept_files(
-    map_file: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_an_edit_reads_one_of_the_older_kept_files(map_file: Path, monkeypatch: pytest.MonkeyPatch):
     """All together may have 1 GB. `history` reads all; `undo` reads the one that it restores."""
     for _ in range(4):
         _without_a_node(map_file)
