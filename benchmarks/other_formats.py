@@ -21,10 +21,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.frame_preparation import prepare_frame
+from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.stored_images import encode_jpeg
+
+sys.path.insert(0, str(Path(__file__).parent))
+from variants.walks import depth_mm
 
 COLMAP_UNIT = 2.5  # metres
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -39,7 +41,7 @@ def write_nerfstudio(sequence: StereoSequence, folder: Path) -> Path:
             continue
         name, depth_name = f"images/frame_{index:05d}.jpg", f"depth/frame_{index:05d}.png"
         _write(folder / name, encode_jpeg(frame.image, 95))
-        _write(folder / depth_name, cv2.imencode(".png", _depth_mm(frame))[1].tobytes())
+        _write(folder / depth_name, cv2.imencode(".png", depth_mm(frame))[1].tobytes())
         matrix = (frame.world_from_cam.matrix() @ GL_FROM_CV).tolist()
         frames.append(
             {"file_path": name, "depth_file_path": depth_name, "transform_matrix": matrix}
@@ -64,23 +66,6 @@ def write_nerfstudio(sequence: StereoSequence, folder: Path) -> Path:
         json.dumps(lens | {"depth_unit_scale_factor": 0.001, "frames": frames})
     )
     return folder
-
-
-def _depth_mm(frame: StereoFrame) -> np.ndarray:
-    """Depth of the left picture by semi-global matching (Hirschmueller 2008, as OpenCV has it), 0
-    where unknown."""
-    view = prepare_frame(frame)
-    assert view.rig is not None
-    assert view.right_grey is not None
-    matcher = cv2.StereoSGBM.create(
-        0, 128, 5, 8 * 25, 32 * 25, 1, 63, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH
-    )
-    disparity = matcher.compute(view.grey, view.right_grey).astype(np.float64) / 16.0
-    with np.errstate(divide="ignore"):
-        millimetres = 1000.0 * view.rig.left.fx * view.rig.baseline / disparity
-    return np.where((disparity > 1.0) & (millimetres < 65000), np.rint(millimetres), 0).astype(
-        np.uint16
-    )
 
 
 def write_colmap(sequence: StereoSequence, folder: Path) -> Path:

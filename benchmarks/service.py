@@ -70,32 +70,38 @@ def service(*args: object) -> Iterator[Service]:
 
 
 class Client:
-    """One connection that is kept."""
+    """One connection that is kept, from an address of this machine."""
 
-    def __init__(self, of: Service, camera: Camera) -> None:
-        self._http, self._camera = (
-            http.client.HTTPConnection(of.host, of.port, timeout=120),
-            quote(json.dumps(camera.to_json())),
+    def __init__(self, of: Service, camera: Camera, address: str = "127.0.0.1") -> None:
+        self._http = http.client.HTTPConnection(
+            of.host, of.port, timeout=120, source_address=(address, 0)
         )
+        self._camera = quote(json.dumps(camera.to_json()))
 
-    def ask(self, name: str, jpeg: bytes) -> tuple[int, bytes]:
-        self._http.request(
-            "POST",
-            f"/v1/maps/{name}/localize?camera={self._camera}&name=q",
-            jpeg,
-            {"Content-Type": "image/jpeg"},
-        )
-        response = self._http.getresponse()
-        return response.status, response.read()
+    def ask(self, name: str, body: bytes | str) -> tuple[int | str, bytes]:
+        """Status and content of the answer for an image, or at a path; instead of the status the
+        name of the error that ended the connection."""
+        try:
+            if isinstance(body, str):
+                self._http.request("GET", body)
+            else:
+                path = f"/v1/maps/{name}/localize?camera={self._camera}&name=q"
+                self._http.request("POST", path, body, {"Content-Type": "image/jpeg"})
+            response = self._http.getresponse()
+            return response.status, response.read()
+        except (OSError, http.client.HTTPException) as error:
+            self._http.close()  # the next request opens another one
+            return type(error).__name__, b""
 
 
 def load(
     of: Service,
     name: str,
     camera: Camera,
-    pictures: Sequence[bytes],
+    pictures: Sequence[bytes | str],
     num_clients: int,
     rate: float | None = None,
+    address: str = "127.0.0.1",
 ) -> tuple[float, list[float], Counter]:
     """Pictures a second, seconds of each answer, and how often each status came; with a rate (1/s)
     requests come as the clock says."""
@@ -103,7 +109,7 @@ def load(
     waiting = iter(enumerate(pictures))
 
     def ask() -> None:
-        client = Client(of, camera)
+        client = Client(of, camera, address)
         while True:
             with lock:
                 number, picture = next(waiting, (-1, b""))

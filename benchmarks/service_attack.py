@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import http.client
-import json
 import random
 import resource
 import socket
@@ -27,12 +26,10 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from urllib.parse import quote
 
 import cv2
 
@@ -40,7 +37,7 @@ from topoloc import open_sequence
 from topoloc.recordings.stored_images import encode_jpeg
 
 sys.path.insert(0, str(Path(__file__).parent))
-from service import Service, garbage, service
+from service import Service, garbage, load, service
 
 HONEST, WATCHER = "127.0.0.2", "127.0.0.3"
 HOSTILE = [f"127.0.1.{number}" for number in range(1, 6)]
@@ -66,44 +63,6 @@ class Third:
             f" {max(self.health_s, default=0.0):.2f} s, {self.health_faults} faults; memory"
             f" {memory}, at most {max(self.memory_mb):.0f}; {self.num_hostile} hostile connections"
         )
-
-
-def ask_honestly(
-    of: Service, path: str, requests: Sequence[bytes | str], clients: int
-) -> Counter[str]:
-    """Send images to this path, and requests for other paths, over so many connections. Return how
-    often each status came."""
-    words = {"Content-Type": "image/jpeg"}
-    waiting, lock, statuses = iter(requests), threading.Lock(), Counter[str]()
-
-    def ask() -> None:
-        connection = None
-        while True:
-            with lock:
-                body = next(waiting, None)
-            if body is None:
-                return
-            if connection is None:
-                connection = http.client.HTTPConnection(
-                    of.host, of.port, timeout=120, source_address=(HONEST, 0)
-                )
-            try:
-                if isinstance(body, str):
-                    connection.request("GET", body)
-                else:
-                    connection.request("POST", path, body, words)
-                response = connection.getresponse()
-                response.read()
-                status = str(response.status)
-            except (OSError, http.client.HTTPException) as error:
-                status, connection = type(error).__name__, None
-            with lock:
-                statuses[status] += 1
-
-    with ThreadPoolExecutor(clients) as pool:
-        for done in [pool.submit(ask) for _ in range(clients)]:
-            done.result()
-    return statuses
 
 
 @contextmanager
@@ -247,7 +206,6 @@ def main() -> int:
     camera = camera.rescaled(args.width, height)
     clear = [encode_jpeg(cv2.resize(one, (args.width, height)), 90) for one in images]
     thirds, name = [Third() for _ in range(3)], args.map.stem
-    path = f"/v1/maps/{name}/localize?camera={quote(json.dumps(camera.to_json()))}"
     requests = list(make_requests(args.requests, args.images, clear, name))
     size = -(-args.requests // 3)
     with service(args.map) as of:
@@ -255,7 +213,8 @@ def main() -> int:
             part = requests[number * size : (number + 1) * size]
             num_hostile = args.hostile if number == 1 else 0
             with watching(of, third), attacking(of, num_hostile, third):
-                third.statuses += ask_honestly(of, path, part, args.clients)
+                statuses = load(of, name, camera, part, args.clients, address=HONEST)[2]
+                third.statuses.update({str(status): k for status, k in statuses.items()})
             print(f"third {number + 1}: {third}", flush=True)
     faults = find_faults(thirds)
     print("; ".join(faults) or "no fault")

@@ -16,6 +16,7 @@ from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.frame import StereoFrame
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.open import open_sequence
 from topoloc.recordings.recording import Recording, SequenceView
@@ -171,14 +172,14 @@ def read_walk(name: str, data: Path, work: Path) -> Walk:
     for row in rows:
         depths.append(work / "depth" / name / f"{row:06d}.png")
         depths[-1].parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(depths[-1]), _depth_mm(base, row))
+        cv2.imwrite(str(depths[-1]), depth_mm(base[row]))
     return replace(walk, others=depths, depth_factor=1000.0)
 
 
-def _depth_mm(recording: Recording, row: int) -> np.ndarray:
+def depth_mm(frame: StereoFrame) -> np.ndarray:
     """Return the depth of the image in millimetres, 0 where unknown. That of stereo pairs is by
     semi-global matching (Hirschmueller 2008, as OpenCV has it)."""
-    view = prepare_frame(recording[row])
+    view = prepare_frame(frame)
     if view.depth is not None:
         return np.rint(1000.0 * np.nan_to_num(view.depth)).astype(np.uint16)
     assert view.rig is not None

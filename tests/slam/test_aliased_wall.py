@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -80,6 +81,50 @@ def test_a_submap_is_joined_by_what_is_unique_and_by_no_panel():
     assert result.num_submaps == result.num_joined == 2
     assert result.num_loops > 0
     assert np.abs(along_the_wall(walked, result)).max() < 0.1
+
+
+def worst_step(sequence: FrameList, result: SlamResult) -> float:
+    """Metres by which the step between two successive poses of one world is off, at most."""
+    worst = 0.0
+    for poses in (result.poses[0], *result.apart[0]):
+        rows = [row for row, pose in enumerate(poses) if pose is not None]
+        for a, b in pairwise(rows):
+            walked, found = (
+                one[a].inverse() @ one[b]  # pyright: ignore[reportOptionalMemberAccess]
+                for one in (sequence.poses, poses)
+            )
+            worst = max(worst, float(np.linalg.norm(walked.translation - found.translation)))
+    return worst
+
+
+STOPS = np.cumsum([0.5] * 8 + [0.0] * 3 + [0.5] * 3)
+THERE_AND_BACK = 0.3 * np.concatenate([np.arange(10), np.arange(9)[::-1]])
+
+
+@pytest.mark.parametrize(
+    ("places", "boards"),
+    [(0.6 * np.arange(12), ()), (STOPS, (0.5, 1.0, 2.5)), (THERE_AND_BACK, ())],
+    ids=["begins fast", "stops", "turns back"],
+)
+def test_between_two_steps_that_look_the_same_the_submap_ends(
+    places: np.ndarray, boards: tuple[float, ...]
+):
+    """No frame is lost. Each of these walks was a whole panel off without a word: a step of more
+    than half a panel looks like a shorter one back."""
+    walked = walk_along(places.tolist(), (0.1 * np.arange(len(places))).tolist(), boards)
+    result = run_slam(walked)
+    assert result.num_submaps > 1
+    assert worst_step(walked, result) < 0.1
+
+
+def test_where_boards_are_in_view_an_uneven_walk_is_followed():
+    """The motion does not tell the steps apart, of which most are 0.2 to 0.7 m. The images do."""
+    steps = 0.45 * (1.0 + 0.4 * np.random.default_rng(5).standard_normal(24))
+    boards = tuple(np.arange(-0.5, 12.0, 1.5))
+    walked = walk_along(np.cumsum(steps).tolist(), (0.1 * np.arange(24)).tolist(), boards)
+    result = run_slam(walked)
+    assert (result.num_submaps, result.num_lost) == (1, 0)
+    assert worst_step(walked, result) < 0.1
 
 
 def test_who_turns_back_before_the_wall_is_not_taken_for_lost():

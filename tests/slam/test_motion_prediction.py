@@ -88,3 +88,15 @@ def test_the_motion_singles_out_one_of_two_or_none():
     assert select_expected_pose(gap, [ahead(1.42), ahead(1.45)]) is None
     assert select_expected_pose(gap, [far]) is far, "alone, it has no rival"
     assert select_expected_pose(None, [near, far]) is None
+
+
+def test_of_an_unknown_motion_the_least_is_expected_if_others_are_twice_as_far():
+    begun = walked([0.0, 0.3]).predict(2 * TENTH)
+    assert begun is not None
+    assert np.isinf(begun.sigma)
+    near, back = ahead(0.55), ahead(-0.45)
+    assert select_expected_pose(begun, [back, near]) is near
+    assert select_expected_pose(begun, [ahead(0.1), ahead(1.1)]) is None
+    lost = walked([0.0]).predict(TENTH, is_gap=True)
+    assert lost is not None
+    assert select_expected_pose(lost, [ahead(0.0), ahead(1.0)]) is None, "frames were lost"

@@ -1,9 +1,9 @@
 """Detect loops: key frames that see a place again, much later or in another recording.
 
-Image retrieval proposes pairs. Local features and PnP verify them (`place_matching.py`). Three
+Image retrieval proposes pairs. Local features and PnP verify them (`place_matching.py`). Four
 checks prevent wrong links. Within a sub-map, a link must not imply more drift than the odometry can
-have. No other link of nearly equal strength may contradict it, which repetitive structures cause. A
-second link nearby must agree with it.
+have. Between two, its images must not be repetitive. No other link of nearly equal strength may
+contradict it, which repetitive structures cause. A second link nearby must agree with it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from topoloc.features.parallel import parallel_map
 from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.vlad import SurfVlad, learn_words_from_parts, vlad
 from topoloc.slam.keyframes import KeyFrame
-from topoloc.slam.place_matching import PlaceMatch, match_places
+from topoloc.slam.place_matching import PlaceMatch, count_repeated_features, match_places
 
 _MAX_VLAD_BYTES = 4_000_000  # in memory: each is read once or twice, in order
 
@@ -54,7 +54,12 @@ def find_links(
             k for k in links if any(_is_supporting(other, k, keyframes, rank) for other in links)
         ]
 
-    plausible = [link for link in links if _is_within_drift(link, keyframes)]
+    repeated: dict[int, int] = {}
+    plausible = [
+        link
+        for link in links
+        if _is_within_drift(link, keyframes) and is_distinct(link, keyframes, repeated)
+    ]
     supported = select_supported(
         [
             link
@@ -119,6 +124,21 @@ def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
         0.5 + _max_drift(keyframes, link.source, link.target),
         np.deg2rad(max_drift_deg),
     )
+
+
+def is_distinct(
+    link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, int], least: int = 30
+) -> bool:
+    """Return whether a match exceeds the repetitions within each of the two images. Within a
+    sub-map the motion tells them apart. `repeated` caches their numbers, which are 0 below `least`.
+    """
+    max_repeated_share = 0.5  # of the matches
+    if keyframes[link.source].submap == keyframes[link.target].submap:
+        return True
+    for end in {link.source, link.target} - repeated.keys():
+        repeated[end] = count_repeated_features(keyframes[end].place, keyframes[end].stereo, least)
+    rivals = max(repeated[link.source], repeated[link.target])
+    return rivals < max(max_repeated_share * len(link.match.source_rows), 1.0)
 
 
 def is_reachable(link: Link, keyframes: Sequence[KeyFrame]) -> bool:

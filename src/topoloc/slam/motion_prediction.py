@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,20 +42,23 @@ def select_expected_pose(prediction: Prediction | None, poses: Sequence[Rigid3])
     """Select the pose (cam_from_world) that the motion supports: it is near the prediction, all
     others far.
 
-    None if there is no such pose.
+    None if there is no such pose. If it is unknown how fast the motion changes, all other poses of
+    the next frame must be twice as far from the prediction.
     """
     # Minimum margin of an expected step over another one: the root of the difference of their
-    # squared distances, in sigma.
-    clear_sigmas = 3.5
+    # squared distances, in sigma. The sigma of the very next frame allows a sudden stop.
+    clear_sigmas = 3.5 if prediction is not None and prediction.is_gap else 3.0
     if len(poses) == 1:
         return poses[0]
     if prediction is None or not poses:
         return None
-    distances = np.array([prediction.distance(pose) for pose in poses])
+    is_unknown = np.isinf(prediction.sigma) and not prediction.is_gap
+    expected = replace(prediction, sigma=1.0) if is_unknown else prediction
+    distances = np.array([expected.distance(pose) for pose in poses])
     nearest, next_one = np.argsort(distances, kind="stable")[:2]
-    clear = distances[nearest] < prediction.max_sigmas and distances[next_one] > np.hypot(
-        distances[nearest], clear_sigmas
-    )
+    least, is_near = distances[nearest], distances[nearest] < prediction.max_sigmas
+    others = 2.0 * least if is_unknown else np.hypot(least, clear_sigmas)
+    clear = (is_near or is_unknown) and distances[next_one] > others
     return poses[int(nearest)] if clear else None
 
 
@@ -93,8 +96,9 @@ class MotionHistory:
         """Discard the motion after the camera was lost. Accelerations are kept."""
         self._velocity, self._t_ns, self._cam_from_world = None, None, None
 
-    def predict(self, t_ns: int) -> Prediction | None:
-        """Predict the pose at a time after the last frame. None if there is no last frame."""
+    def predict(self, t_ns: int, is_gap: bool = False) -> Prediction | None:
+        """Predict the pose at a time after the last frame. None if there is no last frame. `is_gap`
+        tells that frames were lost since; a long time tells it, too."""
         max_intervals = 10.0  # maximum number of intervals over which a motion is extrapolated
         gap = 1.5  # A frame follows a gap if it comes later than this many median intervals
         min_remembered = 3  # minimum number of steps for this estimate
@@ -104,12 +108,12 @@ class MotionHistory:
         if self._t_ns is None or self._cam_from_world is None:
             return None
         time = max(1e-9 * (t_ns - self._t_ns), 0.0)
+        is_gap |= bool(self._intervals) and time > gap * float(np.median(self._intervals))
         if self._velocity is None or not self._intervals:
-            return Prediction(self._cam_from_world, Rigid3.identity(), np.inf, np.inf, False)
+            return Prediction(self._cam_from_world, Rigid3.identity(), np.inf, np.inf, is_gap)
         last = self._intervals[-1]
         step = self._velocity * min(time, max_intervals * last)
         way, turn = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:]))
-        is_gap = time > gap * float(np.median(self._intervals))
         motion = Rigid3.exp(step)
         pose = motion @ self._cam_from_world
         if len(self._squared_accelerations) < min_remembered:

@@ -36,7 +36,7 @@ from topoloc.slam.keyframes import (
     PlaceFeatures,
 )
 from topoloc.slam.motion_prediction import Prediction, select_expected_pose
-from topoloc.slam.place_matching import extract_place_features, match_places
+from topoloc.slam.place_matching import RepetitionCheck, extract_place_features, match_places
 from topoloc.slam.step_estimation import Step, Tracks
 
 # bytes of about 80 places in memory, because matching two takes ten times as long as reading one
@@ -60,6 +60,7 @@ class Odometry(FrameTracker):
         self._place_features = DiskList[PlaceFeatures](max_bytes=_MAX_PLACE_BYTES)
         self._place_executor = ThreadPoolExecutor(1, initializer=mark_worker_thread)
         self._pending_keyframe: KeyFrame | None = None
+        self._repetitions = RepetitionCheck()
 
     def process(
         self, frame_idx: int, frame: StereoFrame, measured: MeasuredView
@@ -105,14 +106,15 @@ class Odometry(FrameTracker):
         one of several."""
         # Minimum share of the points found again for an unexpected step after a gap.
         min_gap_share = 0.5
-        prediction = self._history.predict(frame.t_ns)
+        prediction = self._history.predict(frame.t_ns, self._num_lost > 0)
         if self._last_frame is None or self._reference is None or prediction is None:
             return None
         last_pose = self._last_frame.cam_from_world
         estimator = self._step_estimator(self._last_frame, self._reference, self._tracks, measured)
         step = estimator.estimate_step(prediction.cam_from_world, last_pose)
         is_near = step and prediction.distance(step.cam_from_world) < prediction.max_sigmas
-        if is_near and not prediction.is_gap:
+        is_next = bool(is_near) and not prediction.is_gap
+        if step is not None and is_next and not self._repetitions.is_likely(prediction, step):
             return step
         if self._num_lost == 0:
             self._repeated_motions = estimator.find_repeated_motions(prediction)
@@ -120,17 +122,17 @@ class Odometry(FrameTracker):
             prediction.is_gap and not is_near and step.inlier_ratio < min_gap_share
         ):
             return None
-        expected = self._select_expected_pose(prediction, step.cam_from_world)
+        expected = (
+            select_expected_pose(prediction, estimator.find_similar_steps(step, prediction))
+            if is_next
+            else self._select_expected_pose(prediction, step.cam_from_world)
+        )
         if expected is not None and not estimator.is_close(expected, step.cam_from_world):
             step = estimator.estimate_step(expected)
-        if (
-            expected is None
-            or step is None
-            or not estimator.is_close(expected, step.cam_from_world)
-        ):
-            self._reference = None  # relocalization in the last places would be ambiguous, too
-            return None
-        return step
+        if expected and step and estimator.is_close(expected, step.cam_from_world):
+            return step
+        self._reference = None  # relocalization in the last places would be ambiguous, too
+        return None
 
     def _select_expected_pose(
         self, prediction: Prediction | None, cam_from_world: Rigid3
@@ -189,10 +191,9 @@ class Odometry(FrameTracker):
             # One extraction is pending in a background thread, so that few images are in memory.
             if self._pending_keyframe is not None:
                 _ = self._pending_keyframe.place  # waits
-            keyframe.pending_place = self._place_executor.submit(
-                extract_place_features, measured.view
-            )
-            self._pending_keyframe = keyframe
+            coming = self._place_executor.submit(extract_place_features, measured.view)
+            keyframe.pending_place, self._pending_keyframe = coming, keyframe
+            self._repetitions.add(self._place_executor, coming, measured.stereo)
         return keyframe
 
     def _is_new_place(self, keyframe: KeyFrame) -> bool:
@@ -286,7 +287,7 @@ class Odometry(FrameTracker):
         motion cannot select a pose, the search ends."""
         num_places = 6  # number of last places in which a lost camera is relocalized
         here = extract_place_features(measured.view)
-        prediction = self._history.predict(frame.t_ns)
+        prediction = self._history.predict(frame.t_ns, self._num_lost > 0)
         for keyframe in self._last_places(num_places):
             match = match_places(keyframe.place, here, measured.stereo)
             if match is None:

@@ -140,6 +140,23 @@ class StepEstimator:
         least = min(shifts, key=lambda shift: float(np.linalg.norm(shift.translation))).log()
         return [Rigid3.exp(k * least) for k in range(-max_repeats, max_repeats + 1) if k]
 
+    def find_similar_steps(self, step: Step, prediction: Prediction) -> list[Rigid3]:
+        """Return which cam_from_world, of the step and of others along the motion, nearly as many
+        of the visible points agree on."""
+        min_share = 0.8  # of the largest inlier ratio
+        if np.isinf(prediction.sigma):
+            moved = step.cam_from_world @ self.last.cam_from_world.inverse()
+            prediction = replace(prediction, step=moved)
+        starts = [step.cam_from_world, *self._sample_start_poses(step.cam_from_world, prediction)]
+        found = [one for one in parallel_map(self.estimate_step, starts) if one is not None]
+        enough = min_share * max((one.inlier_ratio for one in found), default=0.0)
+        poses = list[Rigid3]()
+        for one in found:
+            is_known = any(self.is_close(one.cam_from_world, pose) for pose in poses)
+            if one.inlier_ratio >= enough and not is_known:
+                poses.append(one.cam_from_world)
+        return poses
+
     def _sample_start_poses(self, centre: Rigid3, prediction: Prediction) -> list[Rigid3]:
         """Return start poses around one along the predicted motion, as far apart as tracking
         converges."""

@@ -27,8 +27,7 @@ from topoloc.geometry.transform_consensus import (
     propagate_estimate,
 )
 from topoloc.slam.keyframes import KeyFrame, PlaceFeatures
-from topoloc.slam.loop_closure import Link, is_reachable, match_keyframes, rank_places
-from topoloc.slam.place_matching import count_repeated_features
+from topoloc.slam.loop_closure import Link, is_distinct, is_reachable, match_keyframes, rank_places
 
 _MIN_INLIERS = 12  # matches of a pair that agree on a pose
 _MIN_ROTATION_TRACE = 1.0  # of a rotation by 90 degrees, beyond which images hardly overlap
@@ -61,23 +60,9 @@ def find_joins(
             if not keyframes[i].has_place:
                 keyframes[i].place = extract_place(keyframes[i])
         found += _match_pairs(sorted(around), keyframes)
-        distinct = [link for link in found if _is_distinct(link, keyframes, repeated)]
+        distinct = [k for k in found if is_distinct(k, keyframes, repeated, _MIN_INLIERS)]
         joins += _select_consistent(distinct, keyframes)
     return joins
-
-
-def _is_distinct(link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, int]) -> bool:
-    """Return whether a match exceeds the repetitions within each of the two images.
-
-    `repeated` caches the counts by key frame.
-    """
-    max_repeated_share = 0.5  # of the matches
-    for end in (link.source, link.target):
-        if end not in repeated:
-            keyframe = keyframes[end]
-            repeated[end] = count_repeated_features(keyframe.place, keyframe.stereo, _MIN_INLIERS)
-    rivals = max(repeated[link.source], repeated[link.target])
-    return rivals < max(max_repeated_share * len(link.match.source_rows), _MIN_INLIERS)
 
 
 def _select_consistent(links: Sequence[Link], keyframes: Sequence[KeyFrame]) -> list[Link]:

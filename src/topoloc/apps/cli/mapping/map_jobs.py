@@ -85,7 +85,7 @@ class MapJob:
             result = run_slam(sequences, progress, _warn)
             sequences = result.apply(sequences)
             if apart := result.num_submaps - result.num_joined:
-                _warn(f"{apart} of {result.num_submaps} sub-maps share no view with the others")
+                _warn(f"{apart} of {result.num_submaps} sub-maps share no distinct view with any")
         for sequence in sequences:
             if num_without := sum(pose is None for pose in sequence.poses):
                 count = f"{num_without} of {len(sequence)}"
