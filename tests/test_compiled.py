@@ -3,10 +3,13 @@ functions run all the same."""
 
 from __future__ import annotations
 
+import ast
+import inspect
 import os
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
@@ -155,3 +158,17 @@ def test_a_number_of_threads_is_taken_and_changes_no_feature():
         "3 3",
         "at least one thread is needed, not 0",
     ], done.stderr
+
+
+def test_kernels_need_no_scipy():
+    """Numba compiles products of matrices and numpy.linalg with SciPy, which an installation of
+    topoloc does not have."""
+    import topoloc.slam.bundle.bundle_kernels  # noqa: F401 # declares kernels
+
+    assert len(KERNELS) > 10
+    for one in KERNELS:
+        tree = ast.parse(dedent(inspect.getsource(one.py_func)))
+        products = [node for node in ast.walk(tree) if isinstance(node, ast.MatMult)]
+        names = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+        assert not products, one.__name__
+        assert not names & {"dot", "vdot", "linalg"}, one.__name__

@@ -177,6 +177,8 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
         _check_address_space()
         import tyro
 
+        # tyro keeps line breaks of the source; a later one without this name is left as it is
+        vars(tyro)["_strings"].remove_single_line_breaks = _join_lines
         from topoloc.apps.cli.output import UsageError, interruptible
 
         with interruptible():  # too little memory to load the libraries is reported too
@@ -207,6 +209,11 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
     except KeyboardInterrupt:
         _print_error("interrupted; no file is incomplete")
     return 1
+
+
+def _join_lines(text: str) -> str:
+    """Return a text with its paragraphs in one line each."""
+    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n")).strip()
 
 
 def _with_written_files(text: str, args: list[str], written: Iterable[PathLike[str]]) -> str:

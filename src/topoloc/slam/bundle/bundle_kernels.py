@@ -180,10 +180,14 @@ def _eliminate_point(
     slots, column, keyframe_idx, couplings, inverse, gradient, bias_coupling, pattern_starts, pattern_rows, blocks, vector, border, corner  # noqa: E501
 ):  # fmt: skip
     """Eliminate a point from the system by the Schur complement of its poses and bias."""
-    step, product = inverse @ gradient, np.empty((6, 3))
-    if column >= 0:
-        corner[column, 0] -= bias_coupling @ (inverse @ bias_coupling)
-        corner[column, 1] -= bias_coupling @ step
+    step, product = np.zeros(3), np.empty((6, 3))
+    for r in range(3):  # not `@`: Numba takes that from SciPy, which is not installed with topoloc
+        for s in range(3):
+            step[r] += inverse[r, s] * gradient[s]
+            if column >= 0:
+                corner[column, 0] -= bias_coupling[r] * inverse[r, s] * bias_coupling[s]
+        if column >= 0:
+            corner[column, 1] -= bias_coupling[r] * step[r]
     for k in range(len(keyframe_idx)):
         i = slots[keyframe_idx[k]]
         if i < 0:

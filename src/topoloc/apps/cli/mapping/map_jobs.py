@@ -160,6 +160,11 @@ class MapJob:
     def _with_poses(self, sequence: StereoSequence, trajectory: str) -> StereoSequence:
         conventions, _ = parse_conventions(self.pose_options.poses)
         scale = self.pose_options.scale
+        if trajectory.endswith(".json"):
+            raise UsageError(
+                f"--trajectory takes a TUM or KITTI file; the poses of {trajectory} belong to the"
+                f" images that it names: map {trajectory} itself, as the recording"
+            )
         if trajectory == "truth":
             if scale:
                 sequence = scale_poses(sequence, estimate_metric_scale(scale, sequence))
