@@ -56,14 +56,9 @@ def main(out: Path) -> None:
             for true, found in zip(truth, results, strict=True)
             if found.localized
         ]
-        error_cm = (
-            100.0 * np.median([translation_error(*pair) for pair in pairs])
-            if pairs
-            else float("nan")
-        )
-        print(
-            f"with {what}: {len(pairs)} of {len(results)} localized, median error {error_cm:.2f} cm"
-        )
+        errors = [translation_error(*pair) for pair in pairs]
+        says = f"median error {100.0 * np.median(errors):.2f} cm" if pairs else results[0].detail
+        print(f"with {what}: {len(pairs)} of {len(results)} localized, {says}")
 
 
 if __name__ == "__main__":

@@ -116,11 +116,10 @@ def test_own_camera(run: Run, lab: Path, monkeypatch: pytest.MonkeyPatch):
     with_lens, as_pinhole = run("own_camera").splitlines()
     assert [recording.name for recording in recordings] == ["map_lap1"]
     assert "8 of 8 localized" in with_lens
-    (error,), (error_as_pinhole,) = (
-        _centimetres(line, "median error") for line in (with_lens, as_pinhole)
-    )
+    (error,) = _centimetres(with_lens, "median error")
     assert error < 1.5
-    assert error_as_pinhole > 3.0 * error
+    assert "0 of 8 localized" in as_pinhole
+    assert "its lens distorts more than the calibration states" in as_pinhole
 
 
 def test_reject_elsewhere(run: Run, lab: Path):
