@@ -173,11 +173,15 @@ def _serve(command: str, place: Path) -> str:
         text=True,
     )
     assert service.stdout
-    line = next((line for line in service.stdout if "http://" in line), "")
+    lines = list[str]()
+    for line in service.stdout:
+        lines.append(line)
+        if "ready" in line:  # before, Ctrl-C interrupts the start
+            break
     service.send_signal(signal.SIGINT)
-    service.communicate(timeout=60)
-    assert service.returncode == 0
-    return line
+    lines.append(service.communicate(timeout=60)[0])
+    assert service.returncode == 0, "".join(lines)
+    return "".join(lines)
 
 
 def test_each_command_is_typed_or_has_a_reason():
