@@ -213,8 +213,9 @@ class Localizer:
         tile_id: str | None = None,
     ) -> Localization | NotLocalized:
         """Estimate the pose of an image (grey or RGB, uint8). In an atlas it is in the world of the
-        tile that the provenance names. A camera that is not exactly known is estimated too, which
-        takes a few times as long.
+        tile that the provenance names. Of a camera that is not exactly known the focal length is
+        estimated, too, and principal point and distortion if the residuals ask for it. This takes a
+        few times as long.
 
         Args:
             camera: camera model of the image, exact or approximate; K, (fx, fy, cx, cy) in pixels,

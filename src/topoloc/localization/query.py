@@ -233,19 +233,21 @@ def camera_of(image: Image, camera: CameraLike | None) -> Camera | UncalibratedC
     unknown = unknown_camera(image)
     if camera is None:
         return unknown
-    if not isinstance(camera, str | Path):
-        values = np.array(camera, dtype=object)
-        if values.shape == (3, 3):
-            values = values[[0, 1, 0, 1], [0, 1, 2, 2]]
-        if values.shape != (4,):
-            raise QueryError(
-                "a camera is a topoloc.Camera, a 3x3 matrix K, (fx, fy, cx, cy) in pixels, or the"
-                f" path of a calibration, not {type(camera).__name__} of shape {values.shape}"
-            )
-        camera = ",".join(map(str, values))
-    from topoloc.recordings.calibration import parse_calibration  # reads many formats
+    # these modules read many formats
+    from topoloc.recordings.calibration import camera_from_intrinsics, parse_calibration
 
-    return parse_calibration(camera)(unknown.width, unknown.height).camera
+    if isinstance(camera, str | Path):
+        return parse_calibration(camera)(unknown.width, unknown.height).camera
+    values = np.asarray(camera, dtype=np.float64)
+    if values.shape == (3, 3):
+        values = values[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if values.shape != (4,):
+        raise QueryError(
+            "a camera is a topoloc.Camera, a 3x3 matrix K, (fx, fy, cx, cy) in pixels, or the path"
+            f" of a calibration, not {type(camera).__name__} of shape {values.shape}"
+        )
+    fx, fy, cx, cy = values.tolist()
+    return camera_from_intrinsics(fx, fy, cx, cy, unknown.width, unknown.height)
 
 
 def reduce_image(

@@ -45,7 +45,8 @@ class Localization:
             part refers to the world's origin, `camera_covariance` and `position_covariance` to the
             camera.
         probability: probability that the pose is within 0.25 m and 2 degrees. 5 % of the distance
-            of the seen points replaces 0.25 m if that is less.
+            of the seen points replaces 0.25 m if that is less. It is computed from `evidence` with
+            fitted weights.
         calibrated: False if no weights were fitted to this feature type and those of another are
             used.
         node_id: node with the most inliers.
@@ -91,7 +92,8 @@ class Localization:
 
     @property
     def is_of_nodes(self) -> bool:
-        """Return whether the place was recognised by the map's nodes, not by virtual views."""
+        """Return whether the place was recognised by the map's nodes, not by virtual views, which
+        serve where nearby nodes show another side."""
         return self.evidence is None or self.evidence.is_of_nodes
 
     @property
@@ -118,7 +120,14 @@ class Localization:
 
     def to_json(self, query: str) -> dict[str, Any]:
         """Return one line of the result file, see docs/cli.md."""
-        turned = self.frame_rotation_deg
+        optional = {
+            "focal_length_px": self.focal_length_px,
+            "noise_share": self.noise_share if self.noise_share != 1.0 else None,
+            "evidence": self.evidence and asdict(self.evidence),
+            "frame_rotation_deg": self.frame_rotation_deg,
+            "calibration_doubt": self.calibration_doubt and self.calibration_doubt.to_json(),
+            "geopose": self.geopose and self.geopose.to_json(),
+        }
         return {
             "query": query,
             "localized": True,
@@ -130,16 +139,7 @@ class Localization:
             **({} if self.calibrated else {"calibrated": False}),
             "node": self.node_id,
             **_evidence_json(self),
-            **({} if self.focal_length_px is None else {"focal_length_px": self.focal_length_px}),
-            **({} if self.noise_share == 1.0 else {"noise_share": self.noise_share}),
-            **({} if self.evidence is None else {"evidence": asdict(self.evidence)}),
-            **({} if turned is None else {"frame_rotation_deg": turned}),
-            **(
-                {}
-                if self.calibration_doubt is None
-                else {"calibration_doubt": self.calibration_doubt.to_json()}
-            ),
-            **({} if self.geopose is None else {"geopose": self.geopose.to_json()}),
+            **{name: value for name, value in optional.items() if value is not None},
         }
 
     @staticmethod

@@ -76,12 +76,10 @@ def decide_final_result(search: Search) -> ResultWithInliers:
         return _weigh_camera(search, best, result, best.fit.pose.camera)
     with search.query.clock.stage("calibration"):
         turning, frame_rotation_deg = _find_rotation(search, best), None
-        seen, doubt = None, None
-        is_undone = turning is not None and turning.is_evident
-        if not is_undone:
-            seen, doubt = check_image_calibration(search, best.fit)
-            is_undone = turning is not None and doubt is not None
-        if turning is not None and is_undone:
+        is_evident = turning is not None and turning.is_evident
+        seen, doubt = (None, None) if is_evident else check_image_calibration(search, best.fit)
+        # a rotation that is not evident is still likelier than a wrong calibration
+        if turning is not None and (is_evident or doubt is not None):
             best = _undo_rotation(best, turning)
             frame_rotation_deg = float(np.rad2deg(np.linalg.norm(turning.rotation)))
             seen, doubt = check_image_calibration(search, best.fit)

@@ -178,7 +178,8 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
         import tyro
 
         # tyro keeps line breaks of the source; a later one without this name is left as it is
-        vars(tyro)["_strings"].remove_single_line_breaks = _join_lines
+        if strings := vars(tyro).get("_strings"):
+            strings.remove_single_line_breaks = _join_lines
         from topoloc.apps.cli.output import UsageError, interruptible
 
         with interruptible():  # too little memory to load the libraries is reported too
