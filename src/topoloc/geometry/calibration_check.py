@@ -241,8 +241,7 @@ def check_calibration_consistency(
     shares = np.abs(deviation) * np.array([1.0, *np.repeat(calibrated.fx / calibrated.width, 2)])
     is_off = (np.abs(deviation) > _NUM_SIGMAS * sigmas) & (shares > _MIN_RELATIVE_DEVIATION)
     min_distorted_share = 0.3  # of 202 images through their own lens none showed another
-    if is_distorted := np.mean([one.is_distorted for one in observations]) > min_distorted_share:
-        is_off[:] = False  # an estimate without the lens
+    distorted_share = np.mean([one.is_distorted for one in observations])
     focal = calibrated.fx * float(np.exp(deviation[0]))
     centre = np.array([calibrated.cx, calibrated.cy])
     return CalibrationConsistency(
@@ -255,7 +254,7 @@ def check_calibration_consistency(
         centre,
         bool(is_off[0]),
         bool(is_off[1:].any()),
-        bool(is_distorted),
+        bool(distorted_share > min_distorted_share),
     )
 
 
