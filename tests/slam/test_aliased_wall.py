@@ -127,6 +127,18 @@ def test_where_boards_are_in_view_an_uneven_walk_is_followed():
     assert worst_step(walked, result) < 0.1
 
 
+@pytest.mark.parametrize(("step", "num_gone"), [(0.35, 4), (0.25, 8)])
+def test_panels_between_boards_join_nothing(step: float, num_gone: int):
+    """After the gap two boards are seen that were not, and panels that look like those before. The
+    pieces were joined four panels off by those images that show one panel."""
+    rows = [k for k in range(24) if not 10 <= k < 10 + num_gone]
+    boards = tuple(np.arange(-0.5, 9.0, 2.0))
+    walked = walk_along([step * k for k in rows], [0.1 * k for k in rows], boards)
+    result = run_slam(walked)
+    assert (result.num_submaps, result.num_joined) == (2, 1)
+    assert worst_step(walked, result) < 0.1
+
+
 def test_who_turns_back_before_the_wall_is_not_taken_for_lost():
     there = list(np.arange(0.0, 2.0, STEP))
     walked = walk_along([*there, *there[::-1]], list(0.1 * np.arange(2 * len(there))))

@@ -10,15 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Float
 
 from topoloc.disk_list import DiskList
 from topoloc.features.parallel import parallel_map
+from topoloc.geometry.rigid import Rigid3
 from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.vlad import SurfVlad, learn_words_from_parts, vlad
 from topoloc.slam.keyframes import KeyFrame
-from topoloc.slam.place_matching import PlaceMatch, count_repeated_features, match_places
+from topoloc.slam.place_matching import PlaceMatch, find_repetition, match_places
 
 _MAX_VLAD_BYTES = 4_000_000  # in memory: each is read once or twice, in order
 
@@ -121,7 +124,7 @@ def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
         return source.recording != target.recording or is_reachable(link, keyframes)
     return link.match.target_from_source.is_same(
         target.cam_from_world @ source.cam_from_world.inverse(),
-        0.5 + _max_drift(keyframes, link.source, link.target),
+        0.5 + _max_drift(_between(keyframes, link.source, link.target)),
         np.deg2rad(max_drift_deg),
     )
 
@@ -129,57 +132,91 @@ def _is_within_drift(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
 def is_distinct(
     link: Link, keyframes: Sequence[KeyFrame], repeated: dict[int, int], least: int = 30
 ) -> bool:
-    """Return whether a match exceeds the repetitions within each of the two images. Within a
-    sub-map the motion tells them apart. `repeated` caches their numbers, which are 0 below `least`.
+    """Return whether a match exceeds the repetitions within its two images and those around. Within
+    a sub-map the motion tells them apart. `repeated` caches their numbers, 0 below `least`.
     """
-    max_repeated_share = 0.5  # of the matches
+    max_repeated_share = 0.3  # of the matches
+    num_around = 3  # key frames before and after each image
     if keyframes[link.source].submap == keyframes[link.target].submap:
         return True
-    for end in {link.source, link.target} - repeated.keys():
-        repeated[end] = count_repeated_features(keyframes[end].place, keyframes[end].stereo, least)
-    rivals = max(repeated[link.source], repeated[link.target])
+    rivals = 0
+    for end in (link.source, link.target):
+        for i in range(max(end - num_around, 0), min(end + num_around + 1, len(keyframes))):
+            one = keyframes[i]
+            if one.submap == keyframes[end].submap and one.has_place:
+                if i not in repeated:
+                    repeated[i] = find_repetition(one.place, one.stereo, least)[0]
+                rivals = max(rivals, repeated[i])
     return rivals < max(max_repeated_share * len(link.match.source_rows), 1.0)
 
 
 def is_reachable(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
-    """Return whether a link is possible at the camera's maximum speed.
+    """Return whether a link within a recording agrees with the camera's motion.
 
-    The camera must travel from the end of the earlier sub-map to the start of the later one.
+    From the end of the earlier sub-map to the start of the later one the camera passes the sub-maps
+    between them, whose motion is known. In the gaps it goes on as before, give or take a reach.
     """
-    # Maximum speed between two sub-maps of a recording, relative to the maximum speed within
-    # them, in addition to half a metre.
-    max_speedup = 2.0
+    # Reach in a gap: half a metre, ten degrees, and the way at twice the maximum speed on both
+    # sides of it. So the camera may have turned back at once.
+    start, max_speedup = np.array([0.5, np.deg2rad(10.0)]), 2.0
     source, target = keyframes[link.source], keyframes[link.target]
     target_from_source = link.match.target_from_source
     if source.submap > target.submap:
         source, target, target_from_source = target, source, target_from_source.inverse()
-    before, after = ([k for k in keyframes if k.submap == end.submap] for end in (source, target))
-    end_in_source = source.cam_from_world @ before[-1].cam_from_world.inverse()
-    start_in_target = target.cam_from_world @ after[0].cam_from_world.inverse()
+    passed: dict[int, list[KeyFrame]] = {}
+    for keyframe in keyframes:
+        if source.submap <= keyframe.submap <= target.submap:
+            passed.setdefault(keyframe.submap, []).append(keyframe)
+    submaps = [passed[number] for number in sorted(passed)]
+    expected = source.cam_from_world @ submaps[0][-1].cam_from_world.inverse()
+    reaches, turns = list[float](), list[float]()
+    for before, after in pairwise(submaps):
+        seconds = 1e-9 * (after[0].t_ns - before[-1].t_ns)
+        speeds = np.maximum(_max_speeds(before), _max_speeds(after))
+        metres, radians = start + max_speedup * seconds * speeds
+        reaches.append(metres)
+        turns.append(radians)
+        expected = expected @ Rigid3(np.eye(3), seconds * _last_velocity(before))
+        if after is not submaps[-1]:
+            motion = after[0].cam_from_world @ after[-1].cam_from_world.inverse()
+            expected = expected @ motion
+            chord = 2.0 * np.sin(min(np.linalg.norm(turns), np.pi) / 2.0)
+            reaches.append(chord * float(np.linalg.norm(motion.translation)) + _max_drift(after))
+    start_in_target = target.cam_from_world @ submaps[-1][0].cam_from_world.inverse()
     start_in_source = target_from_source.inverse() @ start_in_target
-    seconds = 1e-9 * (after[0].t_ns - before[-1].t_ns)
-    reach = 0.5 + max_speedup * max(_max_speed(before), _max_speed(after)) * seconds
-    return bool(np.linalg.norm(end_in_source.translation - start_in_source.translation) < reach)
+    off = np.linalg.norm(expected.translation - start_in_source.translation)
+    return bool(off < np.linalg.norm(reaches))  # they are independent
 
 
-def _max_speed(submap: Sequence[KeyFrame]) -> float:
-    """Return the maximum speed within a sub-map, metres per second."""
-    positions = np.array([k.cam_from_world.inverse().translation for k in submap])
-    seconds = 1e-9 * np.diff([k.t_ns for k in submap])
-    metres = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return float(np.max(metres / np.maximum(seconds, 1e-9), initial=0.0))
+def _max_speeds(submap: Sequence[KeyFrame]) -> Float[np.ndarray, " 2"]:
+    """Return the maximum speeds within a sub-map, metres and radians per second."""
+    speeds = np.zeros(2)
+    for a, b in pairwise(submap):
+        b_from_a = b.cam_from_world @ a.cam_from_world.inverse()
+        moved = np.array([np.linalg.norm(b_from_a.translation), b_from_a.angle()])
+        speeds = np.maximum(speeds, moved / max(1e-9 * (b.t_ns - a.t_ns), 1e-9))
+    return speeds
 
 
-def _max_drift(keyframes: Sequence[KeyFrame], first: int, last: int) -> float:
-    """Return the maximum drift (metres) of the odometry between two key frames of a sub-map."""
+def _last_velocity(submap: Sequence[KeyFrame]) -> Float[np.ndarray, " 3"]:
+    """Return the velocity at the end of a sub-map, metres per second in the last camera. It is zero
+    if that has one key frame."""
+    a, b = submap[-2:] if len(submap) > 1 else (submap[-1], submap[-1])
+    moved = b.cam_from_world.apply(a.cam_from_world.inverse().translation)
+    return -moved / max(1e-9 * (b.t_ns - a.t_ns), 1e-9)
+
+
+def _max_drift(passed: Sequence[KeyFrame]) -> float:
+    """Return the maximum drift (metres) of the odometry along key frames of a sub-map."""
     drift_share = 0.05  # of the travelled distance
-    submap, (first, last) = keyframes[first].submap, sorted((first, last))
-    between = [
-        k.cam_from_world.inverse().translation
-        for k in keyframes[first : last + 1]
-        if k.submap == submap
-    ]
-    return drift_share * float(np.linalg.norm(np.diff(between, axis=0), axis=1).sum())
+    positions = np.array([k.cam_from_world.inverse().translation for k in passed])
+    return drift_share * float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+def _between(keyframes: Sequence[KeyFrame], one: int, other: int) -> list[KeyFrame]:
+    """Return two key frames of a sub-map and those between them."""
+    first, last = sorted((one, other))
+    return [k for k in keyframes[first : last + 1] if k.submap == keyframes[first].submap]
 
 
 def _is_contradicting(other: Link, link: Link, keyframes: Sequence[KeyFrame]) -> bool:
@@ -193,7 +230,7 @@ def _is_contradicting(other: Link, link: Link, keyframes: Sequence[KeyFrame]) ->
     if len(other.match.source_rows) < rival_share * len(link.match.source_rows):
         return False
     end = "source" if other.target == link.target else "target"
-    drift = _max_drift(keyframes, getattr(link, end), getattr(other, end))
+    drift = _max_drift(_between(keyframes, getattr(link, end), getattr(other, end)))
     return _are_consistent(other, link, keyframes, drift) is False
 
 

@@ -37,6 +37,10 @@ class Prediction:
         poses = self.cam_from_world.inverse(), cam_from_world.inverse()
         return normalized_pose_error(*poses, self.sigma, self.sigma_rad)
 
+    def is_near(self, cam_from_world: Rigid3) -> bool:
+        """Return whether a pose is expected."""
+        return self.distance(cam_from_world) < self.max_sigmas
+
 
 def select_expected_pose(prediction: Prediction | None, poses: Sequence[Rigid3]) -> Rigid3 | None:
     """Select the pose (cam_from_world) that the motion supports: it is near the prediction, all

@@ -35,8 +35,12 @@ from topoloc.slam.keyframes import (
     Observations,
     PlaceFeatures,
 )
-from topoloc.slam.motion_prediction import Prediction, select_expected_pose
-from topoloc.slam.place_matching import RepetitionCheck, extract_place_features, match_places
+from topoloc.slam.motion_prediction import select_expected_pose
+from topoloc.slam.place_matching import (
+    RepetitionCheck,
+    extract_place_features,
+    match_places,
+)
 from topoloc.slam.step_estimation import Step, Tracks
 
 # bytes of about 80 places in memory, because matching two takes ten times as long as reading one
@@ -112,7 +116,7 @@ class Odometry(FrameTracker):
         last_pose = self._last_frame.cam_from_world
         estimator = self._step_estimator(self._last_frame, self._reference, self._tracks, measured)
         step = estimator.estimate_step(prediction.cam_from_world, last_pose)
-        is_near = step and prediction.distance(step.cam_from_world) < prediction.max_sigmas
+        is_near = step and prediction.is_near(step.cam_from_world)
         is_next = bool(is_near) and not prediction.is_gap
         if step is not None and is_next and not self._repetitions.is_likely(prediction, step):
             return step
@@ -122,11 +126,9 @@ class Odometry(FrameTracker):
             prediction.is_gap and not is_near and step.inlier_ratio < min_gap_share
         ):
             return None
-        expected = (
-            select_expected_pose(prediction, estimator.find_similar_steps(step, prediction))
-            if is_next
-            else self._select_expected_pose(prediction, step.cam_from_world)
-        )
+        repeated = [] if is_next else self._repeat(step.cam_from_world)
+        poses = estimator.find_similar_steps(step, prediction, repeated)
+        expected = select_expected_pose(prediction, poses)
         if expected is not None and not estimator.is_close(expected, step.cam_from_world):
             step = estimator.estimate_step(expected)
         if expected and step and estimator.is_close(expected, step.cam_from_world):
@@ -134,12 +136,9 @@ class Odometry(FrameTracker):
         self._reference = None  # relocalization in the last places would be ambiguous, too
         return None
 
-    def _select_expected_pose(
-        self, prediction: Prediction | None, cam_from_world: Rigid3
-    ) -> Rigid3 | None:
-        """Return which of all poses that look the same in a repetitive place is expected."""
-        repeated = [repeat @ cam_from_world for repeat in self._repeated_motions]
-        return select_expected_pose(prediction, [cam_from_world, *repeated])
+    def _repeat(self, cam_from_world: Rigid3) -> list[Rigid3]:
+        """Return a pose and those at which the last image would look the same."""
+        return [cam_from_world, *(move @ cam_from_world for move in self._repeated_motions)]
 
     def _add_keyframe(
         self,
@@ -286,15 +285,22 @@ class Odometry(FrameTracker):
         """Relocalize the camera in one of the last places. If the place is repetitive and the
         motion cannot select a pose, the search ends."""
         num_places = 6  # number of last places in which a lost camera is relocalized
+        max_apart = 0.3, np.deg2rad(10.0)  # metres and radians between estimates of one pose
         here = extract_place_features(measured.view)
-        prediction = self._history.predict(frame.t_ns, self._num_lost > 0)
-        for keyframe in self._last_places(num_places):
-            match = match_places(keyframe.place, here, measured.stereo)
-            if match is None:
-                continue
-            cam_from_world = match.target_from_source @ keyframe.cam_from_world
-            if self._select_expected_pose(prediction, cam_from_world) is cam_from_world:
-                return cam_from_world, Motion(keyframe, match.covariance)
-            self._reference = None
+        places = self._last_places(num_places)
+        matched = [(k, match_places(k.place, here, measured.stereo)) for k in places]
+        found = [(k, match) for k, match in matched if match is not None]
+        if not found:
             return None
+        prediction = self._history.predict(frame.t_ns, self._num_lost > 0)
+        estimates = [match.target_from_source @ k.cam_from_world for k, match in found]
+        poses, (nearest, match) = self._repeat(estimates[0]), found[0]
+        if repetitions := self._repetitions.find_motions():
+            poses += [one for one in estimates if not one.is_same(estimates[0], *max_apart)]
+            poses += [repetitions[0] @ estimates[0], repetitions[0].inverse() @ estimates[0]]
+        is_near = prediction is not None and prediction.is_near(estimates[0])
+        selected = select_expected_pose(prediction, poses)
+        if selected is estimates[0] and (is_near or not repetitions):
+            return estimates[0], Motion(nearest, match.covariance)
+        self._reference = None
         return None

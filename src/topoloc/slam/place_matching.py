@@ -5,6 +5,7 @@ Local features are matched, and robust PnP on metric points gives the pose.
 
 from __future__ import annotations
 
+from collections import deque
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
@@ -81,18 +82,20 @@ def match_places(
     )
 
 
-def count_repeated_features(
+def find_repetition(
     view: PlaceFeatures, stereo: StereoCamera, min_inliers: int = 30
-) -> int:
-    """Count the features of a view that match others of the same image by one common relative pose.
+) -> tuple[int, Rigid3]:
+    """Find the motion of the camera after which a view looks the same.
 
-    The count is high for repetitive structures such as a wall of equal panels. Each feature is
-    matched with the most similar distant one, mutually. The result is the number of PnP inliers, 0
-    if there are fewer than `min_inliers`. Of 500, panels have 42 or more, other scenes at most 18.
+    Return how many features match others of the image by it, and the motion. The number is high for
+    repetitive structures such as a wall of equal panels. Each feature is matched with the most
+    similar distant one, mutually. The number is that of PnP inliers, 0 if there are fewer than
+    `min_inliers`. Of 500, panels have 42 or more, other scenes at most 18.
     """
+    none = 0, Rigid3.identity()
     points_img, descriptors = view.features.points_img.astype(np.float64), view.features.descriptors
     if len(descriptors) < min_inliers:
-        return 0
+        return none
     squares, min_apart = np.sum(points_img**2, axis=1), _MIN_SEPARATION * stereo.camera.width
     squared_apart = squares[:, None] + squares - 2.0 * points_img @ points_img.T
     likeness = np.where(squared_apart < min_apart**2, -np.inf, descriptors @ descriptors.T)
@@ -103,32 +106,39 @@ def count_repeated_features(
         & np.isfinite(likeness[rows, nearest])
     )
     if np.count_nonzero(mutual) < min_inliers:
-        return 0
+        return none
     sources, priorities = nearest[mutual], likeness[rows, nearest][mutual]
     pose = _estimate_pose(points_img[mutual], view.points, sources, stereo, priorities)
-    num_inliers = 0 if pose is None else int(np.count_nonzero(pose.inliers))
-    return num_inliers if num_inliers >= min_inliers else 0
+    if pose is None or np.count_nonzero(pose.inliers) < min_inliers:
+        return none
+    return int(np.count_nonzero(pose.inliers)), pose.cam_from_world
 
 
 class RepetitionCheck:
-    """Hold whether the last places are repetitive. They are counted in the background, so of a
+    """Hold how the last places repeat themselves. They are searched in the background, so of a
     moving camera the last place but one is used."""
 
     def __init__(self) -> None:
-        self._num_repeated, self._pending = 0, Future[int]()
-        self._pending.set_result(0)
+        none = Future[tuple[int, Rigid3]]()
+        none.set_result((0, Rigid3.identity()))
+        self._last = deque([none, none], maxlen=12)
 
     def add(self, executor: Executor, place: Future[PlaceFeatures], stereo: StereoCamera) -> None:
         """Add a place, whose features `executor` extracts."""
-        self._num_repeated = self._pending.result()
-        self._pending = executor.submit(lambda: count_repeated_features(place.result(), stereo))
+        self._last.append(executor.submit(lambda: find_repetition(place.result(), stereo)))
 
     def is_likely(self, prediction: Prediction, step: Step) -> bool:
         """Return whether the places before a step are repetitive. If the motion is unknown, the
         last one counts, too, and so does a step on which few of the visible points agree."""
-        if self._num_repeated or np.isfinite(prediction.sigma):
-            return self._num_repeated > 0
-        return self._pending.result() > 0 or bool(step.inlier_ratio < 0.8)
+        num_repeated = self._last[-2].result()[0]
+        if num_repeated or np.isfinite(prediction.sigma):
+            return num_repeated > 0
+        return self._last[-1].result()[0] > 0 or bool(step.inlier_ratio < 0.8)
+
+    def find_motions(self) -> list[Rigid3]:
+        """Return the motions of the camera after which one of the last places looks the same."""
+        found = [future.result() for future in self._last]
+        return [motion for num, motion in found if num]
 
 
 def _estimate_pose(

@@ -6,6 +6,7 @@ not show this. So the estimation is repeated from other start poses to find alte
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,9 +141,11 @@ class StepEstimator:
         least = min(shifts, key=lambda shift: float(np.linalg.norm(shift.translation))).log()
         return [Rigid3.exp(k * least) for k in range(-max_repeats, max_repeats + 1) if k]
 
-    def find_similar_steps(self, step: Step, prediction: Prediction) -> list[Rigid3]:
+    def find_similar_steps(
+        self, step: Step, prediction: Prediction, repeated: Sequence[Rigid3] = ()
+    ) -> list[Rigid3]:
         """Return which cam_from_world, of the step and of others along the motion, nearly as many
-        of the visible points agree on."""
+        of the visible points agree on, after those that are known to look the same."""
         min_share = 0.8  # of the largest inlier ratio
         if np.isinf(prediction.sigma):
             moved = step.cam_from_world @ self.last.cam_from_world.inverse()
@@ -150,11 +153,10 @@ class StepEstimator:
         starts = [step.cam_from_world, *self._sample_start_poses(step.cam_from_world, prediction)]
         found = [one for one in parallel_map(self.estimate_step, starts) if one is not None]
         enough = min_share * max((one.inlier_ratio for one in found), default=0.0)
-        poses = list[Rigid3]()
-        for one in found:
-            is_known = any(self.is_close(one.cam_from_world, pose) for pose in poses)
-            if one.inlier_ratio >= enough and not is_known:
-                poses.append(one.cam_from_world)
+        poses = list(repeated)
+        for pose in (one.cam_from_world for one in found if one.inlier_ratio >= enough):
+            if not any(self.is_close(pose, known) for known in poses):
+                poses.append(pose)
         return poses
 
     def _sample_start_poses(self, centre: Rigid3, prediction: Prediction) -> list[Rigid3]:
