@@ -44,7 +44,7 @@ export function sentences(result) {
   if (isLocalized(result)) {
     const sigmas = `${lengthText(result.position_sigma_m)} and ${result.rotation_sigma_deg.toFixed(2)}°`;
     said.push(`Standard deviation ${sigmas}, probability ${result.probability.toFixed(2)}.`);
-    said.push(`${result.num_inliers} of ${result.num_matches} matches agree, most with node ${result.node}.`);
+    if (result.num_matches) said.push(`${result.num_inliers} of ${result.num_matches} matches agree, most with node ${result.node}.`);
     if (result.focal_length_px) said.push(`Estimated focal length: ${result.focal_length_px.toFixed(0)} pixels.`);
     if (result.calibration_doubt) said.push("The image contradicts its calibration, so the uncertainty is larger.");
     const earth = result.geopose?.position;
