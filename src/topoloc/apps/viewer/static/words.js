@@ -24,6 +24,12 @@ export function lengthText(metres) {
   return `${(1000 * metres).toFixed(1)} mm`;
 }
 
+/** The text of a length that is a round number. */
+export function roundLengthText(metres) {
+  const [unit, size] = [["km", 1000], ["m", 1], ["cm", 0.01]].find(([, one]) => metres >= 0.999 * one) ?? ["mm", 0.001];
+  return `${Number((metres / size).toPrecision(2))} ${unit}`;
+}
+
 export const pointText = (p) => `(${p.map((value) => value.toFixed(2)).join(", ")}) m`;
 
 /** Whether a result has a pose of its own. */
