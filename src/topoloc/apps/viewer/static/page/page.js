@@ -34,6 +34,7 @@ async function openMap() {
   const wanted = wantedMap();
   forgetPicture();
   part("answer").replaceChildren();
+  state.viewer?.stage.renderer.forceContextLoss(); // a browser lends a page few of them
   [state.viewer, state.asked] = [null, null];
   state.map = state.names.includes(wanted) ? wanted : "";
   part("map").value = state.map;
