@@ -181,6 +181,10 @@ def test_answers_stay_in_a_list_that_can_be_saved(
             with page.expect_download() as download:
                 page.get_by_role("button", name=button).click()
             download.value.save_as(path)
+        page.set_viewport_size({"width": 400, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400
+        assert page.evaluate(UNNAMED) == []
+        assert page.evaluate(CONTRASTS)[0][0] >= 4.5
         page.locator("#map").select_option("room")
         assert page.locator("#answers").is_hidden(), "these answers are of the other map"
     lines = [json.loads(line) for line in saved[0].read_text().splitlines()]
@@ -218,6 +222,20 @@ def test_a_link_draws_its_answer_again(browser: Any, lab: Lab):
         assert "#" not in page.url, "what is shown is no longer what the link holds"
         page.goto(link.replace("pose=", "pose=x"))
         page.get_by_text('The link is damaged: "pose" needs 7 numbers.').wait_for()
+
+
+def test_without_webgl_the_answer_is_in_words(browser: Any, lab: Lab):
+    page = browser.new_page()
+    page.add_init_script("""const first = HTMLCanvasElement.prototype.getContext;
+        HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+          return kind === "2d" ? first.call(this, kind, ...rest) : null; };""")
+    page.goto(lab.service.url)
+    page.get_by_text("This browser shows no 3-D").wait_for()
+    _bring(page, lab, "choose")
+    assert page.inner_text("#answer h2").startswith("Here, at")
+    page.wait_for_timeout(500)  # an error would follow at once
+    assert page.inner_text("#answer h2").startswith("Here, at")
+    page.close()
 
 
 def test_it_is_worked_by_keyboard(browser: Any, lab: Lab):
