@@ -11,8 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hand_made import MAP_INFO, answer, elsewhere, lost, two_nodes
-from topoloc.apps.report.map_figure import _insert_gaps, draw_map, find_horizontal_axes
+from hand_made import MAP_INFO, answer, elsewhere, lost, pose, two_nodes
+from topoloc.apps.report.map_figure import (
+    MapFigure,
+    _insert_gaps,
+    draw_map,
+    find_horizontal_axes,
+)
 from topoloc.apps.report.report import (
     render_gallery,
     select_typical_queries,
@@ -22,6 +27,7 @@ from topoloc.apps.report.report import (
 from topoloc.apps.report.report_tables import PublishedResult, ReportTexts
 from topoloc.errors import TopolocError, UnreadableImageError
 from topoloc.evaluation.metrics import EvaluatedQuery, summarize
+from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.result import Localization
 
 GOOD = [answer(f"good{i}", 0.1 * i, error_m=0.001 * (i + 1), error_deg=0.1) for i in range(9)]
@@ -86,7 +92,7 @@ def test_numbers_on_the_page_are_those_of_the_evaluation(page: str):
     assert "1 not in map, 1 too few inliers" in page
     assert "<th>Largest error</th><td>40.00 m, 2.00°</td>" in page
     assert "largest 40 m" in page or "largest 4e+03 cm" in page
-    assert "1 false position is outside of the figure, marked at its edge" in page
+    assert "1 position is outside of the figure. Arrows name the distance" in page
     assert "1.23 MB" in page
 
 
@@ -106,6 +112,59 @@ def test_the_worst_are_shown_beside_the_node_they_were_matched_with(page: str):
     assert "nearest to the truth is node 0" in far
     assert re.search(r"off by 40.00 m, 2.00°, 16\d\d\.\d standard deviations", far)
     assert far.count("data:image/jpeg;base64,") == 1
+
+
+def _moved(x: float, step: tuple[float, float, float]) -> Rigid3:
+    return Rigid3(pose(x).rotation, pose(x).translation + np.array(step))
+
+
+NODES = [pose(0.0), pose(1.0)]  # in the plan 1 m by 0.5 m, of x and z
+
+
+@pytest.mark.parametrize("step", [(0.4, 0.0, 0.0), (0.0, 0.0, -0.9), (-1.0, 0.0, 0.9)])
+def test_an_answer_beside_the_map_is_in_the_plan(step: tuple[float, float, float]):
+    with MapFigure(NODES, [], 1.0, [_moved(0.5, step)]) as figure:
+        assert figure.draw_arrows([pose(0.5)], [_moved(0.5, step)]) == 0
+        figure.plot([_moved(0.5, step)], marker="x")
+        (mark,) = figure.axes.lines
+        (place,) = figure.flatten([_moved(0.5, step)])
+        np.testing.assert_array_equal(mark.get_xydata()[0], place)
+        assert np.all(place > figure.low)
+        assert np.all(place < figure.high)
+
+
+@pytest.mark.parametrize(
+    ("step", "text"),
+    [((40.0, 0.0, 0.0), "40 m"), ((0.0, 0.0, -3.0), "3.0 m"), ((-3.0, 0.0, 4.0), "5.0 m")],
+)
+def test_an_arrow_points_to_an_answer_far_from_the_map(step: tuple[float, float, float], text: str):
+    with MapFigure(NODES, [], 1.0, [_moved(0.5, step)]) as figure:
+        assert (figure.high - figure.low).max() < 1.2, "the map is as large as without it"
+        assert figure.draw_arrows([pose(0.5)], [_moved(0.5, step)]) == 1
+        figure.plot([_moved(0.5, step)])
+        assert len(figure.axes.lines) == 0
+        (arrow,) = figure.axes.texts
+        assert arrow.get_text() == text
+        start, end = figure.flatten([pose(0.5), _moved(0.5, step)])
+        gaps = np.abs(np.concatenate([figure.low - arrow.xy, figure.high - arrow.xy]))
+        assert gaps.min() < 1e-9, "its tip is at the edge"
+        way = (np.array(arrow.xy) - start) / np.linalg.norm(np.array(arrow.xy) - start)
+        np.testing.assert_allclose(way, (end - start) / np.linalg.norm(end - start), atol=1e-9)
+        tail = np.array(arrow.get_position())
+        stem = arrow.xy - tail
+        np.testing.assert_allclose(stem / np.linalg.norm(stem), way, atol=1e-9)
+
+
+def test_every_answer_outside_of_the_plan_is_counted():
+    far = [answer(f"far{i}", 0.5 + 0.01 * i, 30.0 + 5.0 * i, 1.0) for i in range(3)]
+    moon = elsewhere("moon", accepted=True)
+    assert isinstance(moon.result, Localization)
+    away = replace(moon, result=replace(moon.result, world_from_cam=_moved(1.0, (12.0, 5.0, 0.0))))
+    plan = draw_map([*GOOD, *far, moon, away], two_nodes())
+    texts = re.findall(r"<!-- (.*?) -->", plan)
+    assert "3 answers, 30 m to 40 m" in texts
+    assert "13 m" in texts, "from the nearest node, because the image has no true position"
+    assert any(text.startswith("4 positions are outside of the figure.") for text in texts)
 
 
 @pytest.mark.parametrize("x", [0.0, 100.0])

@@ -1,9 +1,11 @@
 """The page at `/`, in a real browser, of a service in a process of its own: a picture of the demo's
-world is dropped, pasted, chosen."""
+world is dropped, pasted, chosen, and its answer is listed, saved and linked."""
 
 from __future__ import annotations
 
 import base64
+import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 from running_service import TOKEN, Running, running
 
 from in_browser import CONTRASTS, UNNAMED, WIDTHS, chromium, opened
+from topoloc.apps.cli import main
 from topoloc.demo.recordings import SHIPPED, find_missing_recordings
 from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.map_facts.map_building import build_map
@@ -23,6 +26,7 @@ from topoloc.recordings.open import open_sequence
 pytestmark = pytest.mark.skipif(
     bool(find_missing_recordings(SHIPPED)), reason="the demo's recordings are not in this checkout"
 )
+NOTHING = SHIPPED / "pictures_of_nothing" / "black.png"
 ANSWERED = "#answer h2.good, #answer h2.bad"
 # As if a picture were dropped on the page, or pasted.
 BROUGHT = """([how, name, base64]) => {
@@ -37,9 +41,11 @@ BROUGHT = """([how, name, base64]) => {
 
 @dataclass(frozen=True)
 class Lab:
-    """A service of a map of the demo's first frames, and a picture taken there on another lap."""
+    """A service of a map of the demo's first frames and of its copy `room`, and a picture taken
+    there on another lap."""
 
     service: Running
+    map: Path
     picture: Path
     camera: str
     true: Rigid3
@@ -57,14 +63,14 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     build_map(open_sequence(f"{SHIPPED / 'map_lap1'}@4:10"), BuildConfig(other_kinds=())).save(
         folder / "lab.topo"
     )
-    (folder / "token").write_text(TOKEN)
+    shutil.copy(folder / "lab.topo", folder / "room.topo")
     day = open_sequence(SHIPPED / "day")
     camera, pose = day[4].camera, day.poses[4]
     assert camera is not None
     assert pose is not None
     numbers = f"{camera.fx}, {camera.fy}, {camera.cx}, {camera.cy}"
     with running(folder, "--workers", 1) as service:
-        yield Lab(service, SHIPPED / "day" / day.names[4], numbers, pose)
+        yield Lab(service, folder / "lab.topo", SHIPPED / "day" / day.names[4], numbers, pose)
 
 
 def _bring(page: Any, lab: Lab, how: str) -> None:
@@ -120,13 +126,116 @@ def test_it_can_be_read_and_named(browser: Any, lab: Lab, width: int, dark: bool
 def test_a_picture_of_nothing_is_refused_with_advice(browser: Any, lab: Lab):
     with opened(browser, f"{lab.service.url}/", 1300) as page:
         page.wait_for_selector("#scene canvas")
-        nothing = next((SHIPPED / "pictures_of_nothing").rglob("*.jpg"), None) or next(
-            (SHIPPED / "pictures_of_nothing").rglob("*.png")
-        )
-        page.set_input_files("#file", nothing)
+        page.set_input_files("#file", NOTHING)
         page.wait_for_selector("#answer h2.bad", timeout=60_000)
         assert page.inner_text("#answer h2").startswith("Not localized.")
         page.wait_for_selector("#why li", timeout=60_000)
+
+
+def test_a_map_that_is_not_there_is_named_beside_those_that_are(browser: Any, lab: Lab):
+    with opened(browser, f"{lab.service.url}/?map=wrong", 400) as page:
+        page.wait_for_selector("#answer h2.bad")
+        assert page.inner_text("#answer") == 'No map "wrong". Maps here: lab, room'
+        assert page.locator("#scene canvas").count() == 0
+        page.locator("#answer").get_by_role("link", name="room").click()
+        page.wait_for_selector("#scene canvas")
+        assert page.url == f"{lab.service.url}/?map=room"
+        assert page.locator("#map").input_value() == "room"
+        assert page.inner_text("[data-part=details] h3") == "room"
+
+
+def test_the_selector_sets_the_map_in_the_address(browser: Any, lab: Lab):
+    with opened(browser, f"{lab.service.url}/", 1300) as page:
+        page.locator("[data-part=details]").get_by_text("lab", exact=True).wait_for()
+        page.locator("#map").select_option("room")
+        page.locator("[data-part=details]").get_by_text("room", exact=True).wait_for()
+        assert page.url == f"{lab.service.url}/?map=room"
+        page.go_back()
+        page.locator("[data-part=details]").get_by_text("lab", exact=True).wait_for()
+        assert page.locator("#map").input_value() == "lab"
+        for name in ["room", "lab"] * 9:  # Chromium warns of more than 16 WebGL contexts
+            page.locator("#map").select_option(name)
+            page.locator("[data-part=details]").get_by_text(name, exact=True).wait_for()
+
+
+def test_answers_stay_in_a_list_that_can_be_saved(
+    browser: Any, lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    with opened(browser, f"{lab.service.url}/", 1300) as page:
+        _bring(page, lab, "choose")
+        page.wait_for_selector("#matches:not([hidden])", timeout=60_000)
+        page.set_input_files("#file", NOTHING)
+        page.wait_for_selector("#why li", timeout=60_000)
+        rows = page.locator("#answers li")
+        last, first = rows.all_inner_texts()
+        assert last.split("\n") == ["black.png", "too few matches"]
+        assert first.startswith(f"{lab.picture.name}\nlocalized, p ")
+        assert "σ " in first
+        rows.last.get_by_role("button").click()
+        assert np.linalg.norm(_frustum(page) - lab.true.translation) < 0.01
+        assert page.inner_text("#answer h2").startswith("Here, at")
+        page.wait_for_selector("#matches:not([hidden])")
+        assert page.locator("#why").is_hidden()
+        saved = [tmp_path / "saved.jsonl", tmp_path / "saved.tum"]
+        for path, button in zip(saved, ("Save JSON", "Save TUM"), strict=True):
+            with page.expect_download() as download:
+                page.get_by_role("button", name=button).click()
+            download.value.save_as(path)
+        page.set_viewport_size({"width": 400, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400
+        assert page.evaluate(UNNAMED) == []
+        assert page.evaluate(CONTRASTS)[0][0] >= 4.5
+        page.locator("#map").select_option("room")
+        assert page.locator("#answers").is_hidden(), "these answers are of the other map"
+    lines = [json.loads(line) for line in saved[0].read_text().splitlines()]
+    assert [line["query"] for line in lines] == [lab.picture.name, "black.png"]
+    poses = [line for line in saved[1].read_text().splitlines() if not line.startswith("#")]
+    assert len(poses) == 1
+    np.testing.assert_allclose(
+        [float(number) for number in poses[0].split()[1:4]],
+        lines[0]["world_from_cam"]["translation"],
+    )
+    out = str(tmp_path / "lab.html")
+    assert main(["view", str(lab.map), *map(str, saved), "--out", out]) == 0
+    output = capsys.readouterr()
+    assert "2 answers" in output.out
+    assert output.err == ""
+
+
+def test_a_link_draws_its_answer_again(browser: Any, lab: Lab):
+    with opened(browser, f"{lab.service.url}/", 1300) as page:
+        page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+        _bring(page, lab, "choose")
+        page.get_by_role("button", name="Copy link").click()
+        page.get_by_role("button", name="Link copied").wait_for()
+        link, drawn = page.evaluate("navigator.clipboard.readText()"), _frustum(page)
+    with opened(browser, link, 400) as page:
+        page.get_by_role("heading", name=f"Linked answer: {lab.picture.name}").wait_for()
+        np.testing.assert_allclose(_frustum(page), drawn, atol=1e-6)
+        said = page.inner_text("#answer")
+        assert "The link holds this pose." in said
+        assert "another map" not in said
+        page.goto(link.replace("of=", "of=0"))
+        page.get_by_text("The link is of another map").wait_for()
+        page.set_input_files("#file", NOTHING)
+        page.wait_for_selector("#answer h2.bad", timeout=60_000)
+        assert "#" not in page.url, "what is shown is no longer what the link holds"
+        page.goto(link.replace("pose=", "pose=x"))
+        page.get_by_text('The link is damaged: "pose" needs 7 numbers.').wait_for()
+
+
+def test_without_webgl_the_answer_is_in_words(browser: Any, lab: Lab):
+    page = browser.new_page()
+    page.add_init_script("""const first = HTMLCanvasElement.prototype.getContext;
+        HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+          return kind === "2d" ? first.call(this, kind, ...rest) : null; };""")
+    page.goto(lab.service.url)
+    page.get_by_text("This browser shows no 3-D").wait_for()
+    _bring(page, lab, "choose")
+    assert page.inner_text("#answer h2").startswith("Here, at")
+    page.wait_for_timeout(500)  # an error would follow at once
+    assert page.inner_text("#answer h2").startswith("Here, at")
+    page.close()
 
 
 def test_it_is_worked_by_keyboard(browser: Any, lab: Lab):

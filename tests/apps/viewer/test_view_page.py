@@ -153,6 +153,85 @@ def test_it_is_worked_by_keyboard(browser: Any, shown: Shown):
         assert page.evaluate("document.activeElement.tagName") != "BODY"
 
 
+def test_the_bar_and_the_axes_are_those_of_the_view(browser: Any, shown: Shown):
+    with opened(browser, shown.page.as_uri(), 1300) as page:
+        page.evaluate(f"{VIEWER}.stage.turn(0.4, 0.1)")
+        lengths = set[str]()
+        for _ in range(3):
+            page.evaluate(f"{VIEWER}.stage.zoom(0.5)")
+            page.wait_for_timeout(300)
+            bar = page.locator("[data-part=scale]")
+            value, unit = bar.inner_text().split()
+            lengths.add(f"{value} {unit}")
+            metres = float(value) * {"m": 1.0, "cm": 0.01}[unit]
+            box = bar.bounding_box()
+            assert box is not None
+            start, *ends, aside = page.evaluate(f"""() => {{
+                const {{ stage }} = {VIEWER}, middle = stage.controls.target, moved = (way) => stage.seen(middle.clone().add(way));
+                const [x, y, z] = [0, 1, 2].map((k) => middle.clone().set(...[0, 1, 2].map((i) => (i === k ? 1e-3 : 0))));
+                const right = middle.clone().setFromMatrixColumn(stage.camera.matrixWorld, 0).multiplyScalar({metres});
+                return [stage.seen(middle), moved(x), moved(y), moved(z), moved(right)]; }}""")  # noqa: E501
+            assert box["width"] == pytest.approx(aside[0] - start[0], abs=1.5)
+            for label, end in zip("xyz", ends, strict=True):
+                arm = page.locator("[data-part=axes] g", has_text=label).locator("line")
+                drawn = [float(arm.get_attribute(name) or "0") for name in ("x2", "y2")]
+                way = np.subtract(end, start)
+                np.testing.assert_allclose(drawn, 24 * way / _pixels(page, 1e-3), atol=0.3)
+        assert len(lengths) == 3, "it goes with the zoom"
+
+
+def _pixels(page: Any, metres: float) -> float:
+    return metres / page.evaluate(f"{VIEWER}.stage.metresPerPixel()")
+
+
+def test_two_clicks_measure_a_distance(browser: Any, shown: Shown):
+    with opened(browser, shown.page.as_uri(), 1300) as page:
+        said = page.locator("[data-part=measured]")
+        assert said.is_hidden()
+        page.get_by_role("button", name="Measure").click()
+        nodes = page.evaluate(
+            f"{VIEWER}.document.nodes.map((one) => one.world_from_cam.translation)"
+        )
+        ends = [nodes[0], nodes[-1]]
+        for end in ends:
+            page.mouse.click(*page.evaluate(f"(end) => {VIEWER}.stage.seen(end)", end))
+        distance = np.linalg.norm(np.subtract(*ends))
+        assert said.inner_text().startswith(f"{distance:.3f} m (x ")
+        assert page.evaluate(f"{VIEWER}.measure.drawn.children.length") == 1
+        page.mouse.click(5, 790)
+        assert said.inner_text() == "There is no point of the map. Click on one."
+        page.locator("canvas").press("Escape")
+        assert said.is_hidden()
+        assert page.evaluate(f"{VIEWER}.measure.drawn.children.length") == 0
+
+
+def test_a_point_in_front_is_measured(browser: Any, shown: Shown):
+    """Of the points about a click the one that is seen, not one of a wall behind it."""
+    with opened(browser, shown.page.as_uri(), 1300) as page:
+        page.get_by_role("button", name="Measure").click()
+        points, seen, depths, nodes = page.evaluate(f"""() => {{
+            const viewer = {VIEWER}, {{ stage }} = viewer, flat = [...viewer.cloud.geometry.attributes.position.array];
+            const points = flat.flatMap((_, i) => (i % 3 ? [] : [flat.slice(i, i + 3)]));
+            const depth = (point) => -stage.controls.target.clone().set(...point).applyMatrix4(stage.camera.matrixWorldInverse).z;
+            return [points, points.map((point) => stage.seen(point)), points.map(depth), viewer.places.map(({{ centre }}) => stage.seen(centre))]; }}""")  # noqa: E501
+        points, seen, depths = np.array(points), np.array(seen), np.array(depths)
+        away = np.linalg.norm(seen[:, None] - np.array(nodes), axis=2).min(axis=1)
+        inside = (away > 30) & (seen > [20, 120]).all(axis=1) & (seen < [900, 690]).all(axis=1)
+        tried = 0
+        for row in np.flatnonzero(inside)[::97]:
+            near = np.flatnonzero(np.linalg.norm(seen - seen[row], axis=1) < 5.9)
+            front = near[np.argmin(depths[near])]
+            at_edge = np.linalg.norm(seen - seen[row], axis=1)
+            if len(near) < 2 or ((at_edge > 5.9) & (at_edge < 6.9)).any():
+                continue
+            found = page.evaluate(
+                "([x, y]) => " + f"{VIEWER}.measure.nearest(x, y)", seen[row].tolist()
+            )
+            np.testing.assert_allclose(found, points[front], atol=1e-6)
+            tried += 1
+        assert tried >= 3
+
+
 def test_a_layer_goes_and_comes(browser: Any, shown: Shown):
     with opened(browser, shown.page.as_uri(), 1300) as page:
         before = page.locator("canvas").screenshot()

@@ -8,7 +8,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -24,6 +24,7 @@ from topoloc.apps.report.page_template import (
     recording_colours,
     svg_text,
 )
+from topoloc.plugin import format_length
 
 # Height over width of the map.
 MIN_ASPECT, MAX_ASPECT = 0.3, 0.8
@@ -41,17 +42,25 @@ class MapFigure:
         nodes: world_from_cam of the nodes.
         others: further poses that must be visible.
         extra_height: height of the figure beside the map, inches.
+        answers: poses that are visible up to one extent of the others away from them.
     """
 
     def __init__(
-        self, nodes: Sequence[Rigid3], others: Sequence[Rigid3], extra_height: float
+        self,
+        nodes: Sequence[Rigid3],
+        others: Sequence[Rigid3],
+        extra_height: float,
+        answers: Sequence[Rigid3] = (),
     ) -> None:
         self.nodes = nodes
         known = np.array([pose.translation for pose in [*nodes, *others]])
         downs = np.array([pose.rotation[:, 1] for pose in nodes])
         across, up, self._is_mirrored = find_horizontal_axes(known, downs)
         self.axes_idx = [across, up]
-        self.low, self.high = compute_plot_limits(known[:, self.axes_idx])
+        places, found = known[:, self.axes_idx], self.flatten(answers)
+        reach = max(float(np.ptp(places, axis=0).max()), 0.1)
+        near = _are_within(found, places.min(axis=0) - reach, places.max(axis=0) + reach)
+        self.low, self.high = compute_plot_limits(np.concatenate([places, found[near]]))
         self._extra_height = extra_height
         self._stack = ExitStack()
 
@@ -70,17 +79,37 @@ class MapFigure:
         """Return the positions in the axes of the figure."""
         return np.array([pose.translation[self.axes_idx] for pose in poses]).reshape(-1, 2)
 
-    def contains(self, pose: Rigid3) -> bool:
-        """Return whether a position lies within the figure."""
-        (place,) = self.flatten([pose])
-        return bool(np.all(place >= self.low) and np.all(place <= self.high))
-
     def plot(self, poses: Sequence[Rigid3], **style: Any) -> None:
-        """Draw the positions, at the edge if they are outside. Many marks become one image inside
-        the SVG."""
-        if poses:
-            style = {"rasterized": len(poses) > MAX_MARKS} | style
-            self.axes.plot(*np.clip(self.flatten(poses), self.low, self.high).T, **style)
+        """Draw the positions that are within the figure. Many marks become one image inside the
+        SVG."""
+        places = self.flatten(poses)
+        places = places[_are_within(places, self.low, self.high)]
+        if len(places):
+            style = {"rasterized": len(places) > MAX_MARKS} | style
+            self.axes.plot(*places.T, **style)
+
+    def draw_arrows(self, starts: Sequence[Rigid3], ends: Sequence[Rigid3]) -> int:
+        """Draw an arrow at the edge to each end that is outside of the figure, with its distance
+        from its start, which is inside. Neighbouring arrows become one. Return the number of ends
+        outside."""
+        arrows, arm = list[tuple[Any, Any, list[float]]](), 0.08 * (self.high - self.low).max()
+        for start, end in zip(starts, ends, strict=True):
+            origin, place = self.flatten([start, end])
+            if _are_within(place[None], self.low, self.high)[0]:
+                continue
+            way = place - origin
+            room = np.where(way > 0, self.high, self.low) - origin
+            tip = origin + way * np.divide(room, way, out=np.full(2, np.inf), where=way != 0).min()
+            near = (metres for other, _, metres in arrows if np.hypot(*(other - tip)) < arm)
+            if (merged := next(near, None)) is None:
+                arrows.append((tip, tip - arm * way / np.hypot(*way), merged := []))
+            merged.append(float(np.linalg.norm(end.translation - start.translation)))
+        style: dict[str, Any] = {"arrowstyle": "-|>", "color": BAD}
+        box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none"}
+        middle = {"ha": "center", "va": "center", "zorder": 6, "bbox": box, "color": BAD}
+        for tip, tail, metres in arrows:
+            self.axes.annotate(_describe_arrow(metres), tip, tail, arrowprops=style, **middle)
+        return sum(len(metres) for _, _, metres in arrows)
 
     def draw_lines(self, lines: Sequence[Any], **style: Any) -> None:
         """Draw pairs of points as lines."""
@@ -120,7 +149,8 @@ def draw_map(answers: Sequence[EvaluatedQuery], topomap: TopoMetricMap) -> str:
     nodes = [summary.world_from_cam for summary in topomap.summaries]
     groups = Evaluation(with_truth).by_recording
     colours = recording_colours(list(groups))
-    with MapFigure(nodes, _truths(with_truth), 0.9 + 0.2 * (len(groups) // 2)) as figure:
+    height, estimates = 0.9 + 0.2 * (len(groups) // 2), _estimates(answers)
+    with MapFigure(nodes, _truths(with_truth), height, estimates) as figure:
         figure.draw_nodes(topomap)
         figure.plot(nodes, linestyle="", marker="o", color=NODE, markersize=5)
         for name, group in groups.items():
@@ -132,11 +162,13 @@ def draw_map(answers: Sequence[EvaluatedQuery], topomap: TopoMetricMap) -> str:
         ]
         figure.draw_lines(pairs, colors=ERROR, linewidths=1.2, zorder=3)
         false = _estimates([a for a in answers if a.is_false_accept])
-        figure.plot(false, zorder=5, clip_on=False, **_FALSE)
-        if num_outside := sum(not figure.contains(pose) for pose in false):
+        figure.plot(false, zorder=5, **_FALSE)
+        found = [a for a in answers if isinstance(a.result, Localization)]
+        starts = [a.world_from_cam or _find_nearest(nodes, a) for a in found]
+        if num_outside := figure.draw_arrows(starts, estimates):
             what = "positions are" if num_outside > 1 else "position is"
-            text = f"{num_outside} false {what} outside of the figure, marked at its edge"
-            figure.axes.set_title(text, color=BAD)
+            text = f"{num_outside} {what} outside of the figure. Arrows name the distance from the"
+            figure.axes.set_title(f"{text} truth, or from the nearest node without one.", color=BAD)
         return figure.to_svg("map from above", _create_legend(answers, colours), 5)
 
 
@@ -165,6 +197,25 @@ def compute_plot_limits(
     size = high - low + 0.12 * max(float((high - low).max()), 0.1)
     size = np.maximum(size, [size[1] / MAX_ASPECT, size[0] * MIN_ASPECT])
     return (low + high - size) / 2, (low + high + size) / 2
+
+
+def _are_within(
+    places: Float[np.ndarray, "n 2"], low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
+) -> Bool[np.ndarray, " n"]:
+    return np.all((places >= low) & (places <= high), axis=1)
+
+
+def _describe_arrow(metres: Sequence[float]) -> str:
+    """Return the text of an arrow to ends at these distances."""
+    ends = [format_length(one, 0 if one >= 10.0 else 1) for one in (min(metres), max(metres))]
+    several = f"{len(metres)} answers, " if len(metres) > 1 else ""
+    return several + " to ".join(dict.fromkeys(ends))
+
+
+def _find_nearest(nodes: Sequence[Rigid3], answer: EvaluatedQuery) -> Rigid3:
+    """Return the node that is nearest to the estimated position."""
+    (estimate,) = _estimates([answer])
+    return min(nodes, key=lambda node: np.linalg.norm(node.translation - estimate.translation))
 
 
 def _truths(answers: Sequence[EvaluatedQuery]) -> list[Rigid3]:

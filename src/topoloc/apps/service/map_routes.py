@@ -35,7 +35,8 @@ MapName = Annotated[
 ]
 UrlParameters = Annotated[QueryParameters, Query()]
 _PAGE_MODULES = MODULES | {
-    f"topoloc/page/{name}": f"page/{name}.js" for name in ("page", "asking", "live", "matches")
+    f"topoloc/page/{name}": f"page/{name}.js"
+    for name in ("page", "answers", "asking", "live", "matches")
 }
 _TYPES = {
     ".js": "text/javascript",

@@ -27,7 +27,9 @@ from topoloc.plugin import write_bytes, write_text
 MODULES = {
     "three": "three.js",
     "topoloc/geometry": "geometry.js",
+    "topoloc/measure": "measure.js",
     "topoloc/objects": "objects.js",
+    "topoloc/overlay": "overlay.js",
     "topoloc/stage": "stage.js",
     "topoloc/apps/viewer": "viewer.js",
     "topoloc/words": "words.js",

@@ -9,6 +9,9 @@ import { isLocalized } from "topoloc/words";
 const SET_COLOURS = ["#12a594", "#7c6ff0", "#d9822b", "#3f8fe0", "#94ad12", "#c95fc2"];
 export const COLOURS = { node: "#5f86bd", path: "#5f86bd", alternative: "#f0a202", bad: "#e5484d", error: "#f0a202", selected: "#ff3d81" };
 
+/** Colours of the axes x, y and z. */
+export const AXIS_COLOURS = ["#d6404a", "#2f9e44", "#2f7fe0"];
+
 /** The colour of the n-th set of results. */
 export const setColour = (n) => SET_COLOURS[n % SET_COLOURS.length];
 
@@ -53,6 +56,23 @@ export function linesOf(lines, colour, opacity = 1) {
 export function segmentsOf(segments, colour) {
   const geometry = new BufferGeometry().setAttribute("position", new Float32BufferAttribute(segments.flat(2), 3));
   return new LineSegments(geometry, new LineBasicMaterial({ color: colour }));
+}
+
+/** The axes of the world from its origin. */
+export function axesOf(length) {
+  const group = new Group();
+  AXIS_COLOURS.forEach((colour, k) => group.add(segmentsOf([[[0, 0, 0], [0, 1, 2].map((i) => (i === k ? length : 0))]], colour)));
+  return group;
+}
+
+/** One or two points and the line between them, in front of all else. */
+export function ruleOf(ends) {
+  const geometry = new BufferGeometry().setAttribute("position", new Float32BufferAttribute(ends.flat(), 3));
+  const settings = { color: COLOURS.selected, depthTest: false };
+  const marks = new Points(geometry, new PointsMaterial({ ...settings, size: 9, sizeAttenuation: false }));
+  const group = new Group().add(marks, new Line(geometry, new LineBasicMaterial(settings)));
+  group.children.forEach((one) => (one.renderOrder = 1));
+  return group;
 }
 
 /** A picture (address or canvas) where the camera's frustum ends, `depth` metres before it. `drawn` is called when it is there. */

@@ -1,5 +1,5 @@
 // A canvas in which a scene is drawn when it changes, and turned by mouse, fingers and keys.
-import { Color, OrbitControls, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
+import { Color, Matrix4, OrbitControls, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
 
 const STEP = 0.12; // radians a key press
 const FOV_DEG = 50;
@@ -95,7 +95,14 @@ export class Stage {
       this.asked = undefined;
       this.scene.background = new Color(getComputedStyle(this.canvas).getPropertyValue("--scene-ground").trim() || "#11161d");
       this.renderer.render(this.scene, this.camera);
+      this.onDraw?.();
     });
+  }
+
+  /** Metres that one pixel spans at the point that the eye turns about. */
+  metresPerPixel() {
+    const distance = this.camera.position.distanceTo(this.controls.target);
+    return (2 * distance * Math.tan(((FOV_DEG / 2) * Math.PI) / 180)) / Math.max(this.canvas.clientHeight, 1);
   }
 
   /** Where a point of the world is on the canvas, pixels; null behind the eye. */
@@ -103,6 +110,22 @@ export class Stage {
     const place = new Vector3(...point).project(this.camera);
     if (place.z > 1 || place.z < -1) return null;
     return [((place.x + 1) / 2) * this.canvas.clientWidth, ((1 - place.y) / 2) * this.canvas.clientHeight];
+  }
+
+  /** Of positions [x, y, z, x, ...] within `radius` pixels of (x, y), the one that is nearest to the eye; null without one. */
+  frontPoint(positions, x, y, radius) {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const e = new Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse).elements;
+    let [best, nearest] = [null, Infinity];
+    for (let i = 0; i < positions.length; i += 3) {
+      const [a, b, c] = [positions[i], positions[i + 1], positions[i + 2]];
+      const depth = e[3] * a + e[7] * b + e[11] * c + e[15];
+      if (depth < this.camera.near || depth >= nearest) continue;
+      const aside = (((e[0] * a + e[4] * b + e[8] * c + e[12]) / depth + 1) / 2) * width - x;
+      const below = ((1 - (e[1] * a + e[5] * b + e[9] * c + e[13]) / depth) / 2) * height - y;
+      if (aside * aside + below * below <= radius * radius) [best, nearest] = [[a, b, c], depth];
+    }
+    return best;
   }
 
   listenForClicks(onPick) {

@@ -1,7 +1,9 @@
 // The viewer: a scene document in an element of a page, with its layers, its list of pictures, and what is known of the one that is chosen.
 import { Group } from "three";
 import { matrixOf } from "topoloc/geometry";
+import { Measure } from "topoloc/measure";
 import * as objects from "topoloc/objects";
+import { showScale } from "topoloc/overlay";
 import { Stage } from "topoloc/stage";
 import { isLocalized, pointText, sentences, verdict } from "topoloc/words";
 
@@ -29,6 +31,10 @@ export class Viewer {
     this.stage.scene.add(this.chosen, this.live);
     this.addMap();
     document_.results.forEach((set, n) => this.addResults(set, objects.setColour(n)));
+    this.layer("axes", objects.axesOf(0.1 * this.stage.size()), "axes at the origin");
+    const [button, said] = [this.part("measure"), this.part("measured")];
+    this.measure = new Measure(this.stage, { cloud: this.cloud, places: this.places, button, said });
+    showScale(this.stage, this.part("scale"), this.part("axes"));
     this.fillList();
     this.listen();
     this.tellSummary();
@@ -37,7 +43,8 @@ export class Viewer {
 
   addMap() {
     const { points, nodes, paths, map } = this.document;
-    this.layer("points", objects.cloudOf(points, 2), `${map.num_points_shown.toLocaleString("en")} points`);
+    this.cloud = objects.cloudOf(points, 2);
+    this.layer("points", this.cloud, `${map.num_points_shown.toLocaleString("en")} points`);
     const cameras = nodes.map((node) => ({ matrix: matrixOf(node.world_from_cam), camera: node.camera }));
     const frustums = objects.frustumsOf(cameras, this.depth, objects.COLOURS.node, { opacity: 0.6 });
     this.layer("nodes", frustums, `${nodes.length} nodes`, objects.COLOURS.node);
@@ -167,6 +174,7 @@ export class Viewer {
     this.part("further").addEventListener("click", () => this.stage.zoom(1 / 0.75));
     this.part("canvas").addEventListener("keydown", (event) => {
       if (event.key === "n" || event.key === "p") this.step(event.key === "n" ? 1 : -1);
+      if (event.key === "Escape") this.measure.toggle(false);
     });
   }
 
@@ -198,6 +206,7 @@ export class Viewer {
   }
 
   pick(x, y) {
+    if (this.measure.isOn) return this.measure.click(x, y);
     const near = this.places.map((place) => ({ place, seen: place.centre && this.stage.seen(place.centre) })).filter(({ seen }) => seen);
     const ranked = near.map(({ place, seen }) => ({ place, px: Math.hypot(seen[0] - x, seen[1] - y) })).filter(({ px }) => px < PICK_PX);
     ranked.sort((a, b) => a.px - b.px);
@@ -255,7 +264,11 @@ const SHELL = `
     <button type="button" data-part="above" title="Seen from above">Above</button>
     <button type="button" data-part="nearer" title="Nearer (+)" aria-label="Nearer">+</button>
     <button type="button" data-part="further" title="Further (-)" aria-label="Further">&minus;</button>
+    <button type="button" data-part="measure" aria-pressed="false" title="Distance of two points (Escape ends)">Measure</button>
   </div>
+  <p class="measured" data-part="measured" role="status" hidden></p>
+  <div class="scale" data-part="scale" title="Length in the middle of the view"></div>
+  <svg class="axes" data-part="axes" viewBox="-40 -40 80 80" role="img" aria-label="Directions of the axes x, y and z"></svg>
 </div>
 <div class="side">
   <div class="chooser">

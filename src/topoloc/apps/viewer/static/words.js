@@ -24,6 +24,12 @@ export function lengthText(metres) {
   return `${(1000 * metres).toFixed(1)} mm`;
 }
 
+/** The text of a length that is a round number. */
+export function roundLengthText(metres) {
+  const [unit, size] = [["km", 1000], ["m", 1], ["cm", 0.01]].find(([, one]) => metres >= 0.999 * one) ?? ["mm", 0.001];
+  return `${Number((metres / size).toPrecision(2))} ${unit}`;
+}
+
 export const pointText = (p) => `(${p.map((value) => value.toFixed(2)).join(", ")}) m`;
 
 /** Whether a result has a pose of its own. */
@@ -44,7 +50,7 @@ export function sentences(result) {
   if (isLocalized(result)) {
     const sigmas = `${lengthText(result.position_sigma_m)} and ${result.rotation_sigma_deg.toFixed(2)}°`;
     said.push(`Standard deviation ${sigmas}, probability ${result.probability.toFixed(2)}.`);
-    said.push(`${result.num_inliers} of ${result.num_matches} matches agree, most with node ${result.node}.`);
+    if (result.num_matches) said.push(`${result.num_inliers} of ${result.num_matches} matches agree, most with node ${result.node}.`);
     if (result.focal_length_px) said.push(`Estimated focal length: ${result.focal_length_px.toFixed(0)} pixels.`);
     if (result.calibration_doubt) said.push("The image contradicts its calibration, so the uncertainty is larger.");
     const earth = result.geopose?.position;

@@ -1,4 +1,5 @@
 // The page at `/`: a picture goes in, and where it was taken comes out, in words and in the scene.
+import { AnswerList, linkTo, linkedAnswer } from "topoloc/page/answers";
 import { askAbout, mapNames, sceneOf, setToken } from "topoloc/page/asking";
 import { Live } from "topoloc/page/live";
 import { drawMatches } from "topoloc/page/matches";
@@ -6,43 +7,76 @@ import { Viewer, pictureAddress } from "topoloc/apps/viewer";
 import { isLocalized, sentences, verdict } from "topoloc/words";
 
 const part = (id) => document.getElementById(id);
-const state = { map: "", viewer: null, asked: null, picture: null, live: null };
+const state = { names: [], map: "", mapId: "", viewer: null, asked: null, shown: null };
+const answers = new AnswerList(part("answers"), showEntry);
+const MAX_NAMED = 20;
 
 async function start() {
-  let names;
   try {
-    names = await mapNames();
+    state.names = await mapNames();
   } catch (error) {
     part("token-field").hidden = error.status !== 401;
     if (error.status === 401 && !part("token").value) return part("token").focus();
     return tellFailure(error);
   }
   part("token-field").hidden = true;
-  part("map").replaceChildren(...names.map((name) => new Option(name, name)));
-  part("map-field").hidden = names.length < 2;
-  const wanted = new URLSearchParams(location.search).get("map");
-  if (names.includes(wanted)) part("map").value = wanted;
+  part("map").replaceChildren(...state.names.map((name) => new Option(name, name)));
+  part("map-field").hidden = state.names.length < 2;
   await openMap();
 }
 
+/** The map that the address names, else the first one. */
+const wantedMap = () => new URLSearchParams(location.search).get("map") ?? state.names[0];
+
+const addressOfMap = (name) => `${location.pathname}?map=${encodeURIComponent(name)}`;
+
 async function openMap() {
-  state.map = part("map").value;
-  part("answer").replaceChildren();
+  const wanted = wantedMap();
   forgetPicture();
-  document.title = `topoloc: ${state.map}`;
+  part("answer").replaceChildren();
+  state.viewer?.stage.renderer.forceContextLoss(); // a browser lends a page few of them
+  [state.viewer, state.asked] = [null, null];
+  state.map = state.names.includes(wanted) ? wanted : "";
+  part("map").value = state.map;
+  answers.show(state.map);
+  document.title = `topoloc: ${state.map || "no map"}`;
+  if (!state.map) {
+    hint("No map is open.");
+    return tellUnknownMap(wanted);
+  }
+  hint("Loading the map ...");
   try {
     const scene = await sceneOf(state.map);
-    if (scene.name === state.map) state.viewer = new Viewer(part("scene"), scene);
+    if (scene.name !== state.map) return;
+    const viewer = new Viewer(part("scene"), scene);
+    [state.mapId, state.viewer] = [scene.map.id, viewer.stage ? viewer : null];
+    if (state.shown) state.viewer?.showLive(state.shown.result, drawnAs(state.shown));
+    else if (!state.asked) showLinked();
   } catch (error) {
+    if (state.map !== wanted) return;
+    hint("The map is not shown.");
     tellFailure(error);
   }
+}
+
+function hint(text) {
+  part("scene").className = "";
+  part("scene").replaceChildren(Object.assign(document.createElement("p"), { className: "hint", textContent: text }));
+}
+
+function tellUnknownMap(wanted) {
+  const names = state.names.slice(0, MAX_NAMED);
+  const links = names.flatMap((name) => [", ", Object.assign(document.createElement("a"), { href: addressOfMap(name), textContent: name })]);
+  const more = state.names.length > names.length ? ` and ${state.names.length - names.length} more` : "";
+  tell(names.length ? `No map "${wanted}". Maps here: ` : "This service has no maps.", [], "bad");
+  part("answer").firstChild.append(...links.slice(1), more);
 }
 
 /** What was said of the picture before. */
 function forgetPicture() {
   state.asked?.abort();
-  if (state.picture) URL.revokeObjectURL(state.picture);
-  state.picture = null;
+  state.shown = null;
+  answers.mark(null);
   part("matches").hidden = part("why").hidden = true;
 }
 
@@ -55,15 +89,18 @@ async function ask(file) {
   if (!state.map) return;
   forgetPicture();
   const { signal } = (state.asked = new AbortController());
-  const picture = (state.picture = URL.createObjectURL(file));
+  const { map } = state;
   part("answer").setAttribute("aria-live", "polite");
   tell("Localizing ...", []);
   part("answer").setAttribute("aria-busy", "true");
   try {
-    const result = await askAbout(state.map, "localize", file, camera(), signal);
-    tellResult(result);
-    state.viewer?.showLive(result, { title: file.name ?? "picture", picture, quiet: true });
-    await explain(file, picture, signal);
+    const result = await askAbout(map, "localize", file, camera(), signal);
+    const entry = { map, name: file.name || "image", picture: URL.createObjectURL(file), result };
+    answers.add(entry);
+    showEntry(entry);
+    // Where the service is too busy for it, nothing is explained.
+    entry.explained = await askAbout(map, "explain", file, camera(), signal).catch(() => null);
+    if (state.shown === entry) await showExplained(entry);
   } catch (error) {
     if (error.name !== "AbortError" && !signal.aborted) tellFailure(error);
   } finally {
@@ -71,24 +108,69 @@ async function ask(file) {
   }
 }
 
-/** Matches on both pictures, and what would help; where the service is too busy for it, nothing. */
-async function explain(file, picture, signal) {
-  const explained = await askAbout(state.map, "explain", file, camera(), signal).catch(() => null);
-  if (!explained || signal.aborted) return;
-  const [best] = explained.compared;
+/** How the scene shows an answer; what it says stands beside it. */
+const drawnAs = ({ name, picture = null }) => ({ title: name, picture, quiet: true });
+
+/** Show an answer of the list in words and in the scene. */
+function showEntry(entry) {
+  if (location.hash) history.replaceState(null, "", location.pathname + location.search);
+  part("matches").hidden = part("why").hidden = true;
+  state.shown = entry;
+  tellResult(entry.result);
+  if (isLocalized(entry.result)) offerLink(entry);
+  answers.mark(entry);
+  state.viewer?.showLive(entry.result, drawnAs(entry));
+  if (entry.explained) showExplained(entry);
+}
+
+/** Show the answer that the address holds. */
+function showLinked() {
+  let linked;
+  try {
+    linked = linkedAnswer();
+  } catch (error) {
+    return tellFailure(error);
+  }
+  if (!linked) return;
+  forgetPicture();
+  const { result, name } = linked;
+  const said = [verdict(result), ...sentences(result), "The link holds this pose. The service did not compute it now."];
+  if (result.map !== state.mapId) said.push("The link is of another map of this name, so the pose may be wrong.");
+  tell(`Linked answer: ${name}`, said, "good");
+  state.shown = linked;
+  state.viewer?.showLive(result, drawnAs(linked));
+}
+
+function offerLink(entry) {
+  const button = Object.assign(document.createElement("button"), { type: "button", className: "plain", textContent: "Copy link" });
+  button.addEventListener("click", async () => {
+    history.replaceState(null, "", linkTo(entry));
+    // Over plain HTTP a browser has no clipboard for pages of other machines.
+    const copied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
+    button.textContent = copied ? "Link copied" : "The link is in the address bar";
+  });
+  part("answer").append(button);
+}
+
+/** Matches on both pictures, and what would help. */
+async function showExplained(entry) {
+  const { explained, picture } = entry;
+  const [best] = explained?.compared ?? [];
   const node = best && state.viewer?.document.nodes.find((one) => one.id === best.node);
   if (node) {
     const nodePicture = node.picture && pictureAddress(node);
-    const [canvas, caption] = part("matches").children;
+    const canvas = document.createElement("canvas");
     await drawMatches(canvas, picture, explained.picture_size, nodePicture, best);
+    if (state.shown !== entry) return;
     const became = isLocalized(explained) ? "" : `, which is ${best.verdict}`;
+    const caption = part("matches").querySelector("figcaption");
     caption.textContent = `Left the image, right node ${best.node}: ${best.num_inliers} matches agree on a pose${became}.`;
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", caption.textContent);
-    if (signal.aborted) return;
+    part("matches").replaceChildren(canvas, caption);
     part("matches").hidden = false;
   }
-  if (!explained.advice.length) return;
+  if (!explained?.advice.length) return;
   const items = explained.advice.map((text) => Object.assign(document.createElement("li"), { textContent: text }));
   part("why").querySelector("ul").replaceChildren(...items);
   part("why").hidden = false;
@@ -165,10 +247,18 @@ function listenForWebcam() {
     forgetPicture();
     press("live", live.toggle(state.map, camera()));
   });
-  part("map").addEventListener("change", () => {
+  const change = () => {
     live.stop();
     press("live", false);
     openMap();
+  };
+  part("map").addEventListener("change", () => {
+    history.pushState(null, "", addressOfMap(part("map").value));
+    change();
+  });
+  addEventListener("popstate", () => {
+    if (wantedMap() !== state.map) return change();
+    showLinked();
   });
 }
 
