@@ -50,6 +50,7 @@ _GROUPS = {
     },
     "try and set up": {
         "demo": "map and localize the built-in lab by day, at night and with another camera",
+        "doctor": "print what is installed where, and test that it works",
         "weights": "list, fetch or convert networks of local features",
         "config": "print all other settings as a TOML file",
     },
@@ -75,7 +76,7 @@ EXAMPLES = {
         "undo office.topo",
         "export office.topo office-colmap/ --format colmap",
     ),
-    "try and set up": ("demo --out topoloc-demo", "config build", "weights list"),
+    "try and set up": ("demo --out topoloc-demo", "doctor", "config build"),
 }
 # name -> module with a dataclass `Command` of the arguments and its method `run`; line of the help
 COMMANDS = {
@@ -199,6 +200,10 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
             return 2
     except TopolocError as error:
         _print_error(_with_written_files(str(error), args, written))
+    except ImportError as error:
+        if (error.name or "").startswith("topoloc"):
+            raise
+        _print_error(f"{error}; see `topoloc doctor`")
     except OSError as error:
         if error.errno not in (errno.EMFILE, errno.ENFILE):
             raise
