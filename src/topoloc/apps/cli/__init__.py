@@ -13,6 +13,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterable
+from io import TextIOWrapper
 from os import PathLike
 from typing import Any, TextIO
 
@@ -98,7 +99,9 @@ def main(args: list[str] | None = None) -> int:
     """Run one command. Return the exit status: 0 done, 1 a known failure (one line on stderr), 2
     wrong usage."""
     if sys.stdout is None:  # closed by the caller; a file must not get its number
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # code pages lack letters of file names
     try:
         try:
             return _dispatch(sys.argv[1:] if args is None else args)

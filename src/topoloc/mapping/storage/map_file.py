@@ -39,6 +39,7 @@ from topoloc.mapping.validation import (
     describe_failure,
     sqlite_failures_as_os_errors,
 )
+from topoloc.recordings.file_locks import has_locks
 
 MAX_STEPS = 50_000_000
 """Limit of SQLite's steps in one read. A table of MAX_ROWS rows takes a quarter of them."""
@@ -83,8 +84,13 @@ class MapFile:
             # read-only media.
             address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
             self._database = sqlite3.connect(
-                address, uri=True, check_same_thread=False, isolation_level=None
+                address if has_locks() else ":memory:",
+                uri=True,
+                check_same_thread=False,
+                isolation_level=None,
             )
+            if not has_locks():  # an open file could not be replaced, so it is read to memory
+                self._database.deserialize(path.read_bytes())
             for category, limit in _LIMITS.items():
                 self._database.setlimit(category, limit)
             self._database.set_progress_handler(self._is_too_much, MAX_STEPS // 10)

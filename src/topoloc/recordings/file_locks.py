@@ -1,0 +1,105 @@
+"""Lock, replace and synchronize files, on POSIX systems and on Windows.
+
+Windows has no `flock`. It opens no folder, and it neither replaces nor removes a file that is open.
+So no file is held open there: of two writers at once the last one wins, and the temporary files of
+killed writers stay.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+_WAITS_S = (0.01, 0.03, 0.1, 0.3, 1.0)
+
+
+def has_locks() -> bool:
+    """Return whether the system can lock files, and replace open ones. It does not on Windows."""
+    return fcntl is not None
+
+
+def open_to_lock(path: Path, flags: int = os.O_RDONLY) -> tuple[int, os.stat_result]:
+    """Open a file or a folder. Return its descriptor and its status. Without locks it is closed
+    again, and the descriptor is -1. Raises OSError."""
+    if fcntl is None and path.is_dir():
+        return -1, path.stat()
+    descriptor = os.open(path, flags, 0o666)
+    status = os.fstat(descriptor)
+    if fcntl is None:
+        os.close(descriptor)
+        return -1, status
+    return descriptor, status
+
+
+def close(descriptor: int) -> None:
+    """Close a descriptor of `open_to_lock`, which frees its lock."""
+    if descriptor >= 0:
+        os.close(descriptor)
+
+
+def try_lock(descriptor: int) -> bool | None:
+    """Lock an open file. Return False if another process has the lock, None if locks are not
+    supported."""
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return None
+    return True
+
+
+def lock_new(descriptor: int) -> bool:
+    """Lock a file that this process has created. Return False if another process removed it as
+    stale before it was locked."""
+    if fcntl is None:  # nobody removes stale files
+        return True
+    return try_lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0
+
+
+def wait_for_lock(descriptor: int, on_wait: Callable[[], None] | None = None) -> None:
+    """Lock an open file. Call `on_wait` before waiting for another process. Without locks nothing
+    is done."""
+    if try_lock(descriptor) is False and fcntl is not None:
+        if on_wait is not None:
+            on_wait()
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+
+
+def replace(source: Path, target: Path) -> None:
+    """Rename `source` over `target`. On Windows another program may have `target` open: then this
+    waits for a second or two. Raises OSError."""
+    for wait_s in () if has_locks() else _WAITS_S:
+        try:
+            return os.replace(source, target)
+        except PermissionError:
+            time.sleep(wait_s)
+    try:
+        return os.replace(source, target)
+    except PermissionError as error:
+        if has_locks():
+            raise
+        reason = "another program has it open, or it is read-only; close that program"
+        raise PermissionError(error.errno, reason, str(target)) from None
+
+
+def fsync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    if not has_locks() and path.is_dir():  # Windows synchronizes no folder
+        return
+    descriptor = os.open(path, os.O_RDONLY if has_locks() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    except OSError:  # not supported by this file system, whose rename is still atomic
+        pass
+    finally:
+        os.close(descriptor)
