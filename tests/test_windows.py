@@ -83,7 +83,6 @@ def windows() -> Iterator[None]:
         monkeypatch.setattr(os, "fsync", fsync)
         monkeypatch.setattr(shutil, "_use_fd_functions", False)
         monkeypatch.setattr(file_locks, "fcntl", None)
-        monkeypatch.setattr(file_locks, "_WAITS_S", (0.01, 0.2, 0.4))
         for name in ("pread", "sched_getaffinity"):
             monkeypatch.delattr(os, name)
         monkeypatch.setitem(sys.modules, "resource", None)

@@ -17,8 +17,6 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-_WAITS_S = (0.01, 0.03, 0.1, 0.3, 1.0)
-
 
 def has_locks() -> bool:
     """Return whether the system can lock files, and replace open ones. It does not on Windows."""
@@ -61,9 +59,8 @@ def try_lock(descriptor: int) -> bool | None:
 def lock_new(descriptor: int) -> bool:
     """Lock a file that this process has created. Return False if another process removed it as
     stale before it was locked."""
-    if fcntl is None:  # nobody removes stale files
-        return True
-    return try_lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0
+    is_ours = try_lock(descriptor) is not False
+    return is_ours and (descriptor < 0 or os.fstat(descriptor).st_nlink > 0)
 
 
 def wait_for_lock(descriptor: int, on_wait: Callable[[], None] | None = None) -> None:
@@ -78,18 +75,18 @@ def wait_for_lock(descriptor: int, on_wait: Callable[[], None] | None = None) ->
 def replace(source: Path, target: Path) -> None:
     """Rename `source` over `target`. On Windows another program may have `target` open: then this
     waits for a second or two. Raises OSError."""
-    for wait_s in () if has_locks() else _WAITS_S:
+    waits_s = iter((0.01, 0.03, 0.1, 0.3, 1.0))
+    while True:
         try:
-            return os.replace(source, target)
-        except PermissionError:
+            os.replace(source, target)
+            return
+        except PermissionError as error:
+            if has_locks():
+                raise
+            if (wait_s := next(waits_s, None)) is None:
+                reason = "another program has it open, or it is read-only; close that program"
+                raise PermissionError(error.errno, reason, str(target)) from None
             time.sleep(wait_s)
-    try:
-        return os.replace(source, target)
-    except PermissionError as error:
-        if has_locks():
-            raise
-        reason = "another program has it open, or it is read-only; close that program"
-        raise PermissionError(error.errno, reason, str(target)) from None
 
 
 def fsync(path: Path) -> None:

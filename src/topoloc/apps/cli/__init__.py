@@ -129,6 +129,10 @@ def _dispatch(args: list[str]) -> int:
 
         print(version("topoloc"))
         return 0
+    if args[0] == "--completion":
+        from topoloc.apps.cli.completion import print_completion
+
+        return print_completion(args[1:])
     name, *rest = args
     commands = COMMANDS if name in COMMANDS else all_commands()
     if name in commands:
@@ -203,9 +207,7 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
             return 2
     except TopolocError as error:
         _print_error(_with_written_files(str(error), args, written))
-    except ImportError as error:
-        if (error.name or "").startswith("topoloc"):
-            raise
+    except ImportError as error:  # of a library that is missing or broken
         _print_error(f"{error}; see `topoloc doctor`")
     except OSError as error:
         if error.errno not in (errno.EMFILE, errno.ENFILE):
@@ -293,5 +295,6 @@ def _help() -> str:
         "usage: topoloc COMMAND ...\n\nMap a place with a stereo or RGB-D camera, then localize"
         " single images of it with 6-DoF poses.\n\n"
         + "\n\n".join(parts)
-        + "\n\n`topoloc help COMMAND` describes a command, `topoloc -V` prints the version."
+        + "\n\n`topoloc help COMMAND` describes a command, `topoloc -V` prints the version,\n"
+        "`topoloc --completion bash` (or zsh, fish) a script for the Tab key."
     )

@@ -28,7 +28,6 @@ from topoloc.apps.cli.output import (
 
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)[^;>]*(>=(?P<least>[\d.]+))?[^;]*(;(?P<marker>.*))?")
 _FOR_DEVELOPERS = ("all", "docs", "test")
-_MAX_ERROR_M, _MAX_ERROR_DEG = 0.05, 1.0
 _REINSTALL = "reinstall: pip install --force-reinstall topoloc"
 Found = tuple[dict[str, Any], list[str]]
 """What a part of the examination tells, and its faults, each with a remedy."""
@@ -168,7 +167,7 @@ def _examine_pipeline() -> Found:
     if not told["localized"]:
         told |= {"translation_m": None, "rotation_deg": None}
         return told, [f"self-test: an image of the mapped room is not localized; {_REINSTALL}"]
-    if answer.translation_m < _MAX_ERROR_M and answer.rotation_deg < _MAX_ERROR_DEG:
+    if answer.translation_m < 0.05 and answer.rotation_deg < 1.0:
         return told, []
     wrong = f"{100 * answer.translation_m:.1f} cm, {answer.rotation_deg:.1f} degrees off"
     return told, [f"self-test: a pose is {wrong}; {_REINSTALL}"]
