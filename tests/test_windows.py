@@ -234,6 +234,7 @@ def test_the_service_starts_and_stops_without_handlers_of_the_loop(room_map: Pat
     )
     try:
         assert served.stderr is not None
+        line = ""
         for line in served.stderr:
             if "serves on" in line or "Traceback" in line:
                 break

@@ -66,7 +66,7 @@ def write_addresses(tree: Path, folder: str, address: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("repository", metavar="REPOSITORY")
     parser.add_argument("--out", type=Path, default=ROOT / "dist", metavar="DIR")
     args = parser.parse_args()

@@ -183,8 +183,8 @@ class _CacheLocator:
 
 
 def kernel_caches() -> list[Path]:
-    """Return the folders that hold machine code. This is `NUMBA_CACHE_DIR` if it is set. Otherwise
-    it is this package (`__pycache__` beside the functions), then the user's cache folder."""
+    """Return the folders of machine code: `NUMBA_CACHE_DIR`, or else this package (`__pycache__`
+    beside the functions) and then the user's cache folder."""
     if named := vars(config)["CACHE_DIR"]:
         return [Path(named)]
     folders = [_PACKAGE]

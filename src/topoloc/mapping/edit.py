@@ -3,10 +3,9 @@
 An edit replaces the whole file. Readers keep the file they opened. A killed process leaves the map
 before or after its edit.
 
-`lab.topo.undo-AFTER-BEFORE` is the file that an edit replaced: a hard link, or a copy on Windows
-and if the file system has no links. AFTER and BEFORE are digests of the map file after and before
-this edit. So the names alone lead back from edit to edit. The map does not need these files
-otherwise.
+`lab.topo.undo-AFTER-BEFORE` is the file that an edit replaced: a hard link, or a copy where links
+do not work. AFTER and BEFORE are digests of the map file after and before this edit. So the names
+alone lead back from edit to edit. The map does not need these files otherwise.
 """
 
 from __future__ import annotations

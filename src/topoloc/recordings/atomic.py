@@ -2,10 +2,9 @@
 
 A reader sees the old file or the new one, and a failure leaves nothing behind. Data is written to a
 temporary file of a unique name beside the target. It is renamed over the target when it is complete
-and on the disk. The writer holds a lock (`flock`) on the temporary file, which ends with its
-process. A temporary file without a lock is stale, and the next writer of the same target removes
-it. Several writers do not interfere, even from different containers. The last one wins. Windows has
-no such locks, see `file_locks.py`.
+and on the disk. The writer holds a lock on the temporary file, which ends with its process. A
+temporary file without a lock is stale, and the next writer of the same target removes it. Several
+writers do not interfere, even from different containers. The last one wins.
 """
 
 from __future__ import annotations

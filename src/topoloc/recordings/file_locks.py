@@ -1,8 +1,7 @@
 """Lock, replace and synchronize files, on POSIX systems and on Windows.
 
-Windows has no `flock`. It opens no folder, and it neither replaces nor removes a file that is open.
-So no file is held open there: of two writers at once the last one wins, and the temporary files of
-killed writers stay.
+Windows has no `flock`, opens no folder, and replaces no file that is open. So no file is held open
+there: of two writers at once the last one wins, and temporary files of killed writers stay.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 try:
@@ -32,8 +32,7 @@ def open_to_lock(path: Path, flags: int = os.O_RDONLY) -> tuple[int, os.stat_res
     status = os.fstat(descriptor)
     if fcntl is None:
         os.close(descriptor)
-        return -1, status
-    return descriptor, status
+    return -1 if fcntl is None else descriptor, status
 
 
 def close(descriptor: int) -> None:
@@ -43,8 +42,7 @@ def close(descriptor: int) -> None:
 
 
 def try_lock(descriptor: int) -> bool | None:
-    """Lock an open file. Return False if another process has the lock, None if locks are not
-    supported."""
+    """Lock an open file. Return False if another process has the lock, None without locks."""
     if fcntl is None:
         return None
     try:
@@ -57,15 +55,13 @@ def try_lock(descriptor: int) -> bool | None:
 
 
 def lock_new(descriptor: int) -> bool:
-    """Lock a file that this process has created. Return False if another process removed it as
-    stale before it was locked."""
+    """Lock a new file. Return False if another process has removed it as stale."""
     is_ours = try_lock(descriptor) is not False
     return is_ours and (descriptor < 0 or os.fstat(descriptor).st_nlink > 0)
 
 
 def wait_for_lock(descriptor: int, on_wait: Callable[[], None] | None = None) -> None:
-    """Lock an open file. Call `on_wait` before waiting for another process. Without locks nothing
-    is done."""
+    """Lock an open file. Call `on_wait` before waiting for another process."""
     if try_lock(descriptor) is False and fcntl is not None:
         if on_wait is not None:
             on_wait()
@@ -73,8 +69,7 @@ def wait_for_lock(descriptor: int, on_wait: Callable[[], None] | None = None) ->
 
 
 def replace(source: Path, target: Path) -> None:
-    """Rename `source` over `target`. On Windows another program may have `target` open: then this
-    waits for a second or two. Raises OSError."""
+    """Rename a file over another. On Windows wait a little for who has it open. Raises OSError."""
     waits_s = iter((0.01, 0.03, 0.1, 0.3, 1.0))
     while True:
         try:
@@ -86,17 +81,13 @@ def replace(source: Path, target: Path) -> None:
             if (wait_s := next(waits_s, None)) is None:
                 reason = "another program has it open, or it is read-only; close that program"
                 raise PermissionError(error.errno, reason, str(target)) from None
-            time.sleep(wait_s)
+        time.sleep(wait_s)
 
 
 def fsync(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk."""
-    if not has_locks() and path.is_dir():  # Windows synchronizes no folder
-        return
-    descriptor = os.open(path, os.O_RDONLY if has_locks() else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    except OSError:  # not supported by this file system, whose rename is still atomic
-        pass
-    finally:
+    if has_locks() or not path.is_dir():  # Windows synchronizes no folder
+        descriptor = os.open(path, os.O_RDONLY if has_locks() else os.O_RDWR)
+        with suppress(OSError):  # not supported by this file system, whose rename is still atomic
+            os.fsync(descriptor)
         os.close(descriptor)

@@ -14,6 +14,7 @@ import pytest
 
 from topoloc import EvaluatedQuery, Localization, NotLocalized, Rigid3
 from topoloc.apps.cli import doctor, main
+from topoloc.node_ids import NodeId
 
 _ALONE = """
 import os, socket, sys
@@ -110,14 +111,16 @@ def test_a_damaged_network_is_a_fault(
 
 
 def _one_answer(result: Localization | NotLocalized) -> EvaluatedQuery:
-    return EvaluatedQuery("000000.jpg", result, Rigid3.identity(), 0)
+    return EvaluatedQuery("000000.jpg", result, Rigid3.identity())
 
 
 @pytest.mark.parametrize(
     ("result", "fault"),
     [
         (
-            Localization(Rigid3(np.eye(3), np.array([0.3, 0, 0])), np.eye(6), 1.0, 0, [], 9, 9, {}),
+            Localization(
+                Rigid3(np.eye(3), np.array([0.3, 0, 0])), np.eye(6), 1.0, NodeId(0), [], 9, 9, {}
+            ),
             "a pose is 30.0 cm, 0.0 degrees off",
         ),
         (NotLocalized("ambiguous"), "an image of the mapped room is not localized"),

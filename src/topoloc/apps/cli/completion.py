@@ -42,7 +42,8 @@ def print_completion(args: list[str]) -> int:
     options = {name: _find_options(name) for name in commands}
     actions = {name: _find_actions(module) for name, (module, _) in commands.items()}
     if args == ["fish"]:
-        print("\n".join(_fish_lines(commands, options, actions)))
+        for name, (_, text) in commands.items():
+            print("\n".join(_fish_lines(name, text, options[name], actions[name])))
         return 0
     cases = [f'        *" {name} -"*) words="{" ".join(options[name])}" ;;' for name in commands]
     for name, words in actions.items():
@@ -53,31 +54,20 @@ def print_completion(args: list[str]) -> int:
     return 0
 
 
-def _fish_lines(
-    commands: dict[str, tuple[str, str]],
-    options: dict[str, list[str]],
-    actions: dict[str, Sequence[str]],
-) -> list[str]:
-    lines = list[str]()
-    for name, (_, summary) in commands.items():
-        text = summary.replace("'", "")
-        lines.append(f"complete -c topoloc -n __fish_use_subcommand -f -a {name} -d '{text}'")
-        given = f"__fish_seen_subcommand_from {name}"
-        lines += [f"complete -c topoloc -n '{given}' -l {one[2:]}" for one in options[name]]
-        if actions[name]:
-            first = f"{given}; and test (count (commandline -opc)) -eq 2"
-            lines.append(f"complete -c topoloc -n '{first}' -f -a '{' '.join(actions[name])}'")
+def _fish_lines(name: str, summary: str, options: list[str], actions: Sequence[str]) -> list[str]:
+    text, given = summary.replace("'", ""), f"__fish_seen_subcommand_from {name}"
+    lines = [f"complete -c topoloc -n __fish_use_subcommand -f -a {name} -d '{text}'"]
+    lines += [f"complete -c topoloc -n '{given}' -l {one[2:]}" for one in options]
+    if actions:
+        first = f"{given}; and test (count (commandline -opc)) -eq 2"
+        lines.append(f"complete -c topoloc -n '{first}' -f -a '{' '.join(actions)}'")
     return lines
 
 
 def _find_options(name: str) -> list[str]:
     """Return the options that the help of a command lists, none if it cannot be loaded."""
     printed = io.StringIO()
-    with (
-        contextlib.redirect_stdout(printed),
-        contextlib.redirect_stderr(io.StringIO()),
-        contextlib.suppress(SystemExit),
-    ):
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         main([name, "--help"])
     found = re.findall(r"^\W*(--[a-z][\w-]*)", printed.getvalue(), re.MULTILINE)
     return ["--help", *found]

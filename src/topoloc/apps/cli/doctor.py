@@ -27,7 +27,6 @@ from topoloc.apps.cli.output import (
 )
 
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)[^;>]*(>=(?P<least>[\d.]+))?[^;]*(;(?P<marker>.*))?")
-_FOR_DEVELOPERS = ("all", "docs", "test")
 _REINSTALL = "reinstall: pip install --force-reinstall topoloc"
 Found = tuple[dict[str, Any], list[str]]
 """What a part of the examination tells, and its faults, each with a remedy."""
@@ -42,8 +41,7 @@ class Command:
 
     def run(self) -> int:
         check_outputs([self.json])
-        told: dict[str, Any] = {}
-        faults = list[str]()
+        told, faults = dict[str, Any](), list[str]()
         for name, examine in _PARTS.items():
             try:
                 with interruptible():
@@ -62,11 +60,8 @@ class Command:
 
 def _examine_versions() -> Found:
     """Tell the versions of Python and of the libraries that topoloc cannot do without."""
-    told = {
-        "topoloc": _version_of("topoloc"),
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-    }
+    told = {"topoloc": _version_of("topoloc"), "python": platform.python_version()}
+    told["platform"] = platform.platform()
     told |= {name: found for name in PLUGIN_PACKAGES.values() if (found := _version_of(name))}
     needed = {name: least for extra, name, least, _ in _requirements() if not extra}
     libraries = {name: _version_of(name) for name in needed}
@@ -97,7 +92,7 @@ def _examine_extras() -> Found:
     """Tell which extras are installed, and what the others lack."""
     told: dict[str, Any] = {}
     for extra, name, least, condition in _requirements():
-        if extra and extra not in _FOR_DEVELOPERS:
+        if extra and extra not in ("all", "docs", "test"):
             one = told.setdefault(extra, {"missing": [], "only_if": condition, "install": None})
             if _is_older(_version_of(name), least):
                 one["missing"].append(name)
@@ -114,17 +109,13 @@ def _examine_caches() -> Found:
     }
     if any(one["writable"] or one["bytes"] for one in told["kernels"]):
         return told, []
-    named = " or ".join(map(str, kernels))
-    return told, [
-        f"every process compiles for a minute, as {named} cannot be written; NUMBA_CACHE_DIR names"
-        " another folder"
-    ]
+    text = f"{' or '.join(map(str, kernels))} cannot be written; NUMBA_CACHE_DIR names another"
+    return told, [f"every process compiles for a minute: {text} folder"]
 
 
 def _examine_networks() -> Found:
     """Run each network that is here on a small picture."""
-    told: dict[str, Any] = {}
-    faults = list[str]()
+    told, faults = dict[str, Any](), list[str]()
     for network in plugin.NetworkInfo.known():
         try:
             path = network.find_file()
@@ -147,9 +138,8 @@ def _examine_pipeline() -> Found:
     """Map a piece of the demo's room, and localize an image of another walk in the saved map."""
     from topoloc.demo.recordings import SHIPPED
 
-    topoloc.warm_up(
-        only_if_cold=lambda: print_line("compiling, once: about a minute ...", sys.stderr)
-    )
+    wait = "compiling, once: about a minute ..."
+    topoloc.warm_up(only_if_cold=lambda: print_line(wait, sys.stderr))
     start = time.perf_counter()
     with plugin.temporary_folder("topoloc-doctor-") as folder:
         recording = topoloc.open_sequence(f"{SHIPPED / 'map_lap1'}@0:6")
@@ -157,20 +147,19 @@ def _examine_pipeline() -> Found:
         with topoloc.TopoMetricMap.load(folder / "room.topo") as topomap:
             walk = topoloc.open_sequence(SHIPPED / "day")
             (answer,) = topoloc.localize_queries(topoloc.Localizer(topomap), walk, frames=[0])
+    is_localized = isinstance(answer.result, topoloc.Localization)
     told = {
         "images_mapped": len(recording),
-        "localized": isinstance(answer.result, topoloc.Localization),
-        "translation_m": answer.translation_m,
-        "rotation_deg": answer.rotation_deg,
+        "localized": is_localized,
+        "translation_m": answer.translation_m if is_localized else None,
+        "rotation_deg": answer.rotation_deg if is_localized else None,
         "seconds": round(time.perf_counter() - start, 2),
     }
-    if not told["localized"]:
-        told |= {"translation_m": None, "rotation_deg": None}
-        return told, [f"self-test: an image of the mapped room is not localized; {_REINSTALL}"]
     if answer.translation_m < 0.05 and answer.rotation_deg < 1.0:
         return told, []
-    wrong = f"{100 * answer.translation_m:.1f} cm, {answer.rotation_deg:.1f} degrees off"
-    return told, [f"self-test: a pose is {wrong}; {_REINSTALL}"]
+    wrong = f"a pose is {100 * answer.translation_m:.1f} cm, {answer.rotation_deg:.1f} degrees off"
+    wrong = wrong if is_localized else "an image of the mapped room is not localized"
+    return told, [f"self-test: {wrong}; {_REINSTALL}"]
 
 
 _PARTS: dict[str, Callable[[], Found]] = {

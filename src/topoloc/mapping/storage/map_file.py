@@ -60,6 +60,15 @@ _LIMITS = {
 }
 
 
+def _connect(path: Path) -> sqlite3.Connection:
+    """Open a map. It is never changed in place: SQLite needs no locks, and read-only media do."""
+    address = f"{path.absolute().as_uri()}?mode=ro&immutable=1" if has_locks() else ":memory:"
+    database = sqlite3.connect(address, uri=True, check_same_thread=False, isolation_level=None)
+    if not has_locks():  # a file that is open could not be replaced
+        database.deserialize(path.read_bytes())
+    return database
+
+
 class MapFile:
     """Hold an open map database. A lock allows one reader at a time, because several threads may
     read.
@@ -80,17 +89,7 @@ class MapFile:
         self._cache: dict[str, Any] = {}
         self.version = check_header(path)
         with self._guarded_read():
-            # The file is never changed in place, so SQLite needs no locks. This also works on
-            # read-only media.
-            address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-            self._database = sqlite3.connect(
-                address if has_locks() else ":memory:",
-                uri=True,
-                check_same_thread=False,
-                isolation_level=None,
-            )
-            if not has_locks():  # an open file could not be replaced, so it is read to memory
-                self._database.deserialize(path.read_bytes())
+            self._database = _connect(path)
             for category, limit in _LIMITS.items():
                 self._database.setlimit(category, limit)
             self._database.set_progress_handler(self._is_too_much, MAX_STEPS // 10)

@@ -19,7 +19,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from topoloc import RecordingError
 from topoloc.apps.formats.bags.bag import (
@@ -60,8 +60,7 @@ class ChunkedBytes:
     _descriptor: int = -1
     _decompressed: OrderedDict[int, bytes] = field(default_factory=OrderedDict, repr=False)
     _num_cached_bytes: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _position_lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _lock: Any = field(default_factory=threading.RLock, repr=False)
 
     def __post_init__(self) -> None:
         with RecordingError.at(self.path, OSError):
@@ -103,7 +102,7 @@ class ChunkedBytes:
     def _read_at(self, length: int, position: int) -> bytes:
         if hasattr(os, "pread"):
             return os.pread(self._descriptor, length, position)
-        with self._position_lock:  # Windows
+        with self._lock:  # Windows
             os.lseek(self._descriptor, position, os.SEEK_SET)
             return os.read(self._descriptor, length)
 
