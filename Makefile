@@ -6,6 +6,7 @@
 # make acceptance-quick   the part of it that takes at most three minutes
 # make lint      the same without the tests
 # make docs      these pages as HTML, in docs/_build/html; a warning is an error
+# make release REPOSITORY=https://github.com/OWNER/topoloc   the four distributions, in dist/, with the addresses for an index
 # make clean     remove what the above made
 # PYTHON=... chooses the interpreter that .venv is made with.
 
@@ -17,7 +18,7 @@ CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11 python3
 # Without a look at the network for a newer pyright; its node comes from the package index.
 PYRIGHT := PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
 
-.PHONY: demo install test test-slow acceptance acceptance-quick lint kernels docs clean
+.PHONY: demo install test test-slow acceptance acceptance-quick lint kernels docs release clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-core
@@ -54,6 +55,9 @@ lint: $(VENV)/installed-test
 docs: $(VENV)/installed-docs
 	@$(BIN)/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going -d docs/_build/trees docs docs/_build/html
 	@echo "docs/_build/html/index.html"
+
+release: $(VENV)/installed-test
+	@$(BIN)/python tools/release.py '$(REPOSITORY)'
 
 # What each kind of installation brings; one that brings more has brought the others, too.
 $(VENV)/installed-core: EXTRAS := [report]

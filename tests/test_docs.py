@@ -212,3 +212,24 @@ def test_links_lead_somewhere(page: Path):
     links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
     local = [link for link in links if "://" not in link]
     assert [link for link in local if not (page.parent / link).exists()] == []
+
+
+def _read_variables() -> set[str]:
+    """The environment variables that the four distributions read, set or name."""
+    named = (
+        r"[\"'$](TOPOLOC_[A-Z_]+|NUMBA_[A-Z_]+|RAY_AUTH_[A-Z_]+|DRJIT_[A-Z_]+|[A-Z_]*NUM_THREADS)"
+    )
+    read = r"(?:environ(?:\.(?:get|setdefault|pop))?|getenv)[(\[]\s*\"([A-Z_]+)\""
+    folders = ("src", "worlds/src", "training/src", "paper/src")
+    texts = [one.read_text("utf-8") for at in folders for one in (ROOT / at).rglob("*.py")]
+    return {name for text in texts for name in re.findall(read, text) + re.findall(named, text)}
+
+
+def test_environment_variables_are_in_the_table_and_no_others():
+    table = _section(CLI, "Environment variables")
+    found = _read_variables() - {"OMP_NUM_THREADS", "MKL_NUM_THREADS", "COLUMNS"}
+    assert {"TOPOLOC_CACHE", "TOPOLOC_SHARED", "TOPOLOC_MITSUBA_VARIANT"} <= found
+    documented = set(re.findall(r"`([A-Z]+(?:_[A-Z]+)+|TMPDIR)`", table))
+    assert found - documented == set()
+    texts = "".join(path.read_text("utf-8") for path in ROOT.glob("**/src/**/*.py"))
+    assert [name for name in documented if name not in texts] == []

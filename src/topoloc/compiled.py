@@ -24,6 +24,7 @@ from numba.core import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 
 _DEFAULT_NUM_THREADS = 2
+_PACKAGE = Path(__file__).parent
 
 KERNELS: list[Any] = []
 """All kernels declared so far."""
@@ -181,19 +182,24 @@ class _CacheLocator:
         return str(self._function.__code__.co_firstlineno)
 
 
-@cache
-def _cache_folders(source: str) -> list[str]:
-    """Return the folders for the code of functions from the folder `source`. This is
-    `NUMBA_CACHE_DIR` if it is set. Otherwise it is `__pycache__` beside the functions, then the
-    user's cache folder."""
-    subfolder = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+def kernel_caches() -> list[Path]:
+    """Return the folders of machine code: `NUMBA_CACHE_DIR`, or else this package (`__pycache__`
+    beside the functions) and then the user's cache folder."""
     if named := vars(config)["CACHE_DIR"]:
-        return [os.path.join(named, subfolder)]
-    folders = [os.path.join(source, "__pycache__")]
+        return [Path(named)]
+    folders = [_PACKAGE]
     with contextlib.suppress(RuntimeError):  # the user has no home folder
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        folders.append(str(caches / "topoloc" / "kernels" / subfolder))
+        folders.append(caches / "topoloc" / "kernels")
     return folders
+
+
+@cache
+def _cache_folders(source: str) -> list[str]:
+    """Return the folders for the code of functions from the folder `source`."""
+    subfolder = f"{Path(source).name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    beside = os.path.join(source, "__pycache__")
+    return [beside if one is _PACKAGE else str(one / subfolder) for one in kernel_caches()]
 
 
 @cache

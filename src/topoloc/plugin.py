@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         suggest_name as suggest_name,
         with_setting as with_setting,
     )
+    from topoloc.compiled import kernel_caches as kernel_caches
     from topoloc.evaluation.metrics import format_length as format_length
     from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
     from topoloc.features.feature_types import (
@@ -93,6 +94,7 @@ _NAMES = {
     "topoloc.atlas.manifest": "check_tile_id",
     "topoloc.atlas.tile_fetcher": "TilePending",
     "topoloc.bounds": "Above AtLeast Between describe_ranges suggest_name with_setting",
+    "topoloc.compiled": "kernel_caches",
     "topoloc.evaluation.metrics": "format_length",
     "topoloc.evaluation.node_matching": "NodeMatcher",
     "topoloc.features.feature_types": "find_available_types",

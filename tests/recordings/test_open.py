@@ -48,11 +48,24 @@ def test_opening_reads_no_picture(kitti: Path, euroc: Path, tum: Path, seven_sce
     assert len(open_sequence(kitti)) == 3
 
 
-def test_unknown_folders_list_the_formats(tmp_path: Path):
-    (tmp_path / "notes.txt").write_text("nothing")
+@pytest.mark.parametrize(
+    ("held", "nearest"),
+    [
+        ("notes.txt", ""),
+        ("rgb.txt", "; nearest is tum: rgb.txt and depth.txt"),
+        ("transforms.json.orig", ""),
+        ("left", "; nearest is folder: pictures, or left/ and right/"),
+    ],
+)
+def test_unknown_folders_name_what_they_hold_and_the_nearest_format(
+    held: str, nearest: str, tmp_path: Path
+):
+    (tmp_path / held).write_text("nothing")
     with pytest.raises(UnknownFormatError) as error:
         open_sequence(tmp_path)
-    assert all(name in str(error.value) for name in FORMATS)
+    assert f"{tmp_path}: no known recording: here is {held}{nearest}" in str(error.value)
+    assert str(error.value).endswith("; formats: docs/recordings.md")
+    assert len(str(error.value)) - len(str(tmp_path)) < 200
     assert "\n" not in str(error.value)
 
 

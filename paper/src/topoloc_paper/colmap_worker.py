@@ -37,7 +37,7 @@ class Worker:
         self.pycolmap: Any = importlib.import_module("pycolmap")
         self.pycolmap.logging.minloglevel = 2
         self.folder, self.pictures = folder, folder / "pictures"
-        self.job: dict[str, Any] = json.loads((folder / "job.json").read_text())
+        self.job: dict[str, Any] = json.loads((folder / "job.json").read_text(encoding="utf-8"))
 
     def run(self) -> None:
         start = self._now()
@@ -54,7 +54,7 @@ class Worker:
             self._answer(query, database, images, extraction_ms) for query in self.job["queries"]
         ]
         database.close()
-        (self.folder / "answers.json").write_text(json.dumps(answers))
+        (self.folder / "answers.json").write_text(json.dumps(answers), encoding="utf-8")
 
     def _now(self) -> float:
         """Seconds of a clock that never goes back."""
@@ -116,7 +116,9 @@ class Worker:
         """Write the verified matches of the job's pairs into the database of the map."""
         pairing = self.pycolmap.ImportedPairingOptions()
         pairing.match_list_path = str(self.folder / "pairs.txt")
-        (self.folder / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in self.job["pairs"]))
+        (self.folder / "pairs.txt").write_text(
+            "".join(f"{a} {b}\n" for a, b in self.job["pairs"]), encoding="utf-8"
+        )
         self.pycolmap.match_image_pairs(
             self.folder / "map.db", pairing_options=pairing, device=self.pycolmap.Device.cpu
         )

@@ -142,7 +142,7 @@ class LightGlueWorker(Worker):
             result = compute()
             partial = path.with_suffix(f".{os.getpid()}.npz")
             np.savez(partial, seconds=time.perf_counter() - start, **result)
-            partial.rename(path)
+            partial.replace(path)
         self.results[key] = result
         return result
 

@@ -134,13 +134,13 @@ def run_worker(
     Raises:
         TopolocError: The worker ended with an error.
     """
-    (folder / "job.json").write_text(json.dumps(job))
+    (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
     command = [sys.executable, "-m", f"topoloc_paper.{worker}", str(folder), *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, encoding="utf-8")
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise TopolocError(f"{worker} ended with status {done.returncode}: {last[:200]}")
-    return json.loads((folder / "answers.json").read_text())
+    return json.loads((folder / "answers.json").read_text(encoding="utf-8"))
 
 
 def query_row(

@@ -19,11 +19,7 @@ from typing import Protocol, runtime_checkable
 from topoloc.atlas.manifest import TILES
 from topoloc.errors import AtlasError, TopolocError
 from topoloc.recordings.atomic import atomic_write, remove_all_stale_files, write_bytes
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+from topoloc.recordings.file_locks import close, open_to_lock, wait_for_lock
 
 MANIFEST = "atlas.json"
 _LOCK = ".atlas.lock"
@@ -182,14 +178,13 @@ class FolderStore:
         """Hold the writer lock. The operating system frees the lock of a terminated process."""
         with AtlasError.at(f"cannot write {self.folder}", OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+            descriptor, _ = open_to_lock(self.folder / _LOCK, os.O_RDWR | os.O_CREAT)
         try:
-            if fcntl is not None:
-                with suppress(OSError):  # without locks, concurrent writers may lose tiles
-                    fcntl.flock(descriptor, fcntl.LOCK_EX)
+            with suppress(OSError):  # without locks, concurrent writers may lose tiles
+                wait_for_lock(descriptor)
             yield
         finally:
-            os.close(descriptor)
+            close(descriptor)
 
 
 def sha256_of(path: Path) -> str:

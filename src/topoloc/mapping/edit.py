@@ -3,9 +3,9 @@
 An edit replaces the whole file. Readers keep the file they opened. A killed process leaves the map
 before or after its edit.
 
-`lab.topo.undo-AFTER-BEFORE` is the file that an edit replaced: a hard link, or a copy if the file
-system has no links. AFTER and BEFORE are digests of the map file after and before this edit. So the
-names alone lead back from edit to edit. The map does not need these files otherwise.
+`lab.topo.undo-AFTER-BEFORE` is the file that an edit replaced: a hard link, or a copy where links
+do not work. AFTER and BEFORE are digests of the map file after and before this edit. So the names
+alone lead back from edit to edit. The map does not need these files otherwise.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from topoloc.mapping.storage.map_writing import write_map
 from topoloc.mapping.storage.schema import SCHEMA_VERSION
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.mapping.validation import describe_failure
-from topoloc.recordings.atomic import atomic_write, fsync, short_name
+from topoloc.recordings.atomic import atomic_write, short_name
+from topoloc.recordings.file_locks import fsync, has_locks, replace as replace_file
 
 T = TypeVar("T")
 _MAX_BYTES = 1_000_000_000
@@ -68,9 +69,10 @@ def keep_file(path: Path, changed: Path) -> Path:
     file. Raises OSError."""
     kept = kept_path(path, _digest_of(changed), _digest_of(path))
     kept.unlink(missing_ok=True)
-    try:
-        os.link(path, kept)
-    except OSError:  # a file system without links
+    with suppress(OSError):  # a file system without links
+        if has_locks():  # else the link could not be removed while another program reads the map
+            os.link(path, kept)
+    if not kept.exists():
         with atomic_write(kept) as temporary:
             shutil.copyfile(path, temporary)
     with suppress(OSError):  # no handle is left: the file is in place
@@ -82,7 +84,7 @@ def restore_file(kept: Path, path: Path) -> None:
     """Rename a kept file to `path`, if it is undamaged. Raises MapError, OSError."""
     if fault := _find_fault(kept):
         raise MapError(fault)
-    os.replace(kept, path)
+    replace_file(kept, path)
 
 
 def _find_fault(kept: Path) -> str | None:

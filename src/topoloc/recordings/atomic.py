@@ -2,9 +2,9 @@
 
 A reader sees the old file or the new one, and a failure leaves nothing behind. Data is written to a
 temporary file of a unique name beside the target. It is renamed over the target when it is complete
-and on the disk. The writer holds a lock (`flock`) on the temporary file, which ends with its
-process. A temporary file without a lock is stale, and the next writer of the same target removes
-it. Several writers do not interfere, even from different containers. The last one wins.
+and on the disk. The writer holds a lock on the temporary file, which ends with its process. A
+temporary file without a lock is stale, and the next writer of the same target removes it. Several
+writers do not interfere, even from different containers. The last one wins.
 """
 
 from __future__ import annotations
@@ -20,12 +20,7 @@ from hashlib import blake2b
 from pathlib import Path
 
 from topoloc.errors import TopolocError
-
-try:
-    import fcntl
-except ImportError:  # Windows: stale files are not removed
-    fcntl = None
-
+from topoloc.recordings.file_locks import close, fsync, lock_new, open_to_lock, replace, try_lock
 
 _written_paths: ContextVar[list[Path] | None] = ContextVar("written_paths", default=None)
 
@@ -61,7 +56,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     with temporary_file(path) as temporary:
         yield temporary
         fsync(temporary)
-        os.replace(temporary, path)
+        replace(temporary, path)
         _note_written(path)
         with suppress(OSError):  # no handle is left: the file is in place
             fsync(path.parent)
@@ -85,7 +80,7 @@ def temporary_file(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # already renamed, or the folder is missing
             temporary.unlink()
-        os.close(lock)
+        close(lock)
 
 
 @contextmanager
@@ -105,7 +100,7 @@ def temporary_folder(prefix: str) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        os.close(lock)
+        close(lock)
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
@@ -208,11 +203,10 @@ def _create_locked_file(path: Path) -> tuple[Path, int]:
     """Create an empty file beside `path`. Return it and its descriptor, which holds its lock."""
     while True:
         temporary = path.with_name(f"{_temporary_prefix(path)}{secrets.token_hex(8)}.part")
-        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        # another writer may have removed the file as stale before it was locked
-        if _try_lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
+        descriptor, _ = open_to_lock(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+        if lock_new(descriptor):
             return temporary, descriptor
-        os.close(descriptor)
+        close(descriptor)
         with suppress(OSError):
             temporary.unlink()
 
@@ -222,23 +216,23 @@ def _create_locked_folder(prefix: str) -> tuple[Path, int]:
     while True:
         folder = Path(tempfile.mkdtemp(prefix=prefix))
         try:
-            descriptor = os.open(folder, os.O_RDONLY)
+            descriptor, _ = open_to_lock(folder)
         except FileNotFoundError:  # another process removed it as stale
             continue
-        if _try_lock(descriptor) is not False and os.fstat(descriptor).st_nlink > 0:
+        if lock_new(descriptor):
             return folder, descriptor
-        os.close(descriptor)
+        close(descriptor)
 
 
 def _remove_unlocked(temporary: Path) -> None:
     """Remove a file, or a folder with its content, unless a writer holds its lock."""
     is_folder = temporary.is_dir()
     try:
-        descriptor = os.open(temporary, os.O_RDONLY if is_folder else os.O_RDWR)
+        descriptor, _ = open_to_lock(temporary, os.O_RDONLY if is_folder else os.O_RDWR)
     except OSError:  # already removed, or no permission
         return
     try:
-        if not _try_lock(descriptor):
+        if not try_lock(descriptor):
             return
         if is_folder:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -246,29 +240,4 @@ def _remove_unlocked(temporary: Path) -> None:
             with suppress(OSError):
                 temporary.unlink()
     finally:
-        os.close(descriptor)
-
-
-def _try_lock(descriptor: int) -> bool | None:
-    """Lock an open file. Return False if another process has the lock, None if locks are not
-    supported."""
-    if fcntl is None:
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return None
-    return True
-
-
-def fsync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    except OSError:  # not supported by this file system, whose rename is still atomic
-        pass
-    finally:
-        os.close(descriptor)
+        close(descriptor)

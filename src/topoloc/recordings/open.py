@@ -136,17 +136,23 @@ def find_format(
         return "zed"
     if found := next((name for name in FORMATS if load_format(name).can_open(folder)), None):
         return found
-    if folder.is_dir() and not any(folder.iterdir()):
+    names = sorted(os.listdir(folder)) if folder.is_dir() else ["a file of another kind"]
+    if not names:
         raise UnknownFormatError(f"{folder}: no known recording: the folder is empty")
     if inside := _recordings_below(folder):
-        names = ", ".join(f"{path.name} ({name})" for path, name in inside[:10])
+        found = ", ".join(f"{path.name} ({name})" for path, name in inside[:10])
         example = folder / inside[0][0].name
         raise UnknownFormatError(
-            f"{folder}: no recording, but a folder of {len(inside)}: {names}; name one, such as"
+            f"{folder}: no recording, but a folder of {len(inside)}: {found}; name one, such as"
             f" {example}"
         )
-    looked_for = "; ".join(f"{name}: {load_format(name).expected_files}" for name in FORMATS)
-    raise UnknownFormatError(f"{folder}: no known recording. Looked for {looked_for}")
+    expected = {name: load_format(name).expected_files for name in FORMATS}
+    shared = {name: sum(one in text for one in names) for name, text in expected.items()}
+    nearest = max(reversed(FORMATS), key=lambda name: shared[name])  # the plain folder first
+    guess = f"; nearest is {nearest}: {expected[nearest]}" if shared[nearest] else ""
+    held = ", ".join(names[:4]) + " ..." * (len(names) > 4)
+    fault = f"no known recording: here is {held}{guess}; formats: docs/recordings.md"
+    raise UnknownFormatError(f"{folder}: {fault}")
 
 
 def _recordings_below(folder: Path) -> list[tuple[Path, str]]:

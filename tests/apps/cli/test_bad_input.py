@@ -128,9 +128,17 @@ def test_a_folder_that_is_no_recording(tmp_path: Path, complaint: Complaint):
         "build", tmp_path / "letters", tmp_path / "room.topo"
     )
     (tmp_path / "letters/one.txt").write_text("Dear reader,")
-    assert "letters: no known recording. Looked for euroc" in complaint(
-        "build", tmp_path / "letters", tmp_path / "room.topo"
+    said = complaint("build", tmp_path / "letters", tmp_path / "room.topo")
+    assert said.endswith(
+        "letters: no known recording: here is one.txt; formats: docs/recordings.md\n"
     )
+    for name in ("left", "two.txt", "three.txt", "times.txt"):
+        (tmp_path / "letters" / name).mkdir()
+    said = complaint("build", tmp_path / "letters", tmp_path / "room.topo")
+    assert "here is left, one.txt, three.txt, times.txt ...; nearest is folder: " in said
+    assert len(said) - len(str(tmp_path)) < 400
+    said = complaint("build", tmp_path / "letters" / "one.txt", tmp_path / "room.topo")
+    assert "one.txt: no known recording: here is a file of another kind; formats:" in said
     assert "there are euroc, tum" in complaint(
         "build", tmp_path / "letters", tmp_path / "room.topo", "--format", "betamax"
     )

@@ -1,4 +1,4 @@
-"""Files written whole or not at all; a progress bar on terminals only."""
+"""Files written whole or not at all; a progress bar on terminals only; answers in one line."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from topoloc import NotLocalized
 from topoloc.apps.cli import main
 from topoloc.apps.cli.output import check_outputs, print_fields, progress_bar, write_text
+from topoloc.apps.cli.queries.query_answers import QueryAnswer, format_answer
 from topoloc.errors import TopolocError
 
 
@@ -157,3 +159,17 @@ def test_who_closes_the_output_wants_none(room_map: Path):
         [sys.executable, "-c", close, *command], stderr=subprocess.PIPE, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_printed_refusal_says_why_in_one_short_line():
+    refusal = NotLocalized(
+        "ambiguous", detail="as much like node 3 as\nlike node 7 " + 99 * "or so "
+    )
+    line = format_answer(QueryAnswer("photo.jpg", 0, refusal))
+    assert line.startswith(
+        "photo.jpg  not localized: ambiguous: as much like node 3 as like node 7 "
+    )
+    assert "\n" not in line
+    assert len(line) < 240
+    bare = format_answer(QueryAnswer("photo.jpg", 0, NotLocalized("jump")))
+    assert bare == "photo.jpg  not localized: jump  (0 of 0 matches)"

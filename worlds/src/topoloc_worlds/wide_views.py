@@ -67,7 +67,7 @@ def main() -> None:
         for record in render_place(args.out, place, condition, args.positions)
     ]
     records += [record | {"share": share / len(views)} for record in views]
-    (args.out / "views.json").write_text(json.dumps(records))
+    (args.out / "views.json").write_text(json.dumps(records), encoding="utf-8")
 
 
 def add_photos(out: Path, folders: list[Path], count: int) -> Iterator[dict[str, Any]]:

@@ -114,7 +114,7 @@ def main() -> None:
 
 def _write(weights: FittedWeights, path: Path | None) -> None:
     if path:
-        path.write_text(json.dumps(weights.to_json(), indent=2) + "\n")
+        path.write_text(json.dumps(weights.to_json(), indent=2) + "\n", encoding="utf-8")
 
 
 def ask_places(

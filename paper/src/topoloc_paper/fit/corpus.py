@@ -138,6 +138,8 @@ def open_recordings(data: Path, rendered: Path | None) -> dict[str, StereoSequen
 def read_rigid(path: Path) -> Rigid3:
     """The one 4x4 matrix in a JSON file."""
     (matrix,) = [
-        value for value in json.loads(path.read_text()).values() if isinstance(value, list)
+        value
+        for value in json.loads(path.read_text(encoding="utf-8")).values()
+        if isinstance(value, list)
     ]
     return Rigid3.from_matrix(np.array(matrix))

@@ -120,7 +120,7 @@ def ask_place(
 
 
 def save_poses(poses: list[TriedPose], path: Path) -> None:
-    path.write_text(json.dumps([asdict(pose) for pose in poses]))
+    path.write_text(json.dumps([asdict(pose) for pose in poses]), encoding="utf-8")
 
 
 def load_poses(path: Path) -> list[TriedPose]:
@@ -129,7 +129,7 @@ def load_poses(path: Path) -> list[TriedPose]:
     def evidence(saved: dict[str, Any] | None) -> Evidence | None:
         return None if saved is None else Evidence(**saved)
 
-    read = json.loads(path.read_text())
+    read = json.loads(path.read_text(encoding="utf-8"))
     return [
         TriedPose(**row | {key: evidence(row[key]) for key in ("evidence", "first_evidence")})
         for row in read

@@ -13,6 +13,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterable
+from io import TextIOWrapper
 from os import PathLike
 from typing import Any, TextIO
 
@@ -50,6 +51,7 @@ _GROUPS = {
     },
     "try and set up": {
         "demo": "map and localize the built-in lab by day, at night and with another camera",
+        "doctor": "print what is installed where, and test that it works",
         "weights": "list, fetch or convert networks of local features",
         "config": "print all other settings as a TOML file",
     },
@@ -75,7 +77,7 @@ EXAMPLES = {
         "undo office.topo",
         "export office.topo office-colmap/ --format colmap",
     ),
-    "try and set up": ("demo --out topoloc-demo", "config build", "weights list"),
+    "try and set up": ("demo --out topoloc-demo", "doctor", "config build"),
 }
 # name -> module with a dataclass `Command` of the arguments and its method `run`; line of the help
 COMMANDS = {
@@ -97,7 +99,9 @@ def main(args: list[str] | None = None) -> int:
     """Run one command. Return the exit status: 0 done, 1 a known failure (one line on stderr), 2
     wrong usage."""
     if sys.stdout is None:  # closed by the caller; a file must not get its number
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # code pages lack letters of file names
     try:
         try:
             return _dispatch(sys.argv[1:] if args is None else args)
@@ -125,6 +129,10 @@ def _dispatch(args: list[str]) -> int:
 
         print(version("topoloc"))
         return 0
+    if args[0] == "--completion":
+        from topoloc.apps.cli.completion import print_completion
+
+        return print_completion(args[1:])
     name, *rest = args
     commands = COMMANDS if name in COMMANDS else all_commands()
     if name in commands:
@@ -199,6 +207,8 @@ def _run(name: str, module_name: str, summary: str, args: list[str]) -> int:
             return 2
     except TopolocError as error:
         _print_error(_with_written_files(str(error), args, written))
+    except ImportError as error:  # of a library that is missing or broken
+        _print_error(f"{error}; see `topoloc doctor`")
     except OSError as error:
         if error.errno not in (errno.EMFILE, errno.ENFILE):
             raise
@@ -285,5 +295,6 @@ def _help() -> str:
         "usage: topoloc COMMAND ...\n\nMap a place with a stereo or RGB-D camera, then localize"
         " single images of it with 6-DoF poses.\n\n"
         + "\n\n".join(parts)
-        + "\n\n`topoloc help COMMAND` describes a command, `topoloc -V` prints the version."
+        + "\n\n`topoloc help COMMAND` describes a command, `topoloc -V` prints the version,\n"
+        "`topoloc --completion bash` (or zsh, fish) a script for the Tab key."
     )

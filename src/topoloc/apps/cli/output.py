@@ -16,15 +16,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from topoloc import MissingExtraError, StereoSequence, TopolocError, open_sequence
+import topoloc  # most names of it load OpenCV; `topoloc doctor` must run without
+from topoloc import MissingExtraError, TopolocError, plugin
 from topoloc.apps.cli import printable
-from topoloc.plugin import (
-    find_format,
-    has_answers,
-    remove_stale_files,
-    split_selection,
-    write_text,
-)
+from topoloc.plugin import remove_stale_files, write_text
 
 
 def option(metavar: str, default: str = "", **more: Any) -> Any:
@@ -85,13 +80,13 @@ def open_recording(
     topics: str | None = None,
     images: str | None = None,
     whole_only: bool = False,
-) -> StereoSequence:
+) -> topoloc.StereoSequence:
     """Open a recording and print its notes on standard error. See `open_sequence` for errors."""
-    return open_sequence(path, format, camera, images, topics, print_warning, whole_only)
+    return topoloc.open_sequence(path, format, camera, images, topics, print_warning, whole_only)
 
 
 def describe_recording(
-    path: str, format: str | None, camera: str | None, sequence: StereoSequence
+    path: str, format: str | None, camera: str | None, sequence: topoloc.StereoSequence
 ) -> str:
     """Return how a recording was understood: format, frames, image size, duration, focal length,
     poses and gaps, in one line."""
@@ -106,7 +101,7 @@ def describe_recording(
     steps = sorted(after - before for before, after in pairwise(t_ns))
     if steps and steps[-1] > 10 * steps[len(steps) // 2]:
         facts.append(f"largest gap {steps[-1] / 1e9:.1f} s")
-    return f"{path}: {find_format(path, format, camera)}, {', '.join(facts)}"
+    return f"{path}: {plugin.find_format(path, format, camera)}, {', '.join(facts)}"
 
 
 class UsageError(TopolocError):
@@ -119,7 +114,7 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str | None] = 
     answers in a recording may be. Raises TopolocError: the folder is missing or read-only, the path
     is no regular file, or a file is used twice."""
     taken = {os.path.realpath(path) for path in inputs if path}
-    folders = {os.path.realpath(split_selection(path)[0]) for path in inputs if path}
+    folders = {os.path.realpath(plugin.split_selection(path)[0]) for path in inputs if path}
     for path in (Path(output) for output in outputs if output not in (None, "-")):
         parents = {str(one) for one in Path(os.path.realpath(path)).parents}
         faults = {
@@ -130,7 +125,7 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str | None] = 
             "this file is used twice": os.path.realpath(path) in taken,
             "it is a file of the input; choose another path, or remove it first": path.exists()
             and bool(parents & folders)
-            and not has_answers(path),
+            and not plugin.has_answers(path),
         }
         if fault := next((text for text, is_found in faults.items() if is_found), None):
             raise TopolocError(f"cannot write {path}: {fault}")

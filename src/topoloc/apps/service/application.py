@@ -153,12 +153,11 @@ class _Server(uvicorn.Server):
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        loop = asyncio.get_running_loop()
+        # the loop's own handlers do not exist on Windows; uvicorn looks ten times a second
         signals = (signal.SIGTERM, signal.SIGINT)
-        for number in signals:
-            loop.add_signal_handler(number, self.handle_exit, number, None)
+        before = [signal.signal(number, self.handle_exit) for number in signals]
         try:
             yield
         finally:
-            for number in signals:
-                loop.remove_signal_handler(number)
+            for number, handler in zip(signals, before, strict=True):
+                signal.signal(number, handler)

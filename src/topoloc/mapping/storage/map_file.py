@@ -39,6 +39,7 @@ from topoloc.mapping.validation import (
     describe_failure,
     sqlite_failures_as_os_errors,
 )
+from topoloc.recordings.file_locks import has_locks
 
 MAX_STEPS = 50_000_000
 """Limit of SQLite's steps in one read. A table of MAX_ROWS rows takes a quarter of them."""
@@ -57,6 +58,15 @@ _LIMITS = {
     sqlite3.SQLITE_LIMIT_ATTACHED: 0,
     sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 1,
 }
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """Open a map. It is never changed in place: SQLite needs no locks, and read-only media do."""
+    address = f"{path.absolute().as_uri()}?mode=ro&immutable=1" if has_locks() else ":memory:"
+    database = sqlite3.connect(address, uri=True, check_same_thread=False, isolation_level=None)
+    if not has_locks():  # a file that is open could not be replaced
+        database.deserialize(path.read_bytes())
+    return database
 
 
 class MapFile:
@@ -79,12 +89,7 @@ class MapFile:
         self._cache: dict[str, Any] = {}
         self.version = check_header(path)
         with self._guarded_read():
-            # The file is never changed in place, so SQLite needs no locks. This also works on
-            # read-only media.
-            address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-            self._database = sqlite3.connect(
-                address, uri=True, check_same_thread=False, isolation_level=None
-            )
+            self._database = _connect(path)
             for category, limit in _LIMITS.items():
                 self._database.setlimit(category, limit)
             self._database.set_progress_handler(self._is_too_much, MAX_STEPS // 10)

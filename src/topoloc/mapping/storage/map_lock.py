@@ -9,11 +9,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from topoloc.errors import MapError
-
-try:
-    import fcntl
-except ImportError:  # Windows: if two edits run at once, the last one wins
-    fcntl = None
+from topoloc.recordings.file_locks import close, open_to_lock, wait_for_lock
 
 WaitCallback = Callable[[], None]
 """Called before waiting for another process that edits the map."""
@@ -26,13 +22,12 @@ def lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[os.stat_
     """Lock the file at `path` and yield its status. Repeats if the previous owner of the lock
     replaced the file. Raises OSError if it cannot be opened, MapError if this thread edits it."""
     while True:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor, locked = open_to_lock(path)
         try:
-            locked = os.fstat(descriptor)
             key = locked.st_dev, locked.st_ino
             if _owners.get(key) == threading.get_ident():
                 raise MapError(f"map {path} is being edited by this thread: commit that edit first")
-            _wait_for_lock(descriptor, on_wait)
+            wait_for_lock(descriptor, on_wait)
             if path.exists() and os.path.samestat(locked, path.stat()):
                 _owners[key] = threading.get_ident()
                 try:
@@ -41,7 +36,7 @@ def lock_map_file(path: Path, on_wait: WaitCallback | None) -> Iterator[os.stat_
                     del _owners[key]
                 return
         finally:
-            os.close(descriptor)
+            close(descriptor)
 
 
 @contextmanager
@@ -53,16 +48,3 @@ def no_edit_of(path: Path, on_wait: WaitCallback | None) -> Iterator[None]:
             with suppress(OSError):
                 stack.enter_context(lock_map_file(path, on_wait))
         yield
-
-
-def _wait_for_lock(descriptor: int, on_wait: WaitCallback | None) -> None:
-    if fcntl is None:
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        if on_wait is not None:
-            on_wait()
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-    except OSError:  # a file system without locks
-        return

@@ -63,7 +63,10 @@ def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
     """
     key = {"folders": folders, "teacher": teacher.name, "size": [WIDTH, HEIGHT]}
     index_file = cache / "lessons.json"
-    if index_file.is_file() and (index := json.loads(index_file.read_text()))["key"] == key:
+    if (
+        index_file.is_file()
+        and (index := json.loads(index_file.read_text(encoding="utf-8")))["key"] == key
+    ):
         return _opened(cache, index["paths"], index["scales"], "r")
     paths = [str(path) for folder in folders for path in _listed(folder)]
     cache.mkdir(parents=True, exist_ok=True)
@@ -83,7 +86,8 @@ def learn(folders: list[str], teacher: Path, cache: Path) -> Lessons:
         lessons.scores[i] = np.round(scores[0] * 255)
         lessons.descriptors[i] = np.round(descriptors * _UNIT)
     index_file.write_text(
-        json.dumps({"key": key, "paths": paths, "scales": lessons.scales.tolist()})
+        json.dumps({"key": key, "paths": paths, "scales": lessons.scales.tolist()}),
+        encoding="utf-8",
     )
     return lessons
 

@@ -245,7 +245,7 @@ def _save(
 
 
 def _log(out: Path, line: dict[str, int | float]) -> None:
-    with (out / "log.jsonl").open("a") as file:
+    with (out / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 
 

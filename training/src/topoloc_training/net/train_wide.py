@@ -114,7 +114,7 @@ def run_steps(
         if step % _LOG_EVERY == 0:
             line = {"step": step, "seconds": round(time.monotonic() - begun, 1)}
             line |= {"losses": [round(x, 4) for x in (sums / _LOG_EVERY).tolist()]}
-            with (args.out / "log.jsonl").open("a") as file:
+            with (args.out / "log.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
             sums.zero_()
         if time.monotonic() - saved > _SAVE_S:
@@ -166,7 +166,7 @@ def unfold_norms(network: TopolocNet, batch: Batch) -> None:
 
 def read_library(folder: Path, teacher: Path, device: torch.device) -> tuple[Library, KnownPairs]:
     """Return the pictures of `views.json` with the teacher's answers, and the pairs."""
-    records = json.loads((folder / "views.json").read_text())
+    records = json.loads((folder / "views.json").read_text(encoding="utf-8"))
     pictures = torch.stack([_picture(folder / record["file"]) for record in records]).to(device)
     scores, descriptors = ask_teacher(pictures, teacher)
     depth = torch.zeros(len(records), 1, HEIGHT // DEPTH_STEP, WIDTH // DEPTH_STEP)

@@ -156,7 +156,7 @@ def _cache_file() -> Path:
 
 def _read_cache() -> dict[str, bool]:
     try:
-        data = json.loads(_cache_file().read_text())
+        data = json.loads(_cache_file().read_text(encoding="utf-8"))
     except (OSError, ValueError, RuntimeError):  # the last: no home folder
         return {}
     return data if isinstance(data, dict) else {}
@@ -166,6 +166,6 @@ def _write_cache(verdicts: dict[str, bool]) -> None:
     try:
         path = _cache_file()
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(verdicts, indent=1))
+        path.write_text(json.dumps(verdicts, indent=1), encoding="utf-8")
     except (OSError, RuntimeError):
         return  # it is only a shortcut

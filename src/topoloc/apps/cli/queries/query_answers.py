@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from topoloc import (
@@ -179,7 +180,8 @@ def format_answer(answer: QueryAnswer) -> str:
         evidence = f"  ({result.num_inliers} of {result.num_matches} matches)"
         if result.reason == "unreadable" or stream_state == "ambiguous":
             evidence = f"  ({len(result.alternatives)} alternatives)" if result.alternatives else ""
-        return f"{answer.query}  {state}not localized: {result.reason}{evidence}{ms}"
+        reason = shorten(": ".join(filter(None, (result.reason, result.detail))), 160)
+        return f"{answer.query}  {state}not localized: {reason}{evidence}{ms}"
     focal = "" if result.focal_length_px is None else f"  f {result.focal_length_px:.0f} px (found)"
     tile = "" if result.provenance.tile is None else f"  tile {result.provenance.tile}"
     x, y, z = result.world_from_cam.translation

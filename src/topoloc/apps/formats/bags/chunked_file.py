@@ -19,7 +19,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from topoloc import RecordingError
 from topoloc.apps.formats.bags.bag import (
@@ -60,11 +60,11 @@ class ChunkedBytes:
     _descriptor: int = -1
     _decompressed: OrderedDict[int, bytes] = field(default_factory=OrderedDict, repr=False)
     _num_cached_bytes: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _lock: Any = field(default_factory=threading.RLock, repr=False)
 
     def __post_init__(self) -> None:
         with RecordingError.at(self.path, OSError):
-            self._descriptor = os.open(self.path, os.O_RDONLY)
+            self._descriptor = os.open(self.path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         weakref.finalize(self, os.close, self._descriptor)
         self.size = os.fstat(self._descriptor).st_size
 
@@ -94,10 +94,17 @@ class ChunkedBytes:
             return self._read_decompressed(chunk, offset + length)[offset : offset + length]
         start = 0 if chunk == WHOLE_FILE else self.chunks[chunk].start
         with RecordingError.at(self.path, OSError):
-            data = os.pread(self._descriptor, length, start + offset)
+            data = self._read_at(length, start + offset)
         if len(data) != length:  # shorter than when it was opened
             raise TruncatedFileError
         return data
+
+    def _read_at(self, length: int, position: int) -> bytes:
+        if hasattr(os, "pread"):
+            return os.pread(self._descriptor, length, position)
+        with self._lock:  # Windows
+            os.lseek(self._descriptor, position, os.SEEK_SET)
+            return os.read(self._descriptor, length)
 
     def _read_decompressed(self, chunk: int, end: int) -> bytes:
         """Return at least the first `end` bytes of a chunk. If few are needed, such as the time of

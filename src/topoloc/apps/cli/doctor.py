@@ -1,0 +1,234 @@
+"""topoloc doctor: what is installed where, and whether it works."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import topoloc
+from topoloc import plugin
+from topoloc.apps.cli import PLUGIN_PACKAGES
+from topoloc.apps.cli.output import (
+    File,
+    check_outputs,
+    interruptible,
+    print_fields,
+    print_line,
+    write_json,
+)
+
+_REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)[^;>]*(>=(?P<least>[\d.]+))?[^;]*(;(?P<marker>.*))?")
+_REINSTALL = "reinstall: pip install --force-reinstall topoloc"
+Found = tuple[dict[str, Any], list[str]]
+"""What a part of the examination tells, and its faults, each with a remedy."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Arguments of `topoloc doctor`."""
+
+    json: File = None
+    """Write what is found as JSON to this file (- for standard output)."""
+
+    def run(self) -> int:
+        check_outputs([self.json])
+        told, faults = dict[str, Any](), list[str]()
+        for name, examine in _PARTS.items():
+            try:
+                with interruptible():
+                    told[name], found = examine()
+            except Exception as error:  # a broken library may raise any exception
+                reason = " ".join(f"{type(error).__name__}: {error}".split())
+                told[name], found = {}, [f"{name}: {reason}; {_REINSTALL}"]
+            faults += found
+        write_json(self.json, told | {"faults": faults})
+        if self.json != "-":
+            print_fields([*_describe(told), ("faults", str(len(faults) or "none"))])
+        for fault in faults:
+            print_line(f"error: {fault}", sys.stderr)
+        return 1 if faults else 0
+
+
+def _examine_versions() -> Found:
+    """Tell the versions of Python and of the libraries that topoloc cannot do without."""
+    told = {"topoloc": _version_of("topoloc"), "python": platform.python_version()}
+    told["platform"] = platform.platform()
+    told |= {name: found for name in PLUGIN_PACKAGES.values() if (found := _version_of(name))}
+    needed = {name: least for extra, name, least, _ in _requirements() if not extra}
+    libraries = {name: _version_of(name) for name in needed}
+    faults = [
+        f"{name} {found or 'is missing'}; pip install '{name}>={needed[name]}'"
+        for name, found in libraries.items()
+        if _is_older(found, needed[name])
+    ]
+    if not needed:
+        faults.append("topoloc is not installed: pip install topoloc")
+    return told | {"libraries": libraries}, faults
+
+
+def _examine_processor() -> Found:
+    """Tell the processor, and how many of its cores this process may use."""
+    model, usable = platform.processor(), os.cpu_count()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():  # Linux
+        lines = re.search(r"^model name\s*: (.*)", cpuinfo.read_text(encoding="utf-8"), re.M)
+        model = lines[1] if lines else model
+    if hasattr(os, "sched_getaffinity"):  # neither macOS nor Windows
+        usable = len(os.sched_getaffinity(0))
+    told = {"model": model or platform.machine(), "architecture": platform.machine()}
+    return told | {"processors": os.cpu_count(), "usable": usable}, []
+
+
+def _examine_extras() -> Found:
+    """Tell which extras are installed, and what the others lack."""
+    told: dict[str, Any] = {}
+    for extra, name, least, condition in _requirements():
+        if extra and extra not in ("all", "docs", "test"):
+            one = told.setdefault(extra, {"missing": [], "only_if": condition, "install": None})
+            if _is_older(_version_of(name), least):
+                one["missing"].append(name)
+                one["install"] = f"pip install 'topoloc[{extra}]'"
+    return told, []
+
+
+def _examine_caches() -> Found:
+    """Tell the folders of fetched networks and of compiled code."""
+    networks, *kernels = plugin.cache_folder(), *plugin.kernel_caches()
+    told = {
+        "networks": [_describe_folder(networks, "*")],
+        "kernels": [_describe_folder(folder, "**/*.nb?") for folder in kernels],
+    }
+    if any(one["writable"] or one["bytes"] for one in told["kernels"]):
+        return told, []
+    text = f"{' or '.join(map(str, kernels))} cannot be written; NUMBA_CACHE_DIR names another"
+    return told, [f"every process compiles for a minute: {text} folder"]
+
+
+def _examine_networks() -> Found:
+    """Run each network that is here on a small picture."""
+    told, faults = dict[str, Any](), list[str]()
+    for network in plugin.NetworkInfo.known():
+        try:
+            path = network.find_file()
+        except topoloc.WeightsError as missing:
+            told[network.name] = None
+            faults += [] if network.file else [f"{missing}; {_REINSTALL}"]
+            continue
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        told[network.name] = {"path": str(path), "sha256": digest}
+        try:
+            plugin.NetworkInfo.of_file(path)
+        except topoloc.WeightsError as error:
+            remedy = f"remove it; {network.install_hint}" if network.file else _REINSTALL
+            faults.append(f"{error}; {remedy}")
+    return told, faults
+
+
+def _examine_pipeline() -> Found:
+    """Map a piece of the demo's room, and localize an image of another walk in the saved map."""
+    from topoloc.demo.recordings import SHIPPED
+
+    wait = "compiling, once: about a minute ..."
+    topoloc.warm_up(only_if_cold=lambda: print_line(wait, sys.stderr))
+    start = time.perf_counter()
+    with plugin.temporary_folder("topoloc-doctor-") as folder:
+        recording = topoloc.open_sequence(f"{SHIPPED / 'map_lap1'}@0:6")
+        topoloc.build_map(recording).save(folder / "room.topo")
+        with topoloc.TopoMetricMap.load(folder / "room.topo") as topomap:
+            walk = topoloc.open_sequence(SHIPPED / "day")
+            (answer,) = topoloc.localize_queries(topoloc.Localizer(topomap), walk, frames=[0])
+    is_localized = isinstance(answer.result, topoloc.Localization)
+    told = {
+        "images_mapped": len(recording),
+        "localized": is_localized,
+        "translation_m": answer.translation_m if is_localized else None,
+        "rotation_deg": answer.rotation_deg if is_localized else None,
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+    if answer.translation_m < 0.05 and answer.rotation_deg < 1.0:
+        return told, []
+    wrong = f"a pose is {100 * answer.translation_m:.1f} cm, {answer.rotation_deg:.1f} degrees off"
+    wrong = wrong if is_localized else "an image of the mapped room is not localized"
+    return told, [f"self-test: {wrong}; {_REINSTALL}"]
+
+
+_PARTS: dict[str, Callable[[], Found]] = {
+    "versions": _examine_versions,
+    "processor": _examine_processor,
+    "extras": _examine_extras,
+    "caches": _examine_caches,
+    "networks": _examine_networks,
+    "self_test": _examine_pipeline,
+}
+
+
+def _describe(told: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the lines of the printed text. A part that failed is empty."""
+    for name, version in told["versions"].items():
+        if name == "libraries":
+            version = ", ".join(f"{one} {found or 'missing'}" for one, found in version.items())
+        yield name, version or "missing"
+    if one := told["processor"]:
+        yield "processor", f"{one['model']}: {one['processors']} cores, {one['usable']} usable"
+    for name, one in told["extras"].items():
+        only = f" (only {one['only_if']})" if one["only_if"] else ""
+        lack = f"{', '.join(one['missing'])} missing: {one['install']}{only}"
+        yield f"extra {name}", lack if one["missing"] else "installed"
+    for name, folders in told["caches"].items():
+        for one in folders:
+            access = "writable" if one["writable"] else "read-only"
+            yield f"cache of {name}", f"{one['path']}, {one['bytes'] / 1e6:.1f} MB, {access}"
+    for name, one in told["networks"].items():
+        if one:
+            yield f"network {name}", f"{one['path']}, SHA-256 {one['sha256'][:12]}..."
+    if missing := [name for name, one in told["networks"].items() if not one]:
+        yield "other networks", f"{', '.join(missing)}: see `topoloc weights list`"
+    if (one := told["self_test"]) and one["localized"]:
+        errors = f"{100 * one['translation_m']:.2f} cm, {one['rotation_deg']:.2f} degrees"
+        text = f"an image localized in a map of {one['images_mapped']}, {errors} off"
+        yield "self-test", f"{text}; {one['seconds']:.1f} s"
+
+
+def _requirements() -> Iterator[tuple[str, str, str, str]]:
+    """Yield extra, name, least version and condition of each library that topoloc may use."""
+    try:
+        lines = metadata.requires("topoloc") or []
+    except metadata.PackageNotFoundError:
+        return
+    for line in lines:
+        if match := _REQUIREMENT.fullmatch(line):
+            condition, _, extra = (match["marker"] or "").rpartition("extra == ")
+            condition = condition.strip().removesuffix(" and").strip("()")
+            yield extra.strip("'\" "), match["name"], match["least"] or "0", condition
+
+
+def _version_of(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _is_older(found: str | None, least: str) -> bool:
+    """Return whether a library is missing or older than needed."""
+    numbers = [[int(n) for n in re.findall(r"\d+", one)[:3]] for one in (found or "", least)]
+    return numbers[0] < numbers[1]
+
+
+def _describe_folder(folder: Path, pattern: str) -> dict[str, Any]:
+    there = next(one for one in (folder, *folder.parents) if one.exists())
+    return {
+        "path": str(folder),
+        "bytes": sum(one.stat().st_size for one in folder.glob(pattern) if one.is_file()),
+        "writable": there.is_dir() and os.access(there, os.W_OK),
+    }
