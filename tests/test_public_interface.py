@@ -13,7 +13,7 @@ from topoloc.demo.recordings import SHIPPED
 @pytest.fixture(scope="module")
 def lab_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("lab") / "lab.topo"
-    topoloc.build_map(f"{SHIPPED / 'map_lap1'}@0:30").save(path)
+    topoloc.build_map(topoloc.open_sequence(SHIPPED / "map_lap1")[0:30]).save(path)
     return path
 
 
@@ -25,6 +25,17 @@ def test_a_map_is_built_and_localized_in_by_paths(lab_map: Path):
     assert frame.world_from_cam is not None
     error = result.world_from_cam.translation - frame.world_from_cam.translation
     assert abs(error).max() < 0.05
+
+
+def test_a_slice_makes_the_map_of_its_frames(lab_map: Path):
+    recording = topoloc.open_sequence(SHIPPED / "map_lap1")
+    with topoloc.TopoMetricMap.load(lab_map) as whole:
+        assert whole.sessions[0].end_ns <= recording.t_ns[29]
+    part = topoloc.build_map(recording[0:30:2][5:10])
+    assert {node.summary.name for node in part.nodes} <= set(recording.names[10:20:2])
+    assert part.sessions[0].poses_from == "truth"
+    with pytest.raises(topoloc.RecordingError, match="map_lap1: no frames"):
+        topoloc.build_map(recording[5:5])
 
 
 def test_a_map_is_evaluated(lab_map: Path):

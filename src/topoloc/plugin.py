@@ -62,6 +62,7 @@ if TYPE_CHECKING:
         times_from_rate as times_from_rate,
     )
     from topoloc.recordings.formats.video import Video as Video, silence_opencv as silence_opencv
+    from topoloc.recordings.frame import IndexedFrames as IndexedFrames
     from topoloc.recordings.image_io import (
         MAX_PIXELS as MAX_PIXELS,
         EncodedImage as EncodedImage,
@@ -110,6 +111,7 @@ _NAMES = {
         "RecordingFormat list_images match_times natural_key read_ground_truth times_from_rate"
     ),
     "topoloc.recordings.formats.video": "Video silence_opencv",
+    "topoloc.recordings.frame": "IndexedFrames",
     "topoloc.recordings.image_io": (
         "EncodedImage MAX_PIXELS exif_focal_length find_white_level image_size"
     ),

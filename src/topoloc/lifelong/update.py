@@ -40,9 +40,8 @@ from topoloc.mapping.sessions import Session
 from topoloc.mapping.storage.entries import overlay
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.mapping.virtual_nodes import add_virtual_nodes
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import SequenceView, StereoSequence
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import SequenceView
 from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam

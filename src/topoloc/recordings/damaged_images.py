@@ -9,9 +9,8 @@ from pathlib import Path
 
 from topoloc.errors import RecordingError, UnreadableImageError
 from topoloc.recordings.depth_images import read_depth_image
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
 from topoloc.recordings.image_io import read_image
-from topoloc.recordings.recording import SequenceView, sequence_subset
 
 
 def leave_out_damaged(

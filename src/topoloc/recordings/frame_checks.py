@@ -19,7 +19,7 @@ from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import DepthImage, StereoFrame
+from topoloc.recordings.frame import DepthImage, IndexedFrames, StereoFrame
 
 MIN_MEDIAN_DEPTH, MAX_MEDIAN_DEPTH = 0.05, 100.0
 """Limits of the median depth of an image, in metres. A median outside of them indicates a wrong
@@ -166,7 +166,7 @@ def _find_size_problem(what: str, image: np.ndarray, camera: Camera | None) -> s
     return f"{what} is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}"
 
 
-class MemorySequence:
+class MemorySequence(IndexedFrames):
     """A recording of frames in memory: stereo pairs, RGB-D or single images, with or without poses.
 
     All frames are checked at construction, so that a wrong type, size or unit is reported early.
@@ -215,6 +215,6 @@ class MemorySequence:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def __getitem__(self, index: int) -> StereoFrame:
-        """Return one frame as it was given. Raises IndexError."""
-        return self._frames[index]
+    def read_frame(self, row: int) -> StereoFrame:
+        """Return one frame as it was given."""
+        return self._frames[row]
