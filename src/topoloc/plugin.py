@@ -24,8 +24,13 @@ if TYPE_CHECKING:
     from topoloc.evaluation.metrics import format_length as format_length
     from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
     from topoloc.features.feature_types import (
+        FeatureConfig as FeatureConfig,
+        FeatureType as FeatureType,
+        GuidedThresholds as GuidedThresholds,
         find_available_types as find_available_types,
+        register_feature_type as register_feature_type,
     )
+    from topoloc.features.features import Features as Features
     from topoloc.features.network_files import (
         NetworkInfo as NetworkInfo,
         cache_folder as cache_folder,
@@ -89,6 +94,12 @@ if TYPE_CHECKING:
     )
     from topoloc.recordings.trajectory import has_answers as has_answers
     from topoloc.removed_settings import parse_tables as parse_tables
+    from topoloc.retrieval.coarse import (
+        CoarseLocalizer as CoarseLocalizer,
+        CoarseModel as CoarseModel,
+        NodeScore as NodeScore,
+        register_coarse_localizer as register_coarse_localizer,
+    )
 
 _NAMES = {
     "topoloc.atlas.manifest": "check_tile_id",
@@ -96,7 +107,10 @@ _NAMES = {
     "topoloc.bounds": "Above AtLeast Between describe_ranges suggest_name with_setting",
     "topoloc.evaluation.metrics": "format_length",
     "topoloc.evaluation.node_matching": "NodeMatcher",
-    "topoloc.features.feature_types": "find_available_types",
+    "topoloc.features.feature_types": (
+        "FeatureConfig FeatureType GuidedThresholds find_available_types register_feature_type"
+    ),
+    "topoloc.features.features": "Features",
     "topoloc.features.network_files": "NetworkInfo cache_folder",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.localization.query": "Deadline",
@@ -122,6 +136,7 @@ _NAMES = {
     "topoloc.recordings.text_files": "parse_relative_path read_text",
     "topoloc.recordings.trajectory": "has_answers",
     "topoloc.removed_settings": "parse_tables",
+    "topoloc.retrieval.coarse": "CoarseLocalizer CoarseModel NodeScore register_coarse_localizer",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULES)
