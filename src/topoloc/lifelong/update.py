@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from topoloc.json_data import OneLine
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.session_checks import check_session_is_new
 from topoloc.lifelong.session_content import (
@@ -48,8 +49,8 @@ from topoloc.slam.slam import run_slam
 from topoloc.tracking.tracker import Tracker
 
 
-@dataclass(frozen=True, eq=False)
-class MapUpdate:
+@dataclass(frozen=True, eq=False, repr=False)
+class MapUpdate(OneLine):
     """Hold the updated map, the session with its poses in the map's world, and the changes by
     name."""
 

@@ -17,11 +17,7 @@ def leave_out_damaged(
     sequence: StereoSequence, warn: Callable[[str], object] | None = None
 ) -> StereoSequence:
     """Return a recording of image files without the frames that have a missing, empty or truncated
-    file. `warn` is called with their number.
-
-    Raises:
-        RecordingError: more than half of the frames have one.
-    """
+    file. `warn` is called with their number. Raises RecordingError: more than half have one."""
     base, rows = sequence, list(range(len(sequence)))
     while isinstance(base, SequenceView):
         base, rows = base.base, [base.indices[row] for row in rows]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, SupportsIndex, overload, runtime_checkable
+from typing import Any, Protocol, SupportsIndex, overload, runtime_checkable
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from jaxtyping import Float32, UInt8
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 
 Image = UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
 
@@ -24,8 +25,8 @@ def to_grey(image: Image) -> UInt8[np.ndarray, "h w"]:
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-@dataclass(frozen=True, eq=False)
-class DepthImage:
+@dataclass(frozen=True, eq=False, repr=False)
+class DepthImage(OneLine):
     """Hold depth along z in metres, in pixels of its own camera. Unknown depth is NaN. It is
     registered if `cam_from_depth` is the identity."""
 
@@ -92,31 +93,19 @@ class StereoSequence(Protocol):
     def __getitem__(self, index: SupportsIndex, /) -> StereoFrame: ...
     @overload
     def __getitem__(self, index: slice, /) -> StereoSequence: ...
-    def __getitem__(self, index: SupportsIndex | slice, /) -> StereoFrame | StereoSequence:
-        """Read one frame, or select frames. Raises IndexError, UnreadableImageError."""
-        ...
-
-
-class _Readable(StereoSequence, Protocol):
-    def read_frame(self, row: int) -> StereoFrame: ...
 
 
 class IndexedFrames:
-    """A base class of recordings. It makes indices and slices of `read_frame`, which reads the
+    """A base class of recordings. It makes indices and slices of `read_frame(row)`, which reads the
     frame of a row counted from 0."""
 
     @overload
-    def __getitem__(self: _Readable, index: SupportsIndex, /) -> StereoFrame: ...
+    def __getitem__(self: Any, index: SupportsIndex, /) -> StereoFrame: ...
     @overload
-    def __getitem__(self: _Readable, index: slice, /) -> StereoSequence: ...
-    def __getitem__(
-        self: _Readable, index: SupportsIndex | slice, /
-    ) -> StereoFrame | StereoSequence:
-        """Read one frame, or select frames as a recording with their poses, by Python's rules.
-
-        Raises:
-            IndexError: there is no such frame.
-            UnreadableImageError: an image is missing, damaged, or of another size than its camera.
+    def __getitem__(self: Any, index: slice, /) -> StereoSequence: ...
+    def __getitem__(self: Any, index: SupportsIndex | slice, /) -> StereoFrame | StereoSequence:
+        """Read one frame, or select frames as a recording with their poses. Raises IndexError: no
+        such frame; UnreadableImageError: an image is missing, damaged, or not of its camera's size.
         """
         rows = range(len(self))
         if isinstance(index, slice):
@@ -176,11 +165,7 @@ class SequenceView(IndexedFrames):
 
 def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoSequence:
     """Return the given frames of a sequence, in this order, with their poses. Images are still read
-    one by one.
-
-    Raises:
-        IndexError: an index is outside of the sequence.
-    """
+    one by one. Raises IndexError: an index is outside of the sequence."""
     poses, *apart = (sequence.poses, *getattr(sequence, "apart", ()))
     chosen = [[stretch[index] for index in indices] for stretch in (poses, *apart)]
     return SequenceView(sequence, list(indices), chosen[0], tuple(chosen[1:]))

@@ -194,23 +194,11 @@ class MemorySequence(IndexedFrames):
             if problem is not None:
                 raise RecordingError(f"{name}, frame {number} ({frame.name}): {problem}")
         self._frames = [replace(frame, t_ns=int(frame.t_ns)) for frame in self._frames]
+        self.names = [frame.name for frame in self._frames]
+        self.t_ns = [frame.t_ns for frame in self._frames]
+        self.poses = [frame.world_from_cam for frame in self._frames]
         if problem := find_times_problem(self.t_ns):
             raise RecordingError(f"{name}: {problem}")
-
-    @property
-    def names(self) -> list[str]:
-        """Return the name of each frame."""
-        return [frame.name for frame in self._frames]
-
-    @property
-    def t_ns(self) -> list[int]:
-        """Return the time of each frame, in integer nanoseconds."""
-        return [frame.t_ns for frame in self._frames]
-
-    @property
-    def poses(self) -> list[Rigid3 | None]:
-        """Return world_from_cam of each frame, None if unknown."""
-        return [frame.world_from_cam for frame in self._frames]
 
     def __len__(self) -> int:
         return len(self._frames)

@@ -125,15 +125,9 @@ class Recording(IndexedFrames):
         camera = self.camera if self.cameras is None else self.cameras[index]
         image = _read_checked_image(path, camera, self._white_level, self.as_stored)
         focal = exif_focal_length(path, image.shape[1], image.shape[0]) if camera is None else None
-        return StereoFrame(
-            self.names[index],
-            self.t_ns[index],
-            image,
-            camera,
-            rig=self.right and self.right.rig,
-            world_from_cam=self.poses[index],
-            exif_focal_px=focal,
-        )
+        name, t_ns, pose = self.names[index], self.t_ns[index], self.poses[index]
+        rig = self.right and self.right.rig
+        return StereoFrame(name, t_ns, image, camera, None, rig, None, pose, focal)
 
 
 def with_poses(
@@ -164,8 +158,7 @@ def as_monocular(sequence: StereoSequence) -> StereoSequence:
     """Return the recording without its right and depth images, which are then not read."""
     if isinstance(sequence, SequenceView):
         return replace(sequence, base=as_monocular(sequence.base))
-    monocular = getattr(sequence, "monocular", None)
-    return sequence if monocular is None else monocular()
+    return getattr(sequence, "monocular", lambda: sequence)()
 
 
 def read_left_frame(sequence: StereoSequence, index: int) -> StereoFrame:

@@ -32,8 +32,7 @@ def check_stereo(sequence: StereoSequence, num_frames: int = 8) -> None:
 
     Raises:
         CalibrationError: the baseline cannot be in metres.
-        RecordingError: there are no frames, left and right are swapped, or are no rectified pairs
-            of one moment.
+        RecordingError: no frames; left and right are swapped, or no rectified pairs of one moment.
         UnreadableImageError: an image cannot be read.
     """
     max_baseline = 5.0  # metres; a larger one is assumed to be in millimetres

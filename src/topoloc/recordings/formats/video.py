@@ -88,13 +88,8 @@ class Video(IndexedFrames):
     def read_frame(self, row: int) -> StereoFrame:
         """Read one frame. Raises UnreadableImageError: it cannot be decoded, or its size differs
         from the first frame's."""
-        return StereoFrame(
-            self.names[row],
-            self.t_ns[row],
-            self._decode(row),
-            self.camera,
-            world_from_cam=self.poses[row],
-        )
+        name, t_ns, pose = self.names[row], self.t_ns[row], self.poses[row]
+        return StereoFrame(name, t_ns, self._decode(row), self.camera, world_from_cam=pose)
 
     def _decode(self, index: int) -> Image:
         reader = self._reader
