@@ -3,6 +3,8 @@ notebook. Type checkers tell the two results apart."""
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import re
 import subprocess
 import sys
@@ -120,3 +122,17 @@ def test_a_type_checker_tells_results_and_frames_apart(tmp_path: Path):
     assert types == ["Localization", "NotLocalized", "StereoSequence", "StereoFrame"], done.stdout
     errors = re.findall(r"a\.py:(\d+):\d+ - error", done.stdout)
     assert sorted(set(errors)) == ["11", "12"]
+
+
+def test_no_other_public_dataclass_prints_what_it_holds():
+    """A new one inherits `OneLine`, has its own line, or holds a few numbers and joins these."""
+    small = "AtlasConfig GeoPoint GeoPositionPrior Illumination PoseConventions SingleMap"
+    generated = {
+        name
+        for name in topoloc.__all__
+        if dataclasses.is_dataclass(one := getattr(topoloc, name))
+        and one.__dataclass_params__.repr
+        and "def __repr__" not in inspect.getsource(one)
+    }
+    assert generated <= {*small.split(), "TrackerConfig", "UncalibratedCamera"}
+    assert generated

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -59,6 +60,8 @@ def assert_same_frame(one: StereoFrame, other: StereoFrame) -> None:
 def assert_slices(sequence: StereoSequence) -> None:
     """A slice is a recording of the same frames and poses, and every index is one of Python's."""
     num_frames = len(sequence)
+    assert re.fullmatch(r"\w+\(.*, [0-9]+ frames( of stereo| with depth)?\)", repr(sequence))
+    assert len(repr(sequence[:][:][:])) < 200
     for cut in (slice(1, num_frames), slice(None, None, -2), slice(-2, 99, np.int64(1))):
         part, rows = sequence[cut], range(num_frames)[cut]
         assert isinstance(part, StereoSequence)

@@ -99,6 +99,9 @@ class IndexedFrames:
     """A base class of recordings. It makes indices and slices of `read_frame(row)`, which reads the
     frame of a row counted from 0."""
 
+    def __repr__(self: Any) -> str:
+        return f"{type(self).__name__}({self.name!r}, {len(self)} frames)"
+
     @overload
     def __getitem__(self: Any, index: SupportsIndex, /) -> StereoFrame: ...
     @overload
@@ -115,7 +118,7 @@ class IndexedFrames:
         return self.read_frame(rows[index])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SequenceView(IndexedFrames):
     """Show selected frames of another sequence in the given order with the given poses.
 
@@ -127,9 +130,6 @@ class SequenceView(IndexedFrames):
     indices: list[int]
     poses: list[Rigid3 | None]
     apart: tuple[list[Rigid3 | None], ...] = ()
-
-    def __repr__(self) -> str:
-        return f"SequenceView({len(self)} frames of {self.base!r})"
 
     @property
     def name(self) -> str:

@@ -39,7 +39,7 @@ _NAMES = ["timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw"]
 _LENS_NAMES = ["fx", "fy", "cx", "cy"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StrayRecording(IndexedFrames):
     """A StereoSequence of such a folder. `video_idx` are the numbers of the frames in the video."""
 

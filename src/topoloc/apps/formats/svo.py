@@ -26,7 +26,7 @@ from topoloc.plugin import IndexedFrames, read_ground_truth
 SVO_SUFFIXES = frozenset({".svo", ".svo2"})
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class SvoRecording(IndexedFrames):
     """A StereoSequence in an SVO file. Access out of order seeks."""
 

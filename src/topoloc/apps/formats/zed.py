@@ -58,7 +58,7 @@ def can_open(path: Path) -> bool:
     return width >= _MIN_ASPECT_RATIO * height
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SideBySideVideo(IndexedFrames):
     """A StereoSequence of the two halves of a video."""
 

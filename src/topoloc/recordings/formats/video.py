@@ -42,7 +42,7 @@ class _Reader:
     next_idx: int = 0
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Video(IndexedFrames):
     """A StereoSequence in one video file. Frames are decoded in order. Accessing an earlier frame
     restarts the video."""

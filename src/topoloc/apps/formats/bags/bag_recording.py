@@ -66,7 +66,7 @@ class ImageMessages:
     refs: list[MessageRef]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class BagRecording(IndexedFrames):
     """A StereoSequence of a bag. `names` are the times of the frames in seconds."""
 
