@@ -8,6 +8,7 @@ import io
 import json
 import re
 import runpy
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,9 +19,11 @@ import pytest
 
 import topoloc
 from topoloc.demo.recordings import SHIPPED
+from topoloc.features import feature_types
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.trajectory import Trajectory
+from topoloc.retrieval import coarse
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_LINES = 86
@@ -158,12 +161,80 @@ def test_inspect_map(run: Run, lab: Path, tmp_path: Path):
     assert cv2.imread(str(tmp_path / "map.png")).std() > 5.0
 
 
+def test_own_features(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A map of ORB opens where ORB is registered, and is refused with the remedy elsewhere."""
+    monkeypatch.setattr(feature_types, "FEATURE_TYPES", dict(feature_types.FEATURE_TYPES))
+    printed = run("own_features")
+    assert "8 of 8 localized" in printed
+    assert max(_centimetres(printed, "median error")) < 0.5
+    assert TopoMetricMap.load(tmp_path / "lab_orb.topo").kinds == ["orb"]
+    _refuses_in_a_new_process(
+        tmp_path / "lab_orb.topo", "FeatureTypeError: no features of kind 'orb'", "feature_type"
+    )
+    surf = feature_types.FEATURE_TYPES["surf"]
+    with pytest.raises(topoloc.FeatureTypeError, match="'surf' are topoloc's"):
+        feature_types.register_feature_type(surf)
+
+
+def test_own_retrieval(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(coarse, "_extensions", {})
+    printed = run("own_retrieval")
+    assert "8 of 8 localized" in printed
+    assert max(_centimetres(printed, "median error")) < 0.5
+    _refuses_in_a_new_process(
+        tmp_path / "lab_thumbs.topo",
+        "MapError: the map's coarse localizer 'thumbnails' is not known",
+        "coarse_localizer",
+    )
+    with pytest.raises(topoloc.ConfigError, match="'cnn-nn' is topoloc's"):
+        coarse.register_coarse_localizer(
+            "cnn-nn", lambda model: coarse.open_coarse_localizer(model)
+        )
+
+
+def _refuses_in_a_new_process(path: Path, fault: str, remedy: str) -> None:
+    program = f"import topoloc; topoloc.Localizer({str(path)!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert fault in done.stderr
+    assert f"topoloc.plugin.register_{remedy}" in done.stderr.splitlines()[-1]
+
+
+def test_first_map_notebook(tmp_path: Path):
+    """Its code cells run in their order; the last line of each is shown, as a notebook does."""
+    path = EXAMPLES / "first_map.ipynb"
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert [(cell["outputs"], cell["execution_count"]) for cell in cells] == [([], None)] * 4
+    codes = ["".join(cell["source"]) for cell in cells]
+    shown = [ast.parse(code).body[-1] for code in codes]
+    program = f"""
+import json
+names = {{}}
+for code, last in {[(code, ast.unparse(last)) for code, last in zip(codes, shown, strict=True)]!r}:
+    exec(code, names)
+    if not last.startswith(("import", "from", "print")):
+        value = eval(last, names)
+        print(getattr(value, "_repr_html_", value.__repr__)())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "<svg" in done.stdout
+    assert "<div>Localization(" in done.stdout
+    (error,) = _centimetres(done.stdout, "median error")
+    assert error < 0.5
+    assert (tmp_path / "lab.html").is_file()
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("coarse", ["cnn-fc", "cnn-nn"])
-def test_train_classifier(run: Run, coarse: str, tmp_path: Path, request: pytest.FixtureRequest):
+@pytest.mark.parametrize("name", ["cnn-fc", "cnn-nn"])
+def test_train_classifier(run: Run, name: str, tmp_path: Path, request: pytest.FixtureRequest):
     pytest.importorskip("torch")
     weights: tuple[object, ...] = ()
-    if coarse == "cnn-nn":
+    if name == "cnn-nn":
         weights = (
             "--weights",
             request.getfixturevalue("shared") / "weights/squeezenet1_1-imagenet-features.pth",
@@ -171,9 +242,9 @@ def test_train_classifier(run: Run, coarse: str, tmp_path: Path, request: pytest
     printed = run("train_classifier", "--epochs", 1, *weights)
     assert set(TopoMetricMap.load(tmp_path / "lab_learned.topo").first_layer.coarse_models) >= {
         "surf-vlad",
-        coarse,
+        name,
     }
-    near = re.search(rf"^{coarse}: .* in (\d+) %$", printed, re.MULTILINE)
+    near = re.search(rf"^{name}: .* in (\d+) %$", printed, re.MULTILINE)
     assert near
-    if coarse == "cnn-nn":  # one epoch from nothing promises little
+    if name == "cnn-nn":  # one epoch from nothing promises little
         assert int(near.group(1)) >= 90

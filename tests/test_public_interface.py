@@ -2,18 +2,67 @@
 
 from __future__ import annotations
 
+import builtins
+import inspect
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import topoloc
+import topoloc.plugin
+from topoloc import errors
 from topoloc.demo.recordings import SHIPPED
+
+
+def _docstrings() -> Iterator[tuple[str, str]]:
+    for door in (topoloc, topoloc.plugin):
+        for name in door.__all__:
+            public = getattr(door, name)
+            yield name, inspect.getdoc(public) or ""
+            members = vars(public) if inspect.isclass(public) else ()
+            for member in members:
+                text = getattr(getattr(public, member), "__doc__", None)
+                yield f"{name}.{member}", text if isinstance(text, str) else ""
+
+
+def test_errors_that_public_names_raise_are_of_the_documented_tree():
+    """Or Python's own. The tree is on the page of the public names."""
+    raised = {
+        error: name
+        for name, text in _docstrings()
+        for error in re.findall(r"\b[A-Z]\w+Error\b", text)
+    }
+    assert {"EmptyMapError", "UnknownFormatError", "ConfigError"} <= set(raised)
+    own = {error for error in raised if not hasattr(builtins, error)}
+    assert [(raised[error], error) for error in own if not hasattr(errors, error)] == []
+    assert own <= set(re.findall(r"\w+Error", errors.__doc__ or ""))
+
+
+@pytest.mark.parametrize(
+    "name", ["build_map", "run_slam", "evaluate", "certify", "update", "merge"]
+)
+def test_long_calls_tell_their_progress(name: str):
+    assert "progress" in inspect.signature(getattr(topoloc, name)).parameters
+
+
+def test_progress_names_the_stages_and_counts_to_the_end(lab_map: Path):
+    told = list[tuple[str, int, int]]()
+    recording = topoloc.open_sequence(SHIPPED / "map_lap1")[:8]
+    topoloc.build_map(recording, progress=lambda *step: told.append(step))
+    topoloc.evaluate(
+        topoloc.Localizer(lab_map), [recording[:2]], progress=lambda *step: told.append(step)
+    )
+    last = {stage: (done, total) for stage, done, total in told}
+    assert {"nodes", "repetitions", "map_lap1"} <= set(last)
+    assert all(done == total for done, total in last.values())
 
 
 @pytest.fixture(scope="module")
 def lab_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("lab") / "lab.topo"
-    topoloc.build_map(f"{SHIPPED / 'map_lap1'}@0:30").save(path)
+    topoloc.build_map(topoloc.open_sequence(SHIPPED / "map_lap1")[0:30]).save(path)
     return path
 
 
@@ -25,6 +74,17 @@ def test_a_map_is_built_and_localized_in_by_paths(lab_map: Path):
     assert frame.world_from_cam is not None
     error = result.world_from_cam.translation - frame.world_from_cam.translation
     assert abs(error).max() < 0.05
+
+
+def test_a_slice_makes_the_map_of_its_frames(lab_map: Path):
+    recording = topoloc.open_sequence(SHIPPED / "map_lap1")
+    with topoloc.TopoMetricMap.load(lab_map) as whole:
+        assert whole.sessions[0].end_ns <= recording.t_ns[29]
+    part = topoloc.build_map(recording[0:30:2][5:10])
+    assert {node.summary.name for node in part.nodes} <= set(recording.names[10:20:2])
+    assert part.sessions[0].poses_from == "truth"
+    with pytest.raises(topoloc.RecordingError, match="map_lap1: no frames"):
+        topoloc.build_map(recording[5:5])
 
 
 def test_a_map_is_evaluated(lab_map: Path):

@@ -15,8 +15,8 @@ from topoloc.geometry.rigid import Rigid3
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.build import BuildConfig, build_map
 from topoloc.mapping.nodes import NodeConfig
+from topoloc.recordings.frame import sequence_subset
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import sequence_subset
 
 
 @pytest.fixture(scope="module")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from topoloc.geometry.rigid import Rigid3, exp_so3
+from topoloc.recordings.frame import StereoFrame, StereoSequence
 
 WIDTH, HEIGHT = 32, 24
 
@@ -44,6 +47,36 @@ def assert_same_pose(one: Rigid3 | None, other: Rigid3 | None, tolerance: float 
     assert one is not None
     assert other is not None
     np.testing.assert_allclose(one.matrix(), other.matrix(), atol=tolerance)
+
+
+def assert_same_frame(one: StereoFrame, other: StereoFrame) -> None:
+    assert (one.name, one.t_ns, one.camera) == (other.name, other.t_ns, other.camera)
+    np.testing.assert_array_equal(one.image, other.image)
+    assert (one.right is None, one.rig is None) == (other.right is None, other.rig is None)
+    assert (one.depth is None) == (other.depth is None)
+    assert one.world_from_cam is other.world_from_cam
+
+
+def assert_slices(sequence: StereoSequence) -> None:
+    """A slice is a recording of the same frames and poses, and every index is one of Python's."""
+    num_frames = len(sequence)
+    assert re.fullmatch(r"\w+\(.*, [0-9]+ frames( of stereo| with depth)?\)", repr(sequence))
+    assert len(repr(sequence[:][:][:])) < 200
+    for cut in (slice(1, num_frames), slice(None, None, -2), slice(-2, 99, np.int64(1))):
+        part, rows = sequence[cut], range(num_frames)[cut]
+        assert isinstance(part, StereoSequence)
+        assert (part.name, len(part)) == (sequence.name, len(rows))
+        assert part.t_ns == [sequence.t_ns[row] for row in rows]
+        assert part.names == [sequence.names[row] for row in rows]
+        for frame, row in zip(part, rows, strict=True):
+            assert_same_frame(frame, sequence[row])
+        assert_same_frame(part[-1:][0], sequence[np.int32(rows[-1])])
+    assert_same_frame(sequence[-num_frames], sequence[np.uint8(0)])
+    assert len(sequence[3:3]) == 0
+    for index in (num_frames, -num_frames - 1, np.int64(99)):
+        with pytest.raises(IndexError, match=f": no frame {index}; it has {num_frames}$") as raised:
+            sequence[index]
+        assert str(raised.value).startswith(f"{sequence.name}: ")
 
 
 CALIB = "\n".join(

@@ -16,10 +16,10 @@ from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.frame import SequenceView, StereoFrame
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import Recording, SequenceView
+from topoloc.recordings.recording import Recording
 
 Edit = Callable[[np.ndarray], np.ndarray]
 

@@ -7,8 +7,8 @@ numbers are annotated as `Finite`. Arrays are annotated with their shapes, and p
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from typing import Annotated, Any, TypeVar
+from collections.abc import Callable, Collection
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
@@ -75,3 +75,23 @@ def _decode_custom(kind: Any, value: Any) -> Any:
     if not is_finite or not isinstance(array := array.astype(np.float64), kind):
         raise ValueError(f"finite numbers of shape ({kind.dim_str}) are expected")
     return array
+
+
+class OneLine:
+    """A base of structs and of dataclasses with `repr=False`: they print as one line of less than
+    200 characters. Of long lists and arrays it has the length, so that no file is read."""
+
+    __slots__ = ()
+    __match_args__: ClassVar[tuple[str, ...]]
+
+    def __repr__(self) -> str:
+        shown = (f"{name}={_shorten(getattr(self, name))}" for name in type(self).__match_args__)
+        text = f"{type(self).__name__}({', '.join(shown)})"
+        return text if len(text) < 200 else f"{text[:195]}...)"
+
+
+def _shorten(value: object) -> str:
+    if isinstance(value, np.ndarray) or (isinstance(value, Collection) and len(value) > 12):
+        return repr(value) if isinstance(value, str) else f"{type(value).__name__} of {len(value)}"
+    text = f"[{', '.join(map(_shorten, value))}]" if isinstance(value, list) else repr(value)
+    return text if len(text) <= 120 and "\n" not in text else f"{type(value).__name__}(...)"

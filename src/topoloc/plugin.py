@@ -25,8 +25,13 @@ if TYPE_CHECKING:
     from topoloc.evaluation.metrics import format_length as format_length
     from topoloc.evaluation.node_matching import NodeMatcher as NodeMatcher
     from topoloc.features.feature_types import (
+        FeatureConfig as FeatureConfig,
+        FeatureType as FeatureType,
+        GuidedThresholds as GuidedThresholds,
         find_available_types as find_available_types,
+        register_feature_type as register_feature_type,
     )
+    from topoloc.features.features import Features as Features
     from topoloc.features.network_files import (
         NetworkInfo as NetworkInfo,
         cache_folder as cache_folder,
@@ -63,6 +68,7 @@ if TYPE_CHECKING:
         times_from_rate as times_from_rate,
     )
     from topoloc.recordings.formats.video import Video as Video, silence_opencv as silence_opencv
+    from topoloc.recordings.frame import IndexedFrames as IndexedFrames
     from topoloc.recordings.image_io import (
         MAX_PIXELS as MAX_PIXELS,
         EncodedImage as EncodedImage,
@@ -89,6 +95,12 @@ if TYPE_CHECKING:
     )
     from topoloc.recordings.trajectory import has_answers as has_answers
     from topoloc.removed_settings import parse_tables as parse_tables
+    from topoloc.retrieval.coarse import (
+        CoarseLocalizer as CoarseLocalizer,
+        CoarseModel as CoarseModel,
+        NodeScore as NodeScore,
+        register_coarse_localizer as register_coarse_localizer,
+    )
 
 _NAMES = {
     "topoloc.atlas.manifest": "check_tile_id",
@@ -97,7 +109,10 @@ _NAMES = {
     "topoloc.compiled": "kernel_caches",
     "topoloc.evaluation.metrics": "format_length",
     "topoloc.evaluation.node_matching": "NodeMatcher",
-    "topoloc.features.feature_types": "find_available_types",
+    "topoloc.features.feature_types": (
+        "FeatureConfig FeatureType GuidedThresholds find_available_types register_feature_type"
+    ),
+    "topoloc.features.features": "Features",
     "topoloc.features.network_files": "NetworkInfo cache_folder",
     "topoloc.json_data": "Finite decode_json",
     "topoloc.localization.query": "Deadline",
@@ -112,6 +127,7 @@ _NAMES = {
         "RecordingFormat list_images match_times natural_key read_ground_truth times_from_rate"
     ),
     "topoloc.recordings.formats.video": "Video silence_opencv",
+    "topoloc.recordings.frame": "IndexedFrames",
     "topoloc.recordings.image_io": (
         "EncodedImage MAX_PIXELS exif_focal_length find_white_level image_size"
     ),
@@ -122,6 +138,7 @@ _NAMES = {
     "topoloc.recordings.text_files": "parse_relative_path read_text",
     "topoloc.recordings.trajectory": "has_answers",
     "topoloc.removed_settings": "parse_tables",
+    "topoloc.retrieval.coarse": "CoarseLocalizer CoarseModel NodeScore register_coarse_localizer",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULES)

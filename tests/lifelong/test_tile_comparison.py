@@ -34,8 +34,9 @@ from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import SequenceView
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import SequenceView, with_poses
+from topoloc.recordings.recording import with_poses
 
 # each part of the walk in a world of its own: own_from_room
 WORLDS = {

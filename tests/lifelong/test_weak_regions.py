@@ -26,7 +26,7 @@ from topoloc.localization.result import Localization
 from topoloc.mapping.build import BuildConfig
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.mapping.topomap import TopoNode
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.frame import SequenceView
 
 TURNED = Rigid3(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
 

@@ -22,7 +22,7 @@ from topoloc.mapping.coarse_models import node_ids_to_rows
 from topoloc.mapping.nodes import NodePoses, node_distances
 from topoloc.mapping.storage.entries import Edge, VirtualNodes
 from topoloc.mapping.topomap import TopoMetricMap
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.frame import SequenceView
 from topoloc_training.coarse_training import in_ids
 
 

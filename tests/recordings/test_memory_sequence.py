@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import topoloc
-from tiny_recordings import HEIGHT, WIDTH, picture, pose
+from tiny_recordings import HEIGHT, WIDTH, assert_slices, picture, pose
 from topoloc.errors import RecordingError
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import StereoSequence, sequence_subset
 from topoloc.recordings.frame_checks import find_image_problem
-from topoloc.recordings.recording import sequence_subset
 
 CAMERA = topoloc.Camera.pinhole(WIDTH, HEIGHT, 40.0, 41.0, 15.5, 11.5)
 RIG = topoloc.StereoRig.rectified(CAMERA, 0.12)
@@ -50,6 +49,7 @@ def test_a_sequence_of_frames():
     np.testing.assert_array_equal(DEPTH.cam_from_depth.matrix(), np.eye(4))
     assert [found is not None for found in sequence.poses] == [True] * 3
     assert sequence_subset(sequence, [2]).names == ["2"]
+    assert_slices(sequence)
     assert topoloc.MemorySequence([stereo()]).poses == [None]
 
 

@@ -4,18 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tiny_recordings import assert_same_pose, picture, write
+from tiny_recordings import assert_same_pose, assert_slices, picture, write
 from topoloc.errors import RecordingError, UnknownFormatError, UnreadableImageError
 from topoloc.recordings.format import natural_key
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
 from topoloc.recordings.frame_preparation import prepare_frame
 from topoloc.recordings.open import FORMATS, load_format, open_sequence, parse_selection
-from topoloc.recordings.recording import (
-    Recording,
-    SequenceView,
-    read_left_frame,
-    sequence_subset,
-)
+from topoloc.recordings.recording import Recording, as_monocular, read_left_frame
 
 
 @pytest.mark.parametrize("name", ["kitti", "euroc", "tum", "seven_scenes"])
@@ -36,6 +31,8 @@ def test_every_format_is_recognised_by_itself_alone(name: str, request: pytest.F
         == len(sequence.poses)
         == len(list(sequence))
     )
+    assert_slices(sequence)
+    assert_slices(as_monocular(sequence))
 
 
 def test_opening_reads_no_picture(kitti: Path, euroc: Path, tum: Path, seven_scenes: Path):

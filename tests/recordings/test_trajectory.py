@@ -9,8 +9,9 @@ from topoloc.errors import TopolocError, TrajectoryError
 from topoloc.geometry.pose_conventions import PoseConventions
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings import trajectory
+from topoloc.recordings.frame import SequenceView
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import Recording, SequenceView
+from topoloc.recordings.recording import Recording
 from topoloc.recordings.trajectory import (
     Trajectory,
     with_pose_conventions,

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tiny_recordings import assert_slices
 from topoloc.errors import CalibrationError, RecordingError, TrajectoryError, UnreadableImageError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.formats import video
@@ -63,6 +64,7 @@ def test_frames_may_be_asked_for_in_any_order_and_chosen(film: Path):
         assert abs(float(sequence[number].image.mean()) - 20 * (number % NUM_FRAMES)) < 6
     with pytest.raises(IndexError):
         sequence[NUM_FRAMES]
+    assert_slices(sequence)
     part = open_sequence(f"{film}@3::4")
     assert [round(float(frame.image.mean()) / 20) for frame in (part[0], part[1])] == [3, 7]
 

@@ -14,9 +14,9 @@ from room_frames import FrameList, walk
 from topoloc.errors import RecordingError, TrajectoryError
 from topoloc.geometry.rig import StereoRig
 from topoloc.localization.map_facts.map_building import build_map
-from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.frame import SequenceView, StereoFrame
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import Recording, SequenceView
+from topoloc.recordings.recording import Recording
 from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_poses
 

@@ -10,9 +10,9 @@ import pytest
 from topoloc.errors import TrajectoryError
 from topoloc.geometry.pose_conventions import PoseConventions
 from topoloc.geometry.rigid import Rigid3, exp_so3
-from topoloc.recordings.frame import StereoFrame
+from topoloc.recordings.frame import SequenceView, StereoFrame
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import SequenceView, with_poses
+from topoloc.recordings.recording import with_poses
 from topoloc.slam.input_checks import check_pose_coverage
 from topoloc.slam.measured_steps import MeasuredStep, measure_steps
 from topoloc.slam.pose_checks import check_poses, evaluate_poses

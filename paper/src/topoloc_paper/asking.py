@@ -10,9 +10,8 @@ from topoloc.demo.recordings import SHIPPED
 from topoloc.evaluation.metrics import EvaluatedQuery, summarize
 from topoloc.evaluation.query_localization import localize_out_of_map, localize_queries
 from topoloc.localization.localizer import Localizer, LocalizerConfig
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import StereoSequence, sequence_subset
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import sequence_subset
 from topoloc_paper.datasets import Dataset
 from topoloc_paper.known_nodes import answer_with_known_nodes
 from topoloc_paper.maps import MapKind, opened

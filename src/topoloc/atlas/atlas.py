@@ -16,6 +16,7 @@ from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.store import MANIFEST, FolderStore, Store, sha256_of
 from topoloc.atlas.tile_facts import find_other_facts
 from topoloc.errors import AtlasError, MapError
+from topoloc.json_data import OneLine
 from topoloc.mapping.edit import read_history
 
 _OBJECT_STORES = "topoloc.apps.stores.object_store"
@@ -58,8 +59,8 @@ def absolute_address(where: str) -> str:
     return where if "://" in where else os.path.abspath(where)
 
 
-@dataclass(frozen=True, eq=False)
-class Atlas:
+@dataclass(frozen=True, eq=False, repr=False)
+class Atlas(OneLine):
     """Hold a snapshot of an atlas. Later writes do not change it.
 
     The files of its tiles are kept for a while after they are replaced (`GRACE_S` in `editing.py`).

@@ -25,7 +25,7 @@ from topoloc.atlas.joint_worlds import place_tiles
 from topoloc.errors import AtlasError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Count, Finite, Positive, decode_json, encode_json
+from topoloc.json_data import Count, Finite, OneLine, Positive, decode_json, encode_json
 
 FORMAT, FORMAT_VERSION = "topoloc-atlas", 1
 TILES = "tiles"
@@ -48,7 +48,7 @@ class PlacesFile(StoredFile, frozen=True):
     vocabularies: dict[str, str]
 
 
-class Tile(Struct, frozen=True, eq=False, omit_defaults=True, rename={"tile_id": "id"}):
+class Tile(OneLine, Struct, frozen=True, eq=False, omit_defaults=True, rename={"tile_id": "id"}):
     """Describe a map of the atlas.
 
     Attributes:

@@ -28,6 +28,7 @@ from topoloc.atlas.store import MANIFEST, sha256_of
 from topoloc.errors import AtlasError, MapError, ObjectStoreError, TopolocError
 from topoloc.geometry.geodesy import Georeference
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.mapping.edit import kept_path, read_history
 from topoloc.mapping.topomap import TopoMetricMap
 from topoloc.recordings.atomic import temporary_folder
@@ -41,8 +42,8 @@ class PlacedTile:
     world_from_map: Rigid3
 
 
-@dataclass(frozen=True, eq=False)
-class SharedWorld:
+@dataclass(frozen=True, eq=False, repr=False)
+class SharedWorld(OneLine):
     """Hold the tiles of one world, sorted by id.
 
     For georeferenced tiles it is the atlas world (east-north-up). Otherwise it is a joint world, or

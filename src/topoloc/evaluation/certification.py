@@ -27,6 +27,7 @@ from topoloc.evaluation.query_localization import localize_out_of_map, localize_
 from topoloc.evaluation.world_alignment import fit_worlds
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.query import QueryImage
@@ -44,8 +45,8 @@ that differs by less than this factor."""
 _NUM_POINTS = 100
 
 
-@dataclass(frozen=True, eq=False)
-class Certification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Certification(OneLine):
     """Hold a certificate and the answers that it follows from, by condition."""
 
     certificate: Certificate

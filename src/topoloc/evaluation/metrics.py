@@ -13,6 +13,7 @@ import numpy as np
 from topoloc.geometry.alignment import rotation_error, translation_error
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import Image
@@ -24,8 +25,8 @@ RECALL_THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 MAX_TRANSLATION, MAX_ROTATION_DEG = 0.5, 10.0
 
 
-@dataclass(frozen=True, eq=False)
-class EvaluatedQuery:
+@dataclass(frozen=True, eq=False, repr=False)
+class EvaluatedQuery(OneLine):
     """Hold a query with its result and its ground truth. The ground truth is None for an out-of-map
     image, for which any pose is false.
 

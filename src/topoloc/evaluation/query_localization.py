@@ -14,6 +14,7 @@ from topoloc.errors import CalibrationError, TrajectoryError
 from topoloc.evaluation.metrics import EvaluatedQuery, group_by_recording, summarize
 from topoloc.evaluation.world_alignment import WorldFit, fit_worlds
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.localization.image_calibration_check import check_camera_calibrations
 from topoloc.localization.localizer import Localizer
 from topoloc.mapping.config import Progress
@@ -23,8 +24,8 @@ from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import StereoSequence
 
 
-@dataclass(frozen=True, eq=False)
-class Evaluation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation(OneLine):
     """The answers to all queries; `to_json` gives the figures: counts, medians, recall."""
 
     answers: list[EvaluatedQuery]

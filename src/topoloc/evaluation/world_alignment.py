@@ -22,13 +22,14 @@ from topoloc.geometry.alignment import (
 )
 from topoloc.geometry.rigid import Rigid3
 from topoloc.geometry.transform_consensus import find_least_median
+from topoloc.json_data import OneLine
 from topoloc.localization.result import Localization
 
 _POSITION_SCALE_M, _ROTATION_SCALE = 0.25, np.deg2rad(2.0)
 
 
-@dataclass(frozen=True, eq=False)
-class WorldFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class WorldFit(OneLine):
     """Hold `map_from_truth` of one recording, fitted to `num_answers` of `num_localized` results,
     and the medians of the remaining errors."""
 

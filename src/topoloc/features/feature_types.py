@@ -181,16 +181,22 @@ _VIRTUAL_VIEW_TYPES = {
 walls seen from both directions. No map is made of them."""
 
 
-def find_feature_type(name: str) -> FeatureType:
-    """Return the feature type of this name, including types for virtual views.
+def register_feature_type(kind: FeatureType) -> None:
+    """Add a feature type to those that maps may have, in this process. A map of it is opened after
+    its registration only. Raises FeatureTypeError if topoloc has features of this name."""
+    if kind.name in (SURF.name, SIFT.name, *(one.name for one in LEARNED_TYPES)):
+        raise FeatureTypeError(f"features {kind.name!r} are topoloc's; give yours another name")
+    FEATURE_TYPES[kind.name] = kind
 
-    Raises:
-        FeatureTypeError: the name is unknown.
-    """
+
+def find_feature_type(name: str) -> FeatureType:
+    """Return the feature type of this name, including types for virtual views. Raises
+    FeatureTypeError: the name is unknown."""
     kind = FEATURE_TYPES.get(name) or _VIRTUAL_VIEW_TYPES.get(name)
     if kind is None:
         raise FeatureTypeError(
-            f"no features of kind {name!r}; there are {', '.join(FEATURE_TYPES)}"
+            f"no features of kind {name!r}; there are {', '.join(FEATURE_TYPES)}; others after"
+            " topoloc.plugin.register_feature_type"
         )
     return kind
 

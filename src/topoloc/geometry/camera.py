@@ -22,7 +22,7 @@ from topoloc.geometry.distortion import (
     undistort_fisheye,
     undistort_rational,
 )
-from topoloc.json_data import Finite, decode_json
+from topoloc.json_data import Finite, OneLine, decode_json
 
 # Parameter names of each model, in COLMAP's order.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -50,8 +50,8 @@ _TWO_FOCAL_MODELS |= {name: "OPENCV_FISHEYE" for name in MODELS if name.endswith
 _TWO_FOCAL_MODELS["SIMPLE_FISHEYE"] = "FISHEYE"
 
 
-@dataclass(frozen=True)
-class Camera:
+@dataclass(frozen=True, repr=False)
+class Camera(OneLine):
     """Hold one camera: COLMAP model name, image size in pixels, parameters in the model's order.
 
     Raises:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import NonNegative, decode_json, encode_json
+from topoloc.json_data import NonNegative, OneLine, decode_json, encode_json
 
 SEMI_MAJOR = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
@@ -103,8 +103,8 @@ class Quaternion:
             raise ValueError("a quaternion that is not of unit length")
 
 
-@dataclass(frozen=True)
-class GeoPose:
+@dataclass(frozen=True, repr=False)
+class GeoPose(OneLine):
     """Hold an OGC GeoPose 1.0, Basic-Quaternion: the camera's place, and its orientation relative
     to east-north-up at that place.
 
@@ -130,8 +130,8 @@ class GeoPose:
         return decode_json(data, GeoPose, GeoreferenceError, "no GeoPose")
 
 
-@dataclass(frozen=True, eq=False)
-class Georeference:
+@dataclass(frozen=True, eq=False, repr=False)
+class Georeference(OneLine):
     """Hold the place of a map's world frame on earth: `enu_from_world` transforms to the
     east-north-up frame at `origin`.
 

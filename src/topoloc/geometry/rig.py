@@ -11,6 +11,7 @@ from jaxtyping import Float, Float32
 from topoloc.errors import CalibrationError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3, exp_so3, log_so3
+from topoloc.json_data import OneLine
 
 
 def depth_from_disparity(
@@ -82,8 +83,8 @@ _NUM_OUTLINE_POINTS = 101
 _MAX_ANGLE = np.deg2rad(60.0)
 
 
-@dataclass(frozen=True)
-class StereoRig:
+@dataclass(frozen=True, repr=False)
+class StereoRig(OneLine):
     """Hold the left and right camera. `right_from_left` is in metres.
 
     Raises:

@@ -31,8 +31,7 @@ from topoloc.localization.localizer import Localizer
 from topoloc.localization.result import Localization, NotLocalized
 from topoloc.mapping.config import MapConfig, Progress
 from topoloc.mapping.nodes import select_node_frames
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.recording import SequenceView
+from topoloc.recordings.frame import SequenceView, StereoSequence
 from topoloc.slam.pose_graph import Edge, optimize_pose_graph
 
 MIN_AGREEING = 5  # localized images that agree with the motion

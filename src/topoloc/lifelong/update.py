@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from topoloc.json_data import OneLine
 from topoloc.lifelong.node_localization import measure_recall_change
 from topoloc.lifelong.session_checks import check_session_is_new
 from topoloc.lifelong.session_content import (
@@ -40,17 +41,16 @@ from topoloc.mapping.sessions import Session
 from topoloc.mapping.storage.entries import overlay
 from topoloc.mapping.topomap import TopoMetricMap, TopoNode
 from topoloc.mapping.virtual_nodes import add_virtual_nodes
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import SequenceView, StereoSequence
 from topoloc.recordings.open import open_sequence
-from topoloc.recordings.recording import SequenceView
 from topoloc.slam.input_checks import check_stereo
 from topoloc.slam.pose_checks import check_poses
 from topoloc.slam.slam import run_slam
 from topoloc.tracking.tracker import Tracker
 
 
-@dataclass(frozen=True, eq=False)
-class MapUpdate:
+@dataclass(frozen=True, eq=False, repr=False)
+class MapUpdate(OneLine):
     """Hold the updated map, the session with its poses in the map's world, and the changes by
     name."""
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.lifelong.node_localization import (
     LeaveOneOutResult,
     find_near_nodes,
@@ -33,8 +34,8 @@ REASONS: tuple[Reason, ...] = get_args(Reason)
 """The reasons, the most severe first."""
 
 
-@dataclass(frozen=True)
-class NodeQuality:
+@dataclass(frozen=True, repr=False)
+class NodeQuality(OneLine):
     """Hold the quality of a node. `answer` is None if the node was not localized in the rest of the
     map. `seen_share` is the share of its landmarks that other sessions saw."""
 
@@ -63,8 +64,8 @@ class NodeQuality:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class WeakRegion:
+@dataclass(frozen=True, eq=False, repr=False)
+class WeakRegion(OneLine):
     """Hold nodes near each other that are weak for the same reason, in the order of their ids."""
 
     reason: Reason
@@ -83,8 +84,8 @@ class WeakRegion:
         return {"reason": self.reason, "centre": self.centre.round(3).tolist(), "node_ids": ids}
 
 
-@dataclass(frozen=True, eq=False)
-class WeakRegions:
+@dataclass(frozen=True, eq=False, repr=False)
+class WeakRegions(OneLine):
     """Hold the quality of every node, in the map's order, and the weak regions.
 
     Regions are sorted by reason, the most severe first, then by size, the largest first.

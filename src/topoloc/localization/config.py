@@ -9,6 +9,7 @@ from topoloc.bounds import AtLeast, Between
 from topoloc.features.config import MatchingConfig
 from topoloc.features.feature_types import FeatureType
 from topoloc.geometry.absolute_pose import AbsolutePoseConfig
+from topoloc.json_data import OneLine
 from topoloc.localization.guided import GuidedConfig
 
 
@@ -73,8 +74,8 @@ class VirtualViewSearchConfig:
     pose."""
 
 
-@dataclass(frozen=True)
-class LocalizerConfig:
+@dataclass(frozen=True, repr=False)
+class LocalizerConfig(OneLine):
     """Configure the localizer. The features are those that the map was built with."""
 
     kinds: tuple[str, ...] | None = None

@@ -13,7 +13,7 @@ from msgspec.structs import asdict
 from topoloc.errors import CalibrationError, ResultError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Count, Finite, Nanoseconds, decode_json
+from topoloc.json_data import Count, Finite, Nanoseconds, OneLine, decode_json
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ def probability_within_tolerance(doubt: float) -> float:
     return math.erf(1.0 / (math.sqrt(2.0) * doubt))
 
 
-@dataclass(frozen=True)
-class Provenance:
+@dataclass(frozen=True, repr=False)
+class Provenance(OneLine):
     """Hold the source of a result. Unknown values are None or empty.
 
     Attributes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Literal, TypeVar
@@ -14,7 +15,7 @@ from topoloc.errors import ResultError
 from topoloc.geometry.calibration_mismatch import CalibrationMismatch, IntrinsicsDeviation
 from topoloc.geometry.geodesy import GeoPose
 from topoloc.geometry.rigid import Rigid3
-from topoloc.json_data import Count, Finite, NonNegative, decode_json
+from topoloc.json_data import Count, Finite, NonNegative, OneLine, decode_json
 from topoloc.localization.provenance import EMPTY_PROVENANCE, Evidence, Provenance
 from topoloc.node_ids import NodeId
 
@@ -33,8 +34,33 @@ class CandidateNode(Struct, frozen=True, array_like=True, forbid_unknown_fields=
     score: Finite
 
 
+S = TypeVar("S", bound="_Result")
+
+
+class _Result:
+    """Hold what results of both classes have in common."""
+
+    @classmethod
+    def from_json(cls: type[S], line: str | bytes | Mapping[str, Any]) -> S:
+        """Parse the output of `to_json`, as text or as an object, without the query name and
+        `seen_camera`. Raises ResultError: it is not a result, or one of the other class."""
+        result = result_from_json(line)
+        if not isinstance(result, cls):
+            kind = type(result).__name__
+            raise ResultError(f"no {cls.__name__}, but a {kind} ({kind}.from_json reads it)")
+        return result
+
+
+def _to_html(result: Localization | NotLocalized) -> str:
+    """Return lines with the pose or the reason, for notebooks."""
+    counts = f"{result.num_inliers} inliers of {result.num_matches} matches"
+    found = result.alternatives[:8] if isinstance(result, NotLocalized) else ()
+    lines = [repr(result), counts, *map(repr, found)]
+    return "".join(f"<div>{html.escape(line)}</div>" for line in lines)
+
+
 @dataclass(frozen=True, eq=False)
-class Localization:
+class Localization(_Result):
     """Hold the pose `world_from_cam` of an image and its uncertainty.
 
     Attributes:
@@ -85,9 +111,11 @@ class Localization:
         p = f"{self.probability:.3f}, node {self.node_id}"
         return f"Localization({self.world_from_cam}, sigma {sigmas}, p {p})"
 
+    _repr_html_ = _to_html
+
     @property
     def localized(self) -> Literal[True]:
-        """Return True."""
+        """Return True. Type checkers tell the classes apart by `isinstance` or `is True`."""
         return True
 
     @property
@@ -142,25 +170,8 @@ class Localization:
             **{name: value for name, value in optional.items() if value is not None},
         }
 
-    @staticmethod
-    def from_json(line: str | bytes | Mapping[str, Any]) -> Localization:
-        """Parse the output of `to_json`, as text or as an object.
 
-        The query name and `seen_camera` are not restored.
-
-        Raises:
-            ResultError: it is not a result, or the result of an image that was not localized.
-        """
-        result = result_from_json(line)
-        if not isinstance(result, Localization):
-            raise ResultError(
-                "the result of an image that was not localized holds no pose"
-                " (NotLocalized.from_json reads it)"
-            )
-        return result
-
-
-class Alternative(Struct, frozen=True, eq=False, rename={"node_id": "node"}):
+class Alternative(OneLine, Struct, frozen=True, eq=False, rename={"node_id": "node"}):
     """Hold one possible pose of an ambiguous image and its probability.
 
     The probabilities of all alternatives sum to less than 1. The rest is the probability of none of
@@ -185,7 +196,7 @@ class Alternative(Struct, frozen=True, eq=False, rename={"node_id": "node"}):
 
 
 @dataclass(frozen=True, eq=False)
-class NotLocalized:
+class NotLocalized(_Result):
     """Report that no pose is certain enough, with the `reason`.
 
     `alternatives` holds the possible poses of an `ambiguous` image, likeliest first.
@@ -202,7 +213,10 @@ class NotLocalized:
     seen_camera: IntrinsicsDeviation | None = None
 
     def __repr__(self) -> str:
-        return f"NotLocalized({': '.join(filter(None, [self.reason, self.detail]))})"
+        text = ": ".join(filter(None, [self.reason, " ".join(self.detail.split())]))
+        return f"NotLocalized({text if len(text) < 180 else text[:177] + '...'})"
+
+    _repr_html_ = _to_html
 
     @property
     def localized(self) -> Literal[False]:
@@ -215,31 +229,12 @@ class NotLocalized:
         refusal = {"query": query, "localized": False, "reason": self.reason, "detail": self.detail}
         return refusal | {"alternatives": alternatives} | _evidence_json(self)
 
-    @staticmethod
-    def from_json(line: str | bytes | Mapping[str, Any]) -> NotLocalized:
-        """Parse the output of `to_json`, as text or as an object. The query name is not restored.
-
-        Raises:
-            ResultError: it is not a result, or the result of an image that was localized.
-        """
-        result = result_from_json(line)
-        if not isinstance(result, NotLocalized):
-            raise ResultError(
-                "the result of an image that was localized is no refusal (Localization.from_json"
-                " reads it)"
-            )
-        return result
-
 
 R = TypeVar("R", bound=Localization | NotLocalized)
 
 
 def result_from_json(line: str | bytes | Mapping[str, Any]) -> Localization | NotLocalized:
-    """Parse a result of either class.
-
-    Raises:
-        ResultError: it is not a result.
-    """
+    """Parse a result of either class. Raises ResultError: it is not a result."""
     data = decode_json(line, dict[str, Any], ResultError, "no result")
     is_localized = data.get("localized") is True
     kind = _LocalizedLine if is_localized else _RefusedLine

@@ -8,6 +8,7 @@ from typing import Literal
 
 from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.localization.belief import Belief, Hypothesis, log_odds_margin
 from topoloc.localization.config import LocalizerConfig
 from topoloc.localization.exact.patch_alignment import NodeTemplate
@@ -20,8 +21,8 @@ from topoloc.node_ids import NodeId
 from topoloc.retrieval.coarse import NodeScore
 
 
-@dataclass(frozen=True, eq=False)
-class TriedProposal:
+@dataclass(frozen=True, eq=False, repr=False)
+class TriedProposal(OneLine):
     """Record a pose proposal and its outcome.
 
     `first` is the proposal, and `refined` the pose found around it. It is None if the proposal was
@@ -52,8 +53,8 @@ class TriedProposal:
         return self.first
 
 
-@dataclass(eq=False)
-class Trace:
+@dataclass(eq=False, repr=False)
+class Trace(OneLine):
     """Collect all tried pose proposals, in order, and the nodes without a usable image that the
     last step met."""
 

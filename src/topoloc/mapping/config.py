@@ -16,7 +16,7 @@ from topoloc.features.feature_types import (
     find_feature_type,
     parse_feature_types,
 )
-from topoloc.json_data import decode_json
+from topoloc.json_data import OneLine, decode_json
 from topoloc.mapping.nodes import NodeConfig
 from topoloc.mapping.validation import CorruptDataError
 from topoloc.removed_settings import drop_removed_settings
@@ -44,8 +44,8 @@ class VirtualNodesConfig:
     rotation. 0 creates no virtual nodes."""
 
 
-@dataclass(frozen=True)
-class MapConfig:
+@dataclass(frozen=True, repr=False)
+class MapConfig(OneLine):
     """Configure how a map is built. The settings are stored in the map."""
 
     nodes: NodeConfig = field(default_factory=NodeConfig)

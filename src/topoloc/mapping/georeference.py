@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from topoloc.errors import GeoreferenceError
 from topoloc.geometry.geodesy import GeoPoint, Georeference
+from topoloc.json_data import OneLine
 from topoloc.mapping.edit import WaitCallback, edit_map
 from topoloc.mapping.georeferencing import (
     GeoreferenceFit,
@@ -167,8 +168,8 @@ def _parse_geo_point(path: Path, line: int, values: Sequence[float]) -> GeoPoint
         return GeoPoint(*values)
 
 
-@dataclass(frozen=True, eq=False)
-class GeoreferenceResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class GeoreferenceResult(OneLine):
     """The georeference of a map, the heading of its first image (degrees clockwise from true
     north), and the axis of the world that is up (None if points determined it).
 

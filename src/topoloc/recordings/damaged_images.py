@@ -9,20 +9,15 @@ from pathlib import Path
 
 from topoloc.errors import RecordingError, UnreadableImageError
 from topoloc.recordings.depth_images import read_depth_image
-from topoloc.recordings.frame import StereoSequence
+from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
 from topoloc.recordings.image_io import read_image
-from topoloc.recordings.recording import SequenceView, sequence_subset
 
 
 def leave_out_damaged(
     sequence: StereoSequence, warn: Callable[[str], object] | None = None
 ) -> StereoSequence:
     """Return a recording of image files without the frames that have a missing, empty or truncated
-    file. `warn` is called with their number.
-
-    Raises:
-        RecordingError: more than half of the frames have one.
-    """
+    file. `warn` is called with their number. Raises RecordingError: more than half have one."""
     base, rows = sequence, list(range(len(sequence)))
     while isinstance(base, SequenceView):
         base, rows = base.base, [base.indices[row] for row in rows]

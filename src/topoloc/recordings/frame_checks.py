@@ -19,7 +19,7 @@ from topoloc.errors import RecordingError
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
-from topoloc.recordings.frame import DepthImage, StereoFrame
+from topoloc.recordings.frame import DepthImage, IndexedFrames, StereoFrame
 
 MIN_MEDIAN_DEPTH, MAX_MEDIAN_DEPTH = 0.05, 100.0
 """Limits of the median depth of an image, in metres. A median outside of them indicates a wrong
@@ -166,7 +166,7 @@ def _find_size_problem(what: str, image: np.ndarray, camera: Camera | None) -> s
     return f"{what} is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}"
 
 
-class MemorySequence:
+class MemorySequence(IndexedFrames):
     """A recording of frames in memory: stereo pairs, RGB-D or single images, with or without poses.
 
     All frames are checked at construction, so that a wrong type, size or unit is reported early.
@@ -194,27 +194,15 @@ class MemorySequence:
             if problem is not None:
                 raise RecordingError(f"{name}, frame {number} ({frame.name}): {problem}")
         self._frames = [replace(frame, t_ns=int(frame.t_ns)) for frame in self._frames]
+        self.names = [frame.name for frame in self._frames]
+        self.t_ns = [frame.t_ns for frame in self._frames]
+        self.poses = [frame.world_from_cam for frame in self._frames]
         if problem := find_times_problem(self.t_ns):
             raise RecordingError(f"{name}: {problem}")
-
-    @property
-    def names(self) -> list[str]:
-        """Return the name of each frame."""
-        return [frame.name for frame in self._frames]
-
-    @property
-    def t_ns(self) -> list[int]:
-        """Return the time of each frame, in integer nanoseconds."""
-        return [frame.t_ns for frame in self._frames]
-
-    @property
-    def poses(self) -> list[Rigid3 | None]:
-        """Return world_from_cam of each frame, None if unknown."""
-        return [frame.world_from_cam for frame in self._frames]
 
     def __len__(self) -> int:
         return len(self._frames)
 
-    def __getitem__(self, index: int) -> StereoFrame:
-        """Return one frame as it was given. Raises IndexError."""
-        return self._frames[index]
+    def read_frame(self, row: int) -> StereoFrame:
+        """Return one frame as it was given."""
+        return self._frames[row]

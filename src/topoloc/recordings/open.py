@@ -13,8 +13,8 @@ from topoloc.errors import RecordingError, UnknownFormatError
 from topoloc.recordings.calibration import parse_calibration, with_calibration
 from topoloc.recordings.format import RecordingFormat
 from topoloc.recordings.formats.video import Video
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.recording import recording_notes, sequence_subset
+from topoloc.recordings.frame import StereoSequence, sequence_subset
+from topoloc.recordings.recording import recording_notes
 
 # name -> "module:attribute" of a RecordingFormat, in the order of recognition. The plain folder
 # accepts any other folder with images. A format's module is imported when the format is tried.

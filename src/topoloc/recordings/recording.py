@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +11,14 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rig import StereoRig
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.depth_images import read_depth_image, resize_depth
-from topoloc.recordings.frame import DepthImage, Image, StereoFrame, StereoSequence
+from topoloc.recordings.frame import (
+    DepthImage,
+    Image,
+    IndexedFrames,
+    SequenceView,
+    StereoFrame,
+    StereoSequence,
+)
 from topoloc.recordings.image_io import exif_focal_length, find_white_level, read_image
 
 
@@ -39,7 +45,7 @@ class DepthImages:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(IndexedFrames):
     """A StereoSequence on disk.
 
     `names` are image paths relative to `root`. `camera` belongs to the left or colour image.
@@ -102,20 +108,15 @@ class Recording:
         names = self.names[:: max(1, len(self.names) // 5)]
         return find_white_level([self.root / name for name in names])
 
-    def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame.
-
-        Raises:
-            IndexError: there is no such frame.
-            UnreadableImageError: an image is missing, damaged, or of another size than its camera.
-        """
-        frame = self.read_left_frame(index)
+    def read_frame(self, row: int) -> StereoFrame:
+        """Read one frame. Raises as `__getitem__`."""
+        frame = self.read_left_frame(row)
         if self.right is not None:
-            path, camera = self.right.paths[index], self.right.rig.right
+            path, camera = self.right.paths[row], self.right.rig.right
             right = _read_checked_image(path, camera, self._white_level)
             return replace(frame, right=right)
         if self.depth is not None and frame.camera is not None:
-            return replace(frame, depth=_depth_image(self.depth, index, frame.camera))
+            return replace(frame, depth=_depth_image(self.depth, row, frame.camera))
         return frame
 
     def read_left_frame(self, index: int) -> StereoFrame:
@@ -124,63 +125,9 @@ class Recording:
         camera = self.camera if self.cameras is None else self.cameras[index]
         image = _read_checked_image(path, camera, self._white_level, self.as_stored)
         focal = exif_focal_length(path, image.shape[1], image.shape[0]) if camera is None else None
-        return StereoFrame(
-            self.names[index],
-            self.t_ns[index],
-            image,
-            camera,
-            rig=self.right and self.right.rig,
-            world_from_cam=self.poses[index],
-            exif_focal_px=focal,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class SequenceView:
-    """Show selected frames of another sequence in the given order with the given poses.
-
-    `apart` holds the poses of stretches whose transforms to each other are unknown. Each stretch
-    has its own world and one pose per frame, None outside of the stretch.
-    """
-
-    base: StereoSequence
-    indices: list[int]
-    poses: list[Rigid3 | None]
-    apart: tuple[list[Rigid3 | None], ...] = ()
-
-    def __repr__(self) -> str:
-        return f"SequenceView({len(self)} frames of {self.base!r})"
-
-    @property
-    def name(self) -> str:
-        """Return the name of the base sequence."""
-        return self.base.name
-
-    @property
-    def names(self) -> list[str]:
-        """Return the name of each frame."""
-        names = self.base.names
-        return [names[index] for index in self.indices]
-
-    @property
-    def t_ns(self) -> list[int]:
-        """Return the time of each frame, in integer nanoseconds."""
-        t_ns = self.base.t_ns
-        return [t_ns[index] for index in self.indices]
-
-    @property
-    def has_own_poses(self) -> bool:
-        """Return whether a pose is not that of the base sequence."""
-        before = self.base.poses
-        pairs = zip(self.indices, self.poses, strict=True)
-        return any(pose is not before[index] for index, pose in pairs)
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame. Raises as the base sequence."""
-        return replace(self.base[self.indices[index]], world_from_cam=self.poses[index])
+        name, t_ns, pose = self.names[index], self.t_ns[index], self.poses[index]
+        rig = self.right and self.right.rig
+        return StereoFrame(name, t_ns, image, camera, None, rig, None, pose, focal)
 
 
 def with_poses(
@@ -211,8 +158,7 @@ def as_monocular(sequence: StereoSequence) -> StereoSequence:
     """Return the recording without its right and depth images, which are then not read."""
     if isinstance(sequence, SequenceView):
         return replace(sequence, base=as_monocular(sequence.base))
-    monocular = getattr(sequence, "monocular", None)
-    return sequence if monocular is None else monocular()
+    return getattr(sequence, "monocular", lambda: sequence)()
 
 
 def read_left_frame(sequence: StereoSequence, index: int) -> StereoFrame:
@@ -231,17 +177,6 @@ def recording_notes(sequence: StereoSequence) -> list[str]:
     """Return notes for the user on a recording that could be opened, such as truncated or guessed
     data."""
     return list(getattr(_base_of(sequence), "notes", ()))
-
-
-def sequence_subset(sequence: StereoSequence, indices: Sequence[int]) -> StereoSequence:
-    """Return the given frames of a sequence, in this order, with their poses. Images are still read
-    one by one.
-
-    Raises:
-        IndexError: an index is outside of the sequence.
-    """
-    poses = sequence.poses
-    return SequenceView(sequence, list(indices), [poses[index] for index in indices])
 
 
 def _base_of(sequence: StereoSequence) -> StereoSequence:

@@ -27,8 +27,8 @@ from topoloc.geometry.pose_conventions import (
 )
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.atomic import write_text
-from topoloc.recordings.frame import StereoSequence
-from topoloc.recordings.recording import SequenceView, scale_poses, with_poses
+from topoloc.recordings.frame import SequenceView, StereoSequence
+from topoloc.recordings.recording import scale_poses, with_poses
 from topoloc.recordings.text_files import (
     NANOSECONDS_PER_SECOND,
     Rows,

@@ -7,7 +7,7 @@ which the map file stores. Names are the paper's. `surf-vlad` needs neither weig
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Protocol, get_args, runtime_checkable
 
@@ -120,6 +120,18 @@ class ExtendableLocalizer(CoarseLocalizer, Protocol):
         ...
 
 
+Opener = Callable[[CoarseModel], CoarseLocalizer]
+_extensions: dict[str, Opener] = {}
+
+
+def register_coarse_localizer(name: str, open_model: Opener) -> None:
+    """Add a coarse localizer, in this process: `open_model` makes it of the model of this name in a
+    map, whose `node_ids` name the node of each of its `vectors`. Raises ConfigError."""
+    if name in COARSE_NAMES:
+        raise ConfigError(f"coarse localizer {name!r} is topoloc's; give yours another name")
+    _extensions[name] = open_model
+
+
 def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
     """Return the localizer of a stored model.
 
@@ -127,10 +139,12 @@ def open_coarse_localizer(model: CoarseModel) -> CoarseLocalizer:
         MapError: the model is damaged, or this version does not support it.
         MissingExtraError: the model needs torch, which is not installed.
     """
+    if model.name in _extensions:
+        return _extensions[model.name](model)
     if model.name not in COARSE_NAMES:
         raise MapError(
             f"the map's coarse localizer {model.name!r} is not known to this version (known:"
-            f" {', '.join(COARSE_NAMES)})"
+            f" {', '.join(COARSE_NAMES)}; others after topoloc.plugin.register_coarse_localizer)"
         )
     try:
         module = importlib.import_module(f"topoloc.retrieval.{_MODULES[model.name]}")

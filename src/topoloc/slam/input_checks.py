@@ -32,12 +32,14 @@ def check_stereo(sequence: StereoSequence, num_frames: int = 8) -> None:
 
     Raises:
         CalibrationError: the baseline cannot be in metres.
-        RecordingError: left and right are swapped, or are no rectified pairs of one moment.
+        RecordingError: no frames; left and right are swapped, or no rectified pairs of one moment.
         UnreadableImageError: an image cannot be read.
     """
     max_baseline = 5.0  # metres; a larger one is assumed to be in millimetres
     # Maximum vertical distance of left and right points (median), pixels and share of the width.
     max_vertical_px, max_vertical_share = 0.9, 0.001
+    if not len(sequence):
+        raise RecordingError(f"{sequence.name}: no frames")
     if (rig := sequence[0].rig) is None:
         return
     if rig.baseline > max_baseline:

@@ -25,6 +25,7 @@ from topoloc.geometry.alignment import (
     relative_drift,
 )
 from topoloc.geometry.rigid import Rigid3, positions_of
+from topoloc.json_data import OneLine
 from topoloc.points.disparity import MeasuredView, measured_view
 from topoloc.recordings.frame import StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import prepare_frame
@@ -46,8 +47,8 @@ Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the steps done and the total steps."""
 
 
-@dataclass(frozen=True, eq=False)
-class SlamResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class SlamResult(OneLine):
     """Hold the poses of all frames and statistics.
 
     Attributes:

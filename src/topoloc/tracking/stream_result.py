@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.localization.result import Localization, NotLocalized
 
 State = Literal["localized", "tracked", "predicted", "ambiguous", "lost"]
 
 
-@dataclass(frozen=True, eq=False)
-class StreamedPose:
+@dataclass(frozen=True, eq=False, repr=False)
+class StreamedPose(OneLine):
     """Hold the result of one image of a stream.
 
     Attributes:

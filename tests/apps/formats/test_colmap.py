@@ -35,8 +35,9 @@ from topoloc.errors import (
 )
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.recordings.frame import sequence_subset
 from topoloc.recordings.open import find_format, open_sequence
-from topoloc.recordings.recording import has_scale, scale_poses, sequence_subset
+from topoloc.recordings.recording import has_scale, scale_poses
 
 pycolmap = pytest.importorskip("pycolmap", reason="the extra colmap is not installed")
 Make = Callable[..., Path]

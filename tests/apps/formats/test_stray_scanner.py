@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tiny_recordings import assert_same_pose, pose, write
+from tiny_recordings import assert_same_pose, assert_slices, pose, write
 from topoloc.errors import CalibrationError, RecordingError, TopolocError, TrajectoryError
 from topoloc.geometry.camera import Camera
 from topoloc.recordings.open import find_format, open_sequence
@@ -59,6 +59,7 @@ def test_frames(folder: Path):
     assert frame.depth.depth[40, 50] == pytest.approx(1.002)
     assert np.isnan(frame.depth.depth[:20, :28]).all()
     assert as_monocular(sequence)[2].depth is None
+    assert_slices(sequence)
 
 
 def test_rows_of_some_frames_and_a_lens_for_each(folder: Path):

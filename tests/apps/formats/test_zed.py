@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tiny_recordings import assert_slices
 from topoloc.apps.formats.zed import RESOLUTIONS, read_conf
 from topoloc.errors import CalibrationError, RecordingError
 from topoloc.geometry.rig import rectify
@@ -65,6 +66,7 @@ def test_halves_are_left_and_right(film: Path):
         assert frame.camera == frame.rig.left
     np.testing.assert_allclose(np.array(sequence.t_ns) / 1e9, np.arange(3) / 15.0, atol=2e-3)
     assert as_monocular(sequence)[1].right is None
+    assert_slices(sequence)
 
 
 def test_a_real_recording_side_by_side(shared: Path, tmp_path: Path):

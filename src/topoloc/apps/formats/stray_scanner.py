@@ -25,6 +25,7 @@ from topoloc import (
     read_image,
 )
 from topoloc.plugin import (
+    IndexedFrames,
     RecordingFormat,
     Video,
     parse_calibration,
@@ -38,8 +39,8 @@ _NAMES = ["timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw"]
 _LENS_NAMES = ["fx", "fy", "cx", "cy"]
 
 
-@dataclass(frozen=True, eq=False)
-class StrayRecording:
+@dataclass(frozen=True, eq=False, repr=False)
+class StrayRecording(IndexedFrames):
     """A StereoSequence of such a folder. `video_idx` are the numbers of the frames in the video."""
 
     name: str
@@ -78,12 +79,12 @@ class StrayRecording:
         camera, pose = self.cameras[index], self.poses[index]
         return replace(frame, t_ns=self.t_ns[index], camera=camera, world_from_cam=pose)
 
-    def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame. Raises IndexError, UnreadableImageError."""
-        frame, camera = self.read_left_frame(index), self.cameras[index]
+    def read_frame(self, row: int) -> StereoFrame:
+        """Read one frame. Raises UnreadableImageError."""
+        frame, camera = self.read_left_frame(row), self.cameras[row]
         if not self.has_depth:
             return frame
-        path = self._depth_path(index)
+        path = self._depth_path(row)
         depth = read_depth_image(path, units_per_metre=1000.0)
         confidence = self.root / "confidence" / f"{path.stem}.png"
         if confidence.is_file():

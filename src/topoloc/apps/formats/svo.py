@@ -21,13 +21,13 @@ from topoloc import (
     StereoRig,
     UnreadableImageError,
 )
-from topoloc.plugin import read_ground_truth
+from topoloc.plugin import IndexedFrames, read_ground_truth
 
 SVO_SUFFIXES = frozenset({".svo", ".svo2"})
 
 
-@dataclass(eq=False)
-class SvoRecording:
+@dataclass(eq=False, repr=False)
+class SvoRecording(IndexedFrames):
     """A StereoSequence in an SVO file. Access out of order seeks."""
 
     name: str
@@ -52,20 +52,16 @@ class SvoRecording:
         """Return the recording without the right images."""
         return replace(self, with_right=False)
 
-    def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame. Raises IndexError: no such frame; UnreadableImageError: the SDK cannot
-        decode it."""
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"frame {index} of a recording of {len(self)}")
-        index %= len(self)
-        if index != self._position[0]:
-            self.camera.set_svo_position(index)
+    def read_frame(self, row: int) -> StereoFrame:
+        """Read one frame. Raises UnreadableImageError: the SDK cannot decode it."""
+        if row != self._position[0]:
+            self.camera.set_svo_position(row)
         if self.camera.grab() != self.sdk.ERROR_CODE.SUCCESS:
             self._position[0] = -1
-            raise UnreadableImageError(f"{self.path}, frame {index}: cannot be decoded")
-        self._position[0] = index + 1
-        frame = _retrieve_frame(self.sdk, self.camera, index, self.rig, self.with_right)
-        return replace(frame, t_ns=self.t_ns[index], world_from_cam=self.poses[index])
+            raise UnreadableImageError(f"{self.path}, frame {row}: cannot be decoded")
+        self._position[0] = row + 1
+        frame = _retrieve_frame(self.sdk, self.camera, row, self.rig, self.with_right)
+        return replace(frame, t_ns=self.t_ns[row], world_from_cam=self.poses[row])
 
 
 def open_svo(path: Path) -> SvoRecording:

@@ -27,7 +27,7 @@ from topoloc import (
 )
 from topoloc.apps.formats.live import LiveSource
 from topoloc.apps.formats.svo import SVO_SUFFIXES, open_svo
-from topoloc.plugin import RecordingFormat, Video, read_camera_json, read_text
+from topoloc.plugin import IndexedFrames, RecordingFormat, Video, read_camera_json, read_text
 
 EXPECTED_FILES = "a video of left and right side by side with SN*.conf beside it, or .svo"
 # Stereolabs' names of the image sizes.
@@ -58,8 +58,8 @@ def can_open(path: Path) -> bool:
     return width >= _MIN_ASPECT_RATIO * height
 
 
-@dataclass(frozen=True, eq=False)
-class SideBySideVideo:
+@dataclass(frozen=True, eq=False, repr=False)
+class SideBySideVideo(IndexedFrames):
     """A StereoSequence of the two halves of a video."""
 
     video: Video
@@ -89,9 +89,9 @@ class SideBySideVideo:
         """Return the recording without the right halves."""
         return replace(self, with_right=False)
 
-    def __getitem__(self, index: int) -> StereoFrame:
+    def read_frame(self, row: int) -> StereoFrame:
         """Read one frame. See `Video` for errors."""
-        frame = self.video[index]
+        frame = self.video.read_frame(row)
         left, right = _split_halves(frame.image)
         frame = replace(frame, image=left, camera=self.rig.left)
         return replace(frame, right=right, rig=self.rig) if self.with_right else frame

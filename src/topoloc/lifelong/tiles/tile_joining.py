@@ -23,6 +23,7 @@ from topoloc.atlas.joint_worlds import MAX_WORLD_OFFSET_M
 from topoloc.atlas.manifest import Manifest, Tile
 from topoloc.atlas.map_cache import MapCache
 from topoloc.errors import AtlasError, MapError, TrajectoryError
+from topoloc.json_data import OneLine
 from topoloc.lifelong.node_localization import sample_evenly
 from topoloc.lifelong.tiles.tile_comparison import NotJoined, OpenTile, TileTransform, compare_tiles
 from topoloc.localization.localizer import Localizer
@@ -100,8 +101,8 @@ class NotCompared(NotJoined):
     """Hold the reason why a comparison of two tiles did not finish."""
 
 
-@dataclass(frozen=True)
-class PairResult:
+@dataclass(frozen=True, repr=False)
+class PairResult(OneLine):
     """Hold the ids of two tiles and the result of comparing them."""
 
     first: str

@@ -50,6 +50,7 @@ def build_map(
 
     Args:
         sequences: the recordings, or their paths, which `open_sequence` opens.
+        progress: called with a stage's name, steps done and steps in all.
         poses_from: source of each recording's poses (`truth`, `slam`, a file), to be stored in the
             map. If it is given, SLAM is not run.
         are_poses_checked: compare the poses with the images, unless SLAM estimated them.

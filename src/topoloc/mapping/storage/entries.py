@@ -14,6 +14,7 @@ from topoloc.features.feature_types import find_feature_type
 from topoloc.features.features import Features
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
 from topoloc.mapping.landmark_statistics import LandmarkStatistics
 from topoloc.node_ids import LazySequence, NodeId
 from topoloc.retrieval.coarse import CoarseModel
@@ -69,8 +70,8 @@ class NodeSummary:
     of_node: NodeId | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class TopoNode:
+@dataclass(frozen=True, eq=False, repr=False)
+class TopoNode(OneLine):
     """One topological node: "a single template node image, its global SE(3) pose and a point cloud
     comprising of 2D SURF features and their 3D positions".
 

@@ -23,7 +23,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.recordings.camera_json import FILE_NAME, read_camera_json
 from topoloc.recordings.format import RecordingFormat, read_ground_truth
-from topoloc.recordings.frame import Image, StereoFrame
+from topoloc.recordings.frame import Image, IndexedFrames, StereoFrame
 
 # Suppress FFmpeg's messages about broken files on stderr, because an error reports them. FFmpeg
 # reads the variable once per process.
@@ -42,8 +42,8 @@ class _Reader:
     next_idx: int = 0
 
 
-@dataclass(eq=False)
-class Video:
+@dataclass(eq=False, repr=False)
+class Video(IndexedFrames):
     """A StereoSequence in one video file. Frames are decoded in order. Accessing an earlier frame
     restarts the video."""
 
@@ -85,25 +85,11 @@ class Video:
     def __len__(self) -> int:
         return len(self.names)
 
-    def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame.
-
-        Raises:
-            IndexError: there is no such frame.
-            UnreadableImageError: the frame cannot be decoded, or its size differs from the first
-                frame's.
-        """
-        if index < 0:
-            index += len(self)
-        if not 0 <= index < len(self):
-            raise IndexError(f"frame {index} of a video of {len(self)}")
-        return StereoFrame(
-            self.names[index],
-            self.t_ns[index],
-            self._decode(index),
-            self.camera,
-            world_from_cam=self.poses[index],
-        )
+    def read_frame(self, row: int) -> StereoFrame:
+        """Read one frame. Raises UnreadableImageError: it cannot be decoded, or its size differs
+        from the first frame's."""
+        name, t_ns, pose = self.names[row], self.t_ns[row], self.poses[row]
+        return StereoFrame(name, t_ns, self._decode(row), self.camera, world_from_cam=pose)
 
     def _decode(self, index: int) -> Image:
         reader = self._reader

@@ -27,6 +27,7 @@ from bag_writing import (
 )
 
 from built_room import built_room
+from tiny_recordings import assert_slices
 from topoloc.apps.formats.bags import bag as bag_module, messages
 from topoloc.errors import (
     CalibrationError,
@@ -83,6 +84,7 @@ def test_a_bag_is_the_recording_it_was_made_of(
     assert recording_notes(sequence) == []
     assert_same(walk, sequence)
     assert_same(walk, open_sequence(f"{path}@0:5"))
+    assert_slices(sequence)
 
 
 @pytest.mark.parametrize("poses", [by_tf, by_odometry, by_pose])
@@ -112,7 +114,7 @@ def test_the_parts_of_a_split_bag_are_one_recording(walk: StereoSequence, tmp_pa
 
 
 def _part(sequence: StereoSequence, part: range) -> StereoSequence:
-    from topoloc.recordings.recording import sequence_subset
+    from topoloc.recordings.frame import sequence_subset
 
     return sequence_subset(sequence, list(part))
 

@@ -48,6 +48,7 @@ from topoloc.apps.formats.bags.topics import (
 from topoloc.plugin import (
     CameraCalibration,
     EncodedImage,
+    IndexedFrames,
     RecordingFormat,
     find_white_level,
     match_times,
@@ -65,8 +66,8 @@ class ImageMessages:
     refs: list[MessageRef]
 
 
-@dataclass(frozen=True, eq=False)
-class BagRecording:
+@dataclass(frozen=True, eq=False, repr=False)
+class BagRecording(IndexedFrames):
     """A StereoSequence of a bag. `names` are the times of the frames in seconds."""
 
     name: str
@@ -108,16 +109,16 @@ class BagRecording:
         """Return the same recording without its right and depth images."""
         return replace(self, right=None, depth=None)
 
-    def __getitem__(self, index: int) -> StereoFrame:
-        """Read one frame. Raises IndexError: no such frame; UnreadableImageError: a picture is
-        damaged, or of another size than its camera."""
-        frame = self.read_left_frame(index)
+    def read_frame(self, row: int) -> StereoFrame:
+        """Read one frame. Raises UnreadableImageError: a picture is damaged, or of another size
+        than its camera."""
+        frame = self.read_left_frame(row)
         if self.right is not None:
             right, rig = self.right
-            return replace(frame, right=self._read_image(right, index, rig.right))
+            return replace(frame, right=self._read_image(right, row, rig.right))
         if self.depth is not None:
             images, camera, cam_from_depth = self.depth
-            message, name = self._read_message(images, index)
+            message, name = self._read_message(images, row)
             depth = decode_depth(message, name)
             if camera == self.camera:  # registered, and may be coarser
                 depth = resize_depth(name, depth, camera)
@@ -126,7 +127,7 @@ class BagRecording:
         return frame
 
     def read_left_frame(self, index: int) -> StereoFrame:
-        """Read one frame without its right or depth image. Raises the errors of `__getitem__`."""
+        """Read one frame without its right or depth image. Raises the errors of `read_frame`."""
         image = self._read_image(self.left, index, self.camera)
         rig = None if self.right is None else self.right[1]
         name, t_ns, pose = self.names[index], self.t_ns[index], self.poses[index]
