@@ -9,7 +9,7 @@ import pickle
 import sqlite3
 import threading
 from collections import OrderedDict
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import is_dataclass
 from typing import Any, TypeVar, overload
@@ -123,9 +123,7 @@ class DiskList(Sequence[T]):
 
     def _write(self, row: int, entry: T) -> None:
         buffer = io.BytesIO()
-        pickler: Any = pickle.Pickler(buffer, pickle.HIGHEST_PROTOCOL)
-        pickler.persistent_id = lambda one: self._reference_ids.get(id(one))
-        pickler.dump(entry)
+        _Pickler(buffer, self._reference_ids).dump(entry)
         with self._convert_disk_errors():
             self._database.execute(
                 "INSERT OR REPLACE INTO entries VALUES (?, ?)", (row, buffer.getbuffer())
@@ -135,13 +133,29 @@ class DiskList(Sequence[T]):
         with self._convert_disk_errors():
             found = self._database.execute("SELECT entry FROM entries WHERE row = ?", (row,))
             (blob,) = found.fetchone()
-        unpickler: Any = pickle.Unpickler(io.BytesIO(blob))
-        unpickler.persistent_load = self._shared_objects.__getitem__
-        return unpickler.load()
+        return _Unpickler(io.BytesIO(blob), self._shared_objects).load()
 
     def _convert_disk_errors(self) -> AbstractContextManager[None]:
         fault = "the folder of temporary files (TMPDIR) does not hold what is in the making"
         return TopolocError.at(fault, sqlite3.OperationalError)
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(self, file: io.BytesIO, shared_ids: Mapping[int, Any]) -> None:
+        super().__init__(file, pickle.HIGHEST_PROTOCOL)
+        self._shared_ids = shared_ids
+
+    def persistent_id(self, obj: object) -> Any:
+        return self._shared_ids.get(id(obj))
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, shared_objects: Sequence[Any]) -> None:
+        super().__init__(file)
+        self._shared_objects = shared_objects
+
+    def persistent_load(self, pid: Any) -> Any:
+        return self._shared_objects[pid]
 
 
 def bytes_of(value: Any, excluded_ids: Container[int] = ()) -> int:
