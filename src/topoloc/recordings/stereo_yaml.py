@@ -59,7 +59,7 @@ _MONO_KEYS = (
 def read_yaml(path: Path) -> str:
     """Return the text of a calibration without comments. Raises CalibrationError with the file
     name."""
-    text = read_text(path, CalibrationError, "no calibration here")
+    text = read_text(path, CalibrationError, "no calibration here: no such file")
     if len(text) > _MAX_CHARS:
         raise CalibrationError(f"{path}: {len(text)} characters are no calibration")
     return re.sub(r"#.*", "", text)

@@ -36,9 +36,9 @@ def find_depth_shift(sequence: StereoSequence) -> str | None:
     zoom, down, right = np.unravel_index(np.argmax(score), score.shape)
     x, y = sequence[0].image.shape[1] / _WIDTH * (np.array([right, down]) - _MAX_SHIFT)
     return (
-        f"{sequence.name}: depth does not lie on the pictures: edges fit better with the depth"
-        f" images enlarged {_ZOOMS[zoom]:.2f} times and moved by {x:.0f}, {y:.0f} px (right,"
-        " down); register the depth to the colour camera"
+        f"{sequence.name}: depth does not lie on the images, so poses are less exact: edges fit"
+        f" better with depth scaled by {_ZOOMS[zoom]:.2f} and moved by {x:.0f}, {y:.0f} px of the"
+        " image (right, down); record depth that is registered to the colour camera"
     )
 
 

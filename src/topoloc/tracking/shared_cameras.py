@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from hashlib import blake2b
 
 import numpy as np
 
@@ -108,6 +109,7 @@ class _CameraEstimate:
         self._reference = uncalibrated.with_focal(side)
         self._prior = camera_prior(uncalibrated, side)
         self._seen: list[CameraLikelihood] = []
+        self._digests = set[bytes]()
         self._places = set[str]()
         self._viewpoints: list[Rigid3] = []
         self.shared: SharedCamera | None = None
@@ -120,7 +122,7 @@ class _CameraEstimate:
         if result is None:
             query = QueryImage(image, self.uncalibrated)
             result, named = self.localizer.localize_query(query, max_ms=max_ms)
-            self._learn(result, named)
+            self._learn(image, result, named)
         return result
 
     def _localize_by(
@@ -132,7 +134,7 @@ class _CameraEstimate:
         result, named = self.localizer.localize_query(query, max_ms=max_ms)
         if not isinstance(result, Localization) or result.calibration_doubt is not None:
             return None
-        self._learn(result, named)
+        self._learn(image, result, named)
         cam_from_world, of_pose = result.world_from_cam.inverse(), np.zeros((6, 6))
         seen = self._observations(named[0][1])
         fit = linearized_fit(seen, cam_from_world, parameters_of(shared.camera, self._reference))
@@ -143,17 +145,21 @@ class _CameraEstimate:
 
     def _learn(
         self,
+        image: Image,
         result: Localization | NotLocalized,
         named: list[tuple[Localization, PointObservations]],
     ) -> None:
-        """Add what an image shows of the camera, and estimate the camera again."""
+        """Add what an image shows of the camera, unless it was added before, and estimate the
+        camera again."""
         max_images, min_probability = 20, 0.9  # more images change little, and cost time
         is_clear = isinstance(result, Localization) and result.probability >= min_probability
         if not is_clear or len(self._seen) >= max_images:
             return
-        fit = self._fit(*named[0])
+        digest = blake2b(np.ascontiguousarray(image).data).digest()
+        fit = None if digest in self._digests else self._fit(*named[0])
         if fit is None:
             return
+        self._digests.add(digest)
         self._seen.append(fit.likelihood)
         self._places.add(f"{named[0][0].provenance.tile}/{named[0][0].node_id}")
         self._add_viewpoint(*named[0])

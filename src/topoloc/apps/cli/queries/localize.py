@@ -272,7 +272,7 @@ def _localize_queries(
                     raise type(error)(text) from error
                 # One image has another size than its camera; the others are localized.
                 refusal = NotLocalized("unreadable", detail=text)
-                yield QueryAnswer(frame.name, frame.t_ns, refusal)
+                yield QueryAnswer(frame.name, frame.t_ns if frame.has_time else None, refusal)
 
 
 def _localize_live(

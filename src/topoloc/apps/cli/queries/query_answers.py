@@ -60,7 +60,7 @@ class QueryFrame:
             refusal, streamed = cameras.localizer.with_provenance(refusal, t_ns=t_ns), None
             if tracker is not None:
                 streamed = tracker.process_missing(self.t_ns, refusal, self.odom_from_cam)
-            return QueryAnswer(self.name, self.t_ns, refusal, streamed)
+            return QueryAnswer(self.name, t_ns, refusal, streamed)
         camera = select_frame_camera(frame, camera_of_size)
         if tracker is not None:
             streamed = tracker.process(frame.image, camera, self.t_ns, self.odom_from_cam)
@@ -69,7 +69,7 @@ class QueryFrame:
             result = cameras.localize(frame.image, camera, t_ns)
         else:
             result = cameras.localizer.localize(frame.image, camera, t_ns=t_ns)
-        return QueryAnswer(self.name, self.t_ns, result)
+        return QueryAnswer(self.name, t_ns, result)
 
 
 def learn_cameras(
@@ -77,8 +77,7 @@ def learn_cameras(
 ) -> None:
     """Estimate the camera of frames without calibration from images spread over them."""
     golden_ratio = 0.618034  # any first few are spread, too
-    for k in range(min(len(frames), 20)):
-        row = int(k * golden_ratio % 1.0 * len(frames))
+    for row in dict.fromkeys(int(k * golden_ratio % 1.0 * len(frames)) for k in range(20)):
         try:
             frame = frames[row].read()
         except UnreadableImageError:
@@ -99,10 +98,11 @@ def capture_frames(live: LiveSource, stop: threading.Event) -> Iterator[QueryFra
 
 @dataclass(frozen=True, eq=False)
 class QueryAnswer:
-    """Hold a query with the time of its frame, and `streamed` if it is part of a stream."""
+    """Hold a query with the time of its frame, None of a photo, and `streamed` if it is part of a
+    stream."""
 
     query: str
-    t_ns: int
+    t_ns: int | None
     result: Localization | NotLocalized
     streamed: StreamedPose | None = None
 
@@ -119,10 +119,10 @@ class QueryAnswer:
 
 
 def to_trajectory(answers: list[QueryAnswer], smoothed: bool) -> Trajectory:
-    """Return the poses in the order of the queries. If the times do not increase, the numbers of
-    the queries are the seconds."""
-    times = [answer.t_ns for answer in answers]
-    if any(after <= before for before, after in pairwise(times)):
+    """Return the poses in the order of the queries. If there are photos, or the times do not
+    increase, the numbers of the queries are the seconds."""
+    times = [answer.t_ns for answer in answers if answer.t_ns is not None]
+    if len(times) < len(answers) or any(after <= before for before, after in pairwise(times)):
         times = [number * 1_000_000_000 for number in range(len(answers))]
     return Trajectory.of_frames([answer.pose(smoothed) for answer in answers], times)
 
