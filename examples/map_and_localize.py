@@ -14,7 +14,6 @@ import numpy as np
 import topoloc
 from topoloc.demo.recordings import SHIPPED
 from topoloc.geometry.alignment import rotation_error, translation_error
-from topoloc.geometry.rigid import inverse_covariance, position_covariance
 
 
 def main(map_from: str, ask: str, out: Path) -> None:
@@ -33,12 +32,8 @@ def main(map_from: str, ask: str, out: Path) -> None:
         if isinstance(result, topoloc.NotLocalized):
             print(f"{frame.name}: not localized ({result.reason})")
             continue
-        # The covariance is that of a perturbation of the whole pose; the position's own follows
-        # from it.
-        covariance = inverse_covariance(result.world_from_cam, result.covariance)
-        position = position_covariance(result.world_from_cam.inverse(), covariance)
         x, y, z = result.world_from_cam.translation
-        sigma_cm = 100.0 * np.sqrt(np.trace(position))
+        sigma_cm = 100.0 * np.sqrt(np.trace(result.position_covariance))
         line = f"{frame.name}: ({x:.3f}, {y:.3f}, {z:.3f}) m, give or take {sigma_cm:.2f} cm"
         if frame.world_from_cam is not None:
             metres, radians = (
