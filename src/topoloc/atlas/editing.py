@@ -195,8 +195,7 @@ def removing_new_files_on_failure(store: Store) -> Iterator[PutFile]:
         yield put
     except BaseException:
         with suppress(AtlasError, OSError):
-            known = read_manifest(store, creates=True)[1].files
-            for name in set(new).difference(known):
+            for name in set(new).difference(read_manifest(store, creates=True)[1].files):
                 store.remove(name)
         raise
 
@@ -218,14 +217,12 @@ def store_tile(new: NewTile, put: PutFile) -> Tile:
         places = structs.asdict(_store_file(put, f"{new.tile_id}.places", path))
         newest, *older = [new.path, *find_kept_files(new.path)]
         stored = _store_file(put, f"{new.tile_id}.topo", newest)
-        kept = [_store_file(put, f"{new.tile_id}.topo", one) for one in older]
-        previous = [*kept, *new.older]
+        previous = [*(_store_file(put, f"{new.tile_id}.topo", one) for one in older), *new.older]
         previous = select_kept(previous, [one.num_bytes for one in previous])
-        placed = PlacesFile(**places, vocabularies=versions)
         return Tile(
             new.tile_id,
             map=stored,
-            places=placed,
+            places=PlacesFile(**places, vocabularies=versions),
             world=new.world,
             atlas_from_world=None,
             recipe=new.recipe,

@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from topoloc.atlas.atlas import Atlas, store_at
 from topoloc.atlas.editing import (
     NewTile,
-    PutFile,
     new_tiles,
     removing_new_files_on_failure,
     replace_tile,
@@ -245,7 +244,10 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
     def store_atlas(atlas: Atlas) -> dict[str, Tile]:
         _check_same(atlas.store.where, tiles, atlas.manifest.by_id)
         for tile in atlas.manifest.tiles:
-            _copy_files(atlas, tile, put)
+            if (problem := atlas.find_problem(tile.tile_id)) is not None:
+                raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
+            for stored in tile.files:
+                put(stored.name, atlas.store.local_path(stored.name, stored.sha256))
         joins.extend(atlas.manifest.joins)
         return atlas.manifest.by_id
 
@@ -257,14 +259,6 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
         if not store.commit(None, after.to_bytes()):
             raise AtlasError(f"{where} became an atlas meanwhile; it stays as it is")
     return after
-
-
-def _copy_files(atlas: Atlas, tile: Tile, put: PutFile) -> None:
-    problem = atlas.find_problem(tile.tile_id)
-    if problem is not None:
-        raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
-    for stored in tile.files:
-        put(stored.name, atlas.store.local_path(stored.name, stored.sha256))
 
 
 def _check_same(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile]) -> None:

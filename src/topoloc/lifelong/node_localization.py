@@ -84,8 +84,7 @@ def localize_left_out(
             result, *_ = localizer.without(hidden).localize_query(query)
             if isinstance(result, Localization):
                 limits = MAX_TRANSLATION, np.radians(MAX_ROTATION_DEG)
-                pose = node.summary.world_from_cam
-                is_same = pose.is_same(result.world_from_cam, *limits)
+                is_same = node.summary.world_from_cam.is_same(result.world_from_cam, *limits)
                 num_inliers = result.num_inliers if is_same else 0
                 answers[row] = LeaveOneOutResult(is_same, not is_same, num_inliers)
         if progress is not None:

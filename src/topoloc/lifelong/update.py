@@ -145,8 +145,9 @@ def update_map(
     check_session_is_new(topomap, sequence)
     localizer = Localizer(topomap, localizer_config)
     if poses_from == "map":
-        tracker = Tracker(localizer)
-        session_poses = estimate_poses_by_map(sequence, tracker, topomap.config, progress)
+        session_poses = estimate_poses_by_map(
+            sequence, Tracker(localizer), topomap.config, progress
+        )
     else:
         session_poses = estimate_poses_by_motion(sequence, localizer, topomap.config, progress)
     indices = list(range(len(sequence)))

@@ -22,12 +22,14 @@ from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.exact.patch_alignment import PreciseMatches, align, spread
-from topoloc.localization.fitted_weights import (
-    EvidenceWeights,
+from topoloc.localization.exact.patch_alignment import (
     LastStepWeights,
+    PreciseMatches,
+    align,
     load_last_step_weights,
+    spread,
 )
+from topoloc.localization.fitted_weights import EvidenceWeights
 from topoloc.localization.guided import match_guided
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.provenance import Evidence

@@ -72,9 +72,8 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
 
 
 def _session_facts(session: Session) -> dict[str, Any]:
-    camera = None if session.camera is None else session.camera.to_json()
     return asdict(session) | {
-        "camera": camera,
+        "camera": None if session.camera is None else session.camera.to_json(),
         "start_date": session.start_date,
         "end_date": session.end_date,
     }
@@ -91,8 +90,7 @@ def list_coarse_models(path: Path) -> list[dict[str, Any]]:
 def _check_rows(file: MapFile) -> Iterator[str]:
     checksums: dict[str, list[bytes]] = {}
     for table in TABLES:
-        keys = tuple(SORT_COLUMNS[table].split(", "))
-        rows, damage = _try_read(partial(file.rows, table, keys))
+        rows, damage = _try_read(partial(file.rows, table, tuple(SORT_COLUMNS[table].split(", "))))
         yield from damage
         yield from _check_each(rows or (), lambda row, table=table: file.find(table, **row))
         if file.version > 1:
@@ -141,7 +139,6 @@ def _try_read(read: Callable[[], Any]) -> tuple[Any, list[str]]:
 
 def _model_facts(name: str, text: str, num_bytes: int) -> dict[str, Any]:
     settings = decode_json(text, dict[str, Any], CorruptDataError, f"coarse localizer {name}")
-    shown = ("backbone", "weights", "trained")
     return {"name": name, "bytes": num_bytes} | {
-        key: settings[key] for key in shown if key in settings
+        key: settings[key] for key in ("backbone", "weights", "trained") if key in settings
     }
