@@ -189,7 +189,12 @@ def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> T:
             _copy_map(atlas, before.map, path)
             for last in before.previous[:1]:
                 _copy_map(atlas, last, kept_path(path, before.map.sha256, last.sha256))
-            done = _edit_with_tile_name(edit, path, f"{where}, tile {tile_id}")
+            try:
+                done = edit(path)
+            except TopolocError as error:  # the message names the tile instead of the copy
+                text = str(error).replace(str(path), f"{where}, tile {tile_id}")
+                error.args = (text, *error.args[1:])
+                raise
             if sha256_of(path) == before.map.sha256:
                 return done
             new = NewTile(tile_id, path, before.world, before.recipe, before.previous[1:])
@@ -200,15 +205,6 @@ def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> T:
         f"{where}: tile {tile_id} was replaced by others {_MAX_TRIES} times meanwhile; it stays as"
         " they left it"
     )
-
-
-def _edit_with_tile_name(edit: Callable[[Path], T], path: Path, name: str) -> T:
-    """Call `edit` and return its result. Its errors name the tile instead of the copy."""
-    try:
-        return edit(path)
-    except TopolocError as error:
-        error.args = (str(error).replace(str(path), name), *error.args[1:])
-        raise
 
 
 def _copy_map(atlas: Atlas, stored: StoredFile, path: Path) -> None:

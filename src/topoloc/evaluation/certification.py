@@ -149,8 +149,7 @@ def _localize_walks(
                 f"{walk.name}: none of {len(answers)} images is localized. If it is of another"
                 " place, give it by --out-of-map; else the map does not show it: topoloc update"
             )
-        fit = fit_worlds(answers) if has_truth else None
-        if fit is not None:
+        if has_truth and fit_worlds(answers) is not None:
             raise TrajectoryError(
                 f"{walk.name}: its poses are in another world than the map. `topoloc evaluate"
                 " --fit-map-from-truth FILE` writes the transform; certify with --map-from-truth"

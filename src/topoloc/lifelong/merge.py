@@ -191,8 +191,7 @@ def _transfer_edges(
     ids = {}
     for row, summary in zip(second.rows, second.summaries, strict=True):
         distances = node_distances(poses[row], first.node_poses, first.config.lambda_rot)
-        nearest = first.summaries[int(distances.argmin())].node_id
-        ids[summary.node_id] = new_id.get(row, nearest)
+        ids[summary.node_id] = new_id.get(row, first.summaries[int(distances.argmin())].node_id)
     return {
         Edge(ids[e.source_id], ids[e.target_id])
         for e in second.edges

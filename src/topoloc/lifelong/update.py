@@ -221,6 +221,5 @@ def _merge_nodes(
             node, session_id = before[row], observations[0].session_id
             added = count_session_observations(len(node.features), observations, session_id)
             if added is not None:
-                statistics = [*node.session_statistics, added]
-                changed[row] = replace(node, session_statistics=statistics)
+                changed[row] = replace(node, session_statistics=[*node.session_statistics, added])
     return overlay(before, changed, content.nodes[kind])

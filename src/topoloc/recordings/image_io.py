@@ -262,8 +262,7 @@ def _decode_image(
 
 def _reduction(picture: Pillow.Image, max_pixels: int) -> int:
     """Return the factor, 1, 2, 4 or 8, that reduces an image to `max_pixels`."""
-    num_pixels = picture.width * picture.height
-    return next((k for k in (1, 2, 4) if num_pixels <= max_pixels * k * k), 8)
+    return next((k for k in (1, 2, 4) if picture.width * picture.height <= max_pixels * k * k), 8)
 
 
 def _orientation(picture: Pillow.Image) -> int:

@@ -123,8 +123,7 @@ class MapStream:
             self._hypotheses.apply_motion(pose, covariance, frame.odom_from_cam)
         if tracked is None or self._is_localization_due(tracked, frame):
             self._last_attempt_ns = frame.t_ns
-            expected = self._predict_pose(predicted, tracked)
-            found = self._stream_localizer.localize(frame, expected)
+            found = self._stream_localizer.localize(frame, self._predict_pose(predicted, tracked))
             self._drop_stale_reference()
             if isinstance(found, LocalizedPose):
                 answer = self._update_with_localization(frame, found, predicted, tracked, seconds)
@@ -161,8 +160,7 @@ class MapStream:
         reference = self._reference
         if reference is None or predicted is None or reference.follower.camera != frame.grey_camera:
             return None
-        near = predicted.world_from_cam.inverse()
-        motion = reference.follower.track_points(frame.grey, near)
+        motion = reference.follower.track_points(frame.grey, predicted.world_from_cam.inverse())
         if motion is None:
             return None
         offset = fade_offset(reference.offset, (frame.t_ns - reference.t_ns) / 1e9)
@@ -248,6 +246,7 @@ class MapStream:
             measured = errors.noise if tracked is None else tracked.motion.covariance
             state = update_motion(predicted, (offset @ smoothed).inverse(), measured)
             self._hypotheses.set_best_state(state, frame.odom_from_cam)
+        points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
         self._reference = ReferenceImage(
             frame.t_ns,
             found.result,
@@ -256,7 +255,7 @@ class MapStream:
             smoothed,
             pose_covariance + errors.correlated,
             offset,
-            _follow_points(frame, found),
+            PointTracker(frame.grey, points, cam_from_world, frame.grey_camera),
         )
         covariance = compute_smoothed_covariance(self._reference)
         pose = self._hypotheses.leader.world_from_cam
@@ -290,10 +289,3 @@ class MapStream:
         return self._mark_if_ambiguous(
             StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, covariance)
         )
-
-
-def _follow_points(frame: StreamFrame, found: LocalizedPose) -> PointTracker:
-    """Return a tracker of the map points that were found in the image."""
-    points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
-    cam_from_world = found.result.world_from_cam.inverse()
-    return PointTracker(frame.grey, points, cam_from_world, frame.grey_camera)

@@ -100,8 +100,7 @@ class PoseHypotheses:
             pose = one.current.world_from_cam
             for k, other in enumerate(found):
                 if is_same_place(other.world_from_cam, pose):
-                    weight = other.probability + one.weight
-                    found[k] = structs.replace(other, probability=weight)
+                    found[k] = structs.replace(other, probability=other.probability + one.weight)
                     break
             else:
                 found.append(Alternative(pose, one.weight, one.node_id))

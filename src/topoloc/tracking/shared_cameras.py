@@ -128,8 +128,9 @@ class _CameraEstimate:
     ) -> Localization | None:
         """Return the pose by the shared camera, None if there is none or the image contradicts
         it. The camera's uncertainty is added to the covariance."""
-        query = QueryImage(image, shared.camera)
-        result, named = self.localizer.localize_query(query, max_ms=max_ms)
+        result, named = self.localizer.localize_query(
+            QueryImage(image, shared.camera), max_ms=max_ms
+        )
         if not isinstance(result, Localization) or result.calibration_doubt is not None:
             return None
         self._learn(result, named)
@@ -226,8 +227,7 @@ def combine_likelihoods(
         scatter = max(1.0, float(np.median(squares)) / median_chi_square)
         weights = 1.0 / (1.0 + squares / scatter / (CAUCHY_SCALE**2 * 4.0))
         weighted = weights[:, None, None] * inverse
-        pulls = np.einsum("nij,nj->i", weighted, estimates)
-        centre = np.linalg.solve(weighted.sum(axis=0), pulls)
+        centre = np.linalg.solve(weighted.sum(axis=0), np.einsum("nij,nj->i", weighted, estimates))
     scatter = max(1.0, float(np.median(squares)) / median_chi_square) * len(seen) / num_viewpoints
     return CameraLikelihood(
         np.einsum("n,nij->ij", weights / scatter, np.stack([one.information for one in seen])),

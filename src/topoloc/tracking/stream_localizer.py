@@ -77,9 +77,8 @@ class StreamLocalizer:
         if len(candidates) != 1 or not self._hypotheses.is_expected(candidates[0]):
             refusal, found = self._localize_globally(frame)
             candidates = [one.as_candidate(pose_covariance) for one in found]
-        new_evidence_ratio = self._compute_new_evidence(found)
         self._hypotheses.update_weights(
-            frame.t_ns, candidates, frame.odom_from_cam, new_evidence_ratio
+            frame.t_ns, candidates, frame.odom_from_cam, self._compute_new_evidence(found)
         )
         if self._hypotheses.candidate_idx is not None:
             return found[self._hypotheses.candidate_idx]

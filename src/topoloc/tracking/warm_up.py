@@ -80,8 +80,7 @@ def warm_up(
             Localizer(TopoMetricMap.load(map_file)).localize(image, camera)
 
         def estimate_virtual_pose() -> None:
-            node = TopoMetricMap.load(map_file).nodes[0]
-            points = node.points_cam.astype(np.float64)
+            points = TopoMetricMap.load(map_file).nodes[0].points_cam.astype(np.float64)
             estimate_upright_pose(points[:, :2] / points[:, 2:], points)
 
         def track_stream() -> None:

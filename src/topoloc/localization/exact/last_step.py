@@ -269,14 +269,13 @@ class Surroundings:
             config = replace(search.config.guided, radius_px=radius_px)
             matches = match_guided(features, points, cam_from_world, self.camera, config)
             rows = matches.train_idx
-            similarities = 1.0 - np.square(matches.distances.astype(np.float64)) / 2.0
             parts.append(
                 PreciseMatches(
                     features.points_img[matches.query_idx],
                     points.points_world[rows],
                     points.covariances[rows],
                     points.node_ids[rows],
-                    similarities,
+                    1.0 - np.square(matches.distances.astype(np.float64)) / 2.0,
                     np.full(len(rows), self.weights.key_point_sigma_px),
                 )
             )

@@ -116,12 +116,10 @@ def spread(matches: PreciseMatches, camera: Camera, max_number: int) -> PreciseM
     if len(matches) <= max_number:
         return matches
     num_columns = 16
-    cell_px = camera.width / num_columns
-    columns, rows = (matches.points_img / np.float32(cell_px)).astype(np.int64).T
+    columns, rows = (matches.points_img / np.float32(camera.width / num_columns)).astype(np.int64).T
     cells = rows * num_columns + columns
     order = np.lexsort((-matches.similarities, cells))
-    starts = np.searchsorted(cells[order], cells[order])
-    rank = np.arange(len(order)) - starts
+    rank = np.arange(len(order)) - np.searchsorted(cells[order], cells[order])
     return matches.select(np.sort(order[np.argsort(rank, kind="stable")[:max_number]]))
 
 

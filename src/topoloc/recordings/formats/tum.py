@@ -59,8 +59,7 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
     paths, units = [path / depth[row] for _, row in pairs], _depth_factor(path, found)
     images = DepthImages(paths, units, None, Rigid3.identity())
     frames = ([colour[row] for row, _ in pairs], t_ns, poses)
-    name = path.resolve().name
-    return Recording(name, path, *frames, found.camera, depth=images, notes=notes)
+    return Recording(path.resolve().name, path, *frames, found.camera, depth=images, notes=notes)
 
 
 def _calibration(path: Path) -> CameraCalibration:
