@@ -154,8 +154,7 @@ def remove_tiles(where: str, tile_ids: Sequence[str]) -> Manifest:
     store = store_at(where)
 
     def without(manifest: Manifest, now: float) -> Manifest:
-        missing = [tile_id for tile_id in tile_ids if tile_id not in manifest.by_id]
-        if missing:
+        if missing := [tile_id for tile_id in tile_ids if tile_id not in manifest.by_id]:
             raise AtlasError(f"the atlas {where} has no tile {missing[0][:80]!r}")
         left = {key: tile for key, tile in manifest.by_id.items() if key not in tile_ids}
         return manifest.with_tiles(left, now)

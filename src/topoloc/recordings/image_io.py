@@ -226,11 +226,13 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
     except Pillow.UnidentifiedImageError:
         raise UnreadableImageError(f"{path}: {_unreadable_reason(data)}") from None
     except Pillow.DecompressionBombError:
-        fault = f"more than {MAX_PIXELS // 1_000_000} megapixels"
-        raise UnreadableImageError(f"{path}: {fault}") from None
+        raise UnreadableImageError(
+            f"{path}: more than {MAX_PIXELS // 1_000_000} megapixels"
+        ) from None
     except _DAMAGE_ERRORS as error:
-        fault = f"not a picture, or damaged ({_one_line(error)})"
-        raise UnreadableImageError(f"{path}: {fault}") from None
+        raise UnreadableImageError(
+            f"{path}: not a picture, or damaged ({_one_line(error)})"
+        ) from None
     with picture:
         width, height = picture.size
         most = f"{MAX_PIXELS // 1_000_000} megapixels" if width * height > MAX_PIXELS else ""

@@ -47,7 +47,6 @@ from topoloc.tracking.tracker_state import (
     StreamFrame,
     TrackedImage,
     compute_correlated_change,
-    compute_direction_uncertainty,
     compute_motion_covariance,
     compute_smoothed_covariance,
     fade_offset,
@@ -92,8 +91,9 @@ class MapStream:
         return self._complete_result(self._make_predicted_pose(result, t_ns))
 
     def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
-        result = self.localizer.with_provenance(answer.result, camera, answer.t_ns)
-        return replace(answer, result=result)
+        return replace(
+            answer, result=self.localizer.with_provenance(answer.result, camera, answer.t_ns)
+        )
 
     def _process_paper_mode(self, result: Localization | NotLocalized, t_ns: int) -> StreamedPose:
         """Apply section III-B to one result: "when such a jump is found, we copy the previous pose
@@ -126,8 +126,9 @@ class MapStream:
             found = self._stream_localizer.localize(frame, self._predict_pose(predicted, tracked))
             self._drop_stale_reference()
             if isinstance(found, LocalizedPose):
-                answer = self._update_with_localization(frame, found, predicted, tracked, seconds)
-                return self._mark_if_ambiguous(answer)
+                return self._mark_if_ambiguous(
+                    self._update_with_localization(frame, found, predicted, tracked, seconds)
+                )
             if tracked is None or self._reference is None:
                 return self._make_predicted_pose(found, frame.t_ns)
         return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked, clock))
@@ -202,8 +203,10 @@ class MapStream:
         if reference is None or predicted is None:
             return None
         if tracked is None:
-            is_known = compute_direction_uncertainty(predicted, reference.errors.depth) <= max_doubt
-            return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
+            sigmas = np.sqrt(np.diag(predicted.pose_covariance))
+            sigma = float(np.hypot(sigmas[:3].max() / reference.errors.depth, sigmas[3:].max()))
+            is_unique = is_alone and 3.0 * sigma <= max_doubt
+            return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_unique)
         scale = self._hypotheses.prediction_scale**2
         return ExpectedPose(
             tracked.cam_from_world.inverse(),

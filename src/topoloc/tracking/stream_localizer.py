@@ -136,8 +136,9 @@ class StreamLocalizer:
     ) -> tuple[NotLocalized | None, list[LocalizedPose]]:
         """Return the possible poses of the image: one, the alternatives, or none with the
         reason."""
-        query_image = QueryImage(frame.image, frame.camera)
-        result, named = self._localizer.localize_query(query_image, near, frame.limit)
+        result, named = self._localizer.localize_query(
+            QueryImage(frame.image, frame.camera), near, frame.limit
+        )
         refusal, found = result if isinstance(result, NotLocalized) else None, list[LocalizedPose]()
         for one, points in named:
             probability = one.probability

@@ -15,7 +15,6 @@ import numpy as np
 from topoloc.errors import EmptyMapError, MapError
 from topoloc.json_data import decode_json
 from topoloc.mapping.coarse_models import open_map_coarse_localizer
-from topoloc.mapping.sessions import Session
 from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.storage.map_file import MapFile
 from topoloc.mapping.storage.map_writing import compute_map_digest
@@ -61,21 +60,21 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
         "length_m": round(topomap.length_m, 3),
         "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
         "recordings": sorted({s.recording for s in topomap.summaries}),
-        "sessions": [_session_facts(session) for session in topomap.sessions],
+        "sessions": [
+            asdict(session)
+            | {
+                "camera": None if session.camera is None else session.camera.to_json(),
+                "start_date": session.start_date,
+                "end_date": session.end_date,
+            }
+            for session in topomap.sessions
+        ],
         "edits": [asdict(edit) for edit in topomap.edits],
         "coarse": [model["name"] for model in models],
         "default_coarse": topomap.default_coarse,
         "kinds": topomap.kinds,
         "coarse_models": models,
         "config": topomap.config.to_json(),
-    }
-
-
-def _session_facts(session: Session) -> dict[str, Any]:
-    return asdict(session) | {
-        "camera": None if session.camera is None else session.camera.to_json(),
-        "start_date": session.start_date,
-        "end_date": session.end_date,
     }
 
 
