@@ -112,6 +112,7 @@ def align_trajectories(
         TrajectoryError: the lengths differ, or the positions fix no rotation because the camera
             stands or moves straight. Use `align_poses` then.
     """
+    _check_lengths(world_a_from_cams, world_b_from_cams)
     return align_points(positions_of(world_a_from_cams), positions_of(world_b_from_cams))
 
 

@@ -55,8 +55,9 @@ def merge(
     """
     with TopoMetricMap.load(first) as one, TopoMetricMap.load(second) as other:
         merged, changes = merge_maps(one, other, localizer_config, progress)
-        name = f"merge {Path(second).name}"
-        edit = Edit(one.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
+        edit = Edit(
+            one.free_ids.edit, f"merge {Path(second).name}", today(), SCHEMA_VERSION, changes
+        )
         replace(merged, edits=[*one.edits, edit]).save(out, on_wait)
     return changes | {"bytes": Path(out).stat().st_size}
 
