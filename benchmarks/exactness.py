@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 
 from topoloc.localization.exact import last_step
-from topoloc.localization.fitted_weights import load_last_step_weights
+from topoloc.localization.exact.patch_alignment import load_last_step_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import build_map
 from topoloc.localization.result import Localization

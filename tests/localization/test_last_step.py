@@ -20,8 +20,8 @@ from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization import schedule
 from topoloc.localization.exact import patch_alignment
 from topoloc.localization.exact.last_step import Surroundings, make_precise
+from topoloc.localization.exact.patch_alignment import load_last_step_weights
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
-from topoloc.localization.fitted_weights import load_last_step_weights
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.result import Localization
 from topoloc.localization.result_decision import ResultWithInliers

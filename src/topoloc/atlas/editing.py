@@ -154,8 +154,7 @@ def remove_tiles(where: str, tile_ids: Sequence[str]) -> Manifest:
     store = store_at(where)
 
     def without(manifest: Manifest, now: float) -> Manifest:
-        missing = [tile_id for tile_id in tile_ids if tile_id not in manifest.by_id]
-        if missing:
+        if missing := [tile_id for tile_id in tile_ids if tile_id not in manifest.by_id]:
             raise AtlasError(f"the atlas {where} has no tile {missing[0][:80]!r}")
         left = {key: tile for key, tile in manifest.by_id.items() if key not in tile_ids}
         return manifest.with_tiles(left, now)
@@ -195,8 +194,7 @@ def removing_new_files_on_failure(store: Store) -> Iterator[PutFile]:
         yield put
     except BaseException:
         with suppress(AtlasError, OSError):
-            known = read_manifest(store, creates=True)[1].files
-            for name in set(new).difference(known):
+            for name in set(new).difference(read_manifest(store, creates=True)[1].files):
                 store.remove(name)
         raise
 
@@ -218,14 +216,12 @@ def store_tile(new: NewTile, put: PutFile) -> Tile:
         places = structs.asdict(_store_file(put, f"{new.tile_id}.places", path))
         newest, *older = [new.path, *find_kept_files(new.path)]
         stored = _store_file(put, f"{new.tile_id}.topo", newest)
-        kept = [_store_file(put, f"{new.tile_id}.topo", one) for one in older]
-        previous = [*kept, *new.older]
+        previous = [*(_store_file(put, f"{new.tile_id}.topo", one) for one in older), *new.older]
         previous = select_kept(previous, [one.num_bytes for one in previous])
-        placed = PlacesFile(**places, vocabularies=versions)
         return Tile(
             new.tile_id,
             map=stored,
-            places=placed,
+            places=PlacesFile(**places, vocabularies=versions),
             world=new.world,
             atlas_from_world=None,
             recipe=new.recipe,

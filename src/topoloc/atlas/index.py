@@ -197,6 +197,5 @@ def _rank_in_shard(
     is_selected: Bool[np.ndarray, " t"],
 ) -> _Ranking:
     """Rank the tiles of a shard by their numbers in the index. Those numbered -1 are left out."""
-    is_live = (numbers >= 0) & is_selected[numbers]
-    tiles, similarities = shard.rank(vector, num_tiles, is_live)
+    tiles, similarities = shard.rank(vector, num_tiles, (numbers >= 0) & is_selected[numbers])
     return numbers[tiles], similarities

@@ -87,7 +87,13 @@ def open_index(tiles: Sequence[Tile], read: LoadDescriptors, folder: Path) -> Op
     for kind, vectors in few.items():
         if sum(len(rows) for _, rows in vectors) > MAX_EXACT_DESCRIPTORS:
             live_shards[kind] = work.with_new_shards(kind, live_shards[kind], vectors)
-    work.remove_unused(live_shards)
+    used = {one.shard.name for of_kind in live_shards.values() for one in of_kind}
+    for path in folder.glob("*.index"):
+        with suppress(OSError):
+            if path.name in used:
+                os.utime(path)
+            elif time.time() - path.stat().st_mtime > _UNUSED_S:
+                path.unlink()
     ids, exact = [tile.tile_id for tile in tiles], dict[str, dict[str, np.ndarray]]()
     for kind, vectors in few.items():
         for tile, rows in vectors:
@@ -203,29 +209,15 @@ class _IndexBuilder:
         count = max(1, int(np.searchsorted(sizes, SHARD_DESCRIPTORS, "right")))
         tiles = [tile for tile, _ in pending[:count]]
         shard = DescriptorShard(kind, self.versions[kind], tiles, _take_vectors(pending, count))
-        return _LiveShard(self._save_shard(shard), [True] * count)
-
-    def _save_shard(self, shard: DescriptorShard) -> DescriptorShard:
-        """Save a shard and return it memory-mapped. If it cannot be written, return it as is."""
         try:
-            return DescriptorShard.open(shard.save(self.folder))
+            shard = DescriptorShard.open(shard.save(self.folder))  # memory-mapped
         except (OSError, AtlasError) as error:
             text = "the index stays in memory, and is made at each opening: cannot write"
             if not any(note.startswith(text) for note in self.notes):
                 self.notes.append(
                     f"{text} {self.folder}: {getattr(error, 'strerror', None) or error}"
                 )
-            return shard
-
-    def remove_unused(self, live_shards: dict[str, list[_LiveShard]]) -> None:
-        """Delete files that were not used for a day, and update the time stamps of those in use."""
-        used = {one.shard.name for of_kind in live_shards.values() for one in of_kind}
-        for path in self.folder.glob("*.index"):
-            with suppress(OSError):
-                if path.name in used:
-                    os.utime(path)
-                elif time.time() - path.stat().st_mtime > _UNUSED_S:
-                    path.unlink()
+        return _LiveShard(shard, [True] * count)
 
 
 def _take_vectors(pending: list[_Rows], count: int) -> Float16[np.ndarray, "n d"]:

@@ -180,16 +180,8 @@ class Manifest:
         """Return the next manifest, with these tiles and further joins between them. Existing joins
         stay, unless a tile was removed or its map changed. Files that it does not list any more are
         retired at `now`."""
-        origin = self.origin
-        if origin is None:
-            origin = next(
-                (
-                    tile.georeference.origin
-                    for _, tile in sorted(tiles.items())
-                    if tile.georeference is not None
-                ),
-                None,
-            )
+        known = (tile.georeference for _, tile in sorted(tiles.items()))
+        origin = self.origin or next((one.origin for one in known if one is not None), None)
         placed, adjusted_joins = place_tiles(tiles, self._select_joins(tiles, joins), origin)
         after = Manifest(self.serial + 1, placed, origin, {}, adjusted_joins)
         retired = dict.fromkeys(self.files, now) | dict(self.retired)

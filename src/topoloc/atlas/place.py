@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from topoloc.atlas.atlas import Atlas, store_at
 from topoloc.atlas.editing import (
     NewTile,
-    PutFile,
     new_tiles,
     removing_new_files_on_failure,
     replace_tile,
@@ -190,7 +189,12 @@ def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> T:
             _copy_map(atlas, before.map, path)
             for last in before.previous[:1]:
                 _copy_map(atlas, last, kept_path(path, before.map.sha256, last.sha256))
-            done = _edit_with_tile_name(edit, path, f"{where}, tile {tile_id}")
+            try:
+                done = edit(path)
+            except TopolocError as error:  # the message names the tile instead of the copy
+                text = str(error).replace(str(path), f"{where}, tile {tile_id}")
+                error.args = (text, *error.args[1:])
+                raise
             if sha256_of(path) == before.map.sha256:
                 return done
             new = NewTile(tile_id, path, before.world, before.recipe, before.previous[1:])
@@ -201,15 +205,6 @@ def edit_tile(where: str, tile_id: str, edit: Callable[[Path], T]) -> T:
         f"{where}: tile {tile_id} was replaced by others {_MAX_TRIES} times meanwhile; it stays as"
         " they left it"
     )
-
-
-def _edit_with_tile_name(edit: Callable[[Path], T], path: Path, name: str) -> T:
-    """Call `edit` and return its result. Its errors name the tile instead of the copy."""
-    try:
-        return edit(path)
-    except TopolocError as error:
-        error.args = (str(error).replace(str(path), name), *error.args[1:])
-        raise
 
 
 def _copy_map(atlas: Atlas, stored: StoredFile, path: Path) -> None:
@@ -245,7 +240,10 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
     def store_atlas(atlas: Atlas) -> dict[str, Tile]:
         _check_same(atlas.store.where, tiles, atlas.manifest.by_id)
         for tile in atlas.manifest.tiles:
-            _copy_files(atlas, tile, put)
+            if (problem := atlas.find_problem(tile.tile_id)) is not None:
+                raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
+            for stored in tile.files:
+                put(stored.name, atlas.store.local_path(stored.name, stored.sha256))
         joins.extend(atlas.manifest.joins)
         return atlas.manifest.by_id
 
@@ -257,14 +255,6 @@ def merge_atlases(sources: Sequence[str], where: str) -> Manifest:
         if not store.commit(None, after.to_bytes()):
             raise AtlasError(f"{where} became an atlas meanwhile; it stays as it is")
     return after
-
-
-def _copy_files(atlas: Atlas, tile: Tile, put: PutFile) -> None:
-    problem = atlas.find_problem(tile.tile_id)
-    if problem is not None:
-        raise AtlasError(f"tile {tile.tile_id} of {atlas.store.where}: {problem}")
-    for stored in tile.files:
-        put(stored.name, atlas.store.local_path(stored.name, stored.sha256))
 
 
 def _check_same(source: str, known: Mapping[str, Tile], added: Mapping[str, Tile]) -> None:

@@ -119,8 +119,11 @@ def certify(
         conditions = [
             *_localize_walks(localizer, walks, map_from_truth, progress),
             *_localize_beside_map(localizer, walks, map_from_truth, progress),
-            *(_localize_elsewhere(localizer, one, progress) for one in out_of_map),
         ]
+        for one in out_of_map:
+            answers = localize_out_of_map(localizer, one, progress)
+            pieces = find_pieces(topomap.config, answers, False)
+            conditions.append(CertifiedAnswers(one.name, "out_of_map", True, answers, pieces))
     certificate = derive_certificate(conditions, config, max_wrong_share, is_applied)
     with edit_map(path, on_wait) as edit:
         file = edit.topomap.file
@@ -149,8 +152,7 @@ def _localize_walks(
                 f"{walk.name}: none of {len(answers)} images is localized. If it is of another"
                 " place, give it by --out-of-map; else the map does not show it: topoloc update"
             )
-        fit = fit_worlds(answers) if has_truth else None
-        if fit is not None:
+        if has_truth and fit_worlds(answers) is not None:
             raise TrajectoryError(
                 f"{walk.name}: its poses are in another world than the map. `topoloc evaluate"
                 " --fit-map-from-truth FILE` writes the transform; certify with --map-from-truth"
@@ -164,14 +166,6 @@ def _localize_walks(
         )
 
 
-def _localize_elsewhere(
-    localizer: Localizer, sequence: StereoSequence, progress: Progress | None
-) -> CertifiedAnswers:
-    answers = localize_out_of_map(localizer, sequence, progress)
-    pieces = find_pieces(localizer.topomap.config, answers, False)
-    return CertifiedAnswers(sequence.name, "out_of_map", True, answers, pieces)
-
-
 def _localize_beside_map(
     localizer: Localizer,
     walks: Sequence[StereoSequence],
@@ -179,12 +173,11 @@ def _localize_beside_map(
     progress: Progress | None,
 ) -> Iterator[CertifiedAnswers]:
     """Localize images of the map and of the walks, without the nodes that show the same."""
-    of_map, of_walks = list[_HiddenImage](), list[_HiddenImage]()
-    for row in sample_evenly(localizer.topomap.rows, _MAX_IMAGES):
-        of_map.append(_HiddenImage.of_node(localizer.topomap, row))
+    rows = sample_evenly(localizer.topomap.rows, _MAX_IMAGES)
+    of_map = [_HiddenImage.of_node(localizer.topomap, row) for row in rows]
     frames = [(walk, i) for walk in walks for i, pose in enumerate(walk.poses) if pose is not None]
-    for walk, i in sample_evenly(frames, _MAX_IMAGES):
-        of_walks.append(_HiddenImage.of_frame(walk, i, map_from_truth))
+    sampled = sample_evenly(frames, _MAX_IMAGES)
+    of_walks = [_HiddenImage.of_frame(walk, i, map_from_truth) for walk, i in sampled]
     for name, images in (("map", of_map), ("walks", of_walks)):
         answers, label = list[EvaluatedQuery](), f"{name}, surroundings removed"
         for done, one in enumerate(images):

@@ -18,14 +18,12 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import groupby
 from math import exp, lgamma, log, log1p
-from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from topoloc.evaluation.metrics import EvaluatedQuery
-from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
 from topoloc.json_data import encode_json
 from topoloc.localization.localizer import LocalizerConfig
@@ -117,8 +115,7 @@ class Pieces:
     def of(numbers: Sequence[int], wrong: Sequence[float]) -> Pieces:
         """Return the pieces of images. `numbers` are those of their pieces, `wrong` the probability
         of an answer that is wrong, else -1."""
-        pairs = sorted(zip(numbers, wrong, strict=True))
-        groups = groupby(pairs, key=lambda pair: pair[0])
+        groups = groupby(sorted(zip(numbers, wrong, strict=True)), key=lambda pair: pair[0])
         return Pieces(np.array([max(one for _, one in group) for _, group in groups], float))
 
     def num_wrong(self, min_probability: float) -> int:
@@ -155,7 +152,6 @@ class CertifiedAnswers:
         wrong, num_pieces = self.wrong_probabilities(), len(set(self.pieces))
         num_wrong_pieces = Pieces.of(self.pieces, wrong).num_wrong(min_probability)
         given = [one for one in self.answers if _probability(one) >= min_probability]
-        refused = [one for one in self.answers if not one.result.localized]
         return CertifiedCondition(
             self.name,
             self.kind,
@@ -168,7 +164,7 @@ class CertifiedAnswers:
             max_share(num_wrong_pieces, num_pieces, confidence) if self.has_truth else None,
             sum(one.is_inside_ellipsoid for one in given if self.has_truth and not is_wrong(one)),
             _median_ms(given),
-            _median_ms(refused),
+            _median_ms([one for one in self.answers if not one.result.localized]),
         )
 
 
@@ -207,12 +203,16 @@ def derive_certificate(
         if answer.result.localized and not is_wrong(answer)
     ]
     cameras = [one.camera for condition in conditions for one in condition.answers if one.camera]
+    settings, default = encode_json(config), encode_json(LocalizerConfig())
     return Certificate(
         map_version=0,
         program=version("topoloc"),
         date=today(),
-        settings=_changed_settings(config),
-        cameras=[_describe_camera(camera) for camera in dict.fromkeys(cameras)],
+        settings={key: value for key, value in settings.items() if value != default[key]},
+        cameras=[
+            f"{camera.width}x{camera.height}, {camera.model}, f {camera.fx:.0f} px"
+            for camera in dict.fromkeys(cameras)
+        ],
         confidence=CONFIDENCE,
         max_wrong_share=max(bounds, default=None),
         requested_share=max_wrong_share,
@@ -249,13 +249,3 @@ def _probability(answer: EvaluatedQuery) -> float:
 def _median_ms(answers: Sequence[EvaluatedQuery]) -> float | None:
     times = [one.result.times_ms["total"] for one in answers]
     return float(np.median(times)) if times else None
-
-
-def _describe_camera(camera: Camera) -> str:
-    return f"{camera.width}x{camera.height}, {camera.model}, f {camera.fx:.0f} px"
-
-
-def _changed_settings(config: LocalizerConfig) -> dict[str, Any]:
-    """Return the settings that are not the default."""
-    default = encode_json(LocalizerConfig())
-    return {key: value for key, value in encode_json(config).items() if value != default[key]}

@@ -140,7 +140,6 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
     hits = [node == a.nearest_node_id for a, node in first]
     near = [node == a.nearest_node_id or node in a.neighbour_ids for a, node in first]
     reasons = [a.result.reason for a in answers if isinstance(a.result, NotLocalized)]
-    stages = sorted({stage for a in answers for stage in a.result.times_ms})
     return {
         "num_queries": len(with_truth),
         "num_localized": int(localized.sum()),
@@ -165,7 +164,7 @@ def _summarize(answers: list[EvaluatedQuery]) -> dict[str, Any]:
         "not_localized": dict(sorted(Counter(reasons).items())),
         "median_times_ms": {
             stage: _median(np.array([a.result.times_ms.get(stage, 0.0) for a in answers]))
-            for stage in stages
+            for stage in sorted({stage for a in answers for stage in a.result.times_ms})
         },
     }
 

@@ -218,10 +218,9 @@ def _localize(
         raise CalibrationError(
             f"{frame.name}: no calibration; put a camera.json into the recording's folder"
         )
-    result = localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns)
     return EvaluatedQuery(
         frame.name,
-        result,
+        localizer.localize(frame.image, frame.camera, t_ns=frame.t_ns),
         None,
         recording=label,
         read_image=lambda: sequence[index].image,

@@ -40,7 +40,6 @@ def match_pooled(
     train_points_world: Float[np.ndarray, "m 3"],
     train_radii: Float[np.ndarray, " m"],
     config: MatchingConfig,
-    num_threads: int | None = None,
 ) -> Matches:
     """Return matches between an image and the pooled features of several map nodes.
 
@@ -49,7 +48,7 @@ def match_pooled(
     their two `train_radii` (metres, from the depth error).
     """
     points = train_points_world, train_radii
-    return Matcher(query_descriptors, train_descriptors, points, config, num_threads).match_first()
+    return Matcher(query_descriptors, train_descriptors, points, config).match_first()
 
 
 def find_similar_pairs(

@@ -50,8 +50,7 @@ def compute_variance_inflation(
         sigma_px: standard deviation of the pixels.
     """
     matches = Matches.from_pixels(points_img, points_world, point_covariances, camera, sigma_px)
-    of_points = cells_of(points_img, camera.width, camera.height)
-    used, cells = np.unique(of_points, return_inverse=True)
+    used, cells = np.unique(cells_of(points_img, camera.width, camera.height), return_inverse=True)
     if len(used) < _MIN_CELLS:
         return 1.0
     information, independent, clustered = score_outer_products(

@@ -237,7 +237,6 @@ def _compute_remap(
 ) -> Float32[np.ndarray, "h w 2"]:
     shape = rectified.height, rectified.width
     grid = np.indices(shape, dtype=np.float64)[::-1].reshape(2, -1).T
-    rays = rectified.rays_from_img(grid) @ rotation
     # Pixels without a ray get a place outside of the image, where remap fills black.
-    pixels = np.nan_to_num(raw.img_from_cam(rays), nan=-1e4)
+    pixels = np.nan_to_num(raw.img_from_cam(rectified.rays_from_img(grid) @ rotation), nan=-1e4)
     return pixels.reshape(*shape, 2).astype(np.float32)

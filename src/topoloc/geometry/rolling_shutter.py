@@ -44,8 +44,7 @@ class TurningCamera:
         ray stay."""
         rays = np.insert(camera.normalized_from_img(points_img), 2, 1.0, axis=1)
         shares = _row_shares(points_img, self.height)
-        turned = rays - shares[:, None] * np.cross(self.rotation, rays)
-        moved = camera.img_from_cam(turned)
+        moved = camera.img_from_cam(rays - shares[:, None] * np.cross(self.rotation, rays))
         return np.where(np.isfinite(moved), moved, points_img)
 
 

@@ -49,16 +49,6 @@ def transform_nodes(
     return replace(topomap, layers=layers)
 
 
-def quantize_map_descriptors(topomap: TopoMetricMap, step: float) -> TopoMetricMap:
-    """Return the map with quantized descriptors, or the same map if all nodes are quantized
-    already.
-
-    A node is quantized each time it is read. Virtual nodes keep their descriptors. `step` is in
-    root mean squares of a descriptor's numbers. Raises MapError if a node cannot be read.
-    """
-    return transform_nodes(topomap, partial(quantize_node_descriptors, step=step))
-
-
 def quantize_node_descriptors(node: TopoNode, step: float) -> TopoNode:
     """Return the node with its descriptors quantized, or the same node if they are quantized
     already. `step` is in root mean squares of a descriptor's numbers."""

@@ -18,7 +18,7 @@ from topoloc.errors import MapError
 from topoloc.geometry.rigid import Rigid3
 from topoloc.lifelong.node_localization import localize_nodes, measure_recall_change
 from topoloc.lifelong.session_content import is_well_localized, update_coarse_models
-from topoloc.lifelong.session_poses import SessionPoses, align_motion_to_map
+from topoloc.lifelong.session_poses import align_motion_to_map
 from topoloc.localization.localizer import Localizer, LocalizerConfig
 from topoloc.localization.map_facts.map_building import with_map_statistics
 from topoloc.mapping.config import Progress
@@ -55,8 +55,9 @@ def merge(
     """
     with TopoMetricMap.load(first) as one, TopoMetricMap.load(second) as other:
         merged, changes = merge_maps(one, other, localizer_config, progress)
-        name = f"merge {Path(second).name}"
-        edit = Edit(one.free_ids.edit, name, today(), SCHEMA_VERSION, changes)
+        edit = Edit(
+            one.free_ids.edit, f"merge {Path(second).name}", today(), SCHEMA_VERSION, changes
+        )
         replace(merged, edits=[*one.edits, edit]).save(out, on_wait)
     return changes | {"bytes": Path(out).stat().st_size}
 
@@ -77,38 +78,30 @@ def merge_maps(
         )
     if first.map_id is not None and first.map_id == second.map_id:
         raise MapError("they are one map in two versions; nothing is merged")
-    aligned = _align_second_map(first, second, localizer_config, progress)
+    answers = localize_nodes(
+        Localizer(first, localizer_config),
+        second,
+        second.rows,
+        lambda done: progress("comparing the maps", done, len(second.rows)),
+    )
+    odom = dict(enumerate(summary.world_from_cam for summary in second.summaries))
+    aligned = align_motion_to_map("the second map", odom, {**answers}, first.config.d_thresh)
     added = as_rows(
         row
-        for row, answer in aligned.answers.items()
+        for row, answer in answers.items()
         if not is_well_localized(answer, first.config.d_thresh)
     )
     poses = {Row(row): pose for row, pose in aligned.world_from_cams.items()}
     merged, not_updated = _add_nodes(first, second, added, poses)
     changes = {
         "nodes_of_second": len(second.summaries),
-        "localized": sum(answer is not None for answer in aligned.answers.values()),
+        "localized": sum(answer is not None for answer in answers.values()),
         "agreeing": len(aligned.inlier_idx),
         "nodes_added": len(added),
         "not_taught": not_updated,
     }
     merged = with_map_statistics(merged, progress)
     return merged, changes | measure_recall_change(first, merged, localizer_config)
-
-
-def _align_second_map(
-    first: TopoMetricMap,
-    second: TopoMetricMap,
-    localizer_config: LocalizerConfig | None,
-    progress: Progress,
-) -> SessionPoses:
-    """Return poses of the second map's nodes, by row, in the world of the first map."""
-    rows, localizer = second.rows, Localizer(first, localizer_config)
-    answers = localize_nodes(
-        localizer, second, rows, lambda done: progress("comparing the maps", done, len(rows))
-    )
-    odom = dict(enumerate(summary.world_from_cam for summary in second.summaries))
-    return align_motion_to_map("the second map", odom, {**answers}, first.config.d_thresh)
 
 
 def _add_nodes(
@@ -199,8 +192,7 @@ def _transfer_edges(
     ids = {}
     for row, summary in zip(second.rows, second.summaries, strict=True):
         distances = node_distances(poses[row], first.node_poses, first.config.lambda_rot)
-        nearest = first.summaries[int(distances.argmin())].node_id
-        ids[summary.node_id] = new_id.get(row, nearest)
+        ids[summary.node_id] = new_id.get(row, first.summaries[int(distances.argmin())].node_id)
     return {
         Edge(ids[e.source_id], ids[e.target_id])
         for e in second.edges
@@ -225,8 +217,8 @@ def _transfer_virtual_nodes(
         row = None if of.of_node is None else second.row_of(of.of_node)
         if row is not None and row in new_id:
             owner = known[new_id[row]]
-            second_from_node = second.summaries[row].world_from_cam
-            moved = poses[row] @ second_from_node.inverse() @ of.world_from_cam
+            node_from_second = second.summaries[row].world_from_cam.inverse()
+            moved = poses[row] @ node_from_second @ of.world_from_cam
             ids = {"of_node": owner.node_id, "session_id": owner.session_id}
             nodes.append(replace(side, summary=replace(of, world_from_cam=moved, **ids)))
     return add_virtual_nodes(first, nodes)

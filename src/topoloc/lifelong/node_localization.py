@@ -83,9 +83,9 @@ def localize_left_out(
             query = QueryImage.of_features(features, node.camera)
             result, *_ = localizer.without(hidden).localize_query(query)
             if isinstance(result, Localization):
-                limits = MAX_TRANSLATION, np.radians(MAX_ROTATION_DEG)
-                pose = node.summary.world_from_cam
-                is_same = pose.is_same(result.world_from_cam, *limits)
+                is_same = node.summary.world_from_cam.is_same(
+                    result.world_from_cam, MAX_TRANSLATION, np.radians(MAX_ROTATION_DEG)
+                )
                 num_inliers = result.num_inliers if is_same else 0
                 answers[row] = LeaveOneOutResult(is_same, not is_same, num_inliers)
         if progress is not None:

@@ -18,7 +18,7 @@ from jaxtyping import Int
 
 from topoloc.mapping.node_drafts import observe_node
 from topoloc.mapping.nodes import find_nearest_nodes
-from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode, VirtualNodes
+from topoloc.mapping.topomap import Edge, PlaceImage, TopoMetricMap, TopoNode
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes
 from topoloc.node_ids import LazySequence, NodeId, Row
 from topoloc.retrieval.coarse import CoarseModel
@@ -127,6 +127,10 @@ def remove_nodes(
         }
         nodes = LazySequence(partial(len, kept), lambda k, nodes=layer.nodes: nodes[kept[k]])
         layers[kind] = replace(layer, nodes=nodes, coarse_models=models)
+    sides = topomap.sides
+    if sides is not None and any(summary.of_node in new_id for summary in sides.summaries):
+        staying = [node for node in sides.nodes if node.summary.of_node not in new_id]
+        sides = collect_virtual_nodes(staying, sides.kind)
     edges = {
         Edge(*(new_id.get(one, one) for one in (edge.source_id, edge.target_id)))
         for edge in topomap.edges
@@ -137,7 +141,7 @@ def remove_nodes(
         layers=layers,
         edges=sorted(edge for edge in edges if edge.source_id != edge.target_id),
         place_images=_reassign_images(topomap.place_images, new_id),
-        sides=_remove_virtual_nodes(topomap, new_id),
+        sides=sides,
     )
 
 
@@ -174,18 +178,6 @@ def _reassign_descriptors(model: CoarseModel, new_id: Mapping[NodeId, NodeId]) -
         for name, array in model.arrays.items()
     }
     return replace(model, arrays=arrays | {"node_ids": ids[is_kept]})
-
-
-def _remove_virtual_nodes(
-    topomap: TopoMetricMap, new_id: Mapping[NodeId, NodeId]
-) -> VirtualNodes | None:
-    """Return the virtual nodes of the nodes that stay."""
-    sides = topomap.sides
-    if sides is None or not any(summary.of_node in new_id for summary in sides.summaries):
-        return sides
-    return collect_virtual_nodes(
-        [node for node in sides.nodes if node.summary.of_node not in new_id], sides.kind
-    )
 
 
 def select_removed_nodes(

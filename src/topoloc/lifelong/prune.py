@@ -13,6 +13,7 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from topoloc.errors import MapError
 from topoloc.lifelong.landmark_pruning import (
     choose_landmarks,
     find_vanished,
-    quantize_map_descriptors,
+    quantize_node_descriptors,
     select_landmarks,
     transform_nodes,
 )
@@ -152,7 +153,7 @@ def prune_map(
     descriptor_step = 0.64
     counted = transform_nodes(topomap, _merge_session_counts)
     if descriptors == "coarse":
-        counted = quantize_map_descriptors(counted, descriptor_step)
+        counted = transform_nodes(counted, partial(quantize_node_descriptors, step=descriptor_step))
     is_same = counted is topomap
     file = _FileSize.of(path, topomap.kinds) if is_same else _measure_file_size(counted, path)
     fewer = counted if max_bytes is None else _drop_nodes(counted, file, max_bytes)

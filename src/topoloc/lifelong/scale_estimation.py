@@ -160,8 +160,7 @@ def _similarity_hypotheses(answers: _LocalizedFrames) -> Iterator[tuple[int, flo
     # Number of localizations, evenly spaced, of which all pairs are tried as a similarity
     # transform.
     max_rows = 40
-    rows = sample_evenly(range(len(answers.rows)), max_rows)
-    for i, j in permutations(rows, 2):
+    for i, j in permutations(sample_evenly(range(len(answers.rows)), max_rows), 2):
         apart, own_apart = (
             float(np.linalg.norm(places[i] - places[j])) for places in (answers.world, answers.odom)
         )
@@ -222,8 +221,7 @@ def _estimate_scale_profile(
     max_knots = 200  # maximum number of knots along the trajectory at which the scale is estimated
     a, b = answers.select(pairs[:, 0]), answers.select(pairs[:, 1])
     apart = np.linalg.norm(a.world - b.world, axis=1)
-    own_apart = np.linalg.norm(a.odom - b.odom, axis=1)
-    measured = np.log(apart / own_apart)
+    measured = np.log(apart / np.linalg.norm(a.odom - b.odom, axis=1))
     sigmas = WIDENED * np.hypot(a.sigmas, b.sigmas) / apart
     num = len(path_lengths)
     rows = np.linspace(0, num - 1, min(num, max_knots)).astype(int)
@@ -238,9 +236,8 @@ def _estimate_scale_profile(
     matrix = np.concatenate([mean / sigmas[:, None], difference])
     covariance = np.linalg.inv(matrix.T @ matrix + 1e-12 * np.eye(len(knots)))
     logs = covariance @ (matrix[: len(mean)].T @ (measured / sigmas))
-    of_knots = logs, np.sqrt(np.diag(covariance))
-    at_logs, at_sigmas = (np.interp(path_lengths, knots, values) for values in of_knots)
-    return at_logs, at_sigmas
+    knot_sigmas = np.sqrt(np.diag(covariance))
+    return np.interp(path_lengths, knots, logs), np.interp(path_lengths, knots, knot_sigmas)
 
 
 def _select_pairs(answers: _LocalizedFrames) -> Int[np.ndarray, "p 2"]:

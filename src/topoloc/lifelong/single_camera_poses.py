@@ -84,8 +84,7 @@ def estimate_poses_by_map(
     known = sorted(poses.items(), key=lambda pair: pair[0])
     if not known:
         raise TrajectoryError(f"{sequence.name}: {_failure_reason(localized)}; no map is changed")
-    known_poses = [pose for _, pose in known]
-    rows = select_node_frames(known_poses, d_thresh, map_config.lambda_rot)
+    rows = select_node_frames([pose for _, pose in known], d_thresh, map_config.lambda_rot)
     queried = [known[k][0] for k in rows]
     answers = {index: localized.get(index) for index in queried}
     propagated_idx = [index for index, _ in known if index not in localized]

@@ -137,7 +137,13 @@ def correct_trajectory(
         return dict(world_from_cams)
     lengths = compute_path_lengths(positions_of(poses))
     at = lengths[list(answered)]
-    errors = [_pose_error(poses[row], answer) for row, answer in answered.items()]
+    errors = [  # shifts (metres, world) and rotation vectors (radians, world)
+        np.append(
+            answer.world_from_cam.translation - poses[row].translation,
+            log_so3(answer.world_from_cam.rotation @ poses[row].rotation.T),
+        )
+        for row, answer in answered.items()
+    ]
     corrections = _estimate_corrections(errors, list(answered.values()), at, d_thresh)
     beyond = np.maximum(np.maximum(at[0] - lengths, lengths - at[-1]), 0.0) / d_thresh
     decay = np.exp(-0.5 * beyond**2)
@@ -156,12 +162,6 @@ def _is_correctable(pose: Rigid3, answer: Localization) -> bool:
         _MAX_SIGMAS * answer.position_sigma_m,
         math.radians(_MAX_SIGMAS * answer.rotation_sigma_deg),
     )
-
-
-def _pose_error(pose: Rigid3, answer: Localization) -> Float[np.ndarray, "6"]:
-    """Return the shift (metres, world) and rotation vector (radians, world) to the localization."""
-    turn = log_so3(answer.world_from_cam.rotation @ pose.rotation.T)
-    return np.append(answer.world_from_cam.translation - pose.translation, turn)
 
 
 def _estimate_corrections(

@@ -145,8 +145,9 @@ def update_map(
     check_session_is_new(topomap, sequence)
     localizer = Localizer(topomap, localizer_config)
     if poses_from == "map":
-        tracker = Tracker(localizer)
-        session_poses = estimate_poses_by_map(sequence, tracker, topomap.config, progress)
+        session_poses = estimate_poses_by_map(
+            sequence, Tracker(localizer), topomap.config, progress
+        )
     else:
         session_poses = estimate_poses_by_motion(sequence, localizer, topomap.config, progress)
     indices = list(range(len(sequence)))
@@ -158,7 +159,6 @@ def update_map(
     session = create_session(sequence, frames, poses_from, camera, content.lights)
     changed = _add_session(topomap, session, frames, content)
     changed, not_updated = update_coarse_models(changed, content.views, content.images)
-    new_nodes = content.nodes[topomap.kind]
     changes = {
         "session": session.session_id,
         "recording": sequence.name,
@@ -169,15 +169,15 @@ def update_map(
         "asked": len(session_poses.answers),
         "localized": sum(answer is not None for answer in session_poses.answers.values()),
         "agreeing": len(session_poses.inlier_idx),
-        "nodes_added": len(new_nodes),
+        "nodes_added": len(content.nodes[topomap.kind]),
         "side_nodes_added": len(content.sides),
-        "points_added": sum(len(node.features) for node in new_nodes),
+        "points_added": sum(len(node.features) for node in content.nodes[topomap.kind]),
         "place_images_added": len(content.images),
         "not_taught": not_updated,
     }
     changed = with_map_statistics(changed, progress)
-    changes |= measure_recall_change(topomap, changed, localizer_config)
-    return MapUpdate(changed, posed_sequence, changes)
+    recall = measure_recall_change(topomap, changed, localizer_config)
+    return MapUpdate(changed, posed_sequence, changes | recall)
 
 
 def _add_session(
@@ -220,6 +220,5 @@ def _merge_nodes(
             node, session_id = before[row], observations[0].session_id
             added = count_session_observations(len(node.features), observations, session_id)
             if added is not None:
-                statistics = [*node.session_statistics, added]
-                changed[row] = replace(node, session_statistics=statistics)
+                changed[row] = replace(node, session_statistics=[*node.session_statistics, added])
     return overlay(before, changed, content.nodes[kind])

@@ -197,9 +197,14 @@ def find_weak_regions(
         _assess_node(topomap, row, answers.get(row), bool(has_opposite_view[row]), stood_by)
         for row in topomap.rows
     ]
+    parts = list[WeakRegion]()
+    for reason in REASONS:
+        weak = [node for node in nodes if reason in node.reasons]
+        of_reason = [WeakRegion(reason, one) for one in _cluster_nodes(weak, apart * d_thresh)]
+        parts += sorted(of_reason, key=lambda part: -len(part.nodes))
     names = {summary.session_id: summary.recording for summary in topomap.summaries}
     names |= {session.session_id: session.name for session in topomap.sessions}
-    return WeakRegions(nodes, _group_regions(nodes, apart * d_thresh), names)
+    return WeakRegions(nodes, parts, names)
 
 
 def _assess_node(
@@ -258,15 +263,6 @@ def _has_opposite_view(
         is_near = np.linalg.norm(poses.centres - centre, axis=1) <= reach_m
         found[row] = (is_near & (axes @ axis <= max_cos)).any()
     return found
-
-
-def _group_regions(nodes: Sequence[NodeQuality], apart_m: float) -> list[WeakRegion]:
-    parts = list[WeakRegion]()
-    for reason in REASONS:
-        weak = [node for node in nodes if reason in node.reasons]
-        of_reason = [WeakRegion(reason, group) for group in _cluster_nodes(weak, apart_m)]
-        parts += sorted(of_reason, key=lambda part: -len(part.nodes))
-    return parts
 
 
 def _cluster_nodes(nodes: Sequence[NodeQuality], apart_m: float) -> list[list[NodeQuality]]:

@@ -17,7 +17,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from msgspec import Struct, to_builtins
 from msgspec.structs import astuple
@@ -25,7 +25,8 @@ from msgspec.structs import astuple
 from topoloc.errors import FeatureTypeError
 from topoloc.features.feature_types import FEATURE_TYPES, LEARNED_TYPES
 from topoloc.json_data import Finite, decode_json
-from topoloc.localization.provenance import Evidence
+from topoloc.localization.belief import RivalWeights
+from topoloc.localization.provenance import Evidence, log_doubt, log_even_share
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FALLBACK_TYPE, LEARNED_FALLBACK_TYPE = "surf", LEARNED_TYPES[0].name
@@ -55,6 +56,8 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
     hopeless_log_odds: Finite = -3.0
     narrow_spread: Finite = 0.25
     max_narrow_log_odds: Finite = 2.0
+    few_points: ClassVar[float] = 0.0
+    """The covariance of few points is not inflated."""
 
     @property
     def as_vector(self) -> tuple[float, ...]:
@@ -73,22 +76,17 @@ class EvidenceWeights(Struct, frozen=True, forbid_unknown_fields=True):
         """Return the inputs of the regression."""
         e = evidence
         return (
-            _log_even_share(e),
+            log_even_share(e),
             math.log((e.num_found + 1) / (e.num_by_chance + 5)),
             math.log(e.num_inliers + 1),
             math.log((e.num_inliers + 1) / (e.num_matches + 10)),
             math.log(e.spread + 0.02),
-            _log_doubt(e),
+            log_doubt(e),
         )
 
     def limit(self, evidence: Evidence) -> float:
         """Return the highest log-odds with this evidence."""
         return self.max_narrow_log_odds if evidence.spread < self.narrow_spread else math.inf
-
-    @property
-    def few_points(self) -> float:
-        """Return 0: the covariance of few points is not inflated."""
-        return 0.0
 
     def is_clear(self, log_odds: float) -> bool:
         """Return whether a pose with these log-odds is clear."""
@@ -159,8 +157,8 @@ class VirtualViewWeights(Struct, frozen=True, forbid_unknown_fields=True):
             math.log(e.spread + 0.02),
             math.log((e.num_distinct or 0) + 1),
             math.log((e.num_lesser_side or 0) + 2),
-            _log_even_share(e),
-            _log_doubt(e),
+            log_even_share(e),
+            log_doubt(e),
         )
 
     def limit(self, evidence: Evidence) -> float:
@@ -177,39 +175,6 @@ def compute_log_odds(evidence: Evidence, weights: EvidenceWeights | VirtualViewW
     features = weights.features(evidence)
     log_odds = sum(w * x for w, x in zip(weights.as_vector, features, strict=True)) + weights.bias
     return min(log_odds, weights.limit(evidence))
-
-
-def _log_even_share(evidence: Evidence) -> float:
-    return math.log(evidence.even_share + 0.002)
-
-
-def _log_doubt(evidence: Evidence) -> float:
-    return math.log(max(evidence.doubt, 0.01))
-
-
-class RivalWeights(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the weights that compare two poses of one image (`belief.py`).
-
-    They weigh the log-odds, the spatially uniform inlier ratio and the normalized uncertainty, in
-    logarithms. `lead` is the minimum log-odds margin of a reported pose over each other one,
-    `unclear_lead` that of a pose that is not clear over each pose elsewhere.
-    """
-
-    odds: Finite
-    even_share: Finite
-    doubt: Finite
-    unclear_lead: Finite
-    lead: Finite = 2.0
-
-    def score(self, evidence: Evidence, log_odds: float) -> float:
-        """Return the score of a pose. The difference of two scores is a log-odds margin.
-
-        It is NaN for virtual views, whose evidence is of another kind.
-        """
-        if not evidence.is_of_nodes:
-            return math.nan
-        even_share, doubt = _log_even_share(evidence), _log_doubt(evidence)
-        return self.odds * log_odds + self.even_share * even_share + self.doubt * doubt
 
 
 class ConfirmationWeights(Struct, frozen=True, forbid_unknown_fields=True):
@@ -253,77 +218,6 @@ class CorrelatedErrorWeights(Struct, frozen=True, forbid_unknown_fields=True):
     unknown: Finite
 
 
-class CrowdingWeights(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the numbers of the second look at a refused pose with log-odds above `min_log_odds`.
-
-    Its matches are searched within `radius_px` (pixels of an image whose longer side is 640). Of
-    chance matches, `chance_share` lies within `near_px` of the prediction. The matches crowd by
-    the standard deviations above that. `weight` times the crowding plus `bias` is added to the
-    log-odds, if matches crowd in all parts of the view: at least `min_full_cells` of the `cells`
-    (columns, rows) have `min_cell_matches`, and the `quantile` of their shares near the prediction
-    is at least `min_share`.
-    """
-
-    min_log_odds: Finite
-    radius_px: Finite
-    near_px: Finite
-    chance_share: Finite
-    cells: tuple[int, int]
-    min_cell_matches: int
-    min_full_cells: int
-    quantile: Finite
-    min_share: Finite
-    weight: Finite
-    bias: Finite
-
-
-class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the numbers of the last step (`last_step.py`).
-
-    - `num_nodes`: nodes nearest to the pose whose points are matched.
-    - `radii_px`, `max_errors_px`: search radii and inlier limits of the two rounds of matching, in
-      pixels of an image whose longer side is 640. `key_point_sigma_px`: error of a key point.
-    - `max_aligned`: matches that are aligned at most, in rounds that search up to `reaches_px`, by
-      patches of `patch_px` squared pixels whose grey levels vary by `min_patch_sigma`. At least
-      `min_aligned` must agree within `max_aligned_error_px`. `correlations`, `aligned_sigmas_px`:
-      table of the error of an aligned pixel. Matches below the first correlation are dropped.
-      A pose of key points needs `min_matches`.
-    - `max_correlated_error_share`: rho of a map above which the step is left out.
-    - `shared_error_line` (a, b): a + b rho of the verdict's correlated covariance remains.
-    """
-
-    corpus: str
-    date: str
-    command: str
-    num_nodes: int
-    radii_px: tuple[Finite, Finite]
-    max_errors_px: tuple[Finite, Finite]
-    key_point_sigma_px: Finite
-    min_matches: int
-    min_aligned: int
-    max_aligned: int
-    reaches_px: tuple[int, ...]
-    max_aligned_error_px: Finite
-    patch_px: int
-    min_patch_sigma: Finite
-    correlations: tuple[Finite, ...]
-    aligned_sigmas_px: tuple[Finite, ...]
-    max_correlated_error_share: Finite
-    shared_error_line: tuple[Finite, Finite]
-    crowding: CrowdingWeights
-
-
-@cache
-def load_last_step_weights() -> LastStepWeights:
-    """Return the shipped numbers of the last step.
-
-    Raises:
-        FeatureTypeError: the file is damaged.
-    """
-    path = Path(__file__).parent / "exact/weights.json"
-    return decode_json(path.read_bytes(), LastStepWeights, FeatureTypeError, str(path))
-
-
 @dataclass(frozen=True)
 class FittedWeights:
     """Hold the weights of one feature type and their source.
@@ -360,16 +254,9 @@ class FittedWeights:
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object of a file of weights."""
-        groups = _Groups.__struct_fields__
-        weights = {name: to_builtins(getattr(self, name)) for name in groups}
-        return {
-            "kind": self.kind,
-            "corpus": self.corpus,
-            "date": self.date,
-            "command": self.command,
-            "calibration_error": self.calibration_error,
-            "weights": weights,
-        }
+        file = to_builtins(self)
+        file["weights"] = {name: file.pop(name) for name in _Groups.__struct_fields__}
+        return file
 
 
 class _Groups(Struct, frozen=True, forbid_unknown_fields=True):
@@ -401,12 +288,9 @@ def load_fitted_weights(kind: str) -> FittedWeights:
     """
     path = WEIGHTS_FOLDER / f"{kind}.json"
     if not path.exists():
-        like = (
-            LEARNED_FALLBACK_TYPE
-            if kind in FEATURE_TYPES and FEATURE_TYPES[kind].network is not None
-            else FALLBACK_TYPE
-        )
-        return replace(load_fitted_weights(like), kind=kind, calibration_error=None)
+        is_learned = kind in FEATURE_TYPES and FEATURE_TYPES[kind].network is not None
+        weights = load_fitted_weights(LEARNED_FALLBACK_TYPE if is_learned else FALLBACK_TYPE)
+        return replace(weights, kind=kind, calibration_error=None)
     weights = read_weights(path)
     if weights.kind != kind:
         raise FeatureTypeError(f"{path}: weights of {weights.kind}, not of {kind}")

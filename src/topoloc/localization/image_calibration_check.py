@@ -97,10 +97,9 @@ def check_image_calibration(
     if not any(is_off) or not _is_better(_gain(by_calibration, fit)):
         return seen, None
     camera, scale = corrected_camera(fit.camera, found), search.query.scale
-    sigma = math.sqrt(found.covariance[0, 0])
     return seen, CalibrationMismatch(
         camera.fx * scale,
-        sigma * camera.fx * scale,
+        math.sqrt(found.covariance[0, 0]) * camera.fx * scale,
         calibrated.fx * scale,
         _principal_point(camera, scale),
         _principal_point(calibrated, scale),
@@ -231,8 +230,7 @@ def _estimate_image_calibration(search: Search, fit: PoseFit) -> ImageCalibratio
     )
     if found is None:
         return None
-    shared = map_variance(search.correlated_error_share)
-    return replace(found, covariance=shared * found.covariance)
+    return replace(found, covariance=map_variance(search.correlated_error_share) * found.covariance)
 
 
 def _rematch(search: Search, fit: PoseFit, found: ImageCalibration) -> PointMatches:

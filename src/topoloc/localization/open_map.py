@@ -24,7 +24,6 @@ from topoloc.localization.map_facts.repetition import (
     digest_of,
     find_copy_transform,
     find_repetition_shifts,
-    has_repetitions,
 )
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.walls.virtual_view_index import VirtualViewIndex
@@ -186,7 +185,8 @@ class OpenMap:
 
     def _find_shifts(self, row: Row) -> Float[np.ndarray, "k 3"]:
         node, poses = self._local_map(row), self.node_poses
-        if not has_repetitions(node):
+        # in most repetitive places a node's own image shows some part twice
+        if len(find_repetition_shifts(node, node, min_share=0.15)) == 0:
             return np.zeros((0, 3))
         depths = self.cam_from_world(row).apply(node.points_world)[:, 2]
         away = np.linalg.norm(poses.centres - poses.centres[row], axis=1)

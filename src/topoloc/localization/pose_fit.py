@@ -228,14 +228,13 @@ def fit_pose(
         )
         pose, camera = found or (None, camera)
     else:
-        near = start[0] if start else None
         pose = estimate_absolute_pose(
             points_img,
             points_world,
             input_camera,
             config,
             point_covariances=covariances,
-            start=near,
+            start=start[0] if start else None,
         )
     if pose is None:
         return PointMatches(features, input_camera, camera, local_map, matches)

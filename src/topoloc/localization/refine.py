@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeGuard
 
 import numpy as np
 
@@ -103,12 +102,11 @@ def refine(proposal: NodeProposal) -> PointMatches:
     """Return the pose refitted to guided matches, or the proposal if it has too few inliers."""
     search, first = proposal.search, proposal.fit
     final = refit_around(search, first)
-    if final.num_inliers < first.num_inliers and _is_clear(first, search):
+    is_clear = first.num_inliers >= search.config.num_clear_inliers
+    if isinstance(first, PoseFit) and is_clear and final.num_inliers < first.num_inliers:
         # Around a bend the nearest nodes see another place than the image and the nodes it matched.
         final = max(final, _refit_with_own_nodes(search, first), key=lambda fit: fit.num_inliers)
-    if (
-        first.num_inliers < search.config.num_clear_inliers
-    ):  # a poor first pose may need a second round to find all points
+    if not is_clear:  # a poor first pose may need a second round to find all points
         final = max(final, refit_around(search, final), key=lambda fit: fit.num_inliers)
     before = first.camera
     for _ in range(3):  # matches around another camera hold the estimate back
@@ -116,10 +114,6 @@ def refine(proposal: NodeProposal) -> PointMatches:
             break
         before, final = final.camera, refit_around(search, final)
     return final
-
-
-def _is_clear(first: PointMatches, search: Search) -> TypeGuard[PoseFit]:
-    return isinstance(first, PoseFit) and first.num_inliers >= search.config.num_clear_inliers
 
 
 def _refit_with_own_nodes(search: Search, first: PoseFit) -> PointMatches:
@@ -164,8 +158,7 @@ def fit_around(
         matches = match_guided(query.features, local_map, *start, guided)
     matched = query.features, query.input_camera, local_map, matches
     with query.clock.stage("pnp"):
-        rho = search.correlated_error_share
-        return fit_pose(*matched, config.pose, start, min_matches, rho)
+        return fit_pose(*matched, config.pose, start, min_matches, search.correlated_error_share)
 
 
 def find_best_case_evidence(proposal: NodeProposal) -> Evidence | None:

@@ -47,7 +47,7 @@ from topoloc.mapping.topomap import Layer, TopoMetricMap
 from topoloc.mapping.virtual_nodes import collect_virtual_nodes, select_virtual_view_nodes
 from topoloc.node_ids import NodeId, Row, as_rows
 from topoloc.recordings.frame import StereoFrame, StereoSequence
-from topoloc.recordings.recording import find_pose_source
+from topoloc.recordings.recording import find_pose_source, read_left_frame
 from topoloc.retrieval.coarse import CoarseModel
 from topoloc.retrieval.vlad import SurfVlad, append_positions, learn_words_from_parts, vlad
 
@@ -189,7 +189,10 @@ def _process_mapping_images(
     images, lights = list[PlaceImage](), list[Illumination]()
     vlads = {kind: DiskList[np.ndarray]() for kind in config.kinds}
     cells = {kind: [] for kind in config.kinds}
-    read = ((frame, None if frame in drafts.rows else frame.read_left()) for frame in frames)
+    read = (  # feature extraction needs no right or depth image
+        (frame, None if frame in drafts.rows else read_left_frame(frame.sequence, frame.index))
+        for frame in frames
+    )
     visits = parallel_map(lambda one: _observe_image(*one, drafts, nodes, words, config), read)
     for done, (frame, visit) in enumerate(zip(frames, visits, strict=True)):
         image, nearest, observations, own_vlads = visit
@@ -200,8 +203,7 @@ def _process_mapping_images(
         for kind, features in image.features.items():
             vlads[kind].append(own_vlads[kind])
             cells[kind].append(features.cells)
-        node_id, image_id = NodeId(nearest), done + 1
-        images.append(create_place_image(frame, image, node_id, image_id))
+        images.append(create_place_image(frame, image, NodeId(nearest), done + 1))
         lights.append(image.light)
         progress("images", done + 1, len(frames))
     node_ids, models = np.array([image.node_id for image in images]), dict[str, CoarseModel]()
@@ -227,12 +229,13 @@ def _observe_image(
     VLADs by feature type.
     """
     image = (
-        drafts.image(frame)
+        drafts.disk_list[drafts.rows[frame]].image
         if read is None
         else extract_mapping_image(frame, prepare_view(read, with_depth=False), config)
     )
-    pose, lambda_rot = image.world_from_cam, config.lambda_rot
-    nearest = as_rows(find_nearest_nodes(pose, nodes, lambda_rot, NODES_PER_IMAGE))
+    nearest = as_rows(
+        find_nearest_nodes(image.world_from_cam, nodes, config.lambda_rot, NODES_PER_IMAGE)
+    )
     around = {row: drafts.disk_list[row] for row in nearest}
     observed = {
         row: observe_draft(draft, image, frame.session_id)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Protocol, runtime_checkable
 
@@ -117,14 +116,9 @@ def _resolved(value: float | None) -> float:
     return value
 
 
-def config_to_text(config: MapConfig) -> str:
-    """Return the JSON text stored in the map file."""
-    return json.dumps(config.to_json(), sort_keys=True)
-
-
 def config_from_text(text: str, version: int | None) -> MapConfig:
-    """Parse the text of `config_to_text`. Files of schema 1 contain no version. Raises ConfigError
-    with the key."""
+    """Parse the JSON of `MapConfig.to_json`. Files of schema 1 contain no version. Raises
+    ConfigError with the key."""
     data = decode_json(text, dict[str, Any], CorruptDataError, "config")
     if version is not None and data.pop("version", None) != version:
         raise ConfigError(f"config: of another version than {version}, which is known")

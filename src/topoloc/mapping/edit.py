@@ -80,13 +80,6 @@ def keep_file(path: Path, changed: Path) -> Path:
     return kept
 
 
-def restore_file(kept: Path, path: Path) -> None:
-    """Rename a kept file to `path`, if it is undamaged. Raises MapError, OSError."""
-    if fault := _find_fault(kept):
-        raise MapError(fault)
-    replace_file(kept, path)
-
-
 def _find_fault(kept: Path) -> str | None:
     """Return why a kept file cannot be restored, with the remedy, None if it can."""
     try:
@@ -252,7 +245,9 @@ def undo_edit(path: str | Path, on_wait: WaitCallback | None = None) -> Edit:
             raise MapError(f"map {path}: nothing to undo: {_explain_missing(edit.path, last)}")
         try:
             edit.check_still_locked()
-            restore_file(kept[0], edit.path)
+            if fault := _find_fault(kept[0]):
+                raise MapError(fault)
+            replace_file(kept[0], edit.path)
         except OSError as error:
             raise MapError(f"cannot write map {path}: {describe_failure(error)}") from error
     return last

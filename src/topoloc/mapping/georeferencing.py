@@ -230,10 +230,10 @@ def _check_fit(
         information = information + across / pairs.up.sigma**2
     rotation_sigma = 1.0 / math.sqrt(max(float(np.linalg.eigvalsh(information)[0]), 1e-12))
     if rotation_sigma > _MAX_ROTATION_SIGMA:
-        about = f"{math.degrees(min(rotation_sigma, math.pi)):.0f} degrees"
         raise GeoreferenceError(
-            f"the points leave the rotation open by {about}: on one line, or too close together"
-            f" ({extent:.2f} m) for {left}"
+            "the points leave the rotation open by"
+            f" {math.degrees(min(rotation_sigma, math.pi)):.0f} degrees: on one line, or too close"
+            f" together ({extent:.2f} m) for {left}"
         )
     if math.sqrt(3.0) * sigma > _MAX_RESIDUAL_SHARE * extent:
         raise GeoreferenceError(

@@ -82,7 +82,10 @@ def observe_points(
         :, None, None
     ] ** 2 * np.eye(2)
     squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)
-    seen, in_view = in_front & (squares < gate**2), _in_view(points_cam, camera, cam_from_node)
+    seen = in_front & (squares < gate**2)
+    with np.errstate(invalid="ignore"):
+        pixels = camera.img_from_cam(cam_from_node.apply(points_cam))
+    in_view = np.flatnonzero(camera.is_in_image(pixels))  # hidden points, too
     return Observations(
         rows[seen], normalized[seen], sigmas[seen], cam_from_node, in_view, session_id
     )
@@ -157,15 +160,6 @@ def _count_observations(
         counts[0, np.union1d(seen.in_view, seen.rows)] += 1
         counts[1, seen.rows] += 1
     return counts
-
-
-def _in_view(
-    points_node: Float[np.ndarray, "n 3"], camera: Camera, cam_from_node: Rigid3
-) -> Int[np.ndarray, " v"]:
-    """Return the points that project into the image, regardless of occlusion."""
-    with np.errstate(invalid="ignore"):
-        pixels = camera.img_from_cam(cam_from_node.apply(points_node))
-    return np.flatnonzero(camera.is_in_image(pixels))
 
 
 def _normal_equations(

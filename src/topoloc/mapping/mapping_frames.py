@@ -35,7 +35,7 @@ from topoloc.points.motion_triangulation import (
 )
 from topoloc.recordings.frame import Image, StereoFrame, StereoSequence
 from topoloc.recordings.frame_preparation import PreparedFrame, prepare_frame
-from topoloc.recordings.recording import find_source_path, has_scale, read_left_frame
+from topoloc.recordings.recording import find_source_path, has_scale
 from topoloc.recordings.stored_images import encode_jpeg
 
 R = TypeVar("R")
@@ -58,11 +58,6 @@ class MappingFrame:
     def read(self) -> StereoFrame:
         """Read the frame. Recordings are read by one thread, and videos are fastest in order."""
         return self.sequence[self.index]
-
-    def read_left(self) -> StereoFrame:
-        """Read the frame without its right or depth image, which feature extraction does not
-        need."""
-        return read_left_frame(self.sequence, self.index)
 
     def view(self, with_depth: bool = True) -> PreparedFrame:
         """Read the frame and prepare it for measurements."""

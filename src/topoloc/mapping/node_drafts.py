@@ -101,11 +101,6 @@ class NodeDrafts:
             self.num_points.setdefault(kind, []).append(len(points.features))
         self.disk_list.append(draft)
 
-    def image(self, frame: MappingFrame) -> MappingImage:
-        """Return the mapping image of a frame that became a node. Raises KeyError for other
-        frames."""
-        return self.disk_list[self.rows[frame]].image
-
 
 def create_node_draft(
     frame: MappingFrame,

@@ -110,12 +110,6 @@ def average_illumination(lights: Sequence[Illumination]) -> Illumination | None:
     return Illumination(*(round(float(value), 4) for value in rows.mean(axis=0)))
 
 
-def sessions_from_names(names: Sequence[str]) -> list[Session]:
-    """Return a session for each distinct name, in order of first occurrence, for maps without
-    sessions."""
-    return [Session(number, name) for number, name in enumerate(dict.fromkeys(names))]
-
-
 def _format_date(t_ns: int | None) -> str | None:
     if t_ns is None or t_ns < _YEAR_2000_NS:
         return None

@@ -82,8 +82,7 @@ def follow_points(
         **limits,
     )
     kept = aligned.is_matched
-    columns = (column[kept] for column in vars(aligned).values())
-    return rows[kept], AlignedPoints(*columns)
+    return rows[kept], AlignedPoints(*(column[kept] for column in vars(aligned).values()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -130,8 +130,7 @@ def match_times(
     times, partners = np.array(t_ns), np.array(others)
     after = np.clip(np.searchsorted(partners, times), 1, max(len(partners) - 1, 1))
     before, after = after - 1, np.minimum(after, len(partners) - 1)
-    is_before = times - partners[before] <= partners[after] - times
-    nearest = np.where(is_before, before, after)
+    nearest = np.where(times - partners[before] <= partners[after] - times, before, after)
     delays = np.abs(times - partners[nearest])
     kept = np.flatnonzero(delays <= max_delay_ms * 1_000_000)
     num_without = len(times) - len(kept)

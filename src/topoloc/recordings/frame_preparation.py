@@ -146,8 +146,7 @@ def undistort_frame(frame: StereoFrame, max_side_px: int) -> PreparedFrame:
         CalibrationError: the frame has no camera model.
     """
     view = prepare_frame(frame, with_depth=False)
-    camera, grey = view.camera, view.grey
-    grey, camera = downscale_image(grey, camera, max_side_px)
+    grey, camera = downscale_image(view.grey, view.camera, max_side_px)
     if camera.is_distorted:
         grey, camera = _remap(grey, _undistortion_map(camera)), camera.undistorted()
     return PreparedFrame(grey, grey, camera, view.view_from_cam)

@@ -226,11 +226,13 @@ def _open_image(path: Path | EncodedImage) -> Iterator[ImageFile.ImageFile]:
     except Pillow.UnidentifiedImageError:
         raise UnreadableImageError(f"{path}: {_unreadable_reason(data)}") from None
     except Pillow.DecompressionBombError:
-        fault = f"more than {MAX_PIXELS // 1_000_000} megapixels"
-        raise UnreadableImageError(f"{path}: {fault}") from None
+        raise UnreadableImageError(
+            f"{path}: more than {MAX_PIXELS // 1_000_000} megapixels"
+        ) from None
     except _DAMAGE_ERRORS as error:
-        fault = f"not a picture, or damaged ({_one_line(error)})"
-        raise UnreadableImageError(f"{path}: {fault}") from None
+        raise UnreadableImageError(
+            f"{path}: not a picture, or damaged ({_one_line(error)})"
+        ) from None
     with picture:
         width, height = picture.size
         most = f"{MAX_PIXELS // 1_000_000} megapixels" if width * height > MAX_PIXELS else ""
@@ -262,8 +264,7 @@ def _decode_image(
 
 def _reduction(picture: Pillow.Image, max_pixels: int) -> int:
     """Return the factor, 1, 2, 4 or 8, that reduces an image to `max_pixels`."""
-    num_pixels = picture.width * picture.height
-    return next((k for k in (1, 2, 4) if num_pixels <= max_pixels * k * k), 8)
+    return next((k for k in (1, 2, 4) if picture.width * picture.height <= max_pixels * k * k), 8)
 
 
 def _orientation(picture: Pillow.Image) -> int:

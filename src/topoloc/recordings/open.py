@@ -151,8 +151,9 @@ def find_format(
     nearest = max(reversed(FORMATS), key=lambda name: shared[name])  # the plain folder first
     guess = f"; nearest is {nearest}: {expected[nearest]}" if shared[nearest] else ""
     held = ", ".join(names[:4]) + " ..." * (len(names) > 4)
-    fault = f"no known recording: here is {held}{guess}; formats: docs/recordings.md"
-    raise UnknownFormatError(f"{folder}: {fault}")
+    raise UnknownFormatError(
+        f"{folder}: no known recording: here is {held}{guess}; formats: docs/recordings.md"
+    )
 
 
 def _recordings_below(folder: Path) -> list[tuple[Path, str]]:

@@ -81,8 +81,7 @@ class Recording(IndexedFrames):
         as_stored: bool = False,
     ) -> Recording:
         """Return a recording with a camera for each frame, which may be the same for all."""
-        scale_and_turn = has_scale, as_stored
-        others = None, depth, None, *scale_and_turn
+        others = None, depth, None, has_scale, as_stored
         one = Recording(name, root, names, t_ns, poses, cameras[0], *others)
         return one if len(set(cameras)) == 1 else replace(one, camera=None, cameras=cameras)
 
@@ -113,8 +112,7 @@ class Recording(IndexedFrames):
         frame = self.read_left_frame(row)
         if self.right is not None:
             path, camera = self.right.paths[row], self.right.rig.right
-            right = _read_checked_image(path, camera, self._white_level)
-            return replace(frame, right=right)
+            return replace(frame, right=_read_checked_image(path, camera, self._white_level))
         if self.depth is not None and frame.camera is not None:
             return replace(frame, depth=_depth_image(self.depth, row, frame.camera))
         return frame

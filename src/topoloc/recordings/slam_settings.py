@@ -83,8 +83,7 @@ def _camodocal(path: Path, text: str, size: _Size) -> Camera:
         bends = _values(path, text, "distortion_parameters: ", "k1 k2 p1 p2")
         return make_camera(path, "OPENCV", size, lens + bends)
     if model == "KANNALA_BRANDT":
-        names = "mu mv u0 v0 k2 k3 k4 k5"
-        lens = _values(path, text, "projection_parameters: ", names)
+        lens = _values(path, text, "projection_parameters: ", "mu mv u0 v0 k2 k3 k4 k5")
         return make_camera(path, "OPENCV_FISHEYE", size, lens)
     if model == "MEI":
         (xi,) = _values(path, text, "mirror_parameters: ", "xi")
@@ -161,8 +160,7 @@ def _distort(x: np.ndarray, y: np.ndarray, bends: list[float]) -> np.ndarray:
 def _rectified(path: Path, text: str, side: str, size: _Size) -> RosCalibration:
     """Read one camera of ORB-SLAM2's pairs that are not rectified."""
     width, height = _find_size(text, rf"{side}\.width", rf"{side}\.height", size)
-    counts = {"K": 9, "R": 9, "P": 12}
-    for key, count in counts.items():
+    for key, count in {"K": 9, "R": 9, "P": 12}.items():
         if len(yaml_numbers(text, rf"{side}\.{key}")) < count:
             raise CalibrationError(f"{path}: {side}.{key} with {count} numbers is missing")
     matrix, rotation, projection = (
@@ -195,9 +193,9 @@ def _read_orb(path: Path, text: str, size: _Size) -> CameraCalibration:
             right = _orb_camera(path, text, "Camera2", size)
             right_from_left = _transform(path, text, key).inverse().matrix()[:3]
             return CameraCalibration(left, make_rig(path, left, right, right_from_left))
-    baselines = yaml_numbers(text, r"Stereo\.b")
-    if not baselines:
-        baselines = [bf / left.fx for bf in yaml_numbers(text, r"Camera\.bf")]
+    baselines = yaml_numbers(text, r"Stereo\.b") or [
+        bf / left.fx for bf in yaml_numbers(text, r"Camera\.bf")
+    ]
     if not baselines or baselines[0] == 0.0:
         return CameraCalibration(left)
     if left.is_distorted:

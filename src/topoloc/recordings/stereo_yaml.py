@@ -146,8 +146,7 @@ def find_right_file(path: Path) -> Path | None:
     """Return ROS's file of the right camera beside that of the left one, such as right.yaml beside
     left.yaml. Return None if there is none."""
     right = path.with_name(path.name.replace("left", "right"))
-    is_pair = right != path and path.is_file() and right.is_file()
-    files = (path, right) if is_pair else ()
+    files = (path, right) if right != path and path.is_file() and right.is_file() else ()
     has_projections = [bool(yaml_numbers(read_yaml(file), "projection_matrix")) for file in files]
     return right if has_projections and all(has_projections) else None
 

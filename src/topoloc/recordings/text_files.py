@@ -89,8 +89,7 @@ def read_numeric_table(
         numbers = np.loadtxt(lines, comments=None, ndmin=2)
     except ValueError:
         return None
-    is_good = len(numbers) == len(lines) and np.isfinite(numbers).all()
-    return (numbers, lines) if is_good else None
+    return (numbers, lines) if len(numbers) == len(lines) and np.isfinite(numbers).all() else None
 
 
 def parse_uniform_times(lines: Sequence[str]) -> list[int] | None:

@@ -117,8 +117,10 @@ class Trajectory:
         if t_ns and all(pose is None for pose in poses):
             span = f"{self.t_ns[0] / 1e9:.3f} to {self.t_ns[-1] / 1e9:.3f} s"
             frames = f"the frames {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
-            hint = f"{frames}{_clock_hint(self.t_ns, t_ns)}"
-            raise TrajectoryError(f"{path}: no frame has a pose; it covers {span}, {hint}")
+            raise TrajectoryError(
+                f"{path}: no frame has a pose; it covers {span},"
+                f" {frames}{_clock_hint(self.t_ns, t_ns)}"
+            )
         return poses
 
     def to_tum(self, header: bool = True) -> str:
@@ -160,12 +162,14 @@ def _trajectory_from_rows(path: Path) -> Trajectory:
     rows = read_rows(path, TrajectoryError)
     num_columns = len(rows[0][1])
     if num_columns not in (8, 12):
-        text = f"{num_columns} columns; a TUM line has 8, a KITTI line 12"
-        raise TrajectoryError(f"{path}, line {rows[0][0]}: {text}")
+        raise TrajectoryError(
+            f"{path}, line {rows[0][0]}: {num_columns} columns; a TUM line has 8, a KITTI line 12"
+        )
     for line, tokens in rows:
         if len(tokens) != num_columns:
-            text = f"{len(tokens)} columns, the lines before have {num_columns}"
-            raise TrajectoryError(f"{path}, line {line}: {text}")
+            raise TrajectoryError(
+                f"{path}, line {line}: {len(tokens)} columns, the lines before have {num_columns}"
+            )
     if num_columns == 8:
         return timed_trajectory(path, rows, range(1, 8))
     numbers = parse_numbers(path, rows, range(12))

@@ -169,8 +169,7 @@ def _classifier(name: BackboneName, num_outputs: int) -> nn.Sequential:
         convolution = nn.Conv2d(NUM_CHANNELS, num_outputs, 1)
         return nn.Sequential(nn.Dropout(0.5), convolution, nn.ReLU(True), mean)
     if name == "compact":
-        convolution = nn.Conv2d(_COMPACT_LAYERS[-1], num_outputs, 1)
-        return nn.Sequential(nn.Dropout(0.5), convolution, mean)
+        return nn.Sequential(nn.Dropout(0.5), nn.Conv2d(_COMPACT_LAYERS[-1], num_outputs, 1), mean)
     if name == "efficientnet_lite0":
         convolution = nn.Conv2d(_EFFICIENTNET_CHANNELS, num_outputs, 1)
         return nn.Sequential(nn.Dropout(0.2), convolution, mean)

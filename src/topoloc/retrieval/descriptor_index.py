@@ -148,8 +148,7 @@ def learn_whitening(
     centred -= mean
     # Use the smaller matrix: products of images or products of dimensions.
     by_image = len(centred) < centred.shape[1]
-    products = centred @ centred.T if by_image else centred.T @ centred
-    eigenvalues, vectors = np.linalg.eigh(products)
+    eigenvalues, vectors = np.linalg.eigh(centred @ centred.T if by_image else centred.T @ centred)
     order = np.argsort(-eigenvalues, kind="stable")[:dimension]
     # Vectors have unit length, so values below a millionth of it are rounding.
     keep = order[eigenvalues[order] > 1e-6 * max(float(eigenvalues.max()), len(centred) * 1e-6)]

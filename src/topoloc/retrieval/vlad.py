@@ -238,10 +238,9 @@ def learn_words_from_parts(
     if total > max_descriptors:
         generator = np.random.default_rng(config.seed)
         chosen = np.sort(generator.choice(total, max_descriptors, replace=False))
-    rows_by_part = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
     rows = [
         part(k)[rows - (ends[k] - num_rows[k])]
-        for k, rows in enumerate(rows_by_part)
+        for k, rows in enumerate(np.split(chosen, np.searchsorted(chosen, ends[:-1])))
         if len(rows) or k == 0
     ]
     return learn_visual_words(np.concatenate(rows), config.num_words, config.seed)

@@ -111,8 +111,7 @@ def estimate_scale_error(
     if len(ratios) < _MIN_STEPS:
         return None
     (low, sigma), (scale, _), (high, _) = (_median(column) for column in zip(*ratios, strict=True))
-    is_wrong = max(low, -high) - 3.0 * sigma > min_log
-    return math.exp(scale) if is_wrong else None
+    return math.exp(scale) if max(low, -high) - 3.0 * sigma > min_log else None
 
 
 def _median(logs: Sequence[float]) -> tuple[float, float]:

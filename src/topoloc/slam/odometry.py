@@ -36,11 +36,7 @@ from topoloc.slam.keyframes import (
     PlaceFeatures,
 )
 from topoloc.slam.motion_prediction import select_expected_pose
-from topoloc.slam.place_matching import (
-    RepetitionCheck,
-    extract_place_features,
-    match_places,
-)
+from topoloc.slam.place_matching import RepetitionCheck, extract_place_features, match_places
 from topoloc.slam.step_estimation import Step, Tracks
 
 # bytes of about 80 places in memory, because matching two takes ten times as long as reading one
@@ -74,10 +70,9 @@ class Odometry(FrameTracker):
         Return its pose and those of earlier frames that are known only now. The list is empty if
         the pose is unknown. `measured` must be `measured_view(frame)`.
         """
-        # Prior standard deviation of the common disparity bias of a recording, pixels.
-        sigma_bias_px = 1.0
         if measured.right is not None:
-            self._bias.information = 1.0 / sigma_bias_px**2
+            # Prior: the common disparity bias of a recording has a standard deviation of 1 px.
+            self._bias.information = 1.0
         pose = self._track_frame(frame_idx, frame, measured)
         return [pose] if pose is not None else self._handle_lost_frame(frame_idx, frame, measured)
 
@@ -113,9 +108,8 @@ class Odometry(FrameTracker):
         prediction = self._history.predict(frame.t_ns, self._num_lost > 0)
         if self._last_frame is None or self._reference is None or prediction is None:
             return None
-        last_pose = self._last_frame.cam_from_world
         estimator = self._step_estimator(self._last_frame, self._reference, self._tracks, measured)
-        step = estimator.estimate_step(prediction.cam_from_world, last_pose)
+        step = estimator.estimate_step(prediction.cam_from_world, self._last_frame.cam_from_world)
         is_near = step and prediction.is_near(step.cam_from_world)
         is_next = bool(is_near) and not prediction.is_gap
         if step is not None and is_next and not self._repetitions.is_likely(prediction, step):

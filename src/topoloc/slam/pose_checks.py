@@ -229,8 +229,7 @@ def _find_time_shift(
     min_steps, readings = max(_MIN_INFORMATIVE_STEPS, len(measured) // 2), []
     fractions = np.linspace(-1.0, 1.0, 2 * _NUM_SHIFTS + 1)
     for seconds in (largest * fractions * np.abs(fractions)).tolist():  # finer near 0
-        times = [t_ns[k] + round(1e9 * seconds) for k in rows]
-        shifted = trajectory.interpolate(times, _MAX_GAP_S)
+        shifted = trajectory.interpolate([t_ns[k] + round(1e9 * seconds) for k in rows], _MAX_GAP_S)
         errors = [
             step.normalized_error(first.inverse() @ last)
             for step, first, last in zip(measured, shifted[::2], shifted[1::2], strict=True)

@@ -47,7 +47,6 @@ from topoloc.tracking.tracker_state import (
     StreamFrame,
     TrackedImage,
     compute_correlated_change,
-    compute_direction_uncertainty,
     compute_motion_covariance,
     compute_smoothed_covariance,
     fade_offset,
@@ -92,8 +91,9 @@ class MapStream:
         return self._complete_result(self._make_predicted_pose(result, t_ns))
 
     def _complete_result(self, answer: StreamedPose, camera: Camera | None = None) -> StreamedPose:
-        result = self.localizer.with_provenance(answer.result, camera, answer.t_ns)
-        return replace(answer, result=result)
+        return replace(
+            answer, result=self.localizer.with_provenance(answer.result, camera, answer.t_ns)
+        )
 
     def _process_paper_mode(self, result: Localization | NotLocalized, t_ns: int) -> StreamedPose:
         """Apply section III-B to one result: "when such a jump is found, we copy the previous pose
@@ -123,12 +123,12 @@ class MapStream:
             self._hypotheses.apply_motion(pose, covariance, frame.odom_from_cam)
         if tracked is None or self._is_localization_due(tracked, frame):
             self._last_attempt_ns = frame.t_ns
-            expected = self._predict_pose(predicted, tracked)
-            found = self._stream_localizer.localize(frame, expected)
+            found = self._stream_localizer.localize(frame, self._predict_pose(predicted, tracked))
             self._drop_stale_reference()
             if isinstance(found, LocalizedPose):
-                answer = self._update_with_localization(frame, found, predicted, tracked, seconds)
-                return self._mark_if_ambiguous(answer)
+                return self._mark_if_ambiguous(
+                    self._update_with_localization(frame, found, predicted, tracked, seconds)
+                )
             if tracked is None or self._reference is None:
                 return self._make_predicted_pose(found, frame.t_ns)
         return self._mark_if_ambiguous(self._make_tracked_pose(frame, tracked, clock))
@@ -161,8 +161,7 @@ class MapStream:
         reference = self._reference
         if reference is None or predicted is None or reference.follower.camera != frame.grey_camera:
             return None
-        near = predicted.world_from_cam.inverse()
-        motion = reference.follower.track_points(frame.grey, near)
+        motion = reference.follower.track_points(frame.grey, predicted.world_from_cam.inverse())
         if motion is None:
             return None
         offset = fade_offset(reference.offset, (frame.t_ns - reference.t_ns) / 1e9)
@@ -204,8 +203,10 @@ class MapStream:
         if reference is None or predicted is None:
             return None
         if tracked is None:
-            is_known = compute_direction_uncertainty(predicted, reference.errors.depth) <= max_doubt
-            return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_known and is_alone)
+            sigmas = np.sqrt(np.diag(predicted.pose_covariance))
+            sigma = float(np.hypot(sigmas[:3].max() / reference.errors.depth, sigmas[3:].max()))
+            is_unique = is_alone and 3.0 * sigma <= max_doubt
+            return ExpectedPose(predicted.world_from_cam, np.zeros((6, 6)), is_unique)
         scale = self._hypotheses.prediction_scale**2
         return ExpectedPose(
             tracked.cam_from_world.inverse(),
@@ -248,6 +249,7 @@ class MapStream:
             measured = errors.noise if tracked is None else tracked.motion.covariance
             state = update_motion(predicted, (offset @ smoothed).inverse(), measured)
             self._hypotheses.set_best_state(state, frame.odom_from_cam)
+        points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
         self._reference = ReferenceImage(
             frame.t_ns,
             found.result,
@@ -256,7 +258,7 @@ class MapStream:
             smoothed,
             pose_covariance + errors.correlated,
             offset,
-            _follow_points(frame, found),
+            PointTracker(frame.grey, points, cam_from_world, frame.grey_camera),
         )
         covariance = compute_smoothed_covariance(self._reference)
         pose = self._hypotheses.leader.world_from_cam
@@ -290,10 +292,3 @@ class MapStream:
         return self._mark_if_ambiguous(
             StreamedPose(t_ns, "predicted", result, predicted.world_from_cam, covariance)
         )
-
-
-def _follow_points(frame: StreamFrame, found: LocalizedPose) -> PointTracker:
-    """Return a tracker of the map points that were found in the image."""
-    points = found.inlier_points.to_image_scale(frame.grey_camera.width / frame.camera.width)
-    cam_from_world = found.result.world_from_cam.inverse()
-    return PointTracker(frame.grey, points, cam_from_world, frame.grey_camera)

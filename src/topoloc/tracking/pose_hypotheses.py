@@ -100,8 +100,7 @@ class PoseHypotheses:
             pose = one.current.world_from_cam
             for k, other in enumerate(found):
                 if is_same_place(other.world_from_cam, pose):
-                    weight = other.probability + one.weight
-                    found[k] = structs.replace(other, probability=weight)
+                    found[k] = structs.replace(other, probability=other.probability + one.weight)
                     break
             else:
                 found.append(Alternative(pose, one.weight, one.node_id))
@@ -140,9 +139,10 @@ class PoseHypotheses:
         # Maximum squared Mahalanobis distance of a consistent pose from the prediction
         # (chi^2 with 6 degrees of freedom: 1 in 100,000).
         max_surprise = 33.0
-        gate = self._gate_covariance(predicted, covariance)
         return predicted.world_from_cam.is_same(
-            world_from_cam, covariance=gate, max_square=max_surprise
+            world_from_cam,
+            covariance=self._gate_covariance(predicted, covariance),
+            max_square=max_surprise,
         )
 
     def is_expected(self, candidate: Candidate) -> bool:

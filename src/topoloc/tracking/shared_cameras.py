@@ -130,8 +130,9 @@ class _CameraEstimate:
     ) -> Localization | None:
         """Return the pose by the shared camera, None if there is none or the image contradicts
         it. The camera's uncertainty is added to the covariance."""
-        query = QueryImage(image, shared.camera)
-        result, named = self.localizer.localize_query(query, max_ms=max_ms)
+        result, named = self.localizer.localize_query(
+            QueryImage(image, shared.camera), max_ms=max_ms
+        )
         if not isinstance(result, Localization) or result.calibration_doubt is not None:
             return None
         self._learn(image, result, named)
@@ -152,35 +153,35 @@ class _CameraEstimate:
         """Add what an image shows of the camera, unless it was added before, and estimate the
         camera again."""
         max_images, min_probability = 20, 0.9  # more images change little, and cost time
+        max_share, max_angle = 0.2, math.radians(15.0)
         is_clear = isinstance(result, Localization) and result.probability >= min_probability
         if not is_clear or len(self._seen) >= max_images:
             return
         digest = blake2b(np.ascontiguousarray(image).data).digest()
-        fit = None if digest in self._digests else self._fit(*named[0])
+        best, inliers = named[0]
+        fit = None if digest in self._digests else self._fit(best, inliers)
+        pose = best.world_from_cam
         if fit is None:
             return
         self._digests.add(digest)
         self._seen.append(fit.likelihood)
-        self._places.add(f"{named[0][0].provenance.tile}/{named[0][0].node_id}")
-        self._add_viewpoint(*named[0])
-        if len(self._seen) >= MIN_IMAGES and len(self._places) >= MIN_PLACES:
-            self.shared = self._estimate()
-
-    def _add_viewpoint(self, result: Localization, inliers: PointObservations) -> None:
-        """Count the viewpoint unless one is known from which the same points are seen alike."""
-        max_share, max_angle = 0.2, math.radians(15.0)
-        pose = result.world_from_cam
+        self._places.add(f"{best.provenance.tile}/{best.node_id}")
         depth = float(np.median(pose.inverse().apply(inliers.points_world)[:, 2]))
+        # a viewpoint near a known one shows the same points alike
         if not any(pose.is_same(one, max_share * depth, max_angle) for one in self._viewpoints):
             self._viewpoints.append(pose)
+        if len(self._seen) >= MIN_IMAGES and len(self._places) >= MIN_PLACES:
+            self.shared = self._estimate()
 
     def _fit(self, result: Localization, inliers: PointObservations) -> JointFit | None:
         found = result.provenance.camera
         if found is None:
             return None
-        start = parameters_of(found, self._reference)
         return fit_camera(
-            self._observations(inliers), result.world_from_cam.inverse(), start, self._prior
+            self._observations(inliers),
+            result.world_from_cam.inverse(),
+            parameters_of(found, self._reference),
+            self._prior,
         )
 
     def _observations(self, inliers: PointObservations) -> Observations:
@@ -232,8 +233,7 @@ def combine_likelihoods(
         scatter = max(1.0, float(np.median(squares)) / median_chi_square)
         weights = 1.0 / (1.0 + squares / scatter / (CAUCHY_SCALE**2 * 4.0))
         weighted = weights[:, None, None] * inverse
-        pulls = np.einsum("nij,nj->i", weighted, estimates)
-        centre = np.linalg.solve(weighted.sum(axis=0), pulls)
+        centre = np.linalg.solve(weighted.sum(axis=0), np.einsum("nij,nj->i", weighted, estimates))
     scatter = max(1.0, float(np.median(squares)) / median_chi_square) * len(seen) / num_viewpoints
     return CameraLikelihood(
         np.einsum("n,nij->ij", weights / scatter, np.stack([one.information for one in seen])),

@@ -77,9 +77,8 @@ class StreamLocalizer:
         if len(candidates) != 1 or not self._hypotheses.is_expected(candidates[0]):
             refusal, found = self._localize_globally(frame)
             candidates = [one.as_candidate(pose_covariance) for one in found]
-        new_evidence_ratio = self._compute_new_evidence(found)
         self._hypotheses.update_weights(
-            frame.t_ns, candidates, frame.odom_from_cam, new_evidence_ratio
+            frame.t_ns, candidates, frame.odom_from_cam, self._compute_new_evidence(found)
         )
         if self._hypotheses.candidate_idx is not None:
             return found[self._hypotheses.candidate_idx]
@@ -137,8 +136,9 @@ class StreamLocalizer:
     ) -> tuple[NotLocalized | None, list[LocalizedPose]]:
         """Return the possible poses of the image: one, the alternatives, or none with the
         reason."""
-        query_image = QueryImage(frame.image, frame.camera)
-        result, named = self._localizer.localize_query(query_image, near, frame.limit)
+        result, named = self._localizer.localize_query(
+            QueryImage(frame.image, frame.camera), near, frame.limit
+        )
         refusal, found = result if isinstance(result, NotLocalized) else None, list[LocalizedPose]()
         for one, points in named:
             probability = one.probability

@@ -132,12 +132,6 @@ class TrackedImage:
         return self.motion.cam_from_ref.transform_covariance(self.reference.errors.total)
 
 
-def compute_direction_uncertainty(predicted: MotionState, depth: float) -> float:
-    """Return three sigma (radians) of the direction to points at this depth (metres)."""
-    sigmas = np.sqrt(np.diag(predicted.pose_covariance))
-    return 3.0 * float(np.hypot(sigmas[:3].max() / depth, sigmas[3:].max()))
-
-
 def compute_motion_covariance(tracked_motion: TrackedMotion) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of a tracked motion: the noise of the points, and a share of the motion
     for wrong depths."""
@@ -210,8 +204,7 @@ class PoseWindow:
             self._covariance = covariance
         before = self._smoothed[-1] if self._smoothed else None
         self._smoothed.append(cam_from_world if before is None else cam_from_before @ before)
-        motion = cam_from_before, motion_covariance
-        self._measured.append(((cam_from_world, covariance), motion))
+        self._measured.append(((cam_from_world, covariance), (cam_from_before, motion_covariance)))
         edges = list[Edge]()
         for k, (pose, motion) in enumerate(self._measured, start=1):
             edges.append(Edge(0, k, *pose, is_loop=True))

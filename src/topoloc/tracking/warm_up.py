@@ -40,14 +40,6 @@ _TEXELS_PER_METRE = 130.0
 _WALL_Z, _WALL_SLOPE = 2.0, 0.4  # the wall: z = 2 m + 0.4 x
 
 
-def _is_warm() -> bool:
-    """Return whether the machine code for queries is cached.
-
-    It checks kernels at the start and end of a search, and the last one of a stream.
-    """
-    return all(map(is_cached, (integral_image, match_projections, solve_factored)))
-
-
 def warm_up(
     progress: Progress | None = None, only_if_cold: Callable[[], None] | None = None
 ) -> None:
@@ -61,7 +53,8 @@ def warm_up(
             kernels is cached. By default everything is compiled or loaded.
     """
     if only_if_cold is not None:
-        if _is_warm():
+        # kernels at the start and at the end of a search, and the last one of a stream
+        if all(map(is_cached, (integral_image, match_projections, solve_factored))):
             return
         only_if_cold()
     wall = _make_texture(seed=0)
@@ -80,8 +73,7 @@ def warm_up(
             Localizer(TopoMetricMap.load(map_file)).localize(image, camera)
 
         def estimate_virtual_pose() -> None:
-            node = TopoMetricMap.load(map_file).nodes[0]
-            points = node.points_cam.astype(np.float64)
+            points = TopoMetricMap.load(map_file).nodes[0].points_cam.astype(np.float64)
             estimate_upright_pose(points[:, :2] / points[:, 2:], points)
 
         def track_stream() -> None:

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from topoloc.localization.belief import RivalWeights
 from topoloc.localization.fitted_weights import (
     CorrelatedErrorWeights,
     EvidenceWeights,
     FittedWeights,
-    RivalWeights,
     compute_log_odds,
     load_fitted_weights,
     read_weights,

@@ -110,8 +110,7 @@ def compare_tiles(
     alike = first.vectors[common[-1]] @ second.vectors[common[-1]].T
     for num_queries in (num_probed, max_queries):
         for side, one in enumerate(queries):  # the most similar nodes first
-            order = np.argsort(-alike.max(axis=side), kind="stable")
-            one.localize(as_rows(order[:num_queries]))
+            one.localize(as_rows(np.argsort(-alike.max(axis=side), kind="stable")[:num_queries]))
         if not any(answer is not None for one in queries for answer in one.answers.values()):
             return NotJoined("no node of either is recognised in the other")
     found = _find_consensus(*queries)

@@ -224,8 +224,9 @@ def _join_pair(atlas: Atlas, maps: MapCache[Localizer], first: Tile, second: Til
             maps.use_map(ids[0], atlas.map_path(first)) as one,
             maps.use_map(ids[1], atlas.map_path(second)) as other,
         ):
-            tiles = OpenTile(one.content, vectors[0]), OpenTile(other.content, vectors[1])
-            found = compare_tiles(*tiles)
+            found = compare_tiles(
+                OpenTile(one.content, vectors[0]), OpenTile(other.content, vectors[1])
+            )
     except (MapError, AtlasError) as error:
         found = NotCompared(str(error))
     if isinstance(found, TileTransform):

@@ -22,12 +22,14 @@ from topoloc.geometry.clustered_errors import compute_variance_inflation
 from topoloc.geometry.rigid import Rigid3, inverse_covariance
 from topoloc.geometry.uncalibrated_camera import UncalibratedCamera
 from topoloc.localization.belief import Belief, Hypothesis
-from topoloc.localization.exact.patch_alignment import PreciseMatches, align, spread
-from topoloc.localization.fitted_weights import (
-    EvidenceWeights,
+from topoloc.localization.exact.patch_alignment import (
     LastStepWeights,
+    PreciseMatches,
+    align,
     load_last_step_weights,
+    spread,
 )
+from topoloc.localization.fitted_weights import EvidenceWeights
 from topoloc.localization.guided import match_guided
 from topoloc.localization.pose_fit import LocalMap
 from topoloc.localization.provenance import Evidence
@@ -267,14 +269,13 @@ class Surroundings:
             config = replace(search.config.guided, radius_px=radius_px)
             matches = match_guided(features, points, cam_from_world, self.camera, config)
             rows = matches.train_idx
-            similarities = 1.0 - np.square(matches.distances.astype(np.float64)) / 2.0
             parts.append(
                 PreciseMatches(
                     features.points_img[matches.query_idx],
                     points.points_world[rows],
                     points.covariances[rows],
                     points.node_ids[rows],
-                    similarities,
+                    1.0 - np.square(matches.distances.astype(np.float64)) / 2.0,
                     np.full(len(rows), self.weights.key_point_sigma_px),
                 )
             )

@@ -8,20 +8,94 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from msgspec import Struct
 
-from topoloc.errors import MapError
+from topoloc.errors import FeatureTypeError, MapError
 from topoloc.features.parallel import parallel_for_rows
 from topoloc.geometry.camera import Camera
 from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import Finite, decode_json
 from topoloc.localization.exact.patch_alignment_kernels import align_patches
-from topoloc.localization.fitted_weights import LastStepWeights
 from topoloc.localization.pose_fit import PointObservations
 from topoloc.mapping.topomap import TopoNode
 from topoloc.node_ids import NodeId
 from topoloc.recordings.frame import to_grey
+
+
+class CrowdingWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the numbers of the second look at a refused pose with log-odds above `min_log_odds`.
+
+    Its matches are searched within `radius_px` (pixels of an image whose longer side is 640). Of
+    chance matches, `chance_share` lies within `near_px` of the prediction. The matches crowd by
+    the standard deviations above that. `weight` times the crowding plus `bias` is added to the
+    log-odds, if matches crowd in all parts of the view: at least `min_full_cells` of the `cells`
+    (columns, rows) have `min_cell_matches`, and the `quantile` of their shares near the prediction
+    is at least `min_share`.
+    """
+
+    min_log_odds: Finite
+    radius_px: Finite
+    near_px: Finite
+    chance_share: Finite
+    cells: tuple[int, int]
+    min_cell_matches: int
+    min_full_cells: int
+    quantile: Finite
+    min_share: Finite
+    weight: Finite
+    bias: Finite
+
+
+class LastStepWeights(Struct, frozen=True, forbid_unknown_fields=True):
+    """Hold the numbers of the last step (`last_step.py`).
+
+    - `num_nodes`: nodes nearest to the pose whose points are matched.
+    - `radii_px`, `max_errors_px`: search radii and inlier limits of the two rounds of matching, in
+      pixels of an image whose longer side is 640. `key_point_sigma_px`: error of a key point.
+    - `max_aligned`: matches that are aligned at most, in rounds that search up to `reaches_px`, by
+      patches of `patch_px` squared pixels whose grey levels vary by `min_patch_sigma`. At least
+      `min_aligned` must agree within `max_aligned_error_px`. `correlations`, `aligned_sigmas_px`:
+      table of the error of an aligned pixel. Matches below the first correlation are dropped.
+      A pose of key points needs `min_matches`.
+    - `max_correlated_error_share`: rho of a map above which the step is left out.
+    - `shared_error_line` (a, b): a + b rho of the verdict's correlated covariance remains.
+    """
+
+    corpus: str
+    date: str
+    command: str
+    num_nodes: int
+    radii_px: tuple[Finite, Finite]
+    max_errors_px: tuple[Finite, Finite]
+    key_point_sigma_px: Finite
+    min_matches: int
+    min_aligned: int
+    max_aligned: int
+    reaches_px: tuple[int, ...]
+    max_aligned_error_px: Finite
+    patch_px: int
+    min_patch_sigma: Finite
+    correlations: tuple[Finite, ...]
+    aligned_sigmas_px: tuple[Finite, ...]
+    max_correlated_error_share: Finite
+    shared_error_line: tuple[Finite, Finite]
+    crowding: CrowdingWeights
+
+
+@cache
+def load_last_step_weights() -> LastStepWeights:
+    """Return the shipped numbers of the last step.
+
+    Raises:
+        FeatureTypeError: the file is damaged.
+    """
+    path = Path(__file__).parent / "weights.json"
+    return decode_json(path.read_bytes(), LastStepWeights, FeatureTypeError, str(path))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +116,10 @@ def spread(matches: PreciseMatches, camera: Camera, max_number: int) -> PreciseM
     if len(matches) <= max_number:
         return matches
     num_columns = 16
-    cell_px = camera.width / num_columns
-    columns, rows = (matches.points_img / np.float32(cell_px)).astype(np.int64).T
+    columns, rows = (matches.points_img / np.float32(camera.width / num_columns)).astype(np.int64).T
     cells = rows * num_columns + columns
     order = np.lexsort((-matches.similarities, cells))
-    starts = np.searchsorted(cells[order], cells[order])
-    rank = np.arange(len(order)) - starts
+    rank = np.arange(len(order)) - np.searchsorted(cells[order], cells[order])
     return matches.select(np.sort(order[np.argsort(rank, kind="stable")[:max_number]]))
 
 

@@ -78,12 +78,10 @@ def find_contradictions(topomap: TopoMetricMap) -> list[Contradiction]:
     min_metres, min_radians = 0.1, math.radians(4.0)
     poses, lambda_rot = topomap.node_poses, topomap.config.lambda_rot
     errors = topomap.first_layer.shared_errors
-    unknown = load_fitted_weights(topomap.kind).shared_errors.unknown
-    rho = unknown if errors is None else errors.rho
+    rho = load_fitted_weights(topomap.kind).shared_errors.unknown if errors is None else errors.rho
     group, found = list(range(len(topomap.summaries))), []
     for row, summary in enumerate(topomap.summaries):
-        distances = node_distances(summary.world_from_cam, poses, lambda_rot)
-        order = np.argsort(distances, kind="stable")
+        order = np.argsort(node_distances(summary.world_from_cam, poses, lambda_rot), kind="stable")
         neighbours = [int(k) for k in order if k != row][:num_neighbours]
         neighbours += [k for k in (row - 1, row + 1) if 0 <= k < len(group) and k not in neighbours]
         node = topomap.nodes[row]
@@ -97,7 +95,9 @@ def find_contradictions(topomap: TopoMetricMap) -> list[Contradiction]:
             if is_far and is_large and not is_same:
                 found.append((row, other_row, metres, radians))
             else:
-                _merge_groups(group, row, other_row)
+                low, high = sorted((group[row], group[other_row]))
+                if low != high:
+                    group = [low if number == high else number for number in group]
     return _outside_largest_group(topomap, group, found)
 
 
@@ -128,13 +128,6 @@ def _pose_difference(
     covariance = covariance_inflation(int(np.count_nonzero(found.inliers)), rho) * found.covariance
     is_same = poses[0].is_same(poses[1], covariance=covariance, max_square=max_square)
     return is_same, translation_error(*poses), rotation_error(*poses)
-
-
-def _merge_groups(group: list[int], a: int, b: int) -> None:
-    """Merge the groups of two rows under the smaller number."""
-    low, high = sorted((group[a], group[b]))
-    if low != high:
-        group[:] = [low if number == high else number for number in group]
 
 
 def _outside_largest_group(

@@ -168,10 +168,9 @@ class _Views:
     def nearest(self, pose: Rigid3, max_angle: float = 0.5) -> tuple[float, int]:
         """Return distance (metres, infinite if all look elsewhere) and row of the nearest pose."""
         frames = list(self.poses)
-        apart = [pose.inverse() @ self.poses[k] for k in frames]
         costs = [
             float(np.linalg.norm(one.translation)) if one.angle() < max_angle else np.inf
-            for one in apart
+            for one in [pose.inverse() @ self.poses[k] for k in frames]
         ]
         row = int(np.argmin(costs))
         return costs[row], frames[row]

@@ -43,11 +43,6 @@ def digest_of(summaries: Sequence[NodeSummary]) -> str:
     return compute_nodes_digest(summaries, bytes([_METHOD]))
 
 
-def has_repetitions(node: LocalMap) -> bool:
-    """Return whether a node's own image shows some part twice, as in most repetitive places."""
-    return len(find_repetition_shifts(node, node, min_share=0.15)) > 0
-
-
 def find_repetition_shifts(
     node: LocalMap, neighbours: LocalMap, min_share: float = 0.5
 ) -> Float[np.ndarray, "k 3"]:

@@ -119,9 +119,8 @@ class AtlasTiles(Tiles):
         for kind in self._ranking_feature_types:
             vocabulary = shared_vocabulary(kind)
             assert vocabulary is not None
-            config = FeatureConfig(kind=kind)
             features = Query(
-                image, camera, 1.0, config, clock, shared=query_image.features
+                image, camera, 1.0, FeatureConfig(kind=kind), clock, shared=query_image.features
             ).features
             with clock.stage("tiles"):
                 vectors[kind] = vocabulary.global_descriptor(features, camera.width, camera.height)

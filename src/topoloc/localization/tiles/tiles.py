@@ -230,14 +230,13 @@ def _ambiguous_result(
         Alternative(pose.world_from_cam, probability, pose.node_id, pose.geopose, tile_id)
         for probability, tile_id, (pose, _) in probable
     )
-    detail = f"as much like tile {alternatives[1].tile} as like tile {alternatives[0].tile}"
     refusal = NotLocalized(
         "ambiguous",
         found.candidates,
         found.num_matches,
         found.num_inliers,
         {},
-        detail,
+        f"as much like tile {alternatives[1].tile} as like tile {alternatives[0].tile}",
         alternatives,
         found.provenance,
         found.seen_camera,
@@ -251,9 +250,8 @@ def _best_refusal(
     results: Sequence[TileResult],
 ) -> tuple[str, NotLocalized, list[LocalizationWithInliers]]:
     """Return the most informative refusal: one with alternatives, or with the most inliers."""
-    refused = [(one, result) for one in results if isinstance(result := one.result, NotLocalized)]
     best, result = max(
-        refused,
+        [(one, result) for one in results if isinstance(result := one.result, NotLocalized)],
         key=lambda one: (
             one[0].is_exhaustive,
             one[1].reason == "ambiguous",

@@ -55,8 +55,7 @@ class VirtualViewProposal(Proposal):
             for radius_px, max_error_px in search.config.walls.rounds:
                 if _is_seen_by_nodes(search, cam_from_world):
                     return None
-                is_guided = radius_px > 0.0
-                found = walls.match(cam_from_world, radius_px) if is_guided else self.fit
+                found = walls.match(cam_from_world, radius_px) if radius_px > 0.0 else self.fit
                 fit = None if found is None else _fit(walls, found, cam_from_world, max_error_px)
                 if fit is None or fit.num_inliers < min_inliers or _is_found(search, fit):
                     return None
@@ -228,10 +227,9 @@ def _num_distinct(walls: VirtualViewSearch, final: PoseFit) -> int:
     )
     products = np.sum(descriptors * final.local_map.descriptors[columns], axis=1)
     distances = np.sqrt(np.maximum(2.0 - 2.0 * products, 0.0))
-    away = 1.5 * walls.search.config.walls.min_distance * walls.search.map.d_thresh
     is_far = (
         np.linalg.norm(walls.local_map_of_places.points_world - points_world.mean(axis=0), axis=1)
-        > away
+        > 1.5 * walls.search.config.walls.min_distance * walls.search.map.d_thresh
     )
     distant_matches = match_features(
         descriptors, walls.local_map_of_places.descriptors[is_far], MatchingConfig.nearest()

@@ -15,7 +15,6 @@ import numpy as np
 from topoloc.errors import EmptyMapError, MapError
 from topoloc.json_data import decode_json
 from topoloc.mapping.coarse_models import open_map_coarse_localizer
-from topoloc.mapping.sessions import Session
 from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.storage.map_file import MapFile
 from topoloc.mapping.storage.map_writing import compute_map_digest
@@ -61,22 +60,21 @@ def describe_map(topomap: TopoMetricMap, path: Path) -> dict[str, Any]:
         "length_m": round(topomap.length_m, 3),
         "extent_m": np.ptp(centres, axis=0).round(3).tolist(),
         "recordings": sorted({s.recording for s in topomap.summaries}),
-        "sessions": [_session_facts(session) for session in topomap.sessions],
+        "sessions": [
+            asdict(session)
+            | {
+                "camera": None if session.camera is None else session.camera.to_json(),
+                "start_date": session.start_date,
+                "end_date": session.end_date,
+            }
+            for session in topomap.sessions
+        ],
         "edits": [asdict(edit) for edit in topomap.edits],
         "coarse": [model["name"] for model in models],
         "default_coarse": topomap.default_coarse,
         "kinds": topomap.kinds,
         "coarse_models": models,
         "config": topomap.config.to_json(),
-    }
-
-
-def _session_facts(session: Session) -> dict[str, Any]:
-    camera = None if session.camera is None else session.camera.to_json()
-    return asdict(session) | {
-        "camera": camera,
-        "start_date": session.start_date,
-        "end_date": session.end_date,
     }
 
 
@@ -91,8 +89,7 @@ def list_coarse_models(path: Path) -> list[dict[str, Any]]:
 def _check_rows(file: MapFile) -> Iterator[str]:
     checksums: dict[str, list[bytes]] = {}
     for table in TABLES:
-        keys = tuple(SORT_COLUMNS[table].split(", "))
-        rows, damage = _try_read(partial(file.rows, table, keys))
+        rows, damage = _try_read(partial(file.rows, table, tuple(SORT_COLUMNS[table].split(", "))))
         yield from damage
         yield from _check_each(rows or (), lambda row, table=table: file.find(table, **row))
         if file.version > 1:
@@ -141,7 +138,6 @@ def _try_read(read: Callable[[], Any]) -> tuple[Any, list[str]]:
 
 def _model_facts(name: str, text: str, num_bytes: int) -> dict[str, Any]:
     settings = decode_json(text, dict[str, Any], CorruptDataError, f"coarse localizer {name}")
-    shown = ("backbone", "weights", "trained")
     return {"name": name, "bytes": num_bytes} | {
-        key: settings[key] for key in shown if key in settings
+        key: settings[key] for key in ("backbone", "weights", "trained") if key in settings
     }

@@ -16,7 +16,7 @@ from topoloc.geometry.camera import Camera
 from topoloc.geometry.geodesy import Georeference
 from topoloc.json_data import Finite, decode_json
 from topoloc.mapping.certificate import Certificate
-from topoloc.mapping.config import CONFIG_VERSION, MapConfig, config_from_text
+from topoloc.mapping.config import CONFIG_VERSION, config_from_text
 from topoloc.mapping.landmark_statistics import LandmarkStatistics, decode_statistics
 from topoloc.mapping.sessions import Edit, Session
 from topoloc.mapping.storage.entries import (
@@ -71,7 +71,13 @@ def _read_contents(file: MapFile) -> TopoMetricMap:
         if key not in facts:
             raise CorruptDataError(f"key {key!r} of table map is missing")
     config = config_from_text(facts["config"], CONFIG_VERSION if file.version > 1 else None)
-    kinds = _read_feature_types(facts, config)
+    kinds = _decode_fact(facts, "kinds", list[str], [config.features.kind])
+    if len(kinds) > 8 or len(set(kinds)) < len(kinds):
+        raise CorruptDataError("kinds: at most 8 different names are expected")
+    if kinds[:1] != [config.features.kind]:
+        raise CorruptDataError(f"kinds: {kinds} do not begin with that of the configuration")
+    for kind in kinds:
+        find_feature_type(kind)
     map_id = facts.get("map_id")
     if map_id is not None and not re.fullmatch("[0-9a-f]{16}", map_id):
         raise CorruptDataError("map_id: 16 hexadecimal digits are expected")
@@ -100,18 +106,6 @@ def _read_contents(file: MapFile) -> TopoMetricMap:
 def _decode_fact(facts: Mapping[str, str], key: str, kind: Any, default: T) -> T:
     """Decode an entry of the table `map`. Return `default` if it is missing."""
     return decode_json(facts[key], kind, CorruptDataError, key) if key in facts else default
-
-
-def _read_feature_types(facts: Mapping[str, str], config: MapConfig) -> list[str]:
-    """Return the feature types of the map, the first type first."""
-    kinds = _decode_fact(facts, "kinds", list[str], [config.features.kind])
-    if len(kinds) > 8 or len(set(kinds)) < len(kinds):
-        raise CorruptDataError("kinds: at most 8 different names are expected")
-    if kinds[:1] != [config.features.kind]:
-        raise CorruptDataError(f"kinds: {kinds} do not begin with that of the configuration")
-    for kind in kinds:
-        find_feature_type(kind)
-    return kinds
 
 
 # No return types: a type check at run time would read an entry.

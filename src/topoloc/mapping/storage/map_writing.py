@@ -21,9 +21,8 @@ import numpy as np
 
 from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
-from topoloc.mapping.config import config_to_text
 from topoloc.mapping.landmark_statistics import encode_statistics
-from topoloc.mapping.sessions import Session, sessions_from_names
+from topoloc.mapping.sessions import Session
 from topoloc.mapping.storage.entries import TopoNode
 from topoloc.mapping.storage.point_encoding import compress_array, node_to_arrays
 from topoloc.mapping.storage.schema import (
@@ -77,7 +76,8 @@ class _Writer:
             self._database.execute(create_table_statement(table))
         if not topomap.sessions:
             names = [entry.recording for entry in (*topomap.summaries, *topomap.place_images)]
-            topomap = replace(topomap, sessions=sessions_from_names(names))
+            sessions = [Session(number, name) for number, name in enumerate(dict.fromkeys(names))]
+            topomap = replace(topomap, sessions=sessions)
             self._session_ids = {one.name: one.session_id for one in topomap.sessions}
         for session in topomap.sessions:
             self._insert("sessions", session.session_id, session.name, _session_to_json(session))
@@ -129,11 +129,10 @@ class _Writer:
         next_id = max(topomap.next_ids.place_image, 1)
         for image in topomap.place_images:
             image_id = next_id if image.image_id is None else image.image_id
-            session_id = self._session_ids.get(image.recording, image.session_id)
             self._insert(
                 "place_images",
                 image_id,
-                session_id,
+                self._session_ids.get(image.recording, image.session_id),
                 image.name,
                 image.node_id,
                 _pose_to_bytes(image.world_from_cam),
@@ -148,7 +147,7 @@ class _Writer:
         next_ids = replace(topomap.free_ids, place_image=next_image, side_node=side_node)
         counts = {table: len(rows) for table, rows in self._checksums.items() if table != "map"}
         facts = {
-            "config": config_to_text(topomap.config),
+            "config": json.dumps(topomap.config.to_json(), sort_keys=True),
             "kinds": json.dumps(topomap.kinds),
             "length_m": json.dumps(topomap.length_m),
             "default_coarse": json.dumps(topomap.default_coarse),

@@ -46,11 +46,10 @@ def node_to_arrays(node: TopoNode, kind: str) -> list[np.ndarray]:
     """Return the node's arrays for the file, in the order of the table's columns."""
     f = node.features
     shapes = np.stack([f.sizes_px, f.angles, f.responses], axis=1).astype("<f4")
-    descriptors = _stored_or_quantized(node, find_feature_type(kind).descriptor_scale)
     return [
         f.points_img.astype("<f4"),
         shapes,
-        descriptors,
+        _stored_or_quantized(node, find_feature_type(kind).descriptor_scale),
         node.points_cam.astype("<f4"),
         node.point_sqrt_covs.astype("<f2"),
     ]

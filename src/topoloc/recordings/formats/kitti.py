@@ -86,8 +86,7 @@ def read_calib(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
     """
     missing = "no calibration here; a camera.json with a baseline beside it would do as well"
     projections = {}
-    lines = read_text(path, CalibrationError, missing).splitlines()
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_text(path, CalibrationError, missing).splitlines(), start=1):
         key, _, values = line.partition(":")
         if not (key.startswith("P") and key[1:].isdigit()):
             continue

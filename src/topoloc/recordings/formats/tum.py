@@ -52,15 +52,15 @@ def open_tum(path: Path, calibration: CalibrationForSize | None = None) -> Recor
     else:
         found = _calibration(path)
     depth_times, depth = read_file_list(path / "depth.txt", RecordingError)
-    names = ("rgb.txt", "depth.txt")
-    pairs, notes = match_times(colour_times, depth_times, MAX_DEPTH_DELAY_MS, str(path), names)
+    pairs, notes = match_times(
+        colour_times, depth_times, MAX_DEPTH_DELAY_MS, str(path), ("rgb.txt", "depth.txt")
+    )
     t_ns = [colour_times[row] for row, _ in pairs]
     poses = read_ground_truth(path / "groundtruth.txt", [], t_ns)
     paths, units = [path / depth[row] for _, row in pairs], _depth_factor(path, found)
     images = DepthImages(paths, units, None, Rigid3.identity())
     frames = ([colour[row] for row, _ in pairs], t_ns, poses)
-    name = path.resolve().name
-    return Recording(name, path, *frames, found.camera, depth=images, notes=notes)
+    return Recording(path.resolve().name, path, *frames, found.camera, depth=images, notes=notes)
 
 
 def _calibration(path: Path) -> CameraCalibration:
