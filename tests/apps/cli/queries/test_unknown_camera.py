@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -51,14 +52,22 @@ def test_the_focal_length_is_found_with_the_pose(
     assert np.median(errors) < 0.05
 
 
-def test_photos_of_one_camera_share_it(room_map: Path, queries: Path, tmp_path: Path):
+def test_photos_of_one_camera_share_it(
+    room_map: Path, queries: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     folder, camera = tmp_path / "photos", tmp_path / "camera.json"
     folder.mkdir()
     for picture in queries.glob("*.png"):  # a fifth of the width cut off at the left
         cut = cv2.imread(str(picture))[:, CAMERA.width // 5 :]
         cv2.imwrite(str(folder / picture.name), cut)
     words = [str(room_map), str(folder), "--json", str(tmp_path / "a.json")]
-    assert main(["localize", *words, "--save-camera", str(camera)]) == 0
+    trajectory = tmp_path / "photos.tum"
+    assert main(["localize", *words, "--save-camera", str(camera), "--tum", str(trajectory)]) == 0
+    said = "".join(capsys.readouterr())
+    (num_images,) = re.findall(r"from (\d+) images", said)
+    assert int(num_images) <= len(list(folder.iterdir())), "each counts once"
+    rows = [row.split() for row in trajectory.read_text().splitlines() if not row.startswith("#")]
+    assert all(float(row[0]).is_integer() for row in rows), "photos have no times"
     found, width = Camera.from_json(camera.read_text()), CAMERA.width
     assert found.fx == pytest.approx(CAMERA.fx, rel=0.02)
     assert found.cx == pytest.approx(CAMERA.cx - width // 5, abs=0.01 * width)
