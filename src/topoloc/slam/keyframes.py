@@ -206,3 +206,13 @@ def triangulate_points(
         distances = np.linalg.norm(projected - points_img, axis=1)
         np.maximum.at(worst, of_it, np.nan_to_num(distances, nan=np.inf))
     return points, num_rays, parallax, worst
+
+
+def compute_steps(keyframes: Sequence[KeyFrame]) -> Float[np.ndarray, "2 n"]:
+    """Return the steps between successive key frames of a sub-map, metres and radians."""
+    rotations = np.array([k.cam_from_world.rotation for k in keyframes])
+    translations = np.array([k.cam_from_world.translation for k in keyframes])
+    turned = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)
+    moved = translations[1:] - np.einsum("nij,nj->ni", turned, translations[:-1])
+    cosines = 0.5 * (np.trace(turned, axis1=1, axis2=2) - 1.0)
+    return np.stack([np.linalg.norm(moved, axis=1), np.arccos(np.clip(cosines, -1.0, 1.0))])

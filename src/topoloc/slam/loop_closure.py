@@ -20,7 +20,7 @@ from topoloc.features.parallel import parallel_map
 from topoloc.geometry.rigid import Rigid3
 from topoloc.retrieval.coarse import VladConfig
 from topoloc.retrieval.vlad import SurfVlad, learn_words_from_parts, vlad
-from topoloc.slam.keyframes import KeyFrame
+from topoloc.slam.keyframes import KeyFrame, compute_steps
 from topoloc.slam.place_matching import PlaceMatch, find_repetition, match_places
 
 _MAX_VLAD_BYTES = 4_000_000  # in memory: each is read once or twice, in order
@@ -170,10 +170,10 @@ def is_reachable(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
     submaps = [passed[number] for number in sorted(passed)]
     expected = source.cam_from_world @ submaps[0][-1].cam_from_world.inverse()
     reaches, turns = list[float](), list[float]()
-    for before, after in pairwise(submaps):
+    max_speeds = [_max_speeds(submap) for submap in submaps]
+    for (before, after), speeds in zip(pairwise(submaps), pairwise(max_speeds), strict=True):
         seconds = 1e-9 * (after[0].t_ns - before[-1].t_ns)
-        speeds = np.maximum(_max_speeds(before), _max_speeds(after))
-        metres, radians = start + max_speedup * seconds * speeds
+        metres, radians = start + max_speedup * seconds * np.maximum(*speeds)
         reaches.append(metres)
         turns.append(radians)
         expected = expected @ Rigid3(np.eye(3), seconds * _last_velocity(before))
@@ -182,20 +182,15 @@ def is_reachable(link: Link, keyframes: Sequence[KeyFrame]) -> bool:
             expected = expected @ motion
             chord = 2.0 * np.sin(min(np.linalg.norm(turns), np.pi) / 2.0)
             reaches.append(chord * float(np.linalg.norm(motion.translation)) + _max_drift(after))
-    start_in_target = target.cam_from_world @ submaps[-1][0].cam_from_world.inverse()
-    start_in_source = target_from_source.inverse() @ start_in_target
-    off = np.linalg.norm(expected.translation - start_in_source.translation)
-    return bool(off < np.linalg.norm(reaches))  # they are independent
+    target_from_start = target.cam_from_world @ submaps[-1][0].cam_from_world.inverse()
+    apart = expected.translation - (target_from_source.inverse() @ target_from_start).translation
+    return bool(np.linalg.norm(apart) < np.linalg.norm(reaches))  # they are independent
 
 
 def _max_speeds(submap: Sequence[KeyFrame]) -> Float[np.ndarray, " 2"]:
     """Return the maximum speeds within a sub-map, metres and radians per second."""
-    speeds = np.zeros(2)
-    for a, b in pairwise(submap):
-        b_from_a = b.cam_from_world @ a.cam_from_world.inverse()
-        moved = np.array([np.linalg.norm(b_from_a.translation), b_from_a.angle()])
-        speeds = np.maximum(speeds, moved / max(1e-9 * (b.t_ns - a.t_ns), 1e-9))
-    return speeds
+    seconds = np.maximum(1e-9 * np.diff([k.t_ns for k in submap]), 1e-9)
+    return np.max(compute_steps(submap) / seconds, axis=1, initial=0.0)
 
 
 def _last_velocity(submap: Sequence[KeyFrame]) -> Float[np.ndarray, " 3"]:
@@ -209,8 +204,7 @@ def _last_velocity(submap: Sequence[KeyFrame]) -> Float[np.ndarray, " 3"]:
 def _max_drift(passed: Sequence[KeyFrame]) -> float:
     """Return the maximum drift (metres) of the odometry along key frames of a sub-map."""
     drift_share = 0.05  # of the travelled distance
-    positions = np.array([k.cam_from_world.inverse().translation for k in passed])
-    return drift_share * float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    return drift_share * float(compute_steps(passed)[0].sum())
 
 
 def _between(keyframes: Sequence[KeyFrame], one: int, other: int) -> list[KeyFrame]:

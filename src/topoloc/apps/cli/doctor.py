@@ -1,4 +1,4 @@
-"""topoloc doctor: what is installed where, and whether it works."""
+"""topoloc doctor: report the installation and test it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from topoloc.apps.cli.output import (
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)[^;>]*(>=(?P<least>[\d.]+))?[^;]*(;(?P<marker>.*))?")
 _REINSTALL = "reinstall: pip install --force-reinstall topoloc"
 Found = tuple[dict[str, Any], list[str]]
-"""What a part of the examination tells, and its faults, each with a remedy."""
+"""The facts of one part of the report, and its faults, each with a remedy."""
 
 
 @dataclass(frozen=True)
@@ -37,32 +37,32 @@ class Command:
     """Arguments of `topoloc doctor`."""
 
     json: File = None
-    """Write what is found as JSON to this file (- for standard output)."""
+    """Write the report as JSON to this file (- for standard output)."""
 
     def run(self) -> int:
         check_outputs([self.json])
-        told, faults = dict[str, Any](), list[str]()
+        facts, faults = dict[str, Any](), list[str]()
         for name, examine in _PARTS.items():
             try:
                 with interruptible():
-                    told[name], found = examine()
+                    facts[name], found = examine()
             except Exception as error:  # a broken library may raise any exception
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
-                told[name], found = {}, [f"{name}: {reason}; {_REINSTALL}"]
+                facts[name], found = {}, [f"{name}: {reason}; {_REINSTALL}"]
             faults += found
-        write_json(self.json, told | {"faults": faults})
+        write_json(self.json, facts | {"faults": faults})
         if self.json != "-":
-            print_fields([*_describe(told), ("faults", str(len(faults) or "none"))])
+            print_fields([*_describe(facts), ("faults", str(len(faults) or "none"))])
         for fault in faults:
             print_line(f"error: {fault}", sys.stderr)
         return 1 if faults else 0
 
 
 def _examine_versions() -> Found:
-    """Tell the versions of Python and of the libraries that topoloc cannot do without."""
-    told = {"topoloc": _version_of("topoloc"), "python": platform.python_version()}
-    told["platform"] = platform.platform()
-    told |= {name: found for name in PLUGIN_PACKAGES.values() if (found := _version_of(name))}
+    """Return the versions of Python and of the libraries that topoloc cannot do without."""
+    facts = {"topoloc": _version_of("topoloc"), "python": platform.python_version()}
+    facts["platform"] = platform.platform()
+    facts |= {name: found for name in PLUGIN_PACKAGES.values() if (found := _version_of(name))}
     needed = {name: least for extra, name, least, _ in _requirements() if not extra}
     libraries = {name: _version_of(name) for name in needed}
     faults = [
@@ -72,11 +72,11 @@ def _examine_versions() -> Found:
     ]
     if not needed:
         faults.append("topoloc is not installed: pip install topoloc")
-    return told | {"libraries": libraries}, faults
+    return facts | {"libraries": libraries}, faults
 
 
 def _examine_processor() -> Found:
-    """Tell the processor, and how many of its cores this process may use."""
+    """Return the processor, and how many of its cores this process may use."""
     model, usable = platform.processor(), os.cpu_count()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():  # Linux
@@ -84,54 +84,54 @@ def _examine_processor() -> Found:
         model = lines[1] if lines else model
     if hasattr(os, "sched_getaffinity"):  # neither macOS nor Windows
         usable = len(os.sched_getaffinity(0))
-    told = {"model": model or platform.machine(), "architecture": platform.machine()}
-    return told | {"processors": os.cpu_count(), "usable": usable}, []
+    facts = {"model": model or platform.machine(), "architecture": platform.machine()}
+    return facts | {"processors": os.cpu_count(), "usable": usable}, []
 
 
 def _examine_extras() -> Found:
-    """Tell which extras are installed, and what the others lack."""
-    told: dict[str, Any] = {}
+    """Return the extras, and the missing libraries of each."""
+    facts: dict[str, Any] = {}
     for extra, name, least, condition in _requirements():
         if extra and extra not in ("all", "docs", "test"):
-            one = told.setdefault(extra, {"missing": [], "only_if": condition, "install": None})
+            one = facts.setdefault(extra, {"missing": [], "only_if": condition, "install": None})
             if _is_older(_version_of(name), least):
                 one["missing"].append(name)
                 one["install"] = f"pip install 'topoloc[{extra}]'"
-    return told, []
+    return facts, []
 
 
 def _examine_caches() -> Found:
-    """Tell the folders of fetched networks and of compiled code."""
+    """Return the folders of fetched networks and of compiled code."""
     networks, *kernels = plugin.cache_folder(), *plugin.kernel_caches()
-    told = {
+    facts = {
         "networks": [_describe_folder(networks, "*")],
         "kernels": [_describe_folder(folder, "**/*.nb?") for folder in kernels],
     }
-    if any(one["writable"] or one["bytes"] for one in told["kernels"]):
-        return told, []
+    if any(one["writable"] or one["bytes"] for one in facts["kernels"]):
+        return facts, []
     text = f"{' or '.join(map(str, kernels))} cannot be written; NUMBA_CACHE_DIR names another"
-    return told, [f"every process compiles for a minute: {text} folder"]
+    return facts, [f"every process compiles for a minute: {text} folder"]
 
 
 def _examine_networks() -> Found:
     """Run each network that is here on a small picture."""
-    told, faults = dict[str, Any](), list[str]()
+    facts, faults = dict[str, Any](), list[str]()
     for network in plugin.NetworkInfo.known():
         try:
             path = network.find_file()
         except topoloc.WeightsError as missing:
-            told[network.name] = None
+            facts[network.name] = None
             faults += [] if network.file else [f"{missing}; {_REINSTALL}"]
             continue
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        told[network.name] = {"path": str(path), "sha256": digest}
+        facts[network.name] = {"path": str(path), "sha256": digest}
         try:
             plugin.NetworkInfo.of_file(path)
         except topoloc.WeightsError as error:
             remedy = f"remove it; {network.install_hint}" if network.file else _REINSTALL
             faults.append(f"{error}; {remedy}")
-    return told, faults
+    return facts, faults
 
 
 def _examine_pipeline() -> Found:
@@ -148,7 +148,7 @@ def _examine_pipeline() -> Found:
             walk = topoloc.open_sequence(SHIPPED / "day")
             (answer,) = topoloc.localize_queries(topoloc.Localizer(topomap), walk, frames=[0])
     is_localized = isinstance(answer.result, topoloc.Localization)
-    told = {
+    facts = {
         "images_mapped": len(recording),
         "localized": is_localized,
         "translation_m": answer.translation_m if is_localized else None,
@@ -156,10 +156,10 @@ def _examine_pipeline() -> Found:
         "seconds": round(time.perf_counter() - start, 2),
     }
     if answer.translation_m < 0.05 and answer.rotation_deg < 1.0:
-        return told, []
+        return facts, []
     wrong = f"a pose is {100 * answer.translation_m:.1f} cm, {answer.rotation_deg:.1f} degrees off"
     wrong = wrong if is_localized else "an image of the mapped room is not localized"
-    return told, [f"self-test: {wrong}; {_REINSTALL}"]
+    return facts, [f"self-test: {wrong}; {_REINSTALL}"]
 
 
 _PARTS: dict[str, Callable[[], Found]] = {
@@ -172,28 +172,28 @@ _PARTS: dict[str, Callable[[], Found]] = {
 }
 
 
-def _describe(told: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _describe(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the lines of the printed text. A part that failed is empty."""
-    for name, version in told["versions"].items():
+    for name, version in facts["versions"].items():
         if name == "libraries":
             version = ", ".join(f"{one} {found or 'missing'}" for one, found in version.items())
         yield name, version or "missing"
-    if one := told["processor"]:
+    if one := facts["processor"]:
         yield "processor", f"{one['model']}: {one['processors']} cores, {one['usable']} usable"
-    for name, one in told["extras"].items():
+    for name, one in facts["extras"].items():
         only = f" (only {one['only_if']})" if one["only_if"] else ""
         lack = f"{', '.join(one['missing'])} missing: {one['install']}{only}"
         yield f"extra {name}", lack if one["missing"] else "installed"
-    for name, folders in told["caches"].items():
+    for name, folders in facts["caches"].items():
         for one in folders:
             access = "writable" if one["writable"] else "read-only"
             yield f"cache of {name}", f"{one['path']}, {one['bytes'] / 1e6:.1f} MB, {access}"
-    for name, one in told["networks"].items():
+    for name, one in facts["networks"].items():
         if one:
             yield f"network {name}", f"{one['path']}, SHA-256 {one['sha256'][:12]}..."
-    if missing := [name for name, one in told["networks"].items() if not one]:
+    if missing := [name for name, one in facts["networks"].items() if not one]:
         yield "other networks", f"{', '.join(missing)}: see `topoloc weights list`"
-    if (one := told["self_test"]) and one["localized"]:
+    if (one := facts["self_test"]) and one["localized"]:
         errors = f"{100 * one['translation_m']:.2f} cm, {one['rotation_deg']:.2f} degrees"
         text = f"an image localized in a map of {one['images_mapped']}, {errors} off"
         yield "self-test", f"{text}; {one['seconds']:.1f} s"
