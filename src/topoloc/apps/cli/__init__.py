@@ -47,6 +47,7 @@ _GROUPS = {
         "maps.history": "print the edits of a map",
         "maps.undo": "undo the last edit of a map, byte-identical",
         "maps.georeference": "set the position of a map on earth, for OGC GeoPoses",
+        "maps.level": "make a map's world level: z up, floor at 0, as in a robot's plan",
         "maps.export": "export to COLMAP, nerfstudio, PLY, GeoJSON, MCAP, TUM, KITTI",
     },
     "try and set up": {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from topoloc import BuildConfig, check_map
+from topoloc import BuildConfig, TopoMetricMap, check_map, level_map
 from topoloc.apps.cli.features_option import BUILD_FEATURES, select_build_features
 from topoloc.apps.cli.mapping.map_jobs import (
     MapJob,
@@ -87,6 +87,8 @@ class Command:
         float | None, option("M/RAD", "a node every 2 degrees", name="lambda")
     ] = None
     """Weight of rotation against translation (lambda of Eq. 1)."""
+    level: Flag = False
+    """Give the map a world with z up and the floor at z = 0, see `topoloc level`."""
     features: BUILD_FEATURES = None
     """Feature types of the map. `learned`: the first network of `topoloc weights list` that is
     installed. `both`: that and SURF."""
@@ -120,6 +122,8 @@ class Command:
                 "--scale must be a positive number, or IMAGE_A,IMAGE_B=3.2m, not"
                 f" {self.scale[0][:80]}"
             )
+        if self.level and self.ray is not None:
+            raise UsageError("--level goes without --ray: tiles of an atlas keep their worlds")
         settings = read_settings(self.config)
         map_job = self._map_job(recordings, settings)
         if self.ray is not None:
@@ -146,6 +150,9 @@ class Command:
             topomap, poses_from = map_job.make(progress, tell)
         is_replaced = target.is_file()
         topomap.save(target, print_waiting)
+        if self.level:
+            level_map(target)
+            topomap = TopoMetricMap.load(target)
         if is_replaced:
             print_warning(f"{target} was there; `topoloc undo {target}` brings it back")
         info = topomap.describe(target)
