@@ -157,7 +157,7 @@ def update_map(
     content = create_session_content(topomap, frames, session_poses, progress)
     camera = sequence[frames[0].index].camera
     session = create_session(sequence, frames, poses_from, camera, content.lights)
-    changed = _add_session(topomap, session, frames, content)
+    changed = add_session(topomap, session, frames, content)
     changed, not_updated = update_coarse_models(changed, content.views, content.images)
     changes = {
         "session": session.session_id,
@@ -180,12 +180,14 @@ def update_map(
     return MapUpdate(changed, posed_sequence, changes | recall)
 
 
-def _add_session(
+def add_session(
     topomap: TopoMetricMap,
     session: Session,
     frames: Sequence[MappingFrame],
     content: SessionContent,
 ) -> TopoMetricMap:
+    """Return the map with the nodes, images and observations of a session. Its coarse models and
+    statistics are as before."""
     layers = {
         kind: replace(layer, nodes=_merge_nodes(layer.nodes, kind, content))
         for kind, layer in topomap.layers.items()
@@ -220,5 +222,8 @@ def _merge_nodes(
             node, session_id = before[row], observations[0].session_id
             added = count_session_observations(len(node.features), observations, session_id)
             if added is not None:
-                changed[row] = replace(node, session_statistics=[*node.session_statistics, added])
+                by_session = {one.session_id: one for one in node.session_statistics}
+                own = by_session.get(session_id)
+                by_session[session_id] = added if own is None else own.with_counts(added)
+                changed[row] = replace(node, session_statistics=[*by_session.values()])
     return overlay(before, changed, content.nodes[kind])

@@ -203,10 +203,15 @@ def edit_map(path: str | Path, on_wait: WaitCallback | None = None) -> Iterator[
             yield MapEdit(path, topomap, locked)
 
 
-def save_map(topomap: TopoMetricMap, path: Path, on_wait: WaitCallback | None = None) -> None:
+def save_map(
+    topomap: TopoMetricMap,
+    path: Path,
+    on_wait: WaitCallback | None = None,
+    is_old_kept: bool = True,
+) -> None:
     """Write the map to `path` atomically. A reader sees the old map or the new one. A file that is
-    replaced is kept. Waits while another process edits the map at `path`, and calls `on_wait` once
-    before.
+    replaced is kept, if `is_old_kept`. Waits while another process edits the map at `path`, and
+    calls `on_wait` once before.
 
     Raises:
         MapError: the folder does not exist or cannot be written, the disk is full, or this thread
@@ -218,7 +223,7 @@ def save_map(topomap: TopoMetricMap, path: Path, on_wait: WaitCallback | None = 
     try:
         with no_edit_of(path, on_wait), atomic_write(path) as temporary:
             write_map(topomap, temporary)
-            if os.path.isfile(path):
+            if is_old_kept and os.path.isfile(path):
                 kept = keep_file(Path(os.path.realpath(path)), temporary)
     except (OSError, ValueError) as error:
         if kept is not None:

@@ -96,6 +96,19 @@ class LandmarkStatistics:
         is_empty = not self.pulls.any() and bool((np.abs(self.roots) <= _MAX_EMPTY_ROOT).all())
         return len(self.rows) > 0 and is_empty
 
+    def with_counts(self, counted: LandmarkStatistics) -> LandmarkStatistics:
+        """Return the statistics with the counts of further images of the same session."""
+        rows = np.union1d(self.rows, counted.rows)
+        roots = np.zeros((len(rows), 6), np.float16)
+        roots[:, [0, 2, 5]] = _MIN_INFORMATION**0.5
+        pulls, counts = np.zeros((len(rows), 3), np.int16), np.zeros((2, len(rows)), np.int64)
+        own = np.searchsorted(rows, self.rows)
+        roots[own], pulls[own] = self.roots, self.pulls
+        for part in (self, counted):
+            counts[:, np.searchsorted(rows, part.rows)] += [part.expected, part.seen]
+        expected, seen = np.minimum(counts, MAX_COUNT).astype(np.uint16)
+        return LandmarkStatistics(self.session_id, rows, roots, pulls, expected, seen)
+
     def is_reobserved(self) -> bool:
         """Return whether the session saw at least 0.3 of its expected observations. A session in
         other light may see none of them."""

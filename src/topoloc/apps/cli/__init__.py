@@ -24,6 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _GROUPS = {
     "map a place": {
         "mapping.build": "build a map file from stereo or RGB-D recordings",
+        "mapping.map": "build a map while its recording is written or replayed",
         "mapping.slam": "compute the trajectory of a stereo or RGB-D recording",
         "mapping.record": "record a ZED, CARLA, a webcam or a stream to a folder",
         "maps.update": "add recordings to a map: other light, changes, new parts",

@@ -25,7 +25,7 @@ T = TypeVar("T")
 # table of the file -> module and class of its configuration, and the commands that read it
 _QUERY_COMMANDS = ("localize", "evaluate", "explain", "serve", "follow")
 TABLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
-    "build": ("topoloc.mapping.build", "BuildConfig", ("build",)),
+    "build": ("topoloc.mapping.build", "BuildConfig", ("build", "map")),
     "localize": (
         "topoloc.localization.localizer",
         "LocalizerConfig",

@@ -82,6 +82,10 @@ class ErrorShareMeasurement:
         """Measure rho and return it with its digest, to be stored in the map."""
         return CorrelatedErrors(self.measure(), self._digest())
 
+    def carry_over(self, rho: float) -> CorrelatedErrors:
+        """Return rho of nearly the same nodes as that of these."""
+        return CorrelatedErrors(rho, self._digest())
+
     def measure(self) -> float:
         """Measure rho."""
         poses, config = self.topomap.node_poses, self.topomap.config

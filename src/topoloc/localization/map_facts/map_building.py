@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
 from topoloc.mapping.config import Progress
 from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
-from topoloc.node_ids import NodeId
+from topoloc.node_ids import NodeId, Row
 from topoloc.recordings.damaged_images import leave_out_damaged
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
@@ -104,18 +104,45 @@ def with_map_statistics(topomap: TopoMetricMap, progress: Progress | None = None
     return with_repetitions(replace(topomap, layers=layers, repetitions=None), progress)
 
 
+def extend_statistics(topomap: TopoMetricMap, before: TopoMetricMap) -> TopoMetricMap:
+    """Return a map with the statistics of the map that it was `before` nodes were added. Only the
+    repetitions of new nodes are searched."""
+    layers = {
+        kind: replace(
+            layer,
+            shared_errors=None
+            if (known := before.layers[kind].shared_errors) is None
+            else _error_share_of(topomap, kind).carry_over(known.rho),
+        )
+        for kind, layer in topomap.layers.items()
+    }
+    known = before.repetitions.moves if before.repetitions is not None else {}
+    rows = topomap.rows[len(before.summaries) :]
+    return with_repetitions(replace(topomap, layers=layers, repetitions=None), None, rows, known)
+
+
 def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
     """Measure rho of a map for a feature type."""
+    return _error_share_of(topomap, kind).measure_stored()
+
+
+def _error_share_of(topomap: TopoMetricMap, kind: str) -> ErrorShareMeasurement:
     c = LocalizerConfig().for_feature_type(find_feature_type(kind))
     weights = load_fitted_weights(kind)
-    rho = ErrorShareMeasurement(topomap, kind, c.guided, c.pose, weights.shared_errors)
-    return rho.measure_stored()
+    return ErrorShareMeasurement(topomap, kind, c.guided, c.pose, weights.shared_errors)
 
 
-def with_repetitions(topomap: TopoMetricMap, progress: Progress | None = None) -> TopoMetricMap:
-    """Return the map with the repetition moves of its nodes."""
-    opened, moves = OpenMap(topomap), dict[NodeId, Float[np.ndarray, "k 4 4"]]()
-    for row, found in enumerate(parallel_map(opened.moves, topomap.rows)):
+def with_repetitions(
+    topomap: TopoMetricMap,
+    progress: Progress | None = None,
+    rows: Sequence[Row] | None = None,
+    known: Mapping[NodeId, Float[np.ndarray, "k 4 4"]] | None = None,
+) -> TopoMetricMap:
+    """Return the map with the repetition moves of its nodes (or those of `rows`, beside `known`
+    ones)."""
+    opened, moves = OpenMap(topomap), dict(known or {})
+    chosen = topomap.rows if rows is None else rows
+    for row, found in zip(chosen, parallel_map(opened.moves, chosen), strict=True):
         if len(found):
             moves[opened.node_ids[row]] = found
         if progress is not None:
