@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from topoloc.localization.open_map import OpenMap
 from topoloc.mapping import build
 from topoloc.mapping.config import Progress
 from topoloc.mapping.topomap import CorrelatedErrors, Repetitions, TopoMetricMap
-from topoloc.node_ids import NodeId, Row
+from topoloc.node_ids import NodeId
 from topoloc.recordings.damaged_images import leave_out_damaged
 from topoloc.recordings.frame import StereoSequence
 from topoloc.recordings.open import open_sequence
@@ -104,21 +104,15 @@ def with_map_statistics(topomap: TopoMetricMap, progress: Progress | None = None
     return with_repetitions(replace(topomap, layers=layers, repetitions=None), progress)
 
 
-def extend_statistics(topomap: TopoMetricMap, before: TopoMetricMap) -> TopoMetricMap:
-    """Return a map with the statistics of the map that it was `before` nodes were added. Only the
-    repetitions of new nodes are searched."""
+def carry_over_error_shares(topomap: TopoMetricMap, before: TopoMetricMap) -> TopoMetricMap:
+    """Return a map with the correlated errors of the map that it was `before` nodes were added. A
+    localizer finds repetitions when it needs them."""
     layers = {
-        kind: replace(
-            layer,
-            shared_errors=None
-            if (known := before.layers[kind].shared_errors) is None
-            else _error_share_of(topomap, kind).carry_over(known.rho),
-        )
+        kind: replace(layer, shared_errors=_error_share_of(topomap, kind).carry_over(known.rho))
         for kind, layer in topomap.layers.items()
+        if (known := before.layers[kind].shared_errors) is not None
     }
-    known = before.repetitions.moves if before.repetitions is not None else {}
-    rows = topomap.rows[len(before.summaries) :]
-    return with_repetitions(replace(topomap, layers=layers, repetitions=None), None, rows, known)
+    return replace(topomap, layers={**topomap.layers, **layers}, repetitions=None)
 
 
 def _measure_error_share(topomap: TopoMetricMap, kind: str) -> CorrelatedErrors:
@@ -132,17 +126,10 @@ def _error_share_of(topomap: TopoMetricMap, kind: str) -> ErrorShareMeasurement:
     return ErrorShareMeasurement(topomap, kind, c.guided, c.pose, weights.shared_errors)
 
 
-def with_repetitions(
-    topomap: TopoMetricMap,
-    progress: Progress | None = None,
-    rows: Sequence[Row] | None = None,
-    known: Mapping[NodeId, Float[np.ndarray, "k 4 4"]] | None = None,
-) -> TopoMetricMap:
-    """Return the map with the repetition moves of its nodes (or those of `rows`, beside `known`
-    ones)."""
-    opened, moves = OpenMap(topomap), dict(known or {})
-    chosen = topomap.rows if rows is None else rows
-    for row, found in zip(chosen, parallel_map(opened.moves, chosen), strict=True):
+def with_repetitions(topomap: TopoMetricMap, progress: Progress | None = None) -> TopoMetricMap:
+    """Return the map with the repetition moves of its nodes."""
+    opened, moves = OpenMap(topomap), dict[NodeId, Float[np.ndarray, "k 4 4"]]()
+    for row, found in enumerate(parallel_map(opened.moves, topomap.rows)):
         if len(found):
             moves[opened.node_ids[row]] = found
         if progress is not None:

@@ -1,0 +1,240 @@
+"""Build a map while its recording is still written: SLAM and node building by pieces.
+
+Each piece shares its first frames with the last one. SLAM gives its motion, and the shared frames
+give its place. Where the map recognises the piece's other frames, too, they hold it: this closes
+loops against the nodes that exist. Frames that the map does not localize well become nodes, as in
+`update.py`, of one session. The map file is whole after every piece. Existing nodes do not move, so
+the drift of a long loop stays at the place where it closes (`max_shift_m`); `build_map` of the
+whole recording spreads it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from topoloc.errors import EmptyMapError, MapError, RecordingError, TrajectoryError
+from topoloc.geometry.rigid import Rigid3
+from topoloc.json_data import OneLine
+from topoloc.lifelong.session_content import create_session_content, update_coarse_models
+from topoloc.lifelong.session_poses import SessionPoses, align_motion_to_map
+from topoloc.lifelong.update import add_session
+from topoloc.localization.localizer import Localizer, LocalizerConfig
+from topoloc.localization.map_facts.map_building import (
+    carry_over_error_shares,
+    with_map_statistics,
+)
+from topoloc.localization.result import Localization
+from topoloc.mapping import build
+from topoloc.mapping.edit import save_map
+from topoloc.mapping.mapping_frames import create_session, select_posed_frames
+from topoloc.mapping.nodes import select_node_frames
+from topoloc.mapping.topomap import TopoMetricMap
+from topoloc.recordings.frame import SequenceView, StereoSequence, sequence_subset
+from topoloc.slam.slam import run_slam
+
+_NUM_SHARED = 12
+"""Frames that a piece shares with the last one."""
+_MAX_DRIFT, _MIN_DRIFT_M = 0.05, 0.3
+"""A pose in the map may differ from that by motion by this share of the way, or this much."""
+
+
+@dataclass(frozen=True, repr=False)
+class Growth(OneLine):
+    """What a piece brought: the frames given and those with a pose, the nodes of the map after it,
+    metres mapped in all, and how far (metres) the map moved the piece from where motion alone saw
+    it. `is_joined` is False if the piece could not be placed; it may be later."""
+
+    num_frames: int
+    num_posed: int
+    num_nodes: int
+    length_m: float
+    shift_m: float
+    seconds: float
+    is_joined: bool
+
+
+class GrowingMap:
+    """A map file that grows by successive frames of a stereo or RGB-D recording.
+
+    Args:
+        path: the new map file.
+        config: the settings of the map.
+
+    Raises:
+        MapError: the file exists.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        config: build.BuildConfig | None = None,
+        localizer_config: LocalizerConfig | None = None,
+    ) -> None:
+        self.path = Path(path)
+        if self.path.exists():
+            raise MapError(f"cannot write map {path}: it exists; `topoloc update` adds to it")
+        self._config, self._localizer_config = config or build.BuildConfig(), localizer_config
+        self._topomap: TopoMetricMap | None = None
+        self._end = 0  # the first frame that was not given yet
+        self._world_from_cams: dict[int, Rigid3] = {}  # of the last piece, by frame
+        self.max_shift_m = 0.0
+
+    def add(self, sequence: StereoSequence, stop: int | None = None) -> Growth:
+        """Add the frames of the recording up to `stop` that were not given yet, and write the map.
+        The recording may be another object each time, with more frames.
+
+        Raises:
+            CalibrationError, UnreadableImageError: from reading the recording.
+            MapError: the map cannot be written.
+        """
+        began = time.monotonic()
+        stop = len(sequence) if stop is None else stop
+        first = max(0, self._end - _NUM_SHARED)
+        piece = sequence_subset(sequence, range(first, stop))
+        before, num_new = self._end, stop - self._end
+        self._end = stop
+        poses, shift = {}, 0.0
+        try:
+            posed = run_slam(piece).apply([piece])[0]
+            if self._topomap is None:
+                self._begin(posed)
+                poses = _numbered(posed.poses, first)
+            else:
+                poses, shift = self._extend(self._topomap, posed, first, before)
+        except (RecordingError, TrajectoryError, EmptyMapError):
+            poses = {}  # too dark, or nothing that the map knows: the next piece may be
+        self._world_from_cams = poses
+        num_posed = sum(index >= before for index in poses)
+        return Growth(
+            num_new, num_posed, *self._size(), shift, time.monotonic() - began, bool(poses)
+        )
+
+    def finish(self) -> TopoMetricMap | None:
+        """Measure the statistics of the whole map, write it a last time, and return it. None if no
+        piece could be mapped."""
+        if self._topomap is not None:
+            self._write(with_map_statistics(self._topomap))
+        return self._topomap
+
+    def close(self) -> None:
+        """Close the map file."""
+        if self._topomap is not None:
+            self._topomap.close()
+
+    def _size(self) -> tuple[int, float]:
+        known = self._topomap
+        return (0, 0.0) if known is None else (len(known.summaries), known.length_m)
+
+    def _begin(self, posed: StereoSequence) -> None:
+        """Build the map of the first piece."""
+        built = build.build_map(posed, self._config, None, ["slam"])
+        self._write(with_map_statistics(built))
+
+    def _extend(
+        self, topomap: TopoMetricMap, posed: StereoSequence, first: int, before: int
+    ) -> tuple[dict[int, Rigid3], float]:
+        """Add a piece, whose first frame is `first`. Its frames from `before` on are new. Return
+        the poses of all its frames in the map, and the shift. Raises TrajectoryError."""
+        session_poses, shift = self._place(topomap, posed, first)
+        poses = session_poses.world_from_cams
+        new = range(before - first, len(posed))
+        view = SequenceView(posed, [*new], [poses.get(index) for index in new])
+        own = {k - new.start: one for k, one in session_poses.answers.items() if k in new}
+        if any(view.poses):
+            self._write(self._with_content(topomap, view, replace(session_poses, answers=own)))
+        self.max_shift_m = max(self.max_shift_m, shift)
+        return {index + first: pose for index, pose in poses.items()}, shift
+
+    def _with_content(
+        self, topomap: TopoMetricMap, view: StereoSequence, session_poses: SessionPoses
+    ) -> TopoMetricMap:
+        """Return the map with the content of these frames, in its one session."""
+        *_, session = topomap.sessions
+        frames = select_posed_frames(view, session.session_id)
+        content = create_session_content(topomap, frames, session_poses, _no_progress)
+        piece = create_session(view, frames, "slam", session.camera, content.lights)
+        changed = add_session(topomap, piece, frames, content)
+        changed, _ = update_coarse_models(changed, content.views, content.images)
+        changed = replace(changed, sessions=[replace(session, end_ns=piece.end_ns)])
+        return carry_over_error_shares(changed, topomap)
+
+    def _place(
+        self, topomap: TopoMetricMap, posed: StereoSequence, first: int
+    ) -> tuple[SessionPoses, float]:
+        """Return the poses of a piece in the map, and how far (metres) the map moves its end from
+        where motion alone sees it. Raises TrajectoryError: neither its first frames nor the map
+        place it."""
+        odom, config = _numbered(posed.poses), topomap.config
+        by_motion = self._chain(odom, first)
+        indices = list(odom)
+        rows = select_node_frames(list(odom.values()), config.d_thresh, config.lambda_rot)
+        localizer = Localizer(topomap, self._localizer_config)
+        answers = dict[int, Localization | None]()
+        for index in (indices[row] for row in rows):
+            frame, prior = posed[index], None if by_motion is None else by_motion[index]
+            result = localizer.localize(frame.image, frame.camera, prior)
+            answers[index] = result if isinstance(result, Localization) else None
+        if by_motion is not None:
+            answers = _plausible(answers, by_motion, self._way(by_motion))
+        try:
+            aligned = align_motion_to_map(posed.name, odom, answers, config.d_thresh)
+        except TrajectoryError:
+            if by_motion is None:
+                raise
+            return SessionPoses(by_motion, answers, []), 0.0
+        last = max(aligned.world_from_cams)
+        if by_motion is None or last not in by_motion:
+            return aligned, 0.0
+        apart = aligned.world_from_cams[last].translation - by_motion[last].translation
+        return aligned, float(np.linalg.norm(apart))
+
+    def _chain(self, odom: Mapping[int, Rigid3], first: int) -> dict[int, Rigid3] | None:
+        """Return the poses of a piece from the known poses of the frames that it shares with the
+        last one. None if there are none."""
+        shared = [index for index in odom if index + first in self._world_from_cams]
+        if not shared:
+            return None
+        middle = shared[len(shared) // 2]
+        world_from_odom = self._world_from_cams[middle + first] @ odom[middle].inverse()
+        return {index: world_from_odom @ pose for index, pose in odom.items()}
+
+    def _way(self, poses: Mapping[int, Rigid3]) -> float:
+        """Return the way (metres) up to the end of a piece, over which motion may have drifted."""
+        _, length_m = self._size()
+        points = np.array([pose.translation for pose in poses.values()])
+        return length_m + float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+    def _write(self, topomap: TopoMetricMap) -> None:
+        """Write the map, and go on with the file, so that memory does not grow. Raises MapError."""
+        save_map(topomap, self.path, is_old_kept=False)
+        self.close()
+        self._topomap = TopoMetricMap.load(self.path)
+
+
+def _numbered(poses: Sequence[Rigid3 | None], first: int = 0) -> dict[int, Rigid3]:
+    return {first + index: pose for index, pose in enumerate(poses) if pose is not None}
+
+
+def _plausible(
+    answers: Mapping[int, Localization | None], by_motion: Mapping[int, Rigid3], way_m: float
+) -> dict[int, Localization | None]:
+    """Return the answers without those that are further from the poses by motion than its drift
+    allows: similar places elsewhere."""
+    reach = max(_MIN_DRIFT_M, _MAX_DRIFT * way_m)
+
+    def is_near(index: int, answer: Localization) -> bool:
+        return answer.world_from_cam.is_same(by_motion[index], reach, np.deg2rad(15.0))
+
+    return {
+        index: answer if answer is not None and is_near(index, answer) else None
+        for index, answer in answers.items()
+    }
+
+
+def _no_progress(stage: str, done: int, total: int) -> None:
+    """Ignore the progress of a piece."""
