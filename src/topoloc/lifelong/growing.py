@@ -1,11 +1,13 @@
 """Build a map while its recording is still written: SLAM and node building by pieces.
 
 Each piece shares its first frames with the last one. SLAM gives its motion, and the shared frames
-give its place. Where the map recognises the piece's other frames, too, they hold it: this closes
-loops against the nodes that exist. Frames that the map does not localize well become nodes, as in
-`update.py`, of one session. The map file is whole after every piece. Existing nodes do not move, so
-the drift of a long loop stays at the place where it closes (`max_shift_m`); `build_map` of the
-whole recording spreads it.
+give its place, also backwards to pieces that could not be placed at first. Where the map recognises
+the piece's other frames, too, they hold it: this closes loops against the nodes that exist. Frames
+that the map does not localize well become nodes, as in `update.py`, of one session. The map file is
+whole after every piece.
+
+Existing nodes do not move, so the drift of a long loop stays at the place where it closes
+(`max_shift_m`); `build_map` of the whole recording spreads it.
 """
 
 from __future__ import annotations
@@ -43,11 +45,21 @@ _MAX_DRIFT, _MIN_DRIFT_M = 0.05, 0.3
 """A pose in the map may differ from that by motion by this share of the way, or this much."""
 
 
+@dataclass(frozen=True)
+class _Piece:
+    """Frames from `first` to `stop`. Those from `before` on are not in another piece before it."""
+
+    first: int
+    before: int
+    stop: int
+
+
 @dataclass(frozen=True, repr=False)
 class Growth(OneLine):
     """What a piece brought: the frames given and those with a pose, the nodes of the map after it,
     metres mapped in all, and how far (metres) the map moved the piece from where motion alone saw
-    it. `is_joined` is False if the piece could not be placed; it may be later."""
+    it. `num_apart` counts the frames of the last pieces that could not be placed: they join with a
+    later piece, once it is recognised."""
 
     num_frames: int
     num_posed: int
@@ -55,7 +67,7 @@ class Growth(OneLine):
     length_m: float
     shift_m: float
     seconds: float
-    is_joined: bool
+    num_apart: int
 
 
 class GrowingMap:
@@ -81,6 +93,7 @@ class GrowingMap:
         self._config, self._localizer_config = config or build.BuildConfig(), localizer_config
         self._topomap: TopoMetricMap | None = None
         self._end = 0  # the first frame that was not given yet
+        self._apart: list[_Piece] = []  # successive pieces that are not in the map
         self._world_from_cams: dict[int, Rigid3] = {}  # of the last piece, by frame
         self.max_shift_m = 0.0
 
@@ -94,25 +107,40 @@ class GrowingMap:
         """
         began = time.monotonic()
         stop = len(sequence) if stop is None else stop
-        first = max(0, self._end - _NUM_SHARED)
-        piece = sequence_subset(sequence, range(first, stop))
-        before, num_new = self._end, stop - self._end
-        self._end = stop
-        poses, shift = {}, 0.0
+        before, self._end = self._end, stop
+        self._apart.append(_Piece(max(0, before - _NUM_SHARED), before, stop))
+        num_posed, shift = 0, 0.0
+        while self._apart:  # the newest piece, then those before it, which share frames with it
+            joined = self._join(sequence, self._apart[-1])
+            if joined is None:
+                break
+            self._apart.pop()
+            num_posed, shift = num_posed + joined[0], max(shift, joined[1])
+            if num_posed == joined[0]:
+                newest = self._world_from_cams
+        if num_posed:
+            self._world_from_cams = newest
+            self._apart.clear()  # they share no frame with later pieces
+        self.max_shift_m = max(self.max_shift_m, shift)
+        num_apart = sum(one.stop - one.before for one in self._apart)
+        seconds = time.monotonic() - began
+        return Growth(stop - before, num_posed, *self._size(), shift, seconds, num_apart)
+
+    def _join(self, sequence: StereoSequence, piece: _Piece) -> tuple[int, float] | None:
+        """Add a piece to the map. Return how many of its new frames have a pose, and its shift.
+        None if it cannot be placed."""
+        frames = sequence_subset(sequence, range(piece.first, piece.stop))
         try:
-            posed = run_slam(piece).apply([piece])[0]
+            posed = run_slam(frames).apply([frames])[0]
             if self._topomap is None:
                 self._begin(posed)
-                poses = _numbered(posed.poses, first)
+                poses, shift = _numbered(posed.poses, piece.first), 0.0
             else:
-                poses, shift = self._extend(self._topomap, posed, first, before)
+                poses, shift = self._extend(self._topomap, posed, piece)
         except (RecordingError, TrajectoryError, EmptyMapError):
-            poses = {}  # too dark, or nothing that the map knows: the next piece may be
+            return None  # too dark, or nothing that the map knows
         self._world_from_cams = poses
-        num_posed = sum(index >= before for index in poses)
-        return Growth(
-            num_new, num_posed, *self._size(), shift, time.monotonic() - began, bool(poses)
-        )
+        return sum(index >= piece.before for index in poses), shift
 
     def finish(self) -> TopoMetricMap | None:
         """Measure the statistics of the whole map, write it a last time, and return it. None if no
@@ -136,19 +164,18 @@ class GrowingMap:
         self._write(with_map_statistics(built))
 
     def _extend(
-        self, topomap: TopoMetricMap, posed: StereoSequence, first: int, before: int
+        self, topomap: TopoMetricMap, posed: StereoSequence, piece: _Piece
     ) -> tuple[dict[int, Rigid3], float]:
-        """Add a piece, whose first frame is `first`. Its frames from `before` on are new. Return
-        the poses of all its frames in the map, and the shift. Raises TrajectoryError."""
-        session_poses, shift = self._place(topomap, posed, first)
+        """Add a piece. Return the poses of all its frames in the map, and the shift. Raises
+        TrajectoryError."""
+        session_poses, shift = self._place(topomap, posed, piece.first)
         poses = session_poses.world_from_cams
-        new = range(before - first, len(posed))
+        new = range(piece.before - piece.first, len(posed))
         view = SequenceView(posed, [*new], [poses.get(index) for index in new])
         own = {k - new.start: one for k, one in session_poses.answers.items() if k in new}
         if any(view.poses):
             self._write(self._with_content(topomap, view, replace(session_poses, answers=own)))
-        self.max_shift_m = max(self.max_shift_m, shift)
-        return {index + first: pose for index, pose in poses.items()}, shift
+        return {index + piece.first: pose for index, pose in poses.items()}, shift
 
     def _with_content(
         self, topomap: TopoMetricMap, view: StereoSequence, session_poses: SessionPoses
