@@ -69,6 +69,7 @@ def errors_m(topomap: TopoMetricMap, ys: list[float | None]) -> dict[float, floa
     return off
 
 
+@pytest.mark.slow
 def test_unknown_stretch_joins_when_the_camera_is_back(tmp_path: Path):
     ys = [*FIRST, *[None] * DARK, *FAR]
     walk = Interrupted(ys)
